@@ -1,0 +1,1 @@
+"""MeshSplats: Gaussian splats as ordinary triangle meshes."""

@@ -1,0 +1,15 @@
+"""The errors and warnings that users meet. Each message says what, got what, and what to do."""
+
+from __future__ import annotations
+
+
+class FileFormatError(ValueError):
+    """A file that cannot be read as what it was taken for: broken, truncated, hostile or of another kind."""
+
+
+class MissingDependencyError(ImportError):
+    """An optional library is needed here; the message names the extra that installs it."""
+
+
+class DataWarning(UserWarning):
+    """Something in the data was left out or altered; the message counts it."""

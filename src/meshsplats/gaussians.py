@@ -1,0 +1,110 @@
+"""GaussianCloud: splats after activation, in scene units, whatever file they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from meshsplats._arrays import checked_array
+
+Kernel = Literal["3dgs", "antialiased", "2dgs"]
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianCloud:
+    """N Gaussians. Arrays are float32 and C-contiguous; the constructor checks and converts them.
+
+    Concretely, splat i is ``opacities[i] * exp(-0.5 * |diag(1 / scales[i]) R_i^T (x - means[i])|^2)`` with
+    ``R_i`` the rotation of ``quaternions[i]``.
+    """
+
+    means: np.ndarray
+    """(n, 3) centres in the world frame, scene units."""
+    quaternions: np.ndarray
+    """(n, 4) unit quaternions w, x, y, z: rotation from the splat's own axes to the world."""
+    scales: np.ndarray
+    """(n, 3) standard deviations along the splat's own axes, scene units, >= 0; 0 marks a flat axis."""
+    opacities: np.ndarray
+    """(n,) peak opacities in [0, 1]."""
+    sh: np.ndarray
+    """(n, k, 3) spherical harmonic coefficients of the display colour, k = 1, 4, 9 or 16 (degree 0 to 3)."""
+    kernel: Kernel = "3dgs"
+    """How the splats were trained to be drawn: '3dgs' (0.3 px^2 added to the projected covariance),
+    'antialiased' (the same with the opacity lowered to keep its integral) or '2dgs' (flat splats met by the ray)."""
+
+    def __post_init__(self) -> None:
+        means = checked_array("means", self.means, np.float32, (None, 3))
+        n = len(means)
+        quaternions = checked_array("quaternions", self.quaternions, np.float32, (n, 4))
+        scales = checked_array("scales", self.scales, np.float32, (n, 3))
+        opacities = checked_array("opacities", self.opacities, np.float32, (n,))
+        sh = checked_array("sh", self.sh, np.float32, (n, None, 3))
+        if sh.shape[1] not in (1, 4, 9, 16):
+            raise ValueError(f"sh must hold 1, 4, 9 or 16 coefficients a channel, got {sh.shape[1]}")
+        if n:
+            norm = np.einsum("ij,ij->i", quaternions, quaternions)
+            if np.abs(norm - 1).max() > 1e-3:
+                row = int(np.abs(norm - 1).argmax())
+                raise ValueError(f"quaternions must be normalised, row {row} has length {float(norm[row]) ** 0.5:.4g}")
+            if scales.min() < 0:
+                raise ValueError(f"scales are standard deviations and must be >= 0, got {scales.min():.4g}")
+            if opacities.min() < 0 or opacities.max() > 1:
+                raise ValueError(
+                    f"opacities must lie in [0, 1], got {opacities.min():.4g} to {opacities.max():.4g}"
+                    " (apply the sigmoid to stored logits)"
+                )
+        if self.kernel not in get_args(Kernel):
+            raise ValueError(f"kernel must be one of {', '.join(get_args(Kernel))}, got {self.kernel!r}")
+        for name, value in [
+            ("means", means),
+            ("quaternions", quaternions),
+            ("scales", scales),
+            ("opacities", opacities),
+            ("sh", sh),
+        ]:
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the stored spherical harmonics, 0 to 3."""
+        return int(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def colors(self) -> np.ndarray:
+        """(n, 3) display RGB of degree 0 in [0, 1]: ``clip(0.5 + C0 * sh[:, 0])``."""
+        return np.clip(0.5 + np.float32(SH_C0) * self.sh[:, 0], 0, 1)
+
+    @property
+    def rotations(self) -> np.ndarray:
+        """(n, 3, 3) float32 rotation matrices; columns are the splat's own axes in the world frame."""
+        w, x, y, z = self.quaternions.T
+        rows = np.empty((len(self), 3, 3), np.float32)
+        rows[:, 0, 0] = 1 - 2 * (y * y + z * z)
+        rows[:, 0, 1] = 2 * (x * y - w * z)
+        rows[:, 0, 2] = 2 * (x * z + w * y)
+        rows[:, 1, 0] = 2 * (x * y + w * z)
+        rows[:, 1, 1] = 1 - 2 * (x * x + z * z)
+        rows[:, 1, 2] = 2 * (y * z - w * x)
+        rows[:, 2, 0] = 2 * (x * z - w * y)
+        rows[:, 2, 1] = 2 * (y * z + w * x)
+        rows[:, 2, 2] = 1 - 2 * (x * x + y * y)
+        return rows
+
+    def select(self, index: np.ndarray) -> GaussianCloud:
+        """The splats chosen by a boolean mask or an index array, in that order."""
+        return replace(
+            self,
+            means=self.means[index],
+            quaternions=self.quaternions[index],
+            scales=self.scales[index],
+            opacities=self.opacities[index],
+            sh=self.sh[index],
+        )

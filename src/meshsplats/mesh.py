@@ -1,0 +1,113 @@
+"""SplatMesh: translucent vertex-coloured triangles, the form that everything else works on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal, get_args
+
+import numpy as np
+
+from meshsplats._arrays import checked_array
+
+Blending = Literal["display", "linear"]
+
+
+@dataclass(frozen=True, eq=False)
+class SplatMesh:
+    """V vertices and F triangles. The constructor checks and converts the arrays (C-contiguous).
+
+    Concretely, ``colors[faces[j, k]]`` is the straight (not premultiplied) RGBA at corner k of triangle j;
+    inside a triangle RGBA is interpolated with perspective-correct barycentric weights.
+    """
+
+    vertices: np.ndarray
+    """(v, 3) float32 positions in the world frame, scene units."""
+    faces: np.ndarray
+    """(f, 3) int32 vertex numbers. Triangles are seen from both sides."""
+    colors: np.ndarray
+    """(v, 4) float32 straight RGBA in [0, 1]."""
+    face_splat: np.ndarray | None = None
+    """(f,) int32 number of the splat each triangle was made from, ascending; None if the mesh has no such origin."""
+    normals: np.ndarray | None = None
+    """(v, 3) float32 unit shading normals, or None."""
+    depth_group: np.ndarray | None = None
+    """(f,) int32: triangles with the same number >= 0 are coplanar layers that share one depth, that of their common
+    plane, and are ordered by face number; -1 keeps a triangle's own depth."""
+    up: np.ndarray = field(default_factory=lambda: np.array([0, -1, 0], np.float32))
+    """(3,) float32 unit direction that points up in the world frame; splats trained from COLMAP cameras have y down."""
+    blending: Blending = "display"
+    """Space in which the colours were made to be blended: 'display' (sRGB-encoded, as splats are) or 'linear'."""
+    attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Further float32 arrays (v,) or (v, c) by name, one row a vertex."""
+
+    def __post_init__(self) -> None:
+        vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
+        v = len(vertices)
+        faces = checked_array("faces", self.faces, np.int32, (None, 3))
+        f = len(faces)
+        if f and (faces.min() < 0 or faces.max() >= v):
+            raise ValueError(f"faces must number vertices 0 to {v - 1}, got {faces.min()} to {faces.max()}")
+        colors = checked_array("colors", self.colors, np.float32, (v, 4))
+        if v and (colors.min() < 0 or colors.max() > 1):
+            raise ValueError(f"colors must lie in [0, 1], got {colors.min():.4g} to {colors.max():.4g}")
+        set_ = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+        set_("vertices", vertices)
+        set_("faces", faces)
+        set_("colors", colors)
+        if self.face_splat is not None:
+            face_splat = checked_array("face_splat", self.face_splat, np.int32, (f,))
+            if f and (face_splat[0] < 0 or (np.diff(face_splat) < 0).any()):
+                raise ValueError("face_splat must be ascending numbers >= 0")
+            set_("face_splat", face_splat)
+        if self.depth_group is not None:
+            depth_group = checked_array("depth_group", self.depth_group, np.int32, (f,))
+            if f and depth_group.min() < -1:
+                raise ValueError(f"depth_group must be >= 0, or -1 for none, got {depth_group.min()}")
+            set_("depth_group", depth_group)
+        if self.normals is not None:
+            set_("normals", checked_array("normals", self.normals, np.float32, (v, 3)))
+        up = checked_array("up", self.up, np.float32, (3,))
+        length = float(np.linalg.norm(up))
+        if length == 0:
+            raise ValueError("up must not be the zero vector")
+        set_("up", up / np.float32(length))
+        if self.blending not in get_args(Blending):
+            raise ValueError(f"blending must be one of {', '.join(get_args(Blending))}, got {self.blending!r}")
+        attributes = {}
+        for name, value in self.attributes.items():
+            ndim = np.ndim(value)
+            if ndim not in (1, 2):
+                raise ValueError(f"attribute {name!r} must have one row a vertex, got shape {np.shape(value)}")
+            attributes[name] = checked_array(f"attribute {name!r}", value, np.float32, (v, None)[:ndim])
+        set_("attributes", MappingProxyType(attributes))
+
+    @property
+    def splat_count(self) -> int | None:
+        """How many splats own at least one triangle; None where the mesh does not know."""
+        if self.face_splat is None:
+            return None
+        return int(len(self.face_splat) > 0) + int(np.count_nonzero(np.diff(self.face_splat)))
+
+    def keep_faces(self, keep: np.ndarray) -> SplatMesh:
+        """The triangles marked in ``keep`` (f,) bool, in order, without the vertices that no kept triangle uses."""
+        keep = np.asarray(keep, bool)
+        faces = self.faces[keep]
+        used = np.zeros(len(self.vertices), bool)
+        used[faces.ravel()] = True
+        renumber = np.cumsum(used, dtype=np.int32) - 1
+        return replace(
+            self,
+            vertices=self.vertices[used],
+            faces=renumber[faces],
+            colors=self.colors[used],
+            face_splat=None if self.face_splat is None else self.face_splat[keep],
+            normals=None if self.normals is None else self.normals[used],
+            depth_group=None if self.depth_group is None else self.depth_group[keep],
+            attributes={name: value[used] for name, value in self.attributes.items()},
+        )
+
+    def prune(self, min_opacity: float) -> SplatMesh:
+        """Without the triangles all of whose corners are below ``min_opacity``, and without orphaned vertices."""
+        return self.keep_faces((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
