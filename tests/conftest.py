@@ -1,0 +1,22 @@
+"""Shared fixtures and paths."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
+settings.load_profile("repeatable")
+
+SHARED = Path(os.environ.get("MESHSPLATS_SHARED_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def shared_data(path: str) -> Path:
+    """A file of the local collection of real data, which is not part of the project; skips the test without it."""
+    found = SHARED / path
+    if not found.exists():
+        pytest.skip(f"real data not here: {found} (set MESHSPLATS_SHARED_DATA to its folder)")
+    return found
