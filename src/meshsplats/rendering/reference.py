@@ -1,0 +1,447 @@
+"""The executable specification of :mod:`meshsplats.rendering`: slow, in float64, written to be read.
+
+``render`` and ``render_splats`` here say what a correct picture is; the compiled core is tested against them.
+Nothing is culled, binned or bounded: every triangle and every splat is tried at every sample, so the cost is their
+product (about a second for 2,000 triangles on 64 x 64 samples).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.api import Rendering
+
+SPLAT_MIN_ALPHA = 1 / 255
+"""Splats fainter than this at a sample are left out there, as in 3DGS."""
+SPLAT_MAX_ALPHA = 0.99
+"""No splat is more opaque than this at a sample, as in 3DGS."""
+SPLAT_MIN_TRANSMITTANCE = 1e-4
+"""A sample ends before the splat that would let less light than this through, as in 3DGS."""
+
+
+def render(
+    mesh: SplatMesh,
+    camera: Camera,
+    *,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+    samples: int = 1,
+    max_layers: int | None = None,
+    min_transmittance: float = 0.0,
+    depth: bool = False,
+    normals: bool = False,
+    attributes: Sequence[str] = (),
+) -> Rendering:
+    """The picture of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
+
+    At each of the ``samples`` x ``samples`` regularly spaced samples of a pixel, the triangles that cover it are
+    sorted by depth there, equal depths by face number, and blended front to back:
+    C = sum T_k a_k c_k + T background, with T_k the product of the (1 - a) in front. Fragments with a = 0 do not
+    count. ``max_layers`` blends only that many of the nearest fragments of each sample; a sample stops once its T
+    is below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
+
+    ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
+
+    Raises ValueError for options out of range, a background of another shape, or an attribute the mesh lacks.
+    """
+    backdrop = _checked_background(background, camera)
+    if max_layers is not None and not (max_layers == int(max_layers) and max_layers >= 1):
+        raise ValueError(f"max_layers must be a whole number from 1 on, or None for all, got {max_layers}")
+    if unknown := [name for name in attributes if name not in mesh.attributes]:
+        present = ", ".join(mesh.attributes) or "none"
+        raise ValueError(f"the mesh has no attribute {unknown[0]!r}; it has {present}")
+    x, y = _sample_positions(camera, samples)
+    sheet = _fragments(mesh, camera, x, y)
+    corners = mesh.faces[sheet.face]
+
+    def interpolated(values: np.ndarray) -> np.ndarray:
+        at_corners = values.astype(np.float64)[corners]
+        mixed = np.einsum("nk,nkc->nc", sheet.weights, at_corners)
+        # Weights add up to 1 but for rounding, which must not lead outside the range of the corners.
+        return np.clip(mixed, at_corners.min(axis=1), at_corners.max(axis=1))
+
+    rgba = interpolated(mesh.colors)
+    share, transmittance = _front_to_back(sheet, rgba[:, 3], len(x), max_layers, min_transmittance)
+
+    def picture(values: np.ndarray) -> np.ndarray:
+        sums = np.empty((len(x), values.shape[1]))
+        for channel, value in enumerate(values.T):
+            sums[:, channel] = np.bincount(sheet.sample, share * value, minlength=len(x))
+        return _pixel_means(sums, camera, samples)
+
+    through = _pixel_means(transmittance[:, None], camera, samples)
+    extra = {}
+    for name in attributes:
+        values = mesh.attributes[name]
+        mean = picture(interpolated(values[:, None] if values.ndim == 1 else values))
+        extra[name] = mean[..., 0] if values.ndim == 1 else mean
+    return Rendering(
+        color=picture(rgba[:, :3]) + through * backdrop,
+        alpha=1 - through[..., 0],
+        depth=picture(sheet.depth[:, None])[..., 0] if depth else None,
+        normals=picture(_facing_normals(mesh, camera, sheet, x, y)) if normals else None,
+        attributes=extra,
+        fragments=int(np.count_nonzero(share)),
+    )
+
+
+def render_splats(
+    cloud: GaussianCloud,
+    camera: Camera,
+    *,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+    samples: int = 1,
+    sh_degree: int | None = None,
+    dilation: float = 0.3,
+) -> Rendering:
+    """The picture of splats as 3D Gaussian splatting draws it (Kerbl et al. 2023). Arrays are float64.
+
+    Splats are blended front to back in the order of the depth z of their centres, equal depths by number; those
+    with a centre nearer than ``camera.near`` are left out. ``dilation`` (pixels squared, of the picture whatever
+    ``samples`` is) widens every projected splat; kernel '2dgs' has its own widening and does not use it.
+    ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
+
+    Unlike the published rasterisers this has no tiles and no cut at three standard deviations: a splat is drawn
+    wherever its alpha reaches 1/255.
+
+    Raises ValueError for options out of range or a background of another shape.
+    """
+    backdrop = _checked_background(background, camera)
+    if sh_degree is not None and not (sh_degree == int(sh_degree) and sh_degree >= 0):
+        raise ValueError(f"sh_degree must be a whole number from 0 on, or None for all, got {sh_degree}")
+    if not (np.isfinite(dilation) and dilation >= 0):
+        raise ValueError(f"dilation must be >= 0, got {dilation}")
+    x, y = _sample_positions(camera, samples)
+    rgb = splat_colors(cloud, camera, cloud.sh_degree if sh_degree is None else int(sh_degree))
+    opacities = cloud.opacities.astype(np.float64)
+    centers = _to_camera(cloud.means, camera)
+    in_front = np.flatnonzero(centers[:, 2] >= camera.near)
+    nearest_first = in_front[np.argsort(centers[in_front, 2], kind="stable")]
+    # Columns are the splat's own axes in the camera's frame.
+    axes = camera.world_to_camera[:3, :3] @ _rotations(cloud)
+    scales = cloud.scales.astype(np.float64)
+
+    color, transmittance = np.zeros((len(x), 3)), np.ones(len(x))
+    unfinished = np.ones(len(x), bool)
+    fragments = 0
+    for i in nearest_first:
+        if cloud.kernel == "2dgs":
+            falloff = _flat_falloff(centers[i], axes[i], scales[i], camera, x, y)
+        else:
+            falloff = _projected_falloff(centers[i], axes[i], scales[i], camera, x, y, dilation, cloud.kernel)
+        alpha = np.minimum(SPLAT_MAX_ALPHA, opacities[i] * falloff)
+        drawn = unfinished & (alpha >= SPLAT_MIN_ALPHA)
+        after = transmittance * (1 - alpha)
+        unfinished &= ~(drawn & (after < SPLAT_MIN_TRANSMITTANCE))
+        drawn &= unfinished
+        color[drawn] += (transmittance * alpha)[drawn, None] * rgb[i]
+        transmittance[drawn] = after[drawn]
+        fragments += int(drawn.sum())
+    through = _pixel_means(transmittance[:, None], camera, samples)
+    mean = _pixel_means(color, camera, samples)
+    return Rendering(color=mean + through * backdrop, alpha=1 - through[..., 0], fragments=fragments)
+
+
+# Samples and pixels
+
+
+def _checked_background(background: Sequence[float] | np.ndarray, camera: Camera) -> np.ndarray:
+    array = np.asarray(background, np.float64)
+    if array.shape not in ((3,), (camera.height, camera.width, 3)):
+        raise ValueError(
+            f"background must have shape (3,) or ({camera.height}, {camera.width}, 3), got {array.shape}"
+        )
+    return array
+
+
+def _sample_positions(camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """x and y (n,) in pixels of all samples, row by row: pixel centres where ``samples`` is 1."""
+    if not (samples == int(samples) and samples >= 1):
+        raise ValueError(f"samples must be a whole number from 1 on, got {samples}")
+    across = (np.arange(camera.width * samples) + 0.5) / samples
+    down = (np.arange(camera.height * samples) + 0.5) / samples
+    y, x = np.meshgrid(down, across, indexing="ij")
+    return x.ravel(), y.ravel()
+
+
+def _pixel_means(values: np.ndarray, camera: Camera, samples: int) -> np.ndarray:
+    """(h, w, c) means over the samples of each pixel of ``values`` (n, c)."""
+    grid = values.reshape(camera.height, samples, camera.width, samples, values.shape[1])
+    return grid.mean(axis=(1, 3))
+
+
+def _to_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """(n, 3) world points in the camera's frame."""
+    columns = camera.world_to_camera[:3].T
+    x, y, z = points.astype(np.float64).T[:, :, None]
+    # Summed term by term so that a point's rounding does not depend on its row.
+    return x * columns[0] + y * columns[1] + z * columns[2] + columns[3]
+
+
+# Triangles
+
+
+@dataclass
+class _Fragments:
+    """Where triangles meet samples, n fragments; sorted by sample, then nearest first, then face."""
+
+    sample: np.ndarray
+    """(n,) int"""
+    face: np.ndarray
+    """(n,) int"""
+    depth: np.ndarray
+    """(n,) z of the triangle at the sample"""
+    weights: np.ndarray
+    """(n, 3) perspective-correct barycentric weights of the corners"""
+
+
+def _fragments(mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray) -> _Fragments:
+    points = _to_camera(mesh.vertices, camera)
+    # Pixel space before the division by z: a point (X, Y, Z) is seen at (X / Z, Y / Z) pixels.
+    homogeneous = points.copy()
+    homogeneous[:, 0] = camera.fx * points[:, 0] + camera.cx * points[:, 2]
+    homogeneous[:, 1] = camera.fy * points[:, 1] + camera.cy * points[:, 2]
+
+    covers = [_cover(corners, x, y, camera.near) for corners in homogeneous[mesh.faces]]
+    if not covers:
+        return _Fragments(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 3)))
+    sample, depth, weights = (np.concatenate(parts) for parts in zip(*covers, strict=True))
+    face = np.repeat(np.arange(len(covers)), [len(cover[0]) for cover in covers])
+    nearness = 1 / depth
+    if mesh.depth_group is not None:
+        _share_depths(mesh, homogeneous, camera.near, sample, face, nearness, x, y)
+    order = np.lexsort((face, -nearness, sample))
+    return _Fragments(sample[order], face[order], depth[order], weights[order])
+
+
+def _cover(
+    corners: np.ndarray, x: np.ndarray, y: np.ndarray, near: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Samples that a triangle covers at a depth z >= near, the depth there, and the weights of the corners.
+
+    ``corners`` V are (3, 3) homogeneous pixel positions. With p = (x, y, 1), e_i = p . (V_j x V_k) and
+    D = V_0 . (V_1 x V_2), the ray through p meets the triangle's plane at z p = sum b_i V_i with z = D / sum e and
+    b_i = e_i / sum e (Olano and Greer 1997). This point is in the triangle and in front of the camera if and only
+    if no e_i / D is negative, so corners behind the camera need no clipping.
+    """
+    edges = np.stack([np.cross(corners[j], corners[k]) for j, k in ((1, 2), (2, 0), (0, 1))])
+    determinant = float(corners[0] @ edges[0])
+    nothing = np.zeros(0, int), np.zeros(0), np.zeros((0, 3))
+    if determinant == 0:
+        return nothing
+    inside = np.ones(len(x), bool)
+    distances = np.empty((len(x), 3))
+    for i, (a, b, c) in enumerate(edges if determinant > 0 else -edges):
+        # Both triangles at an edge evaluate it alike but for the sign, so that no sample falls between them.
+        distances[:, i] = a * x + b * y + c
+        # A sample on the edge belongs to the triangle to the right of it, or below it where it is level.
+        top_left = a > 0 or (a == 0 and b > 0)
+        inside &= (distances[:, i] >= 0) if top_left else (distances[:, i] > 0)
+    sample = np.flatnonzero(inside)
+    distances = distances[sample]
+    total = distances.sum(axis=1)
+    # Rounding must not separate triangles that lie at one depth, nor lead outside a sliver.
+    depth = np.clip(abs(determinant) / total, corners[:, 2].min(), corners[:, 2].max())
+    seen = depth >= near
+    return sample[seen], depth[seen], distances[seen] / total[seen, None]
+
+
+def _share_depths(
+    mesh: SplatMesh,
+    homogeneous: np.ndarray,
+    near: float,
+    sample: np.ndarray,
+    face: np.ndarray,
+    nearness: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+) -> None:
+    """Replaces 1/z, by which fragments are ordered, with that of the common plane in every depth group.
+
+    The plane is that of the triangle with the largest area in the world, the first of them if equal. Its 1/z is
+    clamped to the range over the group's vertices, of which those nearer than ``near`` count as at that depth. For
+    a plane seen edge on, which has no depth on the picture, the nearest vertex stands.
+    """
+    assert mesh.depth_group is not None
+    world = mesh.vertices.astype(np.float64)[mesh.faces]
+    areas = np.linalg.norm(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]), axis=1)
+    for group in np.unique(mesh.depth_group[mesh.depth_group >= 0]):
+        members = np.flatnonzero(mesh.depth_group == group)
+        largest = members[np.argmax(areas[members])]
+        v0, v1, v2 = homogeneous[mesh.faces[largest]]
+        determinant = v0 @ np.cross(v1, v2)
+        limits = 1 / np.maximum(near, homogeneous[mesh.faces[members], 2])
+        chosen = np.flatnonzero(mesh.depth_group[face] == group)
+        if determinant == 0:
+            nearness[chosen] = limits.max()
+            continue
+        a, b, c = (np.cross(v1, v2) + np.cross(v2, v0) + np.cross(v0, v1)) / determinant
+        plane = a * x[sample[chosen]] + b * y[sample[chosen]] + c
+        nearness[chosen] = np.clip(plane, limits.min(), limits.max())
+
+
+def _front_to_back(
+    sheet: _Fragments, alpha: np.ndarray, count: int, max_layers: int | None, min_transmittance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """T_k a_k of every fragment (0 where it is not blended), and the T left at each of ``count`` samples."""
+    share, transmittance = np.zeros(len(alpha)), np.ones(count)
+    visible = np.flatnonzero(alpha > 0)
+    sample = sheet.sample[visible]
+    first = np.searchsorted(sample, sample)  # of the same sample
+    layer = np.arange(len(sample)) - first
+    by_layer = visible[np.argsort(layer, kind="stable")]
+    sizes = np.bincount(layer)
+    for k, end in enumerate(np.cumsum(sizes)):
+        if max_layers is not None and k >= max_layers:
+            break
+        fragments = by_layer[end - sizes[k] : end]  # at most one a sample
+        fragments = fragments[transmittance[sheet.sample[fragments]] >= min_transmittance]
+        here = sheet.sample[fragments]
+        share[fragments] = transmittance[here] * alpha[fragments]
+        transmittance[here] *= 1 - alpha[fragments]
+    return share, transmittance
+
+
+def _facing_normals(
+    mesh: SplatMesh, camera: Camera, sheet: _Fragments, x: np.ndarray, y: np.ndarray
+) -> np.ndarray:
+    """(n, 3) unit normals in the world frame, turned to the camera; 0 where the mesh has none."""
+    corners = mesh.faces[sheet.face]
+    if mesh.normals is not None:
+        normals = np.einsum("nk,nkc->nc", sheet.weights, mesh.normals.astype(np.float64)[corners])
+    else:
+        a, b, c = mesh.vertices.astype(np.float64)[corners].transpose(1, 0, 2)
+        normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
+    away = np.einsum("nc,nc->n", normals, rays[sheet.sample] @ camera.world_to_camera[:3, :3]) > 0
+    return np.where(away[:, None], -normals, normals)
+
+
+# Splats
+
+
+def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """(n, (degree + 1)^2) real spherical harmonics, degree 0 to 3, of unit ``directions`` (n, 3).
+
+    Orthonormal on the sphere, ordered by degree l and then order m = -l .. l, with the Condon-Shortley sign
+    (-1)^m: the convention of splat files.
+
+    Raises ValueError for another degree.
+    """
+    if not 0 <= degree <= 3:
+        raise ValueError(f"degree must be 0, 1, 2 or 3, got {degree}")
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+
+    def norm(numerator: int, denominator: int) -> float:
+        return float(np.sqrt(numerator / (denominator * np.pi)))
+
+    basis = [
+        np.full(len(x), norm(1, 4)),
+        -norm(3, 4) * y,
+        norm(3, 4) * z,
+        -norm(3, 4) * x,
+        norm(15, 4) * x * y,
+        -norm(15, 4) * y * z,
+        norm(5, 16) * (2 * zz - xx - yy),
+        -norm(15, 4) * x * z,
+        norm(15, 16) * (xx - yy),
+        -norm(35, 32) * y * (3 * xx - yy),
+        norm(105, 4) * x * y * z,
+        -norm(21, 32) * y * (4 * zz - xx - yy),
+        norm(7, 16) * z * (2 * zz - 3 * xx - 3 * yy),
+        -norm(21, 32) * x * (4 * zz - xx - yy),
+        norm(105, 16) * z * (xx - yy),
+        -norm(35, 32) * x * (xx - 3 * yy),
+    ]
+    return np.stack(basis[: (degree + 1) ** 2], axis=1)
+
+
+def splat_colors(cloud: GaussianCloud, camera: Camera, degree: int) -> np.ndarray:
+    """(n, 3) RGB of every splat seen from the camera: max(0, 0.5 + SH), direction camera centre to splat.
+
+    Degrees above the stored one are not there to be used. There is no upper limit, as in 3DGS.
+    """
+    degree = min(degree, cloud.sh_degree)
+    directions = cloud.means.astype(np.float64) - camera.center
+    length = np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = np.divide(directions, length, out=np.zeros_like(directions), where=length > 0)
+    basis = sh_basis(directions, degree)
+    sh = cloud.sh[:, : basis.shape[1]].astype(np.float64)
+    return np.maximum(0, 0.5 + np.einsum("nk,nkc->nc", basis, sh))
+
+
+def _rotations(cloud: GaussianCloud) -> np.ndarray:
+    """(n, 3, 3) rotation matrices; columns are the splat's own axes in the world frame."""
+    w, x, y, z = cloud.quaternions.astype(np.float64).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _projected_falloff(
+    center: np.ndarray,
+    axes: np.ndarray,
+    scales: np.ndarray,
+    camera: Camera,
+    x: np.ndarray,
+    y: np.ndarray,
+    dilation: float,
+    kernel: str,
+) -> np.ndarray:
+    """exp(-d^T cov^-1 d / 2) of one splat at all samples, with its covariance on the picture.
+
+    The projection is linearised at the centre (EWA, Zwicker et al. 2001). Where that is far outside the picture the
+    Jacobian is taken at 1.3 times the half field of view, as in 3DGS; a principal point off the middle moves these
+    limits with it: 0.3 times the half field of view beyond each side of the picture.
+    For the kernel 'antialiased' the values are scaled to keep the integral that they had before the dilation.
+    """
+    tan_x, tan_y = center[0] / center[2], center[1] / center[2]
+    beyond_x, beyond_y = 0.3 * camera.width / (2 * camera.fx), 0.3 * camera.height / (2 * camera.fy)
+    u = np.clip(tan_x, -camera.cx / camera.fx - beyond_x, (camera.width - camera.cx) / camera.fx + beyond_x)
+    v = np.clip(tan_y, -camera.cy / camera.fy - beyond_y, (camera.height - camera.cy) / camera.fy + beyond_y)
+    jacobian = np.array([[camera.fx, 0, -camera.fx * u], [0, camera.fy, -camera.fy * v]]) / center[2]
+    projected_axes = jacobian @ (axes * scales)
+    sharp = projected_axes @ projected_axes.T
+    cov = sharp + dilation * np.eye(2)
+    determinant = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
+    if determinant <= 0:  # seen edge on and not widened
+        return np.zeros_like(x)
+    dx, dy = x - (camera.fx * tan_x + camera.cx), y - (camera.fy * tan_y + camera.cy)
+    power = (cov[1, 1] * dx * dx - 2 * cov[0, 1] * dx * dy + cov[0, 0] * dy * dy) / determinant
+    falloff = np.exp(-0.5 * np.maximum(0, power))  # below 0 by rounding only
+    if kernel == "antialiased":
+        falloff *= np.sqrt(max(0.0, sharp[0, 0] * sharp[1, 1] - sharp[0, 1] ** 2) / determinant)
+    return falloff
+
+
+def _flat_falloff(
+    center: np.ndarray, axes: np.ndarray, scales: np.ndarray, camera: Camera, x: np.ndarray, y: np.ndarray
+) -> np.ndarray:
+    """exp(-rho / 2) of one flat splat at all samples, rho = min(rho3d, rho2d) (2DGS, Huang et al. 2024).
+
+    rho3d is the squared distance, in standard deviations, from the centre to where the ray meets the plane of the
+    splat's first two axes; it is infinite where that is nearer than ``camera.near``, behind the camera or nowhere,
+    and beside the line that a splat with a scale of 0 is. rho2d = 2 |p - c|^2, with p the sample and c the
+    projected centre in pixels, keeps splats that are tiny or seen edge on from falling between the samples.
+    """
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
+    normal = np.cross(axes[:, 0], axes[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        z = (normal @ center) / (rays @ normal)
+        local = (z[:, None] * rays - center) @ axes[:, :2] / scales[:2]
+        rho3d = (local**2).sum(axis=1)
+    rho3d = np.where((z >= camera.near) & np.isfinite(rho3d), rho3d, np.inf)
+    dx = x - (camera.fx * center[0] / center[2] + camera.cx)
+    dy = y - (camera.fy * center[1] / center[2] + camera.cy)
+    return np.exp(-0.5 * np.minimum(rho3d, 2 * (dx * dx + dy * dy)))
