@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import core
+
+MIN_TRANSMITTANCE = 1e-6
+"""A sample stops once less than this fraction of light comes through: what is left out stays below it."""
+
+MAX_SAMPLES = 16
+"""Largest side of the grid of samples in a pixel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,19 +31,205 @@ class Rendering:
     depth: np.ndarray | None = None
     """(h, w) float32 camera depth z summed with the same weights as colour; divide by ``alpha`` for the mean depth."""
     normals: np.ndarray | None = None
-    """(h, w, 3) float32 world-frame normals turned to the camera, summed with the same weights."""
+    """(h, w, 3) float32 world-frame unit normals turned to the camera, summed with the same weights."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Per-vertex attributes asked for, (h, w) or (h, w, c) float32, summed with the same weights."""
     fragments: int = 0
-    """How many triangle (or splat) samples were blended."""
+    """How many samples of triangles (or splats) were blended."""
 
 
-def render(mesh, camera, *, background: Sequence[float] | np.ndarray = (1, 1, 1), samples: int = 1,
-           max_layers: int | None = None, threads: int | None = None, depth: bool = False, normals: bool = False,
-           attributes: Sequence[str] = ()) -> Rendering:
-    raise NotImplementedError
+def render(
+    mesh: SplatMesh,
+    camera: Camera,
+    *,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+    samples: int = 1,
+    max_layers: int | None = None,
+    min_transmittance: float = MIN_TRANSMITTANCE,
+    depth: bool = False,
+    normals: bool = False,
+    attributes: Sequence[str] = (),
+    threads: int | None = None,
+) -> Rendering:
+    """The picture of a mesh of translucent triangles, exact at every sample.
+
+    All triangles that cover a sample are sorted by their depth there (equal depths by face number) and blended
+    front to back, ``C = sum_k T_k a_k c_k + T_end * background`` with ``T_k = prod_{j<k} (1 - a_j)``; colour and
+    opacity are interpolated with perspective-correct weights. A sample on an edge shared by two triangles belongs
+    to exactly one (top-left rule). Triangles are seen from both sides and are cut at the near plane.
+
+    Args:
+        mesh: what to draw.
+        camera: from where.
+        background: RGB, (3,) or (h, w, 3), in the space of the mesh's colours.
+        samples: side of the grid of samples in each pixel, 1 to 16; 2 means 2 x 2 samples, averaged.
+        max_layers: blend only the nearest so many triangles at each sample, as depth peeling with that many passes.
+        min_transmittance: a sample stops once less than this fraction of light comes through; 0 never stops.
+        depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
+        threads: at most this many; all processors by default. The picture does not depend on it.
+
+    Raises:
+        ValueError: an option out of its range, or an attribute that the mesh does not have.
+        MemoryError: the scene does not fit.
+    """
+    keep = _Alive()
+    options = _options(keep, camera, background, samples, threads)
+    if max_layers is not None and not 1 <= max_layers <= np.iinfo(np.int32).max:
+        raise ValueError(f"max_layers must be at least 1, got {max_layers}")
+    if not 0 <= min_transmittance < 1:
+        raise ValueError(f"min_transmittance must lie in [0, 1), got {min_transmittance}")
+    options.max_layers = max_layers or 0
+    options.min_transmittance = min_transmittance
+
+    values, widths = None, {}
+    if attributes:
+        for name in attributes:
+            if name not in mesh.attributes:
+                raise ValueError(f"the mesh has no attribute {name!r}; it has: {', '.join(mesh.attributes) or 'none'}")
+        columns = {name: mesh.attributes[name].reshape(len(mesh.vertices), -1) for name in attributes}
+        widths = {name: column.shape[1] for name, column in columns.items()}
+        values = np.ascontiguousarray(np.concatenate(list(columns.values()), axis=1))
+    subject = core.MeshStruct(
+        vertex_count=len(mesh.vertices),
+        face_count=len(mesh.faces),
+        vertices=keep(mesh.vertices),
+        colors=keep(mesh.colors),
+        faces=keep(mesh.faces),
+        face_splat=keep(mesh.face_splat),
+        depth_group=keep(_compact(mesh.depth_group)),
+        normals=keep(mesh.normals),
+        attributes=keep(values),
+        attribute_count=sum(widths.values()),
+    )
+    h, w = camera.height, camera.width
+    color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
+    depths = np.empty((h, w), np.float32) if depth else None
+    directions = np.empty((h, w, 3), np.float32) if normals else None
+    sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
+    picture = core.PictureStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
+    core.call("ms_render_mesh", subject, _camera(camera), options, picture)
+
+    named = {}
+    start = 0
+    for name, width in widths.items():
+        part = sums[:, :, start : start + width]
+        named[name] = part[:, :, 0] if mesh.attributes[name].ndim == 1 else part
+        start += width
+    return Rendering(color, alpha, depths, directions, named, int(picture.fragments))
 
 
-def render_splats(cloud, camera, *, background: Sequence[float] | np.ndarray = (1, 1, 1), samples: int = 1,
-                  sh_degree: int | None = None, dilation: float = 0.3, threads: int | None = None) -> Rendering:
-    raise NotImplementedError
+def render_splats(
+    cloud: GaussianCloud,
+    camera: Camera,
+    *,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+    samples: int = 1,
+    sh_degree: int | None = None,
+    dilation: float = 0.3,
+    threads: int | None = None,
+) -> Rendering:
+    """The picture of the splats themselves, as 3D Gaussian Splatting draws them.
+
+    Splats are projected by their local affine approximation (EWA), widened by ``dilation``, and blended whole in the
+    order of their centres' depth: opacity below 1/255 is skipped, at most 0.99 is taken, and a sample ends before
+    the splat that would leave less than 1e-4 of the light. Every sample where a splat's opacity reaches 1/255 is
+    drawn, however far from its centre. The cloud's kernel decides what is drawn: '3dgs' as above, 'antialiased' with
+    the opacity lowered by as much as the widening adds, '2dgs' flat splats met by the ray (no widening; a low pass of
+    variance 1/2 px^2).
+
+    Args:
+        cloud: the splats.
+        camera: from where; splats whose centres are nearer than ``camera.near`` are left out.
+        background: RGB, (3,) or (h, w, 3).
+        samples: side of the grid of samples in each pixel, 1 to 16; the widening stays that of whole pixels.
+        sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default.
+        dilation: variance added to the projected covariance, square pixels; models trained otherwise need theirs.
+        threads: at most this many; all processors by default. The picture does not depend on it.
+
+    Raises:
+        ValueError: an option out of its range.
+        MemoryError: the scene does not fit.
+    """
+    keep = _Alive()
+    options = _options(keep, camera, background, samples, threads)
+    if sh_degree is not None and sh_degree not in (0, 1, 2, 3):
+        raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
+    if not (np.isfinite(dilation) and dilation >= 0):
+        raise ValueError(f"dilation must be a variance in square pixels, >= 0, got {dilation}")
+    degree = cloud.sh_degree if sh_degree is None else min(sh_degree, cloud.sh_degree)
+    subject = core.SplatsStruct(
+        count=len(cloud),
+        means=keep(cloud.means),
+        quaternions=keep(cloud.quaternions),
+        scales=keep(cloud.scales),
+        opacities=keep(cloud.opacities),
+        sh=keep(cloud.sh),
+        sh_stored=cloud.sh.shape[1],
+        sh_used=(degree + 1) ** 2,
+        kernel=("3dgs", "antialiased", "2dgs").index(cloud.kernel),
+        dilation=dilation,
+    )
+    h, w = camera.height, camera.width
+    color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
+    picture = core.PictureStruct(keep(color), keep(alpha), None, None, None, 0)
+    core.call("ms_render_splats", subject, _camera(camera), options, picture)
+    return Rendering(color, alpha, fragments=int(picture.fragments))
+
+
+class _Alive:
+    """Addresses of arrays for the core; holds the arrays until the call is over."""
+
+    def __init__(self) -> None:
+        self._arrays: list[np.ndarray] = []
+
+    def __call__(self, array: np.ndarray | None) -> int | None:
+        if array is not None:
+            self._arrays.append(array)
+        return core.pointer(array)
+
+
+def _camera(camera: Camera) -> core.CameraStruct:
+    rows = (core.c_double * 12)(*camera.world_to_camera[:3].ravel())
+    return core.CameraStruct(
+        rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height
+    )
+
+
+def _options(keep: _Alive, camera: Camera, background, samples: int, threads: int | None) -> core.OptionsStruct:
+    if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
+        raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
+    if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
+        raise ValueError(f"threads must be at least 1, got {threads!r}")
+    behind = np.ascontiguousarray(background, np.float32)
+    if behind.shape not in ((3,), (camera.height, camera.width, 3)):
+        raise ValueError(
+            f"background must have shape (3,) or ({camera.height}, {camera.width}, 3), got {behind.shape}"
+        )
+    if not np.isfinite(behind).all():
+        raise ValueError("background must be finite")
+    assert max(camera.width, camera.height) <= MAX_SIDE
+    return core.OptionsStruct(
+        samples=samples,
+        max_layers=0,
+        threads=min(int(threads) if threads else processors(), 256),
+        min_transmittance=0,
+        background=keep(behind),
+        background_per_pixel=behind.ndim == 3,
+    )
+
+
+def _compact(depth_group: np.ndarray | None) -> np.ndarray | None:
+    """The same groups under small numbers, so that tables over them stay as small as the mesh."""
+    if depth_group is None or not len(depth_group) or depth_group.max() < len(depth_group):
+        return depth_group
+    values, numbers = np.unique(depth_group, return_inverse=True)
+    shift = int(values[0] == -1)
+    return np.ascontiguousarray(numbers.reshape(-1) - shift, np.int32)
+
+
+def processors() -> int:
+    """Processors this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        return os.cpu_count() or 1

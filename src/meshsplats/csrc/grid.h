@@ -1,0 +1,144 @@
+// The sample grid, its tiles, and the depth-ordered list of what may touch each tile.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "parallel.h"
+#include "types.h"
+
+namespace ms {
+
+constexpr int TILE = 16;  // samples a side; fixed, so that rounding does not depend on the vector width
+
+struct Grid {
+    int samples;       // a pixel side
+    int width, height; // in samples
+    int side;          // samples a tile side in use: the largest multiple of `samples` up to TILE
+    int tiles_x, tiles_y;
+
+    Grid(const MsCamera &camera, int samples)
+        : samples(samples), width(camera.width * samples), height(camera.height * samples),
+          side(TILE / samples * samples), tiles_x((width + side - 1) / side), tiles_y((height + side - 1) / side) {}
+    int64_t tiles() const { return (int64_t)tiles_x * tiles_y; }
+};
+
+// Something to draw: what it is, how near it comes, the tiles it may touch.
+struct Item {
+    float key;  // no sample of it is nearer: compared with 1 / depth, nearest first
+    int32_t number;
+    uint16_t x0, x1, y0, y1;  // tiles, inclusive
+};
+
+// First and last sample whose centre lies in [lo, hi] widened a little, clamped to [0, count).
+inline bool sample_range(double lo, double hi, int count, int &first, int &last) {
+    constexpr double slack = 1e-3;  // rounding of edge functions must never find a sample outside the box
+    double a = std::ceil(lo - 0.5 - slack), b = std::floor(hi - 0.5 + slack);
+    if (!(b >= 0) || !(a <= count - 1) || !(a <= b)) return false;
+    first = a > 0 ? (int)a : 0;
+    last = b < count - 1 ? (int)b : count - 1;
+    return true;
+}
+
+// Orders items nearest first (stable radix sort by key, which is >= 0).
+inline void sort_items(std::vector<Item> &items) {
+    std::vector<Item> other(items.size());
+    auto digit = [](const Item &item, int pass) {
+        uint32_t bits;
+        std::memcpy(&bits, &item.key, 4);
+        return (~bits >> (11 * pass)) & 2047u;
+    };
+    std::vector<size_t> start(2048);
+    for (int pass = 0; pass < 3; ++pass) {
+        std::fill(start.begin(), start.end(), 0);
+        for (auto &item : items) ++start[digit(item, pass)];
+        size_t sum = 0;
+        for (auto &s : start) {
+            size_t n = s;
+            s = sum;
+            sum += n;
+        }
+        for (auto &item : items) other[start[digit(item, pass)]++] = item;
+        items.swap(other);
+    }
+}
+
+// Tile lists for a run of consecutive tiles, in the order of the items. Long lists are made a run of tiles at a
+// time, so that memory stays bounded however many tiles the items cover.
+class TileLists {
+  public:
+    TileLists(const Grid &grid, const std::vector<Item> &items, int threads)
+        : grid_(grid), items_(items), threads_(threads), count_(grid.tiles()), start_(1) {
+        // Corner counts summed along both axes give every tile's number of items.
+        int w = grid.tiles_x + 1;
+        std::vector<int32_t> corner((size_t)w * (grid.tiles_y + 1));
+        for (auto &item : items) {
+            ++corner[(size_t)item.y0 * w + item.x0];
+            --corner[(size_t)item.y0 * w + item.x1 + 1];
+            --corner[(size_t)(item.y1 + 1) * w + item.x0];
+            ++corner[(size_t)(item.y1 + 1) * w + item.x1 + 1];
+        }
+        for (int y = 0; y < grid.tiles_y; ++y) {
+            int32_t sum = 0;
+            for (int x = 0; x < grid.tiles_x; ++x) {
+                sum += corner[(size_t)y * w + x];
+                count_[(size_t)y * grid.tiles_x + x] = sum + (y ? count_[(size_t)(y - 1) * grid.tiles_x + x] : 0);
+            }
+        }
+    }
+
+    // Prepares the lists of the next run of tiles [begin(), end()); false when all are done.
+    bool next() {
+        begin_ = end_;
+        if (begin_ >= grid_.tiles()) return false;
+        int64_t total = 0;
+        start_.assign(1, 0);
+        while (end_ < grid_.tiles() && (end_ == begin_ || total + count_[end_] <= budget)) {
+            total += count_[end_++];
+            start_.push_back(total);
+        }
+        entries_.resize(total);
+        std::vector<int64_t> fill(start_.begin(), start_.end() - 1);
+        // Each thread fills the lists of its own tiles; about equal numbers of entries each.
+        on_threads(total < 100000 ? 1 : threads_, [&](int thread) {
+            int n = total < 100000 ? 1 : threads_;
+            int64_t a = bound(total * thread / n), b = bound(total * (thread + 1) / n);
+            if (a >= b) return;
+            int row_a = (int)(a / grid_.tiles_x), row_b = (int)((b - 1) / grid_.tiles_x);
+            for (size_t i = 0; i < items_.size(); ++i) {
+                const Item &item = items_[i];
+                for (int y = std::max<int>(item.y0, row_a); y <= std::min<int>(item.y1, row_b); ++y) {
+                    int64_t row = (int64_t)y * grid_.tiles_x;
+                    int64_t first = std::max(row + item.x0, a), last = std::min(row + item.x1, b - 1);
+                    for (int64_t tile = first; tile <= last; ++tile) entries_[fill[tile - begin_]++] = (uint32_t)i;
+                }
+            }
+        });
+        return true;
+    }
+
+    int64_t begin() const { return begin_; }
+    int64_t end() const { return end_; }
+    const uint32_t *list(int64_t tile) const { return entries_.data() + start_[tile - begin_]; }
+    int64_t length(int64_t tile) const { return count_[tile]; }
+
+  private:
+    static constexpr int64_t budget = 12'000'000;  // entries held at once
+
+    int64_t bound(int64_t entries) const {
+        return begin_ + (std::lower_bound(start_.begin(), start_.end(), entries) - start_.begin());
+    }
+
+    const Grid &grid_;
+    const std::vector<Item> &items_;
+    int threads_;
+    std::vector<int32_t> count_;
+    std::vector<int64_t> start_;
+    std::vector<uint32_t> entries_;
+    int64_t begin_ = 0, end_ = 0;
+};
+
+}  // namespace ms

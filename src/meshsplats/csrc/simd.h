@@ -1,0 +1,70 @@
+// Vectors of W floats for a row of samples, and of 4 floats for one RGBA value.
+// Plain IEEE operations in a fixed order: every variant of the core computes the same bits.
+#pragma once
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace ms {
+
+#if defined(__AVX512F__)
+constexpr int W = 16;
+#elif defined(__AVX2__)
+constexpr int W = 8;
+#else
+constexpr int W = 4;
+#endif
+
+typedef float vf __attribute__((vector_size(4 * W)));
+typedef float f4 __attribute__((vector_size(16)));
+
+inline vf set1(float a) { return a - vf{}; }
+inline f4 set4(float a) { return f4{a, a, a, a}; }
+
+inline vf load(const float *p) {
+    vf v;
+    __builtin_memcpy(&v, p, sizeof v);
+    return v;
+}
+inline void store(float *p, vf v) { __builtin_memcpy(p, &v, sizeof v); }
+inline f4 load4(const float *p) {
+    f4 v;
+    __builtin_memcpy(&v, p, sizeof v);
+    return v;
+}
+inline void store4(float *p, f4 v) { __builtin_memcpy(p, &v, sizeof v); }
+
+#if defined(__SSE2__)
+inline f4 min4(f4 a, f4 b) { return _mm_min_ps(a, b); }
+inline f4 max4(f4 a, f4 b) { return _mm_max_ps(a, b); }
+#else
+inline f4 min4(f4 a, f4 b) { return a < b ? a : b; }
+inline f4 max4(f4 a, f4 b) { return a > b ? a : b; }
+#endif
+
+// at_least(a, b): bit i is set where a[i] >= b[i].
+#if defined(__AVX512F__)
+inline vf vmin(vf a, vf b) { return _mm512_min_ps(a, b); }
+inline vf vmax(vf a, vf b) { return _mm512_max_ps(a, b); }
+inline unsigned at_least(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+#elif defined(__AVX2__)
+inline vf vmin(vf a, vf b) { return _mm256_min_ps(a, b); }
+inline vf vmax(vf a, vf b) { return _mm256_max_ps(a, b); }
+inline unsigned at_least(vf a, vf b) { return _mm256_movemask_ps(_mm256_cmp_ps(a, b, _CMP_GE_OQ)); }
+#elif defined(__SSE2__)
+inline vf vmin(vf a, vf b) { return _mm_min_ps(a, b); }
+inline vf vmax(vf a, vf b) { return _mm_max_ps(a, b); }
+inline unsigned at_least(vf a, vf b) { return _mm_movemask_ps(_mm_cmpge_ps(a, b)); }
+#else
+inline vf vmin(vf a, vf b) { return a < b ? a : b; }
+inline vf vmax(vf a, vf b) { return a > b ? a : b; }
+inline unsigned at_least(vf a, vf b) {
+    auto m = a >= b;
+    unsigned bits = 0;
+    for (int i = 0; i < W; ++i) bits |= (unsigned)(m[i] & 1) << i;
+    return bits;
+}
+#endif
+
+}  // namespace ms

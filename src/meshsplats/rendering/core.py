@@ -1,0 +1,157 @@
+"""The compiled core behind ctypes: loads the variant that suits the processor and mirrors csrc/types.h."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_int32, c_int64, c_void_p
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+VARIANTS = ("v4", "v3", "baseline")
+"""Instruction sets a core may be built for, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
+
+INTERFACE_VERSION = 1
+
+
+class CameraStruct(ctypes.Structure):
+    _fields_ = [
+        ("world_to_camera", c_double * 12),
+        ("fx", c_double),
+        ("fy", c_double),
+        ("cx", c_double),
+        ("cy", c_double),
+        ("near", c_double),
+        ("width", c_int32),
+        ("height", c_int32),
+    ]
+
+
+class OptionsStruct(ctypes.Structure):
+    _fields_ = [
+        ("samples", c_int32),
+        ("max_layers", c_int32),
+        ("threads", c_int32),
+        ("min_transmittance", c_float),
+        ("background", c_void_p),
+        ("background_per_pixel", c_int32),
+    ]
+
+
+class MeshStruct(ctypes.Structure):
+    _fields_ = [
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("vertices", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("face_splat", c_void_p),
+        ("depth_group", c_void_p),
+        ("normals", c_void_p),
+        ("attributes", c_void_p),
+        ("attribute_count", c_int32),
+    ]
+
+
+class SplatsStruct(ctypes.Structure):
+    _fields_ = [
+        ("count", c_int64),
+        ("means", c_void_p),
+        ("quaternions", c_void_p),
+        ("scales", c_void_p),
+        ("opacities", c_void_p),
+        ("sh", c_void_p),
+        ("sh_stored", c_int32),
+        ("sh_used", c_int32),
+        ("kernel", c_int32),
+        ("dilation", c_float),
+    ]
+
+
+class PictureStruct(ctypes.Structure):
+    _fields_ = [
+        ("color", c_void_p),
+        ("alpha", c_void_p),
+        ("depth", c_void_p),
+        ("normals", c_void_p),
+        ("attributes", c_void_p),
+        ("fragments", c_int64),
+    ]
+
+
+def pointer(array: np.ndarray | None) -> int | None:
+    """Address of a C-contiguous array, for a structure that is used while the array is alive."""
+    if array is None:
+        return None
+    if not array.flags.c_contiguous:
+        raise ValueError("the core takes C-contiguous arrays only")
+    return array.ctypes.data
+
+
+def library_path(variant: str) -> Path | None:
+    """The file of a variant of the core, or None where it was not built."""
+    import meshsplats.rendering
+
+    # An editable install keeps the compiled files in another folder of the package's path.
+    for folder in meshsplats.rendering.__path__:
+        path = Path(folder) / f"_core_{variant}.so"
+        if path.is_file():
+            return path
+    return None
+
+
+def available_variants() -> list[str]:
+    """The variants that were built and that this processor runs, best first."""
+    baseline = library_path("baseline")
+    if baseline is None:
+        return []
+    library = ctypes.CDLL(str(baseline))
+    library.ms_best_variant.restype = c_char_p
+    best = library.ms_best_variant().decode()
+    runs = VARIANTS[VARIANTS.index(best) :]
+    return [variant for variant in runs if library_path(variant)]
+
+
+@lru_cache(maxsize=None)
+def load_core(variant: str | None = None) -> ctypes.CDLL:
+    """The core's library; the best variant, or the one named by MESHSPLATS_VARIANT, unless another is asked for.
+
+    Raises ImportError if the core was not built, ValueError if the processor cannot run the variant.
+    """
+    available = available_variants()
+    if not available:
+        raise ImportError(
+            "the compiled core of meshsplats is missing: install the package (pip install meshsplats, or pip install ."
+            " in a source tree) instead of running it from its sources"
+        )
+    wanted = variant or os.environ.get("MESHSPLATS_VARIANT") or available[0]
+    if wanted not in available:
+        raise ValueError(f"the core has no variant {wanted!r} that runs here; available: {', '.join(available)}")
+    library = ctypes.CDLL(str(library_path(wanted)))
+    library.ms_variant.restype = c_char_p
+    if library.ms_interface_version() != INTERFACE_VERSION:
+        raise ImportError("the compiled core is of another version than the Python code: install the package again")
+    for name, struct in [("ms_render_mesh", MeshStruct), ("ms_render_splats", SplatsStruct)]:
+        function = getattr(library, name)
+        function.restype = c_int
+        function.argtypes = [
+            POINTER(struct),
+            POINTER(CameraStruct),
+            POINTER(OptionsStruct),
+            POINTER(PictureStruct),
+            c_char_p,
+            c_int,
+        ]
+    return library
+
+
+def call(name: str, subject, camera: CameraStruct, options: OptionsStruct, picture: PictureStruct) -> None:
+    """Runs a function of the core. Raises MemoryError or RuntimeError with the core's message."""
+    message = ctypes.create_string_buffer(256)
+    status = getattr(load_core(), name)(subject, camera, options, picture, message, len(message))
+    if status == 1:
+        raise MemoryError(f"{name}: {message.value.decode()}; render fewer triangles, pixels or samples at a time")
+    if status:
+        raise RuntimeError(f"{name}: {message.value.decode()}")
