@@ -1,8 +1,8 @@
 """The executable specification of :mod:`meshsplats.rendering`: slow, in float64, written to be read.
 
 ``render`` and ``render_splats`` here say what a correct picture is; the compiled core is tested against them.
-Nothing is culled, binned or bounded: every triangle and every splat is tried at every sample, so the cost is their
-product (about a second for 2,000 triangles on 64 x 64 samples).
+Nothing is culled, binned or bounded: every triangle and every splat is tried at every sample, so the cost is
+their product (about a second for 2,000 triangles on 64 x 64 samples).
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ def render(
 ) -> Rendering:
     """The picture of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
 
-    At each of the ``samples`` x ``samples`` regularly spaced samples of a pixel, the triangles that cover it are
-    sorted by depth there, equal depths by face number, and blended front to back:
-    C = sum T_k a_k c_k + T background, with T_k the product of the (1 - a) in front. Fragments with a = 0 do not
-    count. ``max_layers`` blends only that many of the nearest fragments of each sample; a sample stops once its T
-    is below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
+    At each of the ``samples`` x ``samples`` regularly spaced samples of a pixel, the triangles that cover it
+    are sorted by depth there, equal depths by face number, and blended front to back: C = sum T_k a_k c_k + T
+    background, with T_k the product of the (1 - a) in front. Fragments with a = 0 do not count.
+    ``max_layers`` blends only that many of the nearest fragments of each sample; a sample stops once its T is
+    below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
 
     ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
 
@@ -101,13 +101,13 @@ def render_splats(
 ) -> Rendering:
     """The picture of splats as 3D Gaussian splatting draws it (Kerbl et al. 2023). Arrays are float64.
 
-    Splats are blended front to back in the order of the depth z of their centres, equal depths by number; those
-    with a centre nearer than ``camera.near`` are left out. ``dilation`` (pixels squared, of the picture whatever
-    ``samples`` is) widens every projected splat; kernel '2dgs' has its own widening and does not use it.
-    ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
+    Splats are blended front to back in the order of the depth z of their centres, equal depths by number;
+    those with a centre nearer than ``camera.near`` are left out. ``dilation`` (pixels squared, of the picture
+    whatever ``samples`` is) widens every projected splat; kernel '2dgs' has its own widening and does not use
+    it. ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
 
-    Unlike the published rasterisers this has no tiles and no cut at three standard deviations: a splat is drawn
-    wherever its alpha reaches 1/255.
+    Unlike the published rasterisers this has no tiles and no cut at three standard deviations: a splat is
+    drawn wherever its alpha reaches 1/255.
 
     Raises ValueError for options out of range or a background of another shape.
     """
@@ -224,10 +224,10 @@ def _cover(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples that a triangle covers at a depth z >= near, the depth there, and the weights of the corners.
 
-    ``corners`` V are (3, 3) homogeneous pixel positions. With p = (x, y, 1), e_i = p . (V_j x V_k) and
-    D = V_0 . (V_1 x V_2), the ray through p meets the triangle's plane at z p = sum b_i V_i with z = D / sum e and
-    b_i = e_i / sum e (Olano and Greer 1997). This point is in the triangle and in front of the camera if and only
-    if no e_i / D is negative, so corners behind the camera need no clipping.
+    ``corners`` V are (3, 3) homogeneous pixel positions. With p = (x, y, 1), e_i = p . (V_j x V_k) and D =
+    V_0 . (V_1 x V_2), the ray through p meets the triangle's plane at z p = sum b_i V_i with z = D / sum e
+    and b_i = e_i / sum e (Olano and Greer 1997). This point is in the triangle and in front of the camera if
+    and only if no e_i / D is negative, so corners behind the camera need no clipping.
     """
     edges = np.stack([np.cross(corners[j], corners[k]) for j, k in ((1, 2), (2, 0), (0, 1))])
     determinant = float(corners[0] @ edges[0])
@@ -263,9 +263,9 @@ def _share_depths(
 ) -> None:
     """Replaces 1/z, by which fragments are ordered, with that of the common plane in every depth group.
 
-    The plane is that of the triangle with the largest area in the world, the first of them if equal. Its 1/z is
-    clamped to the range over the group's vertices, of which those nearer than ``near`` count as at that depth. For
-    a plane seen edge on, which has no depth on the picture, the nearest vertex stands.
+    The plane is that of the triangle with the largest area in the world, the first of them if equal. Its 1/z
+    is clamped to the range over the group's vertices, of which those nearer than ``near`` count as at that
+    depth. For a plane seen edge on, which has no depth on the picture, the nearest vertex stands.
     """
     assert mesh.depth_group is not None
     world = mesh.vertices.astype(np.float64)[mesh.faces]
@@ -401,10 +401,10 @@ def _projected_falloff(
 ) -> np.ndarray:
     """exp(-d^T cov^-1 d / 2) of one splat at all samples, with its covariance on the picture.
 
-    The projection is linearised at the centre (EWA, Zwicker et al. 2001). Where that is far outside the picture the
-    Jacobian is taken at 1.3 times the half field of view, as in 3DGS; a principal point off the middle moves these
-    limits with it: 0.3 times the half field of view beyond each side of the picture.
-    For the kernel 'antialiased' the values are scaled to keep the integral that they had before the dilation.
+    The projection is linearised at the centre (EWA, Zwicker et al. 2001). Where that is far outside the
+    picture the Jacobian is taken at 1.3 times the half field of view, as in 3DGS; a principal point off the
+    middle moves these limits with it: 0.3 times the half field of view beyond each side of the picture. For
+    the kernel 'antialiased' the values are scaled to keep the integral that they had before the dilation.
     """
     tan_x, tan_y = center[0] / center[2], center[1] / center[2]
     beyond_x, beyond_y = 0.3 * camera.width / (2 * camera.fx), 0.3 * camera.height / (2 * camera.fy)
@@ -430,10 +430,11 @@ def _flat_falloff(
 ) -> np.ndarray:
     """exp(-rho / 2) of one flat splat at all samples, rho = min(rho3d, rho2d) (2DGS, Huang et al. 2024).
 
-    rho3d is the squared distance, in standard deviations, from the centre to where the ray meets the plane of the
-    splat's first two axes; it is infinite where that is nearer than ``camera.near``, behind the camera or nowhere,
-    and beside the line that a splat with a scale of 0 is. rho2d = 2 |p - c|^2, with p the sample and c the
-    projected centre in pixels, keeps splats that are tiny or seen edge on from falling between the samples.
+    rho3d is the squared distance, in standard deviations, from the centre to where the ray meets the plane of
+    the splat's first two axes; it is infinite where that is nearer than ``camera.near``, behind the camera or
+    nowhere, and beside the line that a splat with a scale of 0 is. rho2d = 2 |p - c|^2, with p the sample and
+    c the projected centre in pixels, keeps splats that are tiny or seen edge on from falling between the
+    samples.
     """
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
     normal = np.cross(axes[:, 0], axes[:, 1])
