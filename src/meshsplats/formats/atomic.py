@@ -13,16 +13,16 @@ from pathlib import Path
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path in the folder of ``path``; what is written there becomes ``path`` if the block ends well.
+    """A temporary path in the folder of ``path``; what is written there becomes ``path`` if all goes well.
 
-    The temporary file exists (empty) from the start, is hidden, keeps the suffix of ``path`` and is removed if
-    the block raises, Ctrl-C included; an older file at ``path`` then stays as it was. A new file gets the usual
-    permissions (the umask decides), one that replaces another gets the permissions of the other. Where ``path``
-    is a symbolic link, the file it points to is replaced and the link stays.
+    The temporary file exists (empty) from the start, is hidden, keeps the suffix of ``path`` and is
+    removed if the block raises, Ctrl-C included; an older file at ``path`` then stays as it was. A new
+    file gets the usual permissions (the umask decides), one that replaces another gets the permissions of
+    the other. Where ``path`` is a symbolic link, the file it points to is replaced and the link stays.
 
-    Raises FileNotFoundError or NotADirectoryError for a missing folder, IsADirectoryError where ``path`` is a
-    folder, PermissionError where the folder or an existing file may not be written, OSError for a device or
-    pipe: all before the block is entered.
+    Raises FileNotFoundError or NotADirectoryError for a missing folder, IsADirectoryError where ``path``
+    is a folder, PermissionError where the folder or an existing file may not be written, OSError for a
+    device or pipe: all before the block is entered.
     """
     shown, target = os.fspath(path), Path(os.path.realpath(path))
     if not target.name:
