@@ -2,23 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats.errors import FileFormatError
+from meshsplats.framing import (
+    DEFAULT_UP,
+    Bounds,
+    Scene,
+    front_axes,
+    guess_up,
+    scene_bounds,
+    unit_up,
+    weighted_quantile,
+)
 
 MAX_SIDE = 1 << 15
 """Largest picture side in pixels."""
+MAX_FILE_BYTES = 16 << 20
+"""A camera file larger than this is refused."""
+MAX_CAMERAS = 20_000
+NEAR_SHARE = 0.01
+"""Near plane of the cameras made here, as a share of their distance to the subject's middle."""
+COVERED = 0.98
+"""Share of the subject's opacity that must be on the picture."""
+MARGIN = 1.06
+"""Room left round the subject."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera with OpenCV axes: +x right, +y down, +z forward.
 
-    Concretely, a world point p is at ``X = world_to_camera[:3, :3] @ p + world_to_camera[:3, 3]`` in the camera's
-    frame and on the picture at ``(fx * X[0] / X[2] + cx, fy * X[1] / X[2] + cy)`` pixels from the top left corner;
-    the centre of pixel (row, col) is at (col + 0.5, row + 0.5).
+    Concretely, a world point p is at ``X = world_to_camera[:3, :3] @ p + world_to_camera[:3, 3]`` in the
+    camera's frame and on the picture at ``(fx * X[0] / X[2] + cx, fy * X[1] / X[2] + cy)`` pixels from the
+    top left corner; the centre of pixel (row, col) is at (col + 0.5, row + 0.5).
     """
 
     world_to_camera: np.ndarray
@@ -40,8 +64,13 @@ class Camera:
     def __post_init__(self) -> None:
         matrix = checked_array("world_to_camera", self.world_to_camera, np.float64, (4, 4))
         rotation = matrix[:3, :3]
-        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4:
-            raise ValueError("world_to_camera must be a rigid transform: orthonormal rotation, last row 0 0 0 1")
+        if (
+            np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6
+            or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4
+        ):
+            raise ValueError(
+                "world_to_camera must be a rigid transform: orthonormal rotation, last row 0 0 0 1"
+            )
         if np.linalg.det(rotation) < 0:
             raise ValueError("world_to_camera must not mirror: its rotation has determinant -1")
         object.__setattr__(self, "world_to_camera", matrix)
@@ -65,3 +94,311 @@ class Camera:
     def center(self) -> np.ndarray:
         """(3,) float64 position in the world frame."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) float64 unit direction of the picture's upper edge in the world frame."""
+        return -self.world_to_camera[1, :3]
+
+    def scaled(self, factor: float) -> Camera:
+        """The same view on a picture ``factor`` times as large, its sides rounded to whole pixels, at least
+        1."""
+        if not (np.isfinite(factor) and factor > 0):
+            raise ValueError(f"factor must be positive, got {factor}")
+        width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
+        x, y = width / self.width, height / self.height  # not quite the factor where a side was rounded
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y
+        )
+
+
+def look_at(
+    center: Sequence[float] | np.ndarray,
+    target: Sequence[float] | np.ndarray,
+    *,
+    up: Sequence[float] | np.ndarray = DEFAULT_UP,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 45.0,
+    near: float = 0.01,
+    name: str = "",
+) -> Camera:
+    """Camera at ``center`` (3,) that looks at ``target`` (3,) with ``up`` (3,) towards the picture's upper
+    edge.
+
+    Parameters
+    ----------
+    fov: angle in degrees, 1 to 170, that the shorter side of the picture spans.
+    near: as in Camera.
+
+    Raises ValueError if the two points coincide. Looking straight along ``up``, the scene's front is at the
+    lower edge.
+    """
+    if not 1 <= fov <= 170:
+        raise ValueError(f"fov must lie between 1 and 170 degrees, got {fov}")
+    center = np.asarray(center, np.float64)
+    upward = unit_up(up)
+    forward = np.asarray(target, np.float64) - center
+    length = np.linalg.norm(forward)
+    if not (np.isfinite(length) and length > 0):
+        raise ValueError("center and target must be finite and differ")
+    forward /= length
+    right = np.cross(forward, upward)
+    if np.linalg.norm(right) < 1e-6:
+        right = front_axes(upward)[0]
+        right = right - forward * (right @ forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ center
+    focal = min(width, height) / 2 / np.tan(np.radians(fov) / 2)
+    return Camera(matrix, focal, focal, width / 2, height / 2, width, height, near, name)
+
+
+def orbit(
+    scene: Scene,
+    count: int = 60,
+    *,
+    elevation: float = 15.0,
+    azimuth: float = 0.0,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 45.0,
+    distance: float = 1.0,
+) -> list[Camera]:
+    """``count`` cameras evenly spaced on a circle round the subject of ``scene``, all looking at its middle.
+
+    Parameters
+    ----------
+    scene: GaussianCloud, SplatMesh or points (n, 3); see ``framing.scene_bounds`` for what counts as the
+        subject.
+    elevation: degrees above the subject's horizon, -90 to 90.
+    azimuth: degrees of the first camera, 0 in front (``framing.front_axes``), 90 at the right-hand side.
+    up: (3,) direction; None: ``framing.guess_up``.
+    fov: angle in degrees, 1 to 170, that the shorter side of the picture spans.
+    distance: multiple of the distance at which the subject just fits the picture in every view.
+
+    Raises ValueError for an empty scene or a value out of range.
+    """
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
+    return _round_subject(scene, angles, up, width, height, fov, distance)
+
+
+def dome(
+    scene: Scene,
+    count: int = 32,
+    *,
+    whole: bool = False,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 45.0,
+    distance: float = 1.0,
+) -> list[Camera]:
+    """``count`` cameras spread evenly over the upper half of a sphere round the subject, or all of it.
+
+    The points are those of a Fibonacci spiral: equal steps in height, the golden angle in azimuth, so that
+    each camera has the same share of the surface. Parameters are those of ``orbit``.
+    """
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    golden = 180 * (3 - 5**0.5)
+    lowest = -1.0 if whole else 0.0
+    heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
+    angles = [(i * golden % 360, float(np.degrees(np.arcsin(h)))) for i, h in enumerate(heights)]
+    return _round_subject(scene, angles, up, width, height, fov, distance)
+
+
+def look_around(
+    scene: Scene,
+    count: int = 60,
+    *,
+    elevation: float = 0.0,
+    azimuth: float = 0.0,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 75.0,
+) -> list[Camera]:
+    """``count`` cameras that stand in the middle of ``scene``, a room say, and turn once round to the right.
+
+    ``elevation`` is the direction they look in, above the horizon; the other parameters are those of
+    ``orbit``.
+    """
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    bounds = scene_bounds(scene)
+    axes = front_axes(guess_up(scene) if up is None else unit_up(up))
+    lens: dict[str, Any] = {"width": width, "height": height, "fov": fov, "near": bounds.radius * NEAR_SHARE}
+    cameras = []
+    for i in range(count):
+        # Azimuth 0 looks forward, and a turn to the right is a growing angle.
+        direction = _direction(axes, 180 - azimuth - 360 * i / count, elevation)
+        target = bounds.center + bounds.radius * direction
+        cameras.append(look_at(bounds.center, target, up=axes[1], name=f"view_{i:04d}", **lens))
+    return cameras
+
+
+def _direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
+    """Unit vector from the subject to a camera; ``axes`` as from ``front_axes``."""
+    a, e = np.radians(azimuth), np.radians(elevation)
+    right, up, forward = axes
+    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
+
+
+def _round_subject(
+    scene: Scene,
+    angles: Sequence[tuple[float, float]],
+    up: Sequence[float] | np.ndarray | None,
+    width: int,
+    height: int,
+    fov: float,
+    distance: float,
+) -> list[Camera]:
+    """Cameras at (azimuth, elevation) degrees, at the distance from which every picture shows the subject."""
+    if not (np.isfinite(distance) and distance > 0):
+        raise ValueError(f"distance must be positive, got {distance}")
+    if not all(np.isfinite(a) and -90 <= e <= 90 for a, e in angles):
+        raise ValueError("azimuth must be finite and elevation between -90 and 90 degrees")
+    bounds = scene_bounds(scene)
+    axes = front_axes(guess_up(scene) if up is None else unit_up(up))
+    target = _middle(bounds, axes)
+    directions = [_direction(axes, azimuth, elevation) for azimuth, elevation in angles]
+    lens: dict[str, Any] = {"up": axes[1], "width": width, "height": height, "fov": fov}
+    fit = max(_fitting_distance(bounds, look_at(target + d, target, **lens), target) for d in directions)
+    away = distance * fit
+    return [
+        look_at(target + away * d, target, near=away * NEAR_SHARE, name=f"view_{i:04d}", **lens)
+        for i, d in enumerate(directions)
+    ]
+
+
+def _middle(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
+    """Middle of the box along ``axes`` that the subject fills: half-way along a guitar, not in its body."""
+    along = bounds.points @ axes.T
+    ends = [
+        [weighted_quantile(along[:, k], bounds.weights, q) for q in (1 - COVERED, COVERED)] for k in range(3)
+    ]
+    return np.mean(ends, axis=1) @ axes
+
+
+def _fitting_distance(bounds: Bounds, camera: Camera, target: np.ndarray) -> float:
+    """Least distance from ``target`` at which ``camera``, moved along its axis, shows all with a margin.
+
+    A point at (x, y, z) from the target, in the camera's axes, is on the picture if |x| <= t (d + z): each
+    asks for d = |x| / t - z, and the covered share of them decides.
+    """
+    x, y, z = camera.world_to_camera[:3, :3] @ (bounds.points - target).T
+    tan_x, tan_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
+    needed = np.maximum((np.abs(x) + bounds.sizes) / tan_x, (np.abs(y) + bounds.sizes) / tan_y) - z
+    return max(weighted_quantile(needed, bounds.weights, COVERED) * MARGIN, 0.1 * bounds.radius)
+
+
+def load_cameras(path: str | Path) -> list[Camera]:
+    """Cameras of a JSON file, in file order.
+
+    Two forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
+    4x4 matrix and OpenCV axes; ``name``, ``near``, and cx and cy (then the picture's centre) may be missing.
+    The other is the ``cameras.json`` that INRIA's 3DGS trainer writes: ``{img_name, width, height, position,
+    rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and the principal point at the picture's
+    centre. A folder stands for the ``cameras.json`` in it.
+
+    Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
+    kind, and OSError if it cannot be opened.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "cameras.json"
+    with open(path, "rb") as file:
+        text = file.read(MAX_FILE_BYTES + 1)
+    if len(text) > MAX_FILE_BYTES:
+        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no camera file is")
+    try:
+        entries = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not a JSON file ({error})") from None
+    if not isinstance(entries, list):
+        raise FileFormatError(
+            f"{path}: a camera file is a JSON list of cameras, this is a JSON {_kind(entries)}"
+        )
+    if not entries:
+        raise FileFormatError(f"{path}: holds no camera")
+    if len(entries) > MAX_CAMERAS:
+        raise FileFormatError(
+            f"{path}: {len(entries)} cameras, more than the {MAX_CAMERAS} that are accepted"
+        )
+    return [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+
+
+def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
+    """Writes the JSON list that ``load_cameras`` reads; a file of that name is replaced. No digit is lost."""
+    from meshsplats.formats.atomic import atomic_path
+
+    entries = [
+        {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
+        | {"world_to_camera": camera.world_to_camera.tolist()}
+        for camera in cameras
+    ]
+    with atomic_path(path) as temporary:
+        Path(temporary).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+
+
+def _camera_from_json(entry: object, where: str) -> Camera:
+    if not isinstance(entry, dict):
+        raise FileFormatError(f"{where}: must be a JSON object, got a JSON {_kind(entry)}")
+    name = entry.get("name", entry.get("img_name", ""))
+    if not isinstance(name, str) or len(name) > 1000:
+        raise FileFormatError(f"{where}: field 'name' must be a string of up to 1000 characters")
+    where = f"{where} ({name[:60]!r})" if name else where
+    width, height = (float(_numbers(entry, key, (), where)) for key in ("width", "height"))
+    matrix = np.eye(4)
+    if "world_to_camera" in entry:
+        matrix = _numbers(entry, "world_to_camera", (4, 4), where)
+    elif "rotation" in entry and "position" in entry:
+        rotation = _numbers(entry, "rotation", (3, 3), where).T
+        matrix[:3, :3] = rotation
+        matrix[:3, 3] = -rotation @ _numbers(entry, "position", (3,), where)
+    else:
+        has = ", ".join(entry)[:200]
+        raise FileFormatError(f"{where}: needs 'world_to_camera', or 'rotation' and 'position'; it has {has}")
+    defaults = {"cx": width / 2, "cy": height / 2, "near": 0.01}
+    lens = {
+        key: float(_numbers(entry, key, (), where)) if key in entry or key not in defaults else defaults[key]
+        for key in ("fx", "fy", "cx", "cy", "near")
+    }
+    try:
+        return Camera(matrix, width=width, height=height, name=name, **lens)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise FileFormatError(f"{where}: {error}") from None
+
+
+def _numbers(entry: dict, key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """Field ``key`` as a float64 array of that shape, () for a single number."""
+    if key not in entry:
+        raise FileFormatError(f"{where}: field {key!r} is missing")
+    try:
+        value = np.array(entry[key], dtype=object)
+        fits = value.shape == shape and all(type(v) in (int, float) for v in value.ravel())
+        number = value.astype(np.float64) if fits else None
+    except (ValueError, OverflowError):  # ragged lists; an integer of a thousand digits
+        number = None
+    if number is None or not np.isfinite(number).all():
+        wanted = "a finite number" if shape == () else f"finite numbers of shape {shape}"
+        raise FileFormatError(f"{where}: field {key!r} must be {wanted}, got {_shown(entry[key])}")
+    return number
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, dict):
+        return "object"
+    return "list" if isinstance(value, list) else "value"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, (dict, list)):
+        return f"a JSON {_kind(value)} of {len(value)}"
+    return json.dumps(value)[:60]
