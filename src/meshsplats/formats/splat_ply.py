@@ -2,8 +2,9 @@
 
 Each row of element ``vertex`` is a splat: ``x y z``, ``f_dc_0..2`` and ``f_rest_*`` (spherical harmonics,
 channel by channel), ``opacity`` (logit), ``scale_*`` (logarithms) and ``rot_0..3`` (quaternion w x y z of any
-length). 2DGS files have two scales, the flat axis being the third; Mip-Splatting files have ``filter_3D``,
-the width of a smoothing filter that belongs to scales and opacities. Properties are found by name.
+length). 2DGS files have two scales, the flat axis being the third; Mip-Splatting files have ``filter_3D``, the
+width of a smoothing filter that belongs to scales and opacities. Properties are found by name. How splats
+are to be drawn is said by a comment, if at all: ``SplatRenderMode: mip`` (Brush), ``antialiased 1`` (Postshot).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from meshsplats.formats._cloud_builder import CloudBuilder, SplatRows
 from meshsplats.formats.atomic import atomic_path
 from meshsplats.formats.ply_header import Element, PlyHeader
 from meshsplats.formats.ply_table import CHUNK_BYTES, FloatTable
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
 
 _POSITION = ("x", "y", "z")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -122,8 +123,23 @@ def read_float_ply(file: BinaryIO, header: PlyHeader, where: object, *, strict: 
         if columns.color_span is not None:
             rows.sh[:, 0] = (rows.sh[:, 0] / columns.color_span - np.float32(0.5)) / np.float32(SH_C0)
         builder.keep(rows)
-    flat = len(columns.scale) == 2
-    return builder.finish("2dgs" if flat else "antialiased" if columns.filter else "3dgs", strict=strict)
+    kernel: Kernel = "antialiased" if columns.filter else kernel_of_comments(header.comments)
+    return builder.finish("2dgs" if len(columns.scale) == 2 else kernel, strict=strict)
+
+
+def kernel_of_comments(comments: tuple[str, ...]) -> Kernel:
+    """The kernel that a .ply names in its comments; the last one counts, '3dgs' if there is none."""
+    spelt: dict[str, Kernel] = {
+        "splatrendermode mip": "antialiased",
+        "splatrendermode 2dgs": "2dgs",
+        "splatrendermode default": "3dgs",
+        "antialiased 1": "antialiased",
+        "antialiased 0": "3dgs",
+    }
+    found = [
+        spelt[words] for c in comments if (words := " ".join(c.lower().replace(":", " ").split())) in spelt
+    ]
+    return found[-1] if found else "3dgs"
 
 
 def _activate(
@@ -157,29 +173,19 @@ def write_float_ply(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     flat = cloud.kernel == "2dgs" and not cloud.scales[:, 2].any()
     if cloud.kernel == "2dgs" and not flat:
         warnings.warn(
-            f"{path}: this '2dgs' cloud has third scales that are not 0; written with three scales, it will"
-            " be read"
-            " back as '3dgs'",
+            f"{path}: this '2dgs' cloud has third scales that are not 0; written with three scales,"
+            " it will be read back as '3dgs'",
             DataWarning,
             stacklevel=3,
         )
     scale_names = [f"scale_{i}" for i in range(2 if flat else 3)]
     rest_names = [f"f_rest_{i}" for i in range(3 * (k - 1))]
-    filter_names = [_FILTER] if cloud.kernel == "antialiased" else []
-    names = [
-        *_POSITION,
-        "nx",
-        "ny",
-        "nz",
-        *_DC,
-        *rest_names,
-        "opacity",
-        *scale_names,
-        *_ROTATION,
-        *filter_names,
-    ]
+    names = [*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, "opacity", *scale_names, *_ROTATION]
     at = {name: i for i, name in enumerate(names)}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if cloud.kernel == "antialiased":
+        lines.append("comment SplatRenderMode: mip")
+    lines.append(f"element vertex {len(cloud)}")
     lines += [f"property float {name}" for name in names] + ["end_header", ""]
     per_chunk = max(1, CHUNK_BYTES // (4 * len(names)))
     with atomic_path(path) as temporary, Path(temporary).open("wb") as file:

@@ -41,19 +41,21 @@ def load_gaussians(path: str | os.PathLike[str], *, strict: bool = False) -> Gau
 
 
 def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
-    """Writes ``cloud`` as a float .ply in the layout of the 3D Gaussian Splatting code, replacing an older file.
+    """Writes ``cloud`` as a float .ply laid out as by the 3D Gaussian Splatting code, whole or not at all.
 
     Opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, are stored as
     sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as 2DGS files
-    have it; an 'antialiased' one with ``filter_3D`` = 0 (its filter is part of the scales already), so that
-    both read back as what they are. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it
-    is written with three, with a DataWarning, and reads back as '3dgs'.
+    have it, an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both read back as what
+    they are. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three, with a
+    DataWarning, and reads back as '3dgs'.
 
-    Raises ValueError for another suffix than .ply.
+    Raises ValueError for another suffix than .ply or for a cloud without splats.
     """
     target = Path(path)
     if target.suffix.lower() != ".ply":
         raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
+    if not len(cloud):
+        raise ValueError("no splats to write: the cloud is empty, and no reader takes such a file")
     write_float_ply(cloud, target)
 
 
