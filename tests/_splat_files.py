@@ -1,4 +1,4 @@
-"""An independent writer of PLY files in every layout, row by row with `struct`, and random splats to put in them."""
+"""An independent writer of PLY files in every layout, row by row, and random splats to put in them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,20 @@ import struct
 
 import numpy as np
 
-CODES = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
+CODES = {
+    "char": "b",
+    "uchar": "B",
+    "short": "h",
+    "ushort": "H",
+    "int": "i",
+    "uint": "I",
+    "float": "f",
+    "double": "d",
+}
 
 
 class Table:
-    """One element: ``columns`` are (type, name) or (count type, item type, name) for a list; rows of values."""
+    """One element: ``columns`` are (type, name), or (count type, item type, name) of a list."""
 
     def __init__(self, name, columns, rows):
         self.name, self.columns, self.rows = name, columns, rows
@@ -31,7 +40,9 @@ def write_ply(path, tables, encoding="binary_little_endian", end="\n", comments=
                 flat = []
                 for column, value in zip(t.columns, row, strict=True):
                     flat += [len(value), *value] if len(column) == 3 else [value]
-                data += (" ".join(repr(float(v)) if isinstance(v, float) else str(v) for v in flat) + end).encode()
+                data += (
+                    " ".join(repr(float(v)) if isinstance(v, float) else str(v) for v in flat) + end
+                ).encode()
                 continue
             for column, value in zip(t.columns, row, strict=True):
                 if len(column) == 3:
@@ -62,7 +73,10 @@ def splat_table(values, types=None, name="vertex"):
     columns = [(types.get(key, "float"), key) for key in values]
     whole = [types.get(key, "float") not in ("float", "double") for key in values]
     arrays = list(values.values())
-    rows = [[int(a[i]) if w else float(a[i]) for a, w in zip(arrays, whole, strict=True)] for i in range(len(arrays[0]))]
+    rows = [
+        [int(a[i]) if w else float(a[i]) for a, w in zip(arrays, whole, strict=True)]
+        for i in range(len(arrays[0]))
+    ]
     return Table(name, columns, rows)
 
 
@@ -87,4 +101,6 @@ def expected_cloud(values):
 def assert_same_cloud(cloud, expected, tolerance=1e-6):
     """``cloud`` holds the values of ``expected_cloud`` to a relative ``tolerance`` of float32 size."""
     for name, value in expected.items():
-        np.testing.assert_allclose(getattr(cloud, name), value, rtol=tolerance, atol=tolerance * 1e-3, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(cloud, name), value, rtol=tolerance, atol=tolerance * 1e-3, err_msg=name
+        )

@@ -15,7 +15,9 @@ from meshsplats import DataWarning, FileFormatError, GaussianCloud, load_gaussia
 
 ENCODINGS = ["ascii", "binary_little_endian", "binary_big_endian"]
 FACES = Table("face", [("uchar", "int", "vertex_indices")], [[[0, 1, 2]], [[0, 1, 2, 3]], [[]], [[4, 5, 6]]])
-EDGES = Table("edge", [("int", "a"), ("ushort", "float", "w"), ("double", "b")], [[1, [0.5] * 3, 2.0], [2, [], 3.0]])
+EDGES = Table(
+    "edge", [("int", "a"), ("ushort", "float", "w"), ("double", "b")], [[1, [0.5] * 3, 2.0], [2, [], 3.0]]
+)
 CAMERA = Table("camera", [("float", "fx"), ("int", "width")], [[500.0, 640]])
 
 
@@ -48,18 +50,28 @@ def test_line_ends_and_comments(tmp_path, encoding, end):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("before", [[], [FACES], [EDGES, CAMERA], [FACES, CAMERA, EDGES]])
-@pytest.mark.parametrize("after", [[], [Table("chunk", FACES.columns, FACES.rows)], [Table("c2", CAMERA.columns, CAMERA.rows)]])
+@pytest.mark.parametrize(
+    "after", [[], [Table("chunk", FACES.columns, FACES.rows)], [Table("c2", CAMERA.columns, CAMERA.rows)]]
+)
 def test_other_elements_are_stepped_over(tmp_path, encoding, before, after):
     values = random_splats(degree=1)
     path = write_ply(tmp_path / "a.ply", [*before, splat_table(values), *after], encoding)
     assert_same_cloud(load_gaussians(path), expected_cloud(values))
 
 
-@pytest.mark.parametrize("lengths", [[3] * 5000, [3, 4] * 2500, [0, 200_000, 3], [255] * 40 + [1] * 40 + [255] * 40])
+@pytest.mark.parametrize(
+    "lengths", [[3] * 5000, [3, 4] * 2500, [0, 200_000, 3], [255] * 40 + [1] * 40 + [255] * 40]
+)
 def test_long_lists_before_the_splats(tmp_path, lengths):
     values = random_splats(degree=0)
-    table = Table("face", [("uchar", "tag"), ("int", "short", "v"), ("float", "w")], [[1, [7] * n, 2.0] for n in lengths])
-    assert_same_cloud(load_gaussians(write_ply(tmp_path / "a.ply", [table, splat_table(values)])), expected_cloud(values))
+    table = Table(
+        "face",
+        [("uchar", "tag"), ("int", "short", "v"), ("float", "w")],
+        [[1, [7] * n, 2.0] for n in lengths],
+    )
+    assert_same_cloud(
+        load_gaussians(write_ply(tmp_path / "a.ply", [table, splat_table(values)])), expected_cloud(values)
+    )
 
 
 @given(st.randoms(use_true_random=False), st.integers(0, 3))
@@ -82,7 +94,9 @@ def test_extra_properties_are_ignored_even_if_not_finite(tmp_path):
         cloud = load_gaussians(write_ply(tmp_path / "a.ply", [splat_table(values, {"label": "uchar"})]))
     assert_same_cloud(cloud, expected_cloud(random_splats(degree=1)))
     plain = without(random_splats(degree=1), "nx", "ny", "nz")
-    assert_same_cloud(load_gaussians(write_ply(tmp_path / "b.ply", [splat_table(plain)])), expected_cloud(plain))
+    assert_same_cloud(
+        load_gaussians(write_ply(tmp_path / "b.ply", [splat_table(plain)])), expected_cloud(plain)
+    )
 
 
 def test_integer_properties(tmp_path):
@@ -135,7 +149,9 @@ def test_mip_splatting_filter_is_fused(tmp_path):
     ],
 )
 def test_kernel_named_by_a_comment(tmp_path, comment, kernel):
-    path = write_ply(tmp_path / "a.ply", [splat_table(random_splats(degree=0))], comments=["by Brush", comment])
+    path = write_ply(
+        tmp_path / "a.ply", [splat_table(random_splats(degree=0))], comments=["by Brush", comment]
+    )
     assert load_gaussians(path).kernel == kernel
 
 
@@ -159,7 +175,13 @@ def test_quaternions_of_any_length(tmp_path, size):
     np.testing.assert_allclose(cloud.quaternions, expected, atol=1e-6)
 
 
-BAD = [("x", 2, np.nan), ("z", 0, np.inf), ("f_dc_1", 6, -np.inf), ("f_rest_8", 3, np.nan), ("opacity", 1, np.nan)]
+BAD = [
+    ("x", 2, np.nan),
+    ("z", 0, np.inf),
+    ("f_dc_1", 6, -np.inf),
+    ("f_rest_8", 3, np.nan),
+    ("opacity", 1, np.nan),
+]
 BAD += [("scale_0", 4, 1000.0), ("scale_2", 5, np.nan), ("rot_3", 2, np.inf)]
 
 
@@ -171,7 +193,9 @@ def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path, encoding, 
         values[name][row] = value
     path = write_ply(tmp_path / "a.ply", [splat_table(values)], encoding)
     keep = np.setdiff1d(np.arange(7), [row for _, row, _ in bad])
-    with pytest.warns(DataWarning, match=f"{7 - len(keep)} of 7 splats .*{7 - len(keep)} with values that are not finite"):
+    with pytest.warns(
+        DataWarning, match=f"{7 - len(keep)} of 7 splats .*{7 - len(keep)} with values that are not finite"
+    ):
         cloud = load_gaussians(path)
     assert_same_cloud(cloud, expected_cloud({key: value[keep] for key, value in values.items()}))
     first = min(row for _, row, _ in bad)
@@ -210,7 +234,9 @@ def test_dropping_across_chunks(tmp_path):
     path = tmp_path / "a.ply"
     table = np.stack([values[key] for key in values], axis=1)
     header = "".join(f"property float {key}\n" for key in values)
-    path.write_bytes(f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{header}end_header\n".encode())
+    path.write_bytes(
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{header}end_header\n".encode()
+    )
     with path.open("ab") as file:
         file.write(table.astype("<f4").tobytes())
     with pytest.warns(DataWarning, match="13,334 of 40,000"):
@@ -271,7 +297,9 @@ def test_layout_on_disk_is_that_of_the_3dgs_code(tmp_path):
     raw = (tmp_path / "a.ply").read_bytes()
     header, data = raw.split(b"end_header\n")
     names = [line.split()[2] for line in header.decode().splitlines() if line.startswith("property float ")]
-    expected = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6"
+    expected = (
+        "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6"
+    )
     expected += " f_rest_7 f_rest_8 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     assert names == expected.split()
     table = dict(zip(names, np.frombuffer(data, "<f4").reshape(3, -1).T, strict=True))
@@ -312,7 +340,8 @@ def test_real_files_agree_with_a_reader_of_one_line():
     """guitar: property order differs, no normals; the 2DGS and GaMeS rewrites are the same splats, turned."""
     path = shared_data("splats/guitar_sh0.ply")
     raw = path.read_bytes()
-    names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2".split()
+    names = [*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_0", "rot_1", "rot_2", "rot_3"]
+    names += ["scale_0", "scale_1", "scale_2"]
     table = np.frombuffer(raw[361:], np.dtype([(n, "<f4") for n in names]))
     cloud = load_gaussians(path)
     assert len(cloud) == 90_854
