@@ -1,0 +1,62 @@
+# Set-up, demo and tests. Needs Python 3.10 or newer and a C++17 compiler (GCC 11 or Clang 12, or newer); everything
+# else is installed into .venv. PYTHON=... chooses the Python, VENV=... another place for the environment.
+
+VENV ?= .venv
+DEMO ?= demo-output
+PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 python3.11 python3.10; do \
+	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 10))' 2>/dev/null && echo $$name && break; done)
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(wildcard src/meshsplats/csrc/*)
+
+.PHONY: help demo test lint format bench clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo 'make demo    splats to mesh, GLB, pictures and a comparison, in $(DEMO)/'
+	@echo 'make test    the tests'
+	@echo 'make lint    ruff and mypy (make format tidies the source)'
+	@echo 'make bench   the measurements behind benchmarks/RESULTS.md'
+	@echo 'make clean   removes everything that these made'
+
+$(BIN)/python:
+	@if [ -z "$(PYTHON)" ]; then echo 'No Python 3.10 or newer with venv was found.' \
+	  'Install one (Debian, Ubuntu: apt install python3-venv), or name it: make demo PYTHON=...' >&2; exit 1; fi
+	@echo 'Making $(VENV) with $(PYTHON)'
+	@$(PYTHON) -m venv $(VENV)
+
+# Editable installs: Python is used where it lies in src/; a change of the compiled core's source installs again.
+$(VENV)/installed: $(BUILD_INPUTS) | $(BIN)/python
+	@echo 'Compiling the core and installing MeshSplats: about half a minute'
+	@$(PIP) install --editable . --constraint ci-constraints.txt
+	@touch $@
+
+$(VENV)/installed-dev: $(BUILD_INPUTS) | $(BIN)/python
+	@echo 'Compiling the core and installing MeshSplats with what its tests need: about half a minute'
+	@$(PIP) install --editable '.[dev]' --constraint ci-constraints.txt
+	@touch $(VENV)/installed $@
+
+demo: $(VENV)/installed
+	$(BIN)/python -m meshsplats.demo_scene $(DEMO)/scene.ply
+	$(BIN)/meshsplats convert $(DEMO)/scene.ply -o $(DEMO)/scene.glb --force
+	$(BIN)/meshsplats render $(DEMO)/scene.glb -o $(DEMO)/turntable --orbit 24 --force
+	$(BIN)/meshsplats compare $(DEMO)/scene.ply $(DEMO)/scene.glb -o $(DEMO)/compare --force
+	@echo
+	@echo 'Look in $(DEMO)/: scene.glb opens in any glTF viewer, turntable/ shows it turning,'
+	@echo 'compare/ shows splats, mesh and error side by side.'
+
+test: $(VENV)/installed-dev
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed-dev
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m mypy
+
+format: $(VENV)/installed-dev
+	$(BIN)/python -m ruff format .
+	$(BIN)/python -m ruff check --fix .
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find src tests examples benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
