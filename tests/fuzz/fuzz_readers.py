@@ -1,4 +1,5 @@
 """Mutated files against the splat readers: each gives splats, a FileFormatError or an OSError, soon and small.
+
     python tests/fuzz/fuzz_readers.py [--format ply ...] [--count 20000] [--seed 0] [--keep DIR]
 
 Runs with a limit on the address space and an alarm for each file. A file that fails is kept in DIR; the exit
