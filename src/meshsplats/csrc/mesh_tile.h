@@ -35,11 +35,7 @@ class MeshTile {
     MeshTile(const Scene &scene, const MsOptions &options, const MsPicture &picture, const MsCamera &camera)
         : scene_(scene), grid_(scene.grid), options_(options), picture_(picture), camera_(camera),
           extras_(picture, scene.mesh), arena_(new Arena), sums_((size_t)SAMPLES * extras_.channels) {
-        for (int i = 0; i < TILE; ++i) {
-            center_[i] = i + 0.5f;
-            center4_[i] = set4(i + 0.5f);
-        }
-        for (int i = 0; i < SAMPLES; ++i) capacity_[i] = ROOM;
+        for (int i = 0; i < TILE; ++i) center_[i] = i + 0.5f;
     }
 
     int64_t fragments() const { return fragments_; }
@@ -48,6 +44,8 @@ class MeshTile {
         begin(tile_x, tile_y);
         for (int64_t i = 0; i < length; ++i) {
             const Item &item = scene_.items[list[i]];
+            if (i + 8 < length) prefetch_faces(scene_.items[list[i + 8]].number);
+            if (i + 4 < length) prefetch_corners(scene_.items[list[i + 4]].number);
             if (pending_ >= limit_) {
                 if (flush(item.key)) break;
             }
@@ -62,24 +60,28 @@ class MeshTile {
 
   private:
     static constexpr int SAMPLES = TILE * TILE;
-    static constexpr int ROOM = 32;      // fragments a sample before its list moves to the heap
-    static constexpr int PER_SAMPLE = 8; // mean length of the lists at which they are flushed
+    static constexpr int ROOM = 32;       // fragments a sample in the arena; more go to a list on the heap
+    static constexpr int PER_SAMPLE = 8;  // mean number of waiting fragments at which they are flushed
 
-    // The waiting fragments of one sample.
-    struct List {
-        float *key;
-        int32_t *face;
-        float *rgba;
-        Place *place;
-    };
+    // The waiting fragments of all samples.
     struct Arena {
         alignas(64) float key[SAMPLES][ROOM];
         alignas(64) int32_t face[SAMPLES][ROOM];
         alignas(64) float rgba[SAMPLES][ROOM][4];
         Place place[SAMPLES][ROOM];
     };
-    // A list that outgrew the arena.
-    struct Grown {
+    struct Fragment {
+        f4 rgba;
+        float key;
+        int32_t face;
+        Place place;
+    };
+    // The samples that one triangle covers, side by side.
+    struct Found {
+        alignas(64) float x[SAMPLES + W], y[SAMPLES + W], q[SAMPLES + W], z[SAMPLES + W], e[3][SAMPLES + W];
+    };
+    // The fragments of one sample in one piece.
+    struct Long {
         std::vector<float> key, rgba;
         std::vector<int32_t> face;
         std::vector<Place> place;
@@ -92,23 +94,19 @@ class MeshTile {
     const MsCamera &camera_;
     Extras extras_;
     std::unique_ptr<Arena> arena_;
-    std::unique_ptr<Grown> grown_[SAMPLES];
+    std::vector<Fragment> overflow_[SAMPLES];
+    Long long_;
+    Found found_;
 
     alignas(64) float center_[TILE];
-    f4 center4_[TILE];
-    List list_[SAMPLES];
     int32_t count_[SAMPLES];
-    int32_t capacity_[SAMPLES];
     int32_t layers_[SAMPLES];
     f4 color_[SAMPLES];
     float through_[SAMPLES];
     uint32_t open_[TILE];  // per row, the samples that still take light
     std::vector<float> sums_;
     std::vector<int32_t> order_, rank_;
-    std::vector<float> key_copy_;
-    std::vector<Place> place_copy_;
-    std::vector<f4> rgba_copy_;
-    std::vector<int32_t> face_copy_;
+    std::vector<Fragment> kept_;
 
     int x0_, y0_, columns_, rows_;  // the tile in samples
     int64_t pending_, limit_, fragments_ = 0;
@@ -119,9 +117,7 @@ class MeshTile {
         columns_ = std::min(grid_.side, grid_.width - x0_);
         rows_ = std::min(grid_.side, grid_.height - y0_);
         for (int i = 0; i < SAMPLES; ++i) {
-            if (grown_[i]) grown_[i].reset();
-            list_[i] = {arena_->key[i], arena_->face[i], arena_->rgba[i][0], arena_->place[i]};
-            capacity_[i] = ROOM;
+            overflow_[i].clear();
             count_[i] = 0;
             layers_[i] = 0;
             color_[i] = f4{};
@@ -131,6 +127,21 @@ class MeshTile {
         std::fill(sums_.begin(), sums_.end(), 0.0f);
         pending_ = 0;
         limit_ = (int64_t)PER_SAMPLE * rows_ * columns_;
+    }
+
+    // Groups come in the order of depth, which is no order in memory: their data is asked for some groups ahead.
+    void prefetch_faces(int32_t group) const {
+        const int32_t *face = scene_.mesh.faces + 3 * (int64_t)scene_.group_start[group];
+        __builtin_prefetch(face);
+        __builtin_prefetch(face + 16);
+    }
+    void prefetch_corners(int32_t group) const {
+        const int32_t *face = scene_.mesh.faces + 3 * (int64_t)scene_.group_start[group];
+        const int32_t *end = scene_.mesh.faces + 3 * (int64_t)scene_.group_start[group + 1];
+        for (; face < end; face += 3) {
+            __builtin_prefetch(&scene_.vertices[face[1]]);
+            __builtin_prefetch(scene_.mesh.colors + 4 * (int64_t)face[1]);
+        }
     }
 
     template <bool PLACES>
@@ -187,77 +198,67 @@ class MeshTile {
     // Adds the fragments of a triangle to the lists of the samples it covers.
     template <bool PLACES, bool GENERAL>
     void add_triangle(const Triangle &t, bool crossing, bool shared_depth) {
+        alignas(64) float base[4][TILE];
+        for (int x = 0; x < TILE; x += W) {
+            vf row = load(center_ + x);
+            for (int i = 0; i < 3; ++i) store(base[i] + x, set1(t.eb[i]) * row + set1(t.ec[i]));
+            store(base[3] + x, set1(t.qb) * row + set1(t.qc));
+        }
+        int n = 0;
         for (int x = t.x0 / W * W; x <= t.x1; x += W) {
-            vf column = load(center_ + x);
-            vf ex[3];
+            vf column = load(center_ + x), ex[3];
             for (int i = 0; i < 3; ++i) ex[i] = set1(t.ea[i]) * column;
             vf qx = set1(t.qa) * column;
             unsigned columns = ((2u << (t.x1 - x)) - 1) & ((1u << W) - 1);
             for (int y = t.y0; y <= t.y1; ++y) {
-                float row = y + 0.5f;
                 vf e[3];
-                for (int i = 0; i < 3; ++i) e[i] = ex[i] + set1(t.eb[i] * row + t.ec[i]);
+                for (int i = 0; i < 3; ++i) e[i] = ex[i] + set1(base[i][y]);
                 unsigned inside = at_least(e[0], set1(t.threshold[0])) & at_least(e[1], set1(t.threshold[1])) &
                                   at_least(e[2], set1(t.threshold[2])) & columns & (open_[y] >> x);
-                if (!inside) continue;
-                vf q = qx + set1(t.qb * row + t.qc);
-                if (GENERAL && crossing) {
-                    inside &= at_least(set1(t.q_max), q);
-                    if (!inside) continue;
-                }
-                q = vmin(vmax(q, set1(t.q_min)), set1(t.q_max));
-                vf z = set1(1.0f) / q;
-                alignas(64) float keys[W], depths[W], edges[3][W];
-                if (GENERAL && shared_depth) {
-                    vf k = set1(t.ka) * column + set1(t.kb * row + t.kc);
-                    store(keys, vmin(vmax(k, set1(t.k_min)), set1(t.k_max)));
-                } else {
-                    store(keys, q);
-                }
-                store(depths, z);
+                vf q = qx + set1(base[3][y]);
+                if (GENERAL && crossing) inside &= at_least(set1(t.q_max), q);
+                compress(found_.x + n, column, inside);
+                compress(found_.q + n, q, inside);
                 if (PLACES)
-                    for (int i = 0; i < 3; ++i) store(edges[i], e[i] * set1(t.weight[i]));
-                f4 value = t.vb * set4(row) + t.vc;
-                pending_ += __builtin_popcount(inside);
-                for (; inside; inside &= inside - 1) {
-                    int lane = __builtin_ctz(inside);
-                    int sample = y * TILE + x + lane;
-                    int n = count_[sample]++;
-                    if (__builtin_expect(n >= capacity_[sample], 0)) grow(sample);
-                    List &list = list_[sample];
-                    f4 rgba = (value + t.va * center4_[x + lane]) * set4(depths[lane]);
-                    store4(list.rgba + 4 * n, min4(max4(rgba, t.low), t.high));
-                    list.key[n] = keys[lane];
-                    list.face[n] = t.face;
-                    if (PLACES) {
-                        float sum = edges[0][lane] + edges[1][lane] + edges[2][lane];
-                        Place place = {{1, 0, 0}, depths[lane]};
-                        if (sum > 0)
-                            for (int i = 0; i < 3; ++i) place.b[i] = edges[i][lane] / sum;
-                        list.place[n] = place;
-                    }
-                }
+                    for (int i = 0; i < 3; ++i) compress(found_.e[i] + n, e[i] * set1(t.weight[i]), inside);
+                int more = __builtin_popcount(inside);
+                store(found_.y + n, set1(center_[y]));
+                n += more;
             }
         }
-    }
-
-    void grow(int sample) {
-        int32_t room = capacity_[sample];
-        auto larger = std::make_unique<Grown>();
-        size_t size = 2 * (size_t)room;
-        larger->key.resize(size);
-        larger->face.resize(size);
-        larger->rgba.resize(4 * size);
-        if (extras_.any) larger->place.resize(size);
-        List &list = list_[sample];
-        std::copy(list.key, list.key + room, larger->key.begin());
-        std::copy(list.face, list.face + room, larger->face.begin());
-        std::copy(list.rgba, list.rgba + 4 * (size_t)room, larger->rgba.begin());
-        if (extras_.any) std::copy(list.place, list.place + room, larger->place.begin());
-        list = {larger->key.data(), larger->face.data(), larger->rgba.data(),
-                extras_.any ? larger->place.data() : nullptr};
-        capacity_[sample] = (int32_t)size;
-        grown_[sample] = std::move(larger);
+        if (n == 0) return;
+        pending_ += n;
+        for (int i = 0; i < n; i += W) {
+            vf q = vmin(vmax(load(found_.q + i), set1(t.q_min)), set1(t.q_max));
+            store(found_.z + i, set1(1.0f) / q);
+            if (GENERAL && shared_depth) {
+                q = set1(t.ka) * load(found_.x + i) + (set1(t.kb) * load(found_.y + i) + set1(t.kc));
+                q = vmin(vmax(q, set1(t.k_min)), set1(t.k_max));
+            }
+            store(found_.q + i, q);
+        }
+        for (int i = 0; i < n; ++i) {
+            float x = found_.x[i], y = found_.y[i];
+            int sample = (int)y * TILE + (int)x;
+            f4 rgba = (t.vc + t.vb * set4(y) + t.va * set4(x)) * set4(found_.z[i]);
+            rgba = min4(max4(rgba, t.low), t.high);
+            int k = count_[sample]++;
+            Place place;
+            if (PLACES) {
+                float sum = found_.e[0][i] + found_.e[1][i] + found_.e[2][i];
+                place = {{1, 0, 0}, found_.z[i]};
+                if (sum > 0)
+                    for (int j = 0; j < 3; ++j) place.b[j] = found_.e[j][i] / sum;
+            }
+            if (__builtin_expect(k < ROOM, 1)) {
+                arena_->key[sample][k] = found_.q[i];
+                arena_->face[sample][k] = t.face;
+                store4(arena_->rgba[sample][k], rgba);
+                if (PLACES) arena_->place[sample][k] = place;
+            } else {
+                overflow_[sample].push_back({rgba, found_.q[i], t.face, place});
+            }
+        }
     }
 
     // Blends all waiting fragments nearer than anything with 1 / depth <= key; true once no sample takes more light.
@@ -282,30 +283,28 @@ class MeshTile {
         return any_open == 0;
     }
 
-    // Ranks the n fragments of a list: nearest first, equal depths by face number.
-    void sort(const List &list, int n) {
-        int padded = (n + W - 1) / W * W;
-        if ((int)order_.size() < padded) {
+    // Writes the order of n fragments to order_: nearest first, equal depths by face number.
+    // `key` must be readable up to a multiple of W.
+    void sort(const float *key, const int32_t *face, int n) {
+        size_t padded = (n + W - 1) / W * W;
+        if (order_.size() < padded) {
             order_.resize(padded);
             rank_.resize(padded);
-            key_copy_.resize(padded);
         }
         if (n > 128) {
             for (int i = 0; i < n; ++i) order_[i] = i;
-            std::sort(order_.begin(), order_.begin() + n, [&](int a, int b) {
-                return list.key[a] != list.key[b] ? list.key[a] > list.key[b] : list.face[a] < list.face[b];
-            });
+            std::sort(order_.begin(), order_.begin() + n,
+                      [&](int a, int b) { return key[a] != key[b] ? key[a] > key[b] : face[a] < face[b]; });
             return;
         }
-        const float *keys = list.key;
         typedef int32_t vi __attribute__((vector_size(4 * W)));
-        int total = 0;
-        for (int j = 0; j < padded; j += W) {
-            vf mine = load(keys + j);
+        for (int j = 0; j < n; j += W) {
+            vf mine = load(key + j);
             vi rank = {};
-            for (int i = 0; i < n; ++i) rank -= set1(keys[i]) > mine;
+            for (int i = 0; i < n; ++i) rank -= set1(key[i]) > mine;
             __builtin_memcpy(&rank_[j], &rank, sizeof rank);
         }
+        int total = 0;
         for (int i = 0; i < n; ++i) {
             order_[rank_[i]] = i;
             total += rank_[i];
@@ -314,36 +313,41 @@ class MeshTile {
         if (total != n * (n - 1) / 2) {
             for (int i = 0; i < n; ++i) {
                 int rank = 0;
-                for (int k = 0; k < n; ++k)
-                    rank += keys[k] > keys[i] || (keys[k] == keys[i] && list.face[k] < list.face[i]);
+                for (int k = 0; k < n; ++k) rank += key[k] > key[i] || (key[k] == key[i] && face[k] < face[i]);
                 order_[rank] = i;
             }
         }
     }
 
-    // Blends the front of one sample's list and keeps the rest; true if the sample takes no more light.
-    bool blend(int sample, float key) {
-        List &list = list_[sample];
+    // Blends the front of one sample's fragments and keeps the rest; true if the sample takes no more light.
+    bool blend(int sample, float nearest_to_come) {
         int n = count_[sample];
-        if (n == 1)
-            order_.resize(std::max<size_t>(order_.size(), W)), order_[0] = 0;
-        else
-            sort(list, n);
+        float *key = arena_->key[sample], *rgba = arena_->rgba[sample][0];
+        int32_t *face = arena_->face[sample];
+        Place *place = arena_->place[sample];
+        if (n > ROOM) {
+            gather(sample);
+            key = long_.key.data();
+            rgba = long_.rgba.data();
+            face = long_.face.data();
+            place = long_.place.data();
+        }
+        sort(key, face, n);
         f4 color = color_[sample];
         float through = through_[sample];
         int done = 0;
         bool closed = false;
         for (; done < n; ++done) {
             int i = order_[done];
-            if (!(list.key[i] > key)) break;
-            f4 rgba = load4(list.rgba + 4 * i);
-            float alpha = rgba[3];
+            if (!(key[i] > nearest_to_come)) break;
+            f4 c = load4(rgba + 4 * i);
+            float alpha = c[3];
             if (!(alpha > 0)) continue;
             float weight = through * alpha;
-            color += set4(weight) * rgba;
+            color += set4(weight) * c;
             through -= weight;
             ++fragments_;
-            if (extras_.any) add_extras(sample, list.face[i], list.place[i], weight);
+            if (extras_.any) add_extras(sample, face[i], place[i], weight);
             if (options_.max_layers && ++layers_[sample] >= options_.max_layers) closed = true;
             if (closed || through < options_.min_transmittance) {
                 closed = true;
@@ -353,31 +357,44 @@ class MeshTile {
         color_[sample] = color;
         through_[sample] = through;
         if (closed) return true;
-        keep(list, sample, done, n);
+
+        // Moves what has to wait to the front, in order.
+        int left = n - done;
+        count_[sample] = left;
+        if (n > ROOM) overflow_[sample].clear();
+        if (left == 0 || (done == 0 && n <= ROOM)) return false;
+        if ((int)kept_.size() < left) kept_.resize(left);
+        for (int i = 0; i < left; ++i) {
+            int from = order_[done + i];
+            kept_[i].rgba = load4(rgba + 4 * from);
+            kept_[i].key = key[from];
+            kept_[i].face = face[from];
+            if (extras_.any) kept_[i].place = place[from];
+        }
+        for (int i = 0; i < std::min(left, ROOM); ++i) {
+            store4(arena_->rgba[sample][i], kept_[i].rgba);
+            arena_->key[sample][i] = kept_[i].key;
+            arena_->face[sample][i] = kept_[i].face;
+            if (extras_.any) arena_->place[sample][i] = kept_[i].place;
+        }
+        if (left > ROOM) overflow_[sample].assign(kept_.begin() + ROOM, kept_.begin() + left);
         return false;
     }
 
-    // Moves the fragments from `done` on in sorted order to the front of the list.
-    void keep(List &list, int sample, int done, int n) {
-        int left = n - done;
-        count_[sample] = left;
-        if (left == 0 || done == 0) return;
-        key_copy_.resize(std::max<size_t>(key_copy_.size(), left));
-        face_copy_.resize(std::max<size_t>(face_copy_.size(), left));
-        rgba_copy_.resize(std::max<size_t>(rgba_copy_.size(), left));
-        if (extras_.any) place_copy_.resize(std::max<size_t>(place_copy_.size(), left));
-        for (int i = 0; i < left; ++i) {
-            int from = order_[done + i];
-            key_copy_[i] = list.key[from];
-            face_copy_[i] = list.face[from];
-            rgba_copy_[i] = load4(list.rgba + 4 * from);
-            if (extras_.any) place_copy_[i] = list.place[from];
-        }
-        for (int i = 0; i < left; ++i) {
-            list.key[i] = key_copy_[i];
-            list.face[i] = face_copy_[i];
-            store4(list.rgba + 4 * i, rgba_copy_[i]);
-            if (extras_.any) list.place[i] = place_copy_[i];
+    // Copies all fragments of a sample that has more than the arena holds to long_.
+    void gather(int sample) {
+        int n = count_[sample];
+        long_.key.resize((n + W - 1) / W * W);
+        long_.face.resize(n);
+        long_.rgba.resize(4 * (size_t)n);
+        long_.place.resize(n);
+        for (int i = 0; i < n; ++i) {
+            const bool inside = i < ROOM;
+            const Fragment *f = inside ? nullptr : &overflow_[sample][i - ROOM];
+            long_.key[i] = inside ? arena_->key[sample][i] : f->key;
+            long_.face[i] = inside ? arena_->face[sample][i] : f->face;
+            store4(&long_.rgba[4 * (size_t)i], inside ? load4(arena_->rgba[sample][i]) : f->rgba);
+            if (extras_.any) long_.place[i] = inside ? arena_->place[sample][i] : f->place;
         }
     }
 

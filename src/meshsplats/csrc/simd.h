@@ -67,4 +67,30 @@ inline unsigned at_least(vf a, vf b) {
 }
 #endif
 
+// Writes the lanes of `v` whose bit is set next to each other from `out` on, which has room for W.
+#if defined(__AVX512F__)
+inline void compress(float *out, vf v, unsigned bits) { store(out, _mm512_maskz_compress_ps((__mmask16)bits, v)); }
+#elif defined(__AVX2__)
+struct CompressTable {
+    alignas(32) unsigned char lane[256][8];
+    constexpr CompressTable() : lane() {
+        for (int bits = 0; bits < 256; ++bits) {
+            int n = 0;
+            for (int i = 0; i < 8; ++i)
+                if (bits >> i & 1) lane[bits][n++] = (unsigned char)i;
+        }
+    }
+};
+constexpr CompressTable compress_table;
+inline void compress(float *out, vf v, unsigned bits) {
+    __m256i lane = _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)compress_table.lane[bits]));
+    _mm256_storeu_ps(out, _mm256_permutevar8x32_ps(v, lane));
+}
+#else
+inline void compress(float *out, vf v, unsigned bits) {
+    for (int i = 0; i < W; ++i)
+        if (bits >> i & 1) *out++ = v[i];
+}
+#endif
+
 }  // namespace ms

@@ -55,7 +55,7 @@ struct Linear {
 // One triangle made ready for a tile; positions count from the tile's corner. `value` holds RGBA divided by depth.
 struct Triangle {
     float ea[3], eb[3], ec[3];  // edge functions, positive inside
-    float threshold[3];         // 0 where samples on the edge belong to this triangle, else the least positive float
+    float threshold[3];         // 0 where samples on the edge belong to this triangle, else the least normal float
     float qa, qb, qc;           // 1 / depth
     float q_min, q_max;         // its range over the corners
     float ka, kb, kc;           // 1 / depth by which fragments are ordered
@@ -69,7 +69,7 @@ struct Triangle {
 
 inline float edge_threshold(double a, double b) {
     bool top_left = a > 0 || (a == 0 && b > 0);
-    return top_left ? 0.0f : std::numeric_limits<float>::denorm_min();
+    return top_left ? 0.0f : std::numeric_limits<float>::min();
 }
 
 // Fills `t` but for face, box and ordering; false if the triangle has no area on the picture.
