@@ -1,0 +1,334 @@
+"""Reading meshes from glTF 2.0: the files of ``glb`` exactly, those of other programs as far as triangles and
+vertex colours go."""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from meshsplats.colors import linear_to_srgb
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.glb import up_quaternion
+from meshsplats.formats.gltf_document import GltfDocument
+from meshsplats.formats.mesh_checks import checked_mesh, straight_colors
+from meshsplats.mesh import Blending, SplatMesh
+
+_POINTS_TO_LINES = (0, 1, 2, 3)
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+
+@dataclass
+class _Piece:
+    """One primitive as placed by one node."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    linear: np.ndarray
+    normals: np.ndarray | None
+
+
+def read_gltf(path: Path) -> SplatMesh:
+    """The mesh in a `.glb` or `.gltf` file.
+
+    A file of ours comes back as it was saved: positions and extra arrays exactly, colours within the
+    precision they were stored in. From other programs' files all triangles of the scene are joined in
+    its y-up frame; colours are COLOR_0 times the material's base colour, converted to display values;
+    textures are left out with a DataWarning. Buffers must be embedded or lie beside the file. Raises
+    FileFormatError, for Draco and meshopt compression and sparse accessors too.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers end in the check for finite values
+        return _read(GltfDocument(path))
+
+
+def _read(document: GltfDocument) -> SplatMesh:
+    path = document.path
+    placed = list(_placed_meshes(document))
+    pieces, skipped, textured = [], 0, 0
+    own = placed[0][0] if len(placed) == 1 else {}
+    note = _our_note(own)
+    for mesh, matrix in placed:
+        if note and _is_own_placement(matrix, note):
+            matrix = np.eye(4)
+        elif note:  # someone has moved the mesh in the scene
+            note["up"] = [0.0, 1.0, 0.0]
+        for primitive in _objects(document, mesh.get("primitives"), "primitives of a mesh"):
+            mode = primitive.get("mode", _TRIANGLES)
+            if mode in _POINTS_TO_LINES:
+                skipped += 1
+                _refuse_splats(document, primitive)
+                continue
+            material = _material(document, primitive)
+            textured += "baseColorTexture" in _pbr(material)
+            pieces.append(_piece(document, primitive, material, matrix))
+    if skipped:
+        _warn(f"{path}: {skipped:,} primitives of points or lines were left out")
+    if textured:
+        _warn(f"{path}: {textured:,} primitives have a texture, which was left out; colours may differ")
+    if not pieces:
+        raise document.error("the scene holds no triangles")
+    return _join(document, pieces, own, note)
+
+
+def _placed_meshes(document: GltfDocument) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Each mesh of the scene with the (4, 4) matrix from its own to the scene's frame."""
+    nodes, scenes = document.items("nodes"), document.items("scenes")
+    if scenes:
+        roots = document.item("scenes", document.json.get("scene", 0), "the file").get("nodes", [])
+    elif nodes:
+        below = {c for n in nodes for c in _list(document, n.get("children", []), "children of a node")}
+        roots = [i for i in range(len(nodes)) if i not in below]
+    else:
+        yield from ((mesh, np.eye(4)) for mesh in document.items("meshes"))
+        return
+    seen: set[int] = set()
+    stack = [(root, np.eye(4)) for root in reversed(_list(document, roots, "nodes of a scene"))]
+    while stack:
+        index, parent = stack.pop()
+        node = document.item("nodes", index, "a scene or node")
+        if index in seen:
+            raise document.error(f"node {index} has two parents")
+        seen.add(index)
+        matrix = parent @ _local_matrix(document, node)
+        if "mesh" in node:
+            yield document.item("meshes", node["mesh"], f"node {index}"), matrix
+        children = _list(document, node.get("children", []), "children of a node")
+        stack += [(child, matrix) for child in reversed(children)]
+
+
+def _local_matrix(document: GltfDocument, node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return document.numbers(node["matrix"], 16, "matrix of a node").reshape(4, 4).T
+    matrix = _rotation(document.numbers(node.get("rotation", [0, 0, 0, 1]), 4, "rotation of a node"))
+    matrix[:3, :3] *= document.numbers(node.get("scale", [1, 1, 1]), 3, "scale of a node")
+    matrix[:3, 3] = document.numbers(node.get("translation", [0, 0, 0]), 3, "translation of a node")
+    return matrix
+
+
+def _rotation(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
+    """(4, 4) matrix of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return matrix
+
+
+def _piece(
+    document: GltfDocument, primitive: dict[str, Any], material: dict[str, Any], matrix: np.ndarray
+) -> _Piece:
+    attributes = primitive.get("attributes")
+    if not isinstance(attributes, dict) or "POSITION" not in attributes:
+        raise document.error("a primitive has no POSITION")
+    if "KHR_draco_mesh_compression" in _dict(primitive.get("extensions")):
+        raise document.compressed()
+    vertices = document.floats(attributes["POSITION"], "POSITION")
+    v = len(vertices)
+    faces = _faces(document, primitive, v)
+    document.budget.spend(64 * v + 12 * len(faces), "a mesh")
+    factor = document.numbers(_pbr(material).get("baseColorFactor", [1, 1, 1, 1]), 4, "baseColorFactor")
+    linear = np.ones((v, 4), np.float32)
+    if "COLOR_0" in attributes:
+        colors = document.floats(attributes["COLOR_0"], "COLOR_0")
+        if len(colors) != v or colors.shape[1] < 3:
+            raise document.error(f"COLOR_0 must be {v:,} RGB or RGBA colours, got shape {colors.shape}")
+        linear[:, : colors.shape[1]] = colors
+    if (factor != 1).any():
+        linear *= factor.astype(np.float32)
+    if material.get("alphaMode", "OPAQUE") == "OPAQUE":
+        linear[:, 3] = 1
+    normals = None
+    if "NORMAL" in attributes:
+        normals = document.floats(attributes["NORMAL"], "NORMAL")
+    for name, values in (("POSITION", vertices), ("NORMAL", normals)):
+        if values is not None and values.shape != (v, 3):
+            raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")
+    if (matrix != np.eye(4)).any():
+        vertices = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
+        if normals is not None:
+            # Normals follow the inverse transpose or, as its length does not matter, the matrix of cofactors.
+            a, b, c = matrix[:3, :3].T
+            cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+            turned = normals @ cofactors.T
+            length = np.linalg.norm(turned, axis=1, keepdims=True)
+            normals = (turned / np.where(length > 0, length, 1)).astype(np.float32)
+    return _Piece(vertices, faces, linear, normals)
+
+
+def _faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
+    if "indices" in primitive:
+        stored = document.accessor(primitive["indices"], "indices")
+        if stored.dtype.kind != "u" or stored.shape[1] != 1:
+            raise document.error(f"indices must be unsigned integers, got {stored.dtype}")
+        if len(stored) and stored.max() >= v:
+            raise document.error(f"indices run up to {stored.max()}, there are {v:,} vertices")
+        document.budget.spend(4 * len(stored), "indices")
+        corners = stored[:, 0].astype(np.int32)
+    else:
+        corners = np.arange(v, dtype=np.int32)
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode == _TRIANGLES:
+        if len(corners) % 3:
+            raise document.error(f"{len(corners):,} indices are no whole number of triangles")
+        return corners.reshape(-1, 3)
+    n = max(len(corners) - 2, 0)
+    document.budget.spend(36 * n, "indices")
+    i = np.arange(n)
+    if mode == _STRIP:
+        return corners[np.stack([i, i + 1 + i % 2, i + 2 - i % 2], axis=1)]
+    if mode == _FAN:
+        return corners[np.stack([i + 1, i + 2, 0 * i], axis=1)]
+    raise document.error(f"unknown primitive mode {str(mode)[:20]}")
+
+
+def _join(
+    document: GltfDocument, pieces: list[_Piece], own: dict[str, Any], note: dict[str, Any]
+) -> SplatMesh:
+    counts = np.cumsum([0, *(len(p.vertices) for p in pieces)])
+    if counts[-1] > np.iinfo(np.int32).max:
+        raise document.error(f"{counts[-1]:,} vertices are more than a mesh can number")
+    one = len(pieces) == 1
+    linear = pieces[0].linear if one else np.concatenate([p.linear for p in pieces])
+    colors = straight_colors(linear, document.path)
+    if note.get("blending") != "linear":
+        colors[:, :3] = linear_to_srgb(colors[:, :3])
+    normals: np.ndarray | None = None
+    if all(p.normals is not None for p in pieces) and note.get("normals") != "computed":
+        normals = np.concatenate([p.normals for p in pieces])  # type: ignore[misc]
+    faces = [p.faces + np.int32(start) for p, start in zip(pieces, counts[:-1], strict=True)]
+    arrays: dict[str, Any] = {
+        "vertices": pieces[0].vertices if one else np.concatenate([p.vertices for p in pieces]),
+        "faces": np.concatenate(faces),
+        "colors": colors,
+        "normals": normals,
+        "up": (0, 1, 0),
+    }
+    if note and len(own["primitives"]) == 1:
+        arrays |= _restore(document, own, note, len(arrays["faces"]), int(counts[-1]))
+    return checked_mesh(document.path, **arrays)
+
+
+# -- what our own files hold beyond glTF
+
+
+def _our_note(mesh: dict[str, Any]) -> dict[str, Any]:
+    """The entry ``extras.meshsplats`` of a mesh where it is one of ours and in order, else an empty one."""
+    note = _dict(_dict(mesh.get("extras")).get("meshsplats"))
+    up = note.get("up")
+    good = (
+        isinstance(up, list) and len(up) == 3 and all(isinstance(u, (int, float)) and abs(u) <= 2 for u in up)
+    )
+    if not good or note.get("blending") not in get_args(Blending) or not any(up):  # type: ignore[arg-type]
+        return {}
+    return note
+
+
+def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
+    """Whether the node still does what we wrote: turn the mesh's up direction to +y, nothing more."""
+    wanted = _rotation(up_quaternion(np.array(note["up"], np.float64)))
+    return bool(np.abs(matrix - wanted).max() < 1e-5)
+
+
+def _restore(
+    document: GltfDocument, mesh: dict[str, Any], note: dict[str, Any], f: int, v: int
+) -> dict[str, Any]:
+    """Constructor arguments from our note. What another program has dropped or renumbered is left out, with a
+    DataWarning: better no splat numbers than wrong ones."""
+    result: dict[str, Any] = {"up": note["up"], "blending": note["blending"]}
+    lost: list[str] = []
+    for name in ("face_splat", "depth_group"):
+        if name in note:
+            values = _raw(document, _dict(note[name]), "<i4", f)
+            if values is None:
+                lost.append(name)
+            else:
+                result[name] = values
+    attributes: dict[str, np.ndarray] = {}
+    stored = _dict(mesh["primitives"][0]["attributes"])
+    entries = note.get("attributes", [])
+    for entry in entries if isinstance(entries, list) else []:
+        key, columns = _dict(entry).get("name"), _dict(entry).get("columns")
+        if isinstance(key, str) and (columns is None or (isinstance(columns, int) and 0 <= columns <= 4096)):
+            values = _attribute(document, stored, entry, v, 1 if columns is None else columns)
+            if values is None:
+                lost.append(key[:40])
+            else:
+                attributes[key] = values[:, 0] if columns is None else values
+    if lost:
+        _warn(f"{document.path}: another program has altered the file, left out: {', '.join(lost)}")
+    return result | {"attributes": attributes}
+
+
+def _attribute(
+    document: GltfDocument, stored: dict[str, Any], entry: dict[str, Any], v: int, columns: int
+) -> np.ndarray | None:
+    """(v, columns) values of one attribute, None where they are gone."""
+    if columns == 0:
+        return np.empty((v, 0), np.float32)
+    semantic = entry.get("semantic")
+    if semantic is None:
+        values = _raw(document, entry, "<f4", v * columns)
+        return None if values is None else values.reshape(v, columns)
+    if not isinstance(semantic, str) or semantic not in stored:
+        return None
+    values = document.floats(stored[semantic], semantic[:60])
+    return values if values.shape == (v, columns) else None
+
+
+def _raw(document: GltfDocument, entry: dict[str, Any], dtype: str, count: int) -> np.ndarray | None:
+    """``count`` numbers of a buffer view that only our note refers to; None if the view is not the one
+    we wrote."""
+    try:
+        data, _ = document.view_bytes(entry.get("bufferView"), "meshsplats")
+    except FileFormatError:
+        return None
+    if len(data) != count * np.dtype(dtype).itemsize or zlib.crc32(data) != entry.get("crc32"):
+        return None
+    document.budget.spend(len(data), "meshsplats")
+    return np.frombuffer(data, dtype).astype(np.dtype(dtype).newbyteorder("="))
+
+
+# -- small change
+
+
+def _material(document: GltfDocument, primitive: dict[str, Any]) -> dict[str, Any]:
+    if "material" not in primitive:
+        return {}
+    return document.item("materials", primitive["material"], "a primitive")
+
+
+def _pbr(material: dict[str, Any]) -> dict[str, Any]:
+    return _dict(material.get("pbrMetallicRoughness"))
+
+
+def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:
+    if any("gaussian_splatting" in name for name in _dict(primitive.get("extensions"))):
+        raise document.error("holds Gaussian splats, not a mesh; read it with load_gaussians")
+
+
+def _dict(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _list(document: GltfDocument, value: object, what: str) -> list[Any]:
+    if not isinstance(value, list) or not all(isinstance(x, int) for x in value):
+        raise document.error(f"{what} must be an array of whole numbers")
+    return value
+
+
+def _objects(document: GltfDocument, value: object, what: str) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(x, dict) for x in value):
+        raise document.error(f"{what} must be an array of objects")
+    return value
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, DataWarning, stacklevel=4)

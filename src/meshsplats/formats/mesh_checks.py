@@ -1,0 +1,80 @@
+"""What all mesh readers share: a memory budget and the way from a stranger's arrays to a SplatMesh."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.mesh import SplatMesh
+
+
+class Budget:
+    """Bytes that reading one file may take: 256 MiB, and 64 times its size.
+
+    No mesh file of the known formats unpacks further, save for long runs of equal values; a decompression
+    bomb or a small file that repeats one mesh a million times does.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file_bytes = 0
+        self._left = 256 << 20
+        self.extend(os.stat(path).st_size)
+
+    def extend(self, file_bytes: int) -> None:
+        """Adds the share of a further file that belongs to the first."""
+        self._file_bytes += file_bytes
+        self._left += 64 * file_bytes
+
+    def spend(self, count: int, what: str) -> None:
+        """Books ``count`` bytes for ``what``; FileFormatError when the budget is exceeded. Call it before
+        allocating."""
+        self._left -= count
+        if self._left < 0:
+            raise FileFormatError(
+                f"{self._path}: {what} would take the data beyond what a file of {self._file_bytes:,} bytes"
+                " may unpack to (a decompression bomb?); refused"
+            )
+
+
+def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:
+    """(v, 4) float32 RGBA in [0, 1] from stored colours (v, 3) or (v, 4): integers are divided by the largest
+    value of their type, a missing alpha becomes 1, float values beyond [0, 1] are clipped with a counted
+    DataWarning."""
+    result = np.ones((len(colors), 4), np.float32)
+    if colors.dtype.kind == "u":
+        result[:, : colors.shape[1]] = colors
+        result[:, : colors.shape[1]] /= np.float32(np.iinfo(colors.dtype).max)
+        return result
+    if colors.dtype.kind != "f":
+        raise FileFormatError(f"{path}: colours must be floats or unsigned integers, got {colors.dtype}")
+    with np.errstate(over="ignore"):
+        result[:, : colors.shape[1]] = colors
+    low, high = (result.min(), result.max()) if result.size else (0, 1)
+    # Values that are not finite are left to the mesh's own check, which names their row.
+    if (low < 0 or high > 1) and np.isfinite(result).all():
+        if low < -1e-6 or high > 1 + 1e-6:  # a rounding error outside is no news
+            outside = int(((result < 0) | (result > 1)).any(axis=1).sum())
+            warnings.warn(
+                f"{path}: {outside:,} vertex colours lay outside [0, 1] and were clipped",
+                DataWarning,
+                stacklevel=2,
+            )
+        np.clip(result, 0, 1, out=result)
+    return result
+
+
+def checked_mesh(path: Path, **arrays) -> SplatMesh:
+    """A SplatMesh of arrays from a file; what does not fit together becomes a FileFormatError naming
+    ``path``."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return SplatMesh(**arrays)
+    except FileFormatError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"{path}: {error}") from None
