@@ -30,9 +30,9 @@ MAX_FILE_BYTES = 16 << 20
 MAX_CAMERAS = 20_000
 NEAR_SHARE = 0.01
 """Near plane of the cameras made here, as a share of their distance to the subject's middle."""
-COVERED = 0.98
+COVERED = 0.99
 """Share of the subject's opacity that must be on the picture."""
-MARGIN = 1.06
+MARGIN = 1.08
 """Room left round the subject."""
 
 

@@ -1,0 +1,272 @@
+"""What the commands share: input by content, output that is not overwritten, cameras and drawing options."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import numpy as np
+import tyro
+
+from meshsplats.camera import Camera, dome, load_cameras, look_around, orbit
+from meshsplats.cli import UsageError
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.framing import guess_up
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+T = TypeVar("T")
+# Options that may be left out. Their help says what happens then, instead of "(default: None)".
+Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
+Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
+Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
+File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+
+NAMED_COLORS = {
+    "white": (1.0, 1.0, 1.0),
+    "black": (0.0, 0.0, 0.0),
+    "grey": (0.5, 0.5, 0.5),
+    "gray": (0.5, 0.5, 0.5),
+}
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """From where, and how large. Give one of --orbit, --dome, --look-around, --cameras."""
+
+    orbit: Count = None
+    """N views on a circle round the subject."""
+    dome: Count = None
+    """N views spread evenly over the upper half of a sphere round the subject."""
+    look_around: Count = None
+    """N views from the middle of the scene, a room say, turning once round."""
+    cameras: File = None
+    """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder that has
+    one."""
+    elevation: Number = None
+    """Degrees above the horizon. Default: 15; 0 with --look-around."""
+    azimuth: float = 0.0
+    """Degrees of the first view: 0 from the front, 90 from the subject's right-hand side in that view."""
+    distance: float = 1.0
+    """Multiple of the distance from which the subject just fits the picture."""
+    fov: Number = None
+    """Degrees that the picture's shorter side spans. Default: 45; 75 with --look-around."""
+    up: Text = None
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
+    folder, of the mesh, else -y, as COLMAP's scenes have it."""
+    width: Count = None
+    """Picture width in pixels. With --cameras, pictures are scaled to this width."""
+    height: Count = None
+    """Picture height in pixels. Default: the width. Not with --cameras, where it follows."""
+
+    @property
+    def moving(self) -> bool:
+        """Whether the views make a turntable."""
+        return self.cameras is None and self.dome is None
+
+    def make(self, scene: GaussianCloud | SplatMesh, source: Path, *, count: int, side: int) -> list[Camera]:
+        """The cameras; ``count`` views of an orbit, ``side`` pixels wide, where nothing else is asked for."""
+        self.check()
+        if self.cameras is not None:
+            cameras = load_cameras(self.cameras)
+            return cameras if self.width is None else [c.scaled(self.width / c.width) for c in cameras]
+        width = self.width or self.height or side
+        lens: dict[str, Any] = {"width": width, "height": self.height or width}
+        lens["up"] = parse_up(self.up) if self.up is not None else guess_up(scene, cameras_beside(source))
+        if self.look_around is not None:
+            lens["elevation"] = 0.0 if self.elevation is None else self.elevation
+            lens["fov"] = 75.0 if self.fov is None else self.fov
+            return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
+        lens["fov"] = 45.0 if self.fov is None else self.fov
+        lens["distance"] = self.distance
+        if self.dome is not None:
+            return dome(scene, self.dome, **lens)
+        lens["elevation"] = 15.0 if self.elevation is None else self.elevation
+        return orbit(scene, count if self.orbit is None else self.orbit, azimuth=self.azimuth, **lens)
+
+    def check(self) -> None:
+        """UsageError for options that exclude each other or would do nothing."""
+        modes = [
+            name for name in ("orbit", "dome", "look_around", "cameras") if getattr(self, name) is not None
+        ]
+        if len(modes) > 1:
+            raise UsageError(f"give one of {', '.join(map(_flag, modes))}, not several")
+        without_effect = {
+            "dome": ("elevation", "azimuth"),
+            "look_around": ("distance",),
+            "cameras": ("elevation", "azimuth", "distance", "fov", "up", "height"),
+        }
+        for mode in modes:
+            for name in without_effect.get(mode, ()):
+                if getattr(self, name) != next(f.default for f in fields(self) if f.name == name):
+                    raise UsageError(f"{_flag(name)} has no effect with {_flag(mode)}")
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """How pictures are drawn."""
+
+    background: str = "white"
+    """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
+    samples: int = 2
+    """Side of the grid of samples in each pixel; 2 means 2 x 2."""
+    sh_degree: Count = None
+    """Draw splats with spherical harmonics up to this degree, 0 to 3. Default: all that are stored."""
+    max_layers: Count = None
+    """Blend only the nearest N triangles of a mesh at each sample, like N passes of depth peeling. Default: all."""
+    threads: Count = None
+    """At most N threads. Default: all processors."""
+
+
+def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
+    """What kind of thing ``path`` is, by its content. Raises FileFormatError if it is none of them."""
+    from meshsplats.formats.ply_header import read_header
+    from meshsplats.formats.splat_ply import is_float_splat
+
+    if path.is_dir():
+        return "splats"
+    with open(path, "rb") as file:
+        start = file.read(64)
+        if start.startswith(b"ply"):
+            file.seek(0)
+            return "splats" if is_float_splat(read_header(file, path)) else "mesh"
+    if start.startswith((b"glTF", b"PK\x03\x04")):
+        return "mesh"
+    if start.lstrip()[:1] in (b"[", b"{"):
+        return "cameras"
+    if not start:
+        raise FileFormatError(f"{path}: the file is empty")
+    raise FileFormatError(
+        f"{path}: neither splats (.ply), a mesh (.npz, .ply, .glb) nor cameras (.json);"
+        f" it begins with {start[:8]!r}"
+    )
+
+
+def load_scene(path: Path, *, strict: bool = False) -> GaussianCloud | SplatMesh:
+    """The splats or the mesh at ``path``."""
+    from meshsplats.formats.meshes import load_mesh
+    from meshsplats.formats.splats import load_gaussians
+
+    kind = identify(path)
+    if kind == "cameras":
+        raise FileFormatError(
+            f"{path}: a JSON file; expected splats or a mesh (cameras are given with --cameras)"
+        )
+    return load_gaussians(path, strict=strict) if kind == "splats" else load_mesh(path)
+
+
+def cameras_beside(source: Path) -> list[Camera] | None:
+    """The training cameras in a model folder, or None."""
+    if not (source / "cameras.json").is_file():
+        return None
+    try:
+        return load_cameras(source)
+    except FileFormatError as error:
+        warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
+        return None
+
+
+def parse_up(text: str) -> np.ndarray:
+    """(3,) direction from ``-y``, ``+z``, ``x`` or ``x,y,z``. Raises ValueError for anything else."""
+    axis = text.lower().lstrip("+-")
+    if axis in ("x", "y", "z") and len(text) <= 2:
+        direction = np.zeros(3)
+        direction["xyz".index(axis)] = -1 if text.startswith("-") else 1
+        return direction
+    numbers = _numbers(text)
+    if numbers is None or not any(numbers):
+        raise ValueError(f"--up must be an axis such as -y or z, or three numbers x,y,z, got {text!r}")
+    return np.array(numbers)
+
+
+def parse_color(text: str) -> tuple[float, ...]:
+    """RGB in [0, 1] from a name, ``#rrggbb`` or ``r,g,b``. Raises ValueError for anything else."""
+    if text.lower() in NAMED_COLORS:
+        return NAMED_COLORS[text.lower()]
+    if text.startswith("#") and len(text) == 7 and all(c in "0123456789abcdefABCDEF" for c in text[1:]):
+        return tuple(int(text[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    numbers = _numbers(text)
+    if numbers is None or not all(0 <= v <= 1 for v in numbers):
+        raise ValueError(
+            f"--background must be {', '.join(NAMED_COLORS)}, #rrggbb, or r,g,b from 0 to 1, got {text!r}"
+        )
+    return numbers
+
+
+def _numbers(text: str) -> tuple[float, ...] | None:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return numbers if len(numbers) == 3 and np.isfinite(numbers).all() else None
+
+
+def prepare_folder(folder: Path) -> None:
+    """Makes the output folder; its parent must exist, so that a misspelt path does not become a tree of
+    folders."""
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(20, "the output must be a folder here, this is a file", str(folder))
+    folder.mkdir(exist_ok=True)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes ``content`` whole or not at all; infinities and NaN, which JSON lacks, are a ValueError."""
+    from meshsplats.formats.atomic import atomic_path
+
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def configuration(command: str, options: Any) -> dict:
+    """What was asked for, for the file beside the results: enough to run the command again."""
+    import meshsplats
+
+    flat: dict[str, Any] = {}
+    for key, value in asdict(options).items():
+        flat |= value if isinstance(value, dict) else {key: value}
+    return {
+        "command": command,
+        "meshsplats": meshsplats.__version__,
+        "options": {k: str(v) if isinstance(v, Path) else v for k, v in flat.items()},
+    }
+
+
+def track(items: Iterable[T], label: str, total: int) -> Iterable[T]:
+    """``items`` with a progress bar on stderr, where that is a terminal."""
+    if not sys.stderr.isatty():
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import track as progress
+
+    yield from progress(items, label, total, console=Console(stderr=True), transient=True)
+
+
+def plural(count: int, thing: str) -> str:
+    return f"{count:,} {thing}" + ("" if count == 1 else "s")
+
+
+def size_of(path: Path) -> str:
+    """Size of a file for people: 3.2 MB."""
+    size = float(path.stat().st_size)
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.2f} GB"
+
+
+def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:
+    """File names of ``count`` views, numbered for video tools; names from camera files never become paths."""
+    return [f"{prefix}_{i:04d}{suffix}" for i in range(count)]
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

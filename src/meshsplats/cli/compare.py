@@ -1,0 +1,126 @@
+"""``meshsplats compare``: how close the mesh comes to the splats."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from meshsplats.camera import save_cameras
+from meshsplats.cli.common import (
+    DrawOptions,
+    File,
+    Output,
+    ViewOptions,
+    configuration,
+    identify,
+    parse_color,
+    prepare_folder,
+    track,
+    view_names,
+    write_json,
+)
+from meshsplats.comparison import Comparison, compare_views
+from meshsplats.errors import FileFormatError
+from meshsplats.formats.atomic import refuse_existing
+
+CONFIGURATION, RESULTS, CAMERAS = "config.json", "results.json", "cameras.json"
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Draws splats and mesh from the same cameras: PSNR and SSIM per view, and strips splats | mesh |
+    error."""
+
+    splats: tyro.conf.Positional[Path]
+    """Splat file or model folder."""
+    mesh: tyro.conf.Positional[File] = None
+    """The mesh. Default: the splats converted with --preset for these cameras."""
+    output: Output = tyro.MISSING
+    """Folder for strips, results.json, cameras.json and config.json."""
+    preset: str = "default"
+    """Preset of the conversion where no mesh is given: default or paper."""
+    views: ViewOptions = field(default_factory=ViewOptions)
+    """8 views of an orbit, 400 pixels wide, where nothing else is asked for."""
+    draw: DrawOptions = field(default_factory=DrawOptions)
+    amplify: float = 4.0
+    """Factor that makes the error visible in the strips."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.formats.splats import load_gaussians
+        from meshsplats.pictures import amplified_error, save_png, strip
+
+        if not self.amplify > 0:
+            raise ValueError(f"--amplify must be positive, got {self.amplify}")
+        background = parse_color(self.draw.background)
+        cloud = load_gaussians(self.splats)
+        cameras = self.views.make(cloud, self.splats, count=8, side=400)
+        strips = view_names(len(cameras))
+        names = (*strips, RESULTS, CAMERAS, CONFIGURATION)
+        refuse_existing([self.output / name for name in names], self.force)
+        if self.mesh is None:
+            from meshsplats.conversion import convert
+
+            mesh = convert(cloud, preset=self.preset, cameras=cameras)  # type: ignore[arg-type]
+        else:
+            from meshsplats.formats.meshes import load_mesh
+
+            if identify(self.mesh) != "mesh":
+                raise FileFormatError(f"{self.mesh}: not a mesh; give splats first, then the mesh")
+            mesh = load_mesh(self.mesh)
+        prepare_folder(self.output)
+        start = time.perf_counter()
+        scores = []
+        views = compare_views(
+            cloud,
+            mesh,
+            cameras,
+            sh_degree=self.draw.sh_degree,
+            background=background,
+            samples=self.draw.samples,
+            max_layers=self.draw.max_layers,
+            threads=self.draw.threads,
+        )
+        captions = ("splats", "mesh", f"error x {self.amplify:g}")
+        for name, view in zip(strips, track(views, "comparing", len(cameras)), strict=True):
+            scores.append(view.score)
+            error = amplified_error(view.splats, view.mesh, self.amplify)
+            save_png(self.output / name, strip([view.splats, view.mesh, error], captions))
+        comparison = Comparison(tuple(scores))
+        result = {
+            "splats": len(cloud),
+            "triangles": len(mesh.faces),
+            "ssim_convention": "3dgs",
+            "error_amplified": self.amplify,
+            "seconds": round(time.perf_counter() - start, 3),
+            **comparison.to_dict(),
+        }
+        write_json(self.output / RESULTS, result)
+        save_cameras(cameras, self.output / CAMERAS)
+        write_json(self.output / CONFIGURATION, configuration("compare", self))
+        if self.json:
+            print(json.dumps(result, indent=1, allow_nan=False))
+            return
+        _print_table(comparison)
+        print(f"{len(cloud):,} splats against {len(mesh.faces):,} triangles, {result['seconds']:.1f} s")
+        print(f"strips splats | mesh | error x {self.amplify:g}: {self.output}/")
+
+
+def _print_table(comparison: Comparison) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("view", box=None, pad_edge=False, show_footer=True)
+    table.columns[0].footer = "mean"
+    table.add_column("PSNR dB", justify="right", footer=f"{comparison.psnr:.2f}")
+    table.add_column("SSIM", justify="right", footer=f"{comparison.ssim:.4f}")
+    for view in comparison.views:
+        table.add_row(view.name, f"{view.psnr:.2f}", f"{view.ssim:.4f}")
+    Console().print(table)

@@ -1,0 +1,120 @@
+"""``meshsplats doctor``: what is installed here, and what is missing."""
+
+from __future__ import annotations
+
+import json
+import platform
+import re
+from dataclasses import dataclass
+from importlib import metadata
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Shows what is installed, the instruction set in use, and what is missing. Exit code 1 if nothing can be
+    drawn."""
+
+    json: bool = False
+    """Print the findings as JSON."""
+
+    def run(self) -> int:
+        findings = examine()
+        if self.json:
+            print(json.dumps(findings, indent=1))
+        else:
+            print(_text(findings))
+        return 0 if findings["core"]["works"] else 1
+
+
+def examine() -> dict:
+    """The findings, ready for JSON."""
+    import meshsplats
+    from meshsplats.rendering.api import processors
+
+    libraries = {e: {name: _version(name) for name in names} for e, names in _requirements().items()}
+    return {
+        "meshsplats": meshsplats.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "threads": processors(),
+        "core": _core(),
+        "required": libraries.pop("", {}),
+        "extras": libraries,
+    }
+
+
+def _core() -> dict:
+    """Variants of the compiled core, and whether the one in use draws a triangle."""
+    from meshsplats.rendering import core
+
+    result: dict = {"works": False, "in_use": None, "available": [], "problem": None}
+    try:
+        result["available"] = core.available_variants()
+        result["in_use"] = core.load_core().ms_variant().decode()
+        result["works"] = _draws()
+        if not result["works"]:
+            result["problem"] = "the picture of one triangle is wrong"
+    except (ImportError, OSError, ValueError, RuntimeError) as error:
+        result["problem"] = " ".join(str(error).split())
+    return result
+
+
+def _draws() -> bool:
+    from meshsplats.camera import look_at
+    from meshsplats.mesh import SplatMesh
+    from meshsplats.rendering import render
+
+    corners = np.array([[-9, -9, 0], [9, -9, 0], [0, 9, 0]])
+    mesh = SplatMesh(corners, np.array([[0, 1, 2]]), np.array([[1, 0.5, 0, 0.5]] * 3))
+    camera = look_at((0, 0, -5), (0, 0, 0), width=3, height=3)
+    middle = render(mesh, camera, background=(0, 0, 1)).color[1, 1]
+    return bool(abs(middle - [0.5, 0.25, 0.5]).max() < 1e-5)
+
+
+def _requirements() -> dict[str, list[str]]:
+    """Names of the libraries that the package asks for, by extra; those always needed under ''."""
+    try:
+        lines = metadata.requires("meshsplats") or []
+    except metadata.PackageNotFoundError:
+        lines = []
+    found: dict[str, list[str]] = {"": []}
+    for line in lines:
+        name = re.match(r"[A-Za-z0-9._-]+", line)
+        extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)['\"]", line)
+        if name:
+            found.setdefault(extra[1] if extra else "", []).append(name[0])
+    return found
+
+
+def _version(name: str) -> str | None:
+    """Version of an installed library that can be imported, or None."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _text(findings: dict) -> str:
+    core = findings["core"]
+    lines = [
+        f"MeshSplats {findings['meshsplats']}, Python {findings['python']}, {findings['platform']}",
+        f"threads: {findings['threads']}",
+    ]
+    if core["works"]:
+        lines.append(
+            f"core: {core['in_use']} in use; runs here: {', '.join(core['available'])}; draws correctly"
+        )
+    else:
+        lines.append(f"core: DOES NOT WORK: {core['problem']}")
+    lines.append("libraries: " + _listed(findings["required"]))
+    for extra, libraries in findings["extras"].items():
+        missing = [name for name, version in libraries.items() if version is None]
+        advice = f"; to install: pip install 'meshsplats[{extra}]'" if missing else ""
+        lines.append(f"extra {extra!r}: {_listed(libraries)}{advice}")
+    return "\n".join(lines)
+
+
+def _listed(libraries: dict[str, str | None]) -> str:
+    return ", ".join(f"{name} {version or 'MISSING'}" for name, version in libraries.items()) or "unknown"

@@ -1,0 +1,150 @@
+"""``meshsplats info``: what is in a splat file, a mesh, a camera file or a model folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from meshsplats.camera import Camera, load_cameras
+from meshsplats.cli.common import cameras_beside, identify
+from meshsplats.framing import guess_up, scene_bounds
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+TRIED = 4000
+"""Splats that are converted to tell how large the mesh will be."""
+
+
+@dataclass(frozen=True)
+class Info:
+    """Shows what is in a splat file, a mesh, a camera file or a model folder."""
+
+    input: tyro.conf.Positional[Path]
+    """The file or folder."""
+    strict: bool = False
+    """Splats with values that are not finite are an error, not left out with a warning."""
+    json: bool = False
+    """Print it as JSON."""
+
+    def run(self) -> None:
+        findings = describe(self.input, strict=self.strict)
+        if self.json:
+            print(json.dumps(findings, indent=1, allow_nan=False))
+            return
+        width = max(map(len, findings))
+        for key, value in findings.items():
+            print(f"{key.replace('_', ' '):<{width}}  {_shown(value)}")
+
+
+def describe(path: Path, *, strict: bool = False) -> dict[str, Any]:
+    """Findings about ``path``, ready for JSON. Lengths are in scene units."""
+    kind = identify(path)
+    found: dict[str, Any] = {"path": str(path), "kind": kind}
+    if path.is_file():
+        found["bytes"] = path.stat().st_size
+    if kind == "splats":
+        from meshsplats.formats.splats import load_gaussians
+
+        found |= _splats(load_gaussians(path, strict=strict))
+        if cameras := cameras_beside(path):
+            found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
+    elif kind == "mesh":
+        from meshsplats.formats.meshes import load_mesh
+
+        found |= _mesh(load_mesh(path))
+    else:
+        found |= _cameras(load_cameras(path))
+    return found
+
+
+def _splats(cloud: GaussianCloud) -> dict[str, Any]:
+    from meshsplats.conversion import convert
+
+    sample = cloud.select(np.arange(0, len(cloud), -(-len(cloud) // TRIED)))
+    tried = convert(sample)
+    share = len(cloud) / len(sample)
+    ordered = np.sort(cloud.scales, axis=1).astype(np.float64)
+    flatness = ordered[:, 0] / np.maximum(ordered[:, 1], 1e-30)
+    return {
+        "splats": len(cloud),
+        "sh_degree": cloud.sh_degree,
+        "kernel": cloud.kernel,
+        **_extent(cloud.means, scene_bounds(cloud)),
+        "opacity_5_50_95_percent": _quantiles(cloud.opacities),
+        "faint_splats": int((cloud.opacities < 1 / 255).sum()),
+        "scale_5_50_95_percent": _quantiles(ordered.mean(axis=1)),
+        "flatness_median": float(np.float32(np.median(flatness))),
+        "becomes_triangles_about": round(len(tried.faces) * share),
+        "becomes_vertices_about": round(len(tried.vertices) * share),
+    }
+
+
+def _mesh(mesh: SplatMesh) -> dict[str, Any]:
+    found: dict[str, Any] = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    if mesh.splat_count is not None:
+        found["splats"] = mesh.splat_count
+    if len(mesh.vertices):
+        found |= _extent(mesh.vertices, scene_bounds(mesh))
+        found["opacity_5_50_95_percent"] = _quantiles(mesh.colors[:, 3])
+    return found | {
+        "up": _rounded(mesh.up),
+        "blending": mesh.blending,
+        "normals": mesh.normals is not None,
+        "depth_groups": mesh.depth_group is not None,
+        "attributes": list(mesh.attributes),
+    }
+
+
+def _cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
+    centers = np.array([camera.center for camera in cameras])
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    return {
+        "cameras": len(cameras),
+        "picture_sizes": [list(size) for size in sizes[:8]],
+        "fx": _range([camera.fx for camera in cameras]),
+        "near": _range([camera.near for camera in cameras]),
+        "lower": _rounded(centers.min(axis=0)),
+        "upper": _rounded(centers.max(axis=0)),
+        "up_by_cameras": _rounded(guess_up(None, cameras)),
+    }
+
+
+def _extent(points: np.ndarray, bounds) -> dict[str, Any]:
+    return {
+        "lower": _rounded(points.min(axis=0)),
+        "upper": _rounded(points.max(axis=0)),
+        "center": _rounded(bounds.center),
+        "radius_90_percent": float(f"{bounds.radius:.6g}"),
+    }
+
+
+def _quantiles(values: np.ndarray) -> list[float]:
+    return _rounded(np.quantile(values, (0.05, 0.5, 0.95)))
+
+
+def _range(values: Sequence[float]) -> list[float]:
+    return _rounded(np.array([min(values), max(values)]))
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    return [float(f"{v:.6g}") + 0.0 for v in values]  # + 0.0: no -0
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        if value and isinstance(value[0], list):
+            return ", ".join(" x ".join(map(str, size)) for size in value)
+        return "  ".join(_shown(v) for v in value) or "none"
+    return str(value)
