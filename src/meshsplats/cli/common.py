@@ -119,7 +119,8 @@ class DrawOptions:
     sh_degree: Count = None
     """Draw splats with spherical harmonics up to this degree, 0 to 3. Default: all that are stored."""
     max_layers: Count = None
-    """Blend only the nearest N triangles of a mesh at each sample, like N passes of depth peeling. Default: all."""
+    """Blend only the nearest N triangles of a mesh at each sample, as N passes of depth peeling do. Default:
+    all."""
     threads: Count = None
     """At most N threads. Default: all processors."""
 
@@ -150,15 +151,18 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
 
 def load_scene(path: Path, *, strict: bool = False) -> GaussianCloud | SplatMesh:
     """The splats or the mesh at ``path``."""
-    from meshsplats.formats.meshes import load_mesh
-    from meshsplats.formats.splats import load_gaussians
-
     kind = identify(path)
     if kind == "cameras":
         raise FileFormatError(
             f"{path}: a JSON file; expected splats or a mesh (cameras are given with --cameras)"
         )
-    return load_gaussians(path, strict=strict) if kind == "splats" else load_mesh(path)
+    if kind == "splats":
+        from meshsplats.formats.splats import load_gaussians
+
+        return load_gaussians(path, strict=strict)
+    from meshsplats.formats.meshes import load_mesh
+
+    return load_mesh(path)
 
 
 def cameras_beside(source: Path) -> list[Camera] | None:
