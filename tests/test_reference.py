@@ -290,8 +290,8 @@ def test_a_depth_group_lies_where_its_largest_triangle_lies():
 
 
 def test_a_depth_group_stays_within_its_vertices():
-    # Blue, outside the picture, is the largest. Its plane z = 1 + x / 2 is 1 / z = 1 - u / 2 at u = x / z: z
-    # is 4 / 3 at u = 0.5, 4 at 1.5, and behind the camera from 2 on. There the farthest vertex limits it to 2.
+    # Blue, outside the picture, is the largest. Its plane z = 1 + x / 2 is 1 / z = 1 - u / 2 at u = x / z:
+    # z is 4 / 3 at u = 0.5, 4 at 1.5, and behind the camera from 2 on. The farthest vertex limits it to 2.
     slope = [(0, -800, 1), (2, -800, 2), (0, -100, 1)]
     red, green = (1, 0, 0, 1), (0, 1, 0, 1)
     for z, seen in ((2.25, [red] * 4), (1.75, [red, green, green, green]), (1.25, [green] * 4)):
