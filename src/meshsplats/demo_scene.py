@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -96,7 +97,7 @@ def _vase(n: int, rng: np.random.Generator) -> Patch:
     normals = np.stack([slope_h * c, slope_r, slope_h * s], axis=1) / length[:, None]
     along = np.stack([-s, np.zeros(n), c], axis=1)  # round the axis: the bands of the glaze run this way
     spacing = np.sqrt(area[-1] / n)
-    sigmas = np.tile(spacing * np.array([0.62, 0.48, 0.05]), (n, 1))
+    sigmas = np.tile(spacing * np.array([0.68, 0.54, 0.05]), (n, 1))
     sigmas[:, 0] = np.minimum(sigmas[:, 0], 0.4 * r)  # flat splats cannot go round a narrow neck
     inside = at > np.interp(np.argmax(height), np.arange(len(area)), area)
 
@@ -113,7 +114,7 @@ def _vase(n: int, rng: np.random.Generator) -> Patch:
         tangents=along,
         sigmas=sigmas,
         albedo=albedo,
-        opacities=np.full(n, 0.96),
+        opacities=np.full(n, 0.985),
         gloss=0.58,
         occlusion=np.where(inside, 0.25 + 0.75 * np.clip((h - 0.9) / 0.15, 0, 1), 1.0),
     )
@@ -134,9 +135,9 @@ def _sphere(
         points=center + radius * normals,
         normals=normals,
         tangents=tangents,
-        sigmas=np.broadcast_to(spacing * np.array([0.62, 0.46, 0.05]), (n, 3)),
+        sigmas=np.broadcast_to(spacing * np.array([0.68, 0.52, 0.05]), (n, 3)),
         albedo=skin(normals, rng),
-        opacities=np.full(n, 0.96),
+        opacities=np.full(n, 0.985),
         gloss=gloss,
     )
 
@@ -260,9 +261,9 @@ def _table(n: int, rng: np.random.Generator) -> Patch:
         points=np.stack([x, 0.002 * rng.random(n), z], axis=1),
         normals=np.broadcast_to([0.0, -1.0, 0.0], (n, 3)),
         tangents=tangents,
-        sigmas=column(spacing) * np.stack([0.52 + 0.12 * edge, 0.52 - 0.14 * edge, 0.05 + 0 * edge], axis=1),
+        sigmas=column(spacing) * np.stack([0.60 + 0.10 * edge, 0.60 - 0.20 * edge, 0.05 + 0 * edge], axis=1),
         albedo=albedo,
-        opacities=np.clip(0.94 * fade**1.5, 0.01, None),
+        opacities=np.clip(0.97 * fade**1.5, 0.01, None),
         gloss=0.05,
     )
 
@@ -311,15 +312,17 @@ def _quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """``python -m meshsplats.demo_scene FILE.ply [COUNT]``"""
+    """``python -m meshsplats.demo_scene FILE.ply [COUNT]`` writes the scene, over a file that is there."""
     from meshsplats import save_gaussians
 
     arguments = sys.argv[1:] if arguments is None else arguments
-    if len(arguments) not in (1, 2) or not arguments[0].endswith(".ply"):
+    if len(arguments) not in (1, 2) or not all(a.isdecimal() for a in arguments[1:]):
         raise SystemExit("usage: python -m meshsplats.demo_scene FILE.ply [COUNT]")
-    cloud = make_scene(*(int(a) for a in arguments[1:]))
-    save_gaussians(cloud, arguments[0])
-    print(f"{arguments[0]}: {len(cloud):,} splats")
+    path = Path(arguments[0])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cloud = make_scene(*map(int, arguments[1:]))
+    save_gaussians(cloud, path)
+    print(f"{path}: {len(cloud):,} splats of our own still life")
 
 
 if __name__ == "__main__":
