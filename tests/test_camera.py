@@ -106,8 +106,8 @@ def test_orbit_by_hand():
     np.testing.assert_allclose(target, 0, atol=0.05)
     directions = [(c.center - target) / np.linalg.norm(c.center - target) for c in cameras]
     np.testing.assert_allclose(directions, [(0, 0, -1), (1, 0, 0), (0, 0, 1), (-1, 0, 0)], atol=1e-9)
-    above = orbit(ball(), 1, elevation=30, azimuth=0)[0].center - target
-    np.testing.assert_allclose(above / np.linalg.norm(above), (0, -0.5, -(0.75**0.5)), atol=1e-9)
+    above = orbit(ball(), 1, elevation=30, azimuth=0)[0].world_to_camera[2, :3]
+    np.testing.assert_allclose(above, (0, 0.5, 0.75**0.5), atol=1e-9)
 
 
 def test_orbit_frames_a_ball():
@@ -148,12 +148,19 @@ def test_strays_and_surroundings_do_not_move_the_frame():
     assert np.linalg.norm(a.center - b.center) < 0.15 * np.linalg.norm(a.center)
 
 
+def test_the_subject_is_in_the_middle_of_the_pictures():
+    """A plate seen from above is nearer at its lower edge, which then takes more of the picture."""
+    rng = np.random.default_rng(0)
+    plate = rng.uniform(-1, 1, (5000, 3)) * [1, 0.05, 1]
+    for camera in orbit(plate, 4, elevation=25, azimuth=45, width=400, height=400):
+        rows = project(camera, plate)[0][:, 1]
+        assert abs((rows.min() + rows.max()) / 2 - 200) < 15
+
+
 def test_dome_is_even_and_upper():
     for whole in (False, True):
         cameras = dome(ball(), 400, whole=whole)
-        target = np.mean([c.center for c in dome(ball(), 400, whole=True)], axis=0)
-        d = np.array([c.center - target for c in cameras])
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        d = -np.array([c.world_to_camera[2, :3] for c in cameras])
         heights = np.sort(-d[:, 1])
         even = np.linspace(-1 if whole else 0, 1, 401)
         np.testing.assert_allclose(heights, (even[1:] + even[:-1]) / 2, atol=0.01)

@@ -14,13 +14,13 @@ from meshsplats._arrays import checked_array
 from meshsplats.errors import FileFormatError
 from meshsplats.framing import (
     DEFAULT_UP,
-    Bounds,
     Scene,
+    fit_pictures,
     front_axes,
     guess_up,
+    middle,
     scene_bounds,
     unit_up,
-    weighted_quantile,
 )
 
 MAX_SIDE = 1 << 15
@@ -30,10 +30,6 @@ MAX_FILE_BYTES = 16 << 20
 MAX_CAMERAS = 20_000
 NEAR_SHARE = 0.01
 """Near plane of the cameras made here, as a share of their distance to the subject's middle."""
-COVERED = 0.99
-"""Share of the subject's opacity that must be on the picture."""
-MARGIN = 1.08
-"""Room left round the subject."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,36 +262,18 @@ def _round_subject(
         raise ValueError("azimuth must be finite and elevation between -90 and 90 degrees")
     bounds = scene_bounds(scene)
     axes = front_axes(guess_up(scene) if up is None else unit_up(up))
-    target = _middle(bounds, axes)
     directions = [_direction(axes, azimuth, elevation) for azimuth, elevation in angles]
     lens: dict[str, Any] = {"up": axes[1], "width": width, "height": height, "fov": fov}
-    fit = max(_fitting_distance(bounds, look_at(target + d, target, **lens), target) for d in directions)
+    target = middle(bounds, axes)
+    around = [look_at(target + direction, target, **lens) for direction in directions]
+    rotations = [camera.world_to_camera[:3, :3] for camera in around]
+    slopes = (width / 2 / around[0].fx, height / 2 / around[0].fy)
+    target, fit = fit_pictures(bounds, target, rotations, slopes)
     away = distance * fit
     return [
         look_at(target + away * d, target, near=away * NEAR_SHARE, name=f"view_{i:04d}", **lens)
         for i, d in enumerate(directions)
     ]
-
-
-def _middle(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
-    """Middle of the box along ``axes`` that the subject fills: half-way along a guitar, not in its body."""
-    along = bounds.points @ axes.T
-    ends = [
-        [weighted_quantile(along[:, k], bounds.weights, q) for q in (1 - COVERED, COVERED)] for k in range(3)
-    ]
-    return np.mean(ends, axis=1) @ axes
-
-
-def _fitting_distance(bounds: Bounds, camera: Camera, target: np.ndarray) -> float:
-    """Least distance from ``target`` at which ``camera``, moved along its axis, shows all with a margin.
-
-    A point at (x, y, z) from the target, in the camera's axes, is on the picture if |x| <= t (d + z): each
-    asks for d = |x| / t - z, and the covered share of them decides.
-    """
-    x, y, z = camera.world_to_camera[:3, :3] @ (bounds.points - target).T
-    tan_x, tan_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
-    needed = np.maximum((np.abs(x) + bounds.sizes) / tan_x, (np.abs(y) + bounds.sizes) / tan_y) - z
-    return max(weighted_quantile(needed, bounds.weights, COVERED) * MARGIN, 0.1 * bounds.radius)
 
 
 def load_cameras(path: str | Path) -> list[Camera]:

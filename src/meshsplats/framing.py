@@ -24,6 +24,11 @@ SURROUNDINGS = 4.0
 an object on its own reach about 2 (a ball's surface: 1; a filled ball: 1.26; the longest object measured:
 3.9)."""
 
+COVERED = 0.99
+"""Share of the subject's opacity that must be on the picture."""
+MARGIN = 1.08
+"""Room left round the subject."""
+
 Scene = GaussianCloud | SplatMesh | np.ndarray
 
 
@@ -123,3 +128,54 @@ def front_axes(up: np.ndarray) -> np.ndarray:
     right = right - up * (right @ up)
     right /= np.linalg.norm(right)
     return np.stack([right, up, np.cross(up, right)])
+
+
+def middle(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
+    """(3,) middle of the box along ``axes`` that the subject fills: half-way along a guitar, not in its
+    body."""
+    along = bounds.points @ axes.T
+    return np.array([_middle_of(along[:, k], bounds.weights) for k in range(3)]) @ axes
+
+
+def fit_pictures(
+    bounds: Bounds, target: np.ndarray, rotations: Sequence[np.ndarray], slopes: tuple[float, float]
+) -> tuple[np.ndarray, float]:
+    """Point to look at, near ``target``, and the least distance from it at which every view shows the
+    subject.
+
+    ``rotations`` (3, 3) turn the world's axes into the views' (OpenCV axes), all upright in the same sense;
+    ``slopes`` are x / z and y / z at the right and the lower edge of the picture.
+    """
+    # What is near looks larger: from above, the middle of the box is not the middle of the picture. Two steps
+    # bring it there within a few pixels; a dozen of the views are enough to know.
+    some = rotations[:: -(-len(rotations) // 12)]
+    up = -np.mean([rotation[1] for rotation in some], axis=0)
+    length = float(np.linalg.norm(up))
+    for _ in range(2 if length > 0.1 else 0):
+        away = max(_fitting_distance(bounds, target, rotation, slopes) for rotation in some)
+        rise = np.mean([_middle_height(bounds, target, rotation, away) for rotation in some])
+        target = target + rise * up / length
+    return target, max(_fitting_distance(bounds, target, rotation, slopes) for rotation in rotations)
+
+
+def _fitting_distance(
+    bounds: Bounds, target: np.ndarray, rotation: np.ndarray, slopes: tuple[float, float]
+) -> float:
+    """A point at (x, y, z) from the target, in the view's axes, is on the picture if |x| <= slope (d + z):
+    each asks for d = |x| / slope - z, and the covered share of them decides."""
+    x, y, z = rotation @ (bounds.points - target).T
+    needed = np.maximum((np.abs(x) + bounds.sizes) / slopes[0], (np.abs(y) + bounds.sizes) / slopes[1]) - z
+    return max(weighted_quantile(needed, bounds.weights, COVERED) * MARGIN, 0.1 * bounds.radius)
+
+
+def _middle_height(bounds: Bounds, target: np.ndarray, rotation: np.ndarray, away: float) -> float:
+    """How far above the picture's centre the subject's middle is seen, as a length at the target."""
+    _, y, z = rotation @ (bounds.points - target).T
+    seen = z > -0.9 * away
+    if not seen.any():
+        return 0.0
+    return -_middle_of(y[seen] / (z[seen] + away), bounds.weights[seen]) * away
+
+
+def _middle_of(values: np.ndarray, weights: np.ndarray) -> float:
+    return (weighted_quantile(values, weights, 1 - COVERED) + weighted_quantile(values, weights, COVERED)) / 2
