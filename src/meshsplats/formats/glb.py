@@ -18,6 +18,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from meshsplats.colors import srgb_to_linear
+from meshsplats.formats.mesh_checks import check_attribute_names
 from meshsplats.mesh import SplatMesh
 
 ColorType = Literal["uint16", "float32"]
@@ -44,6 +45,7 @@ def write_glb(mesh: SplatMesh, path: Path, *, lit: bool = False, color_type: Col
         raise ValueError(f"color_type must be one of {', '.join(get_args(ColorType))}, got {color_type!r}")
     if not len(mesh.faces):
         raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
+    check_attribute_names(mesh)
     document, parts = _document(mesh, lit, color_type)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)

@@ -52,7 +52,7 @@ class GltfDocument:
         asset = self.json.get("asset")
         version = asset.get("version") if isinstance(asset, dict) else None
         if not isinstance(version, str) or version.split(".")[0] != "2":
-            raise self.error(f"glTF of version 2 expected, got {str(version)[:20]!r}")
+            raise self.error(f"not a glTF 2 file: its asset version is {str(version)[:20]!r}, expected '2.0'")
         self._refuse_extensions()
         self._buffers: dict[int, memoryview] = {}
 

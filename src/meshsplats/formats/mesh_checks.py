@@ -42,10 +42,17 @@ class Budget:
 
 
 def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:
-    """(v, 4) float32 RGBA in [0, 1] from stored colours (v, 3) or (v, 4): integers are divided by the largest
-    value of their type, a missing alpha becomes 1, float values beyond [0, 1] are clipped with a counted
-    DataWarning."""
+    """(v, 4) float32 RGBA in [0, 1] from stored colours (v, 4), (v, 3) or (v, 0).
+
+    Integers are divided by the largest value of their type, a missing alpha becomes 1, float values
+    beyond [0, 1] are clipped with a counted DataWarning. Without colours the mesh is mid grey, with a
+    DataWarning.
+    """
     result = np.ones((len(colors), 4), np.float32)
+    if colors.shape[1] == 0:
+        result[:, :3] = 0.5
+        warnings.warn(f"{path}: no vertex colours; the mesh is shown in grey", DataWarning, stacklevel=2)
+        return result
     if colors.dtype.kind == "u":
         result[:, : colors.shape[1]] = colors
         result[:, : colors.shape[1]] /= np.float32(np.iinfo(colors.dtype).max)
@@ -66,6 +73,17 @@ def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:
             )
         np.clip(result, 0, 1, out=result)
     return result
+
+
+def check_attribute_names(mesh: SplatMesh) -> None:
+    """Raises ValueError for attribute names that no file should hold."""
+    for name in mesh.attributes:
+        try:
+            encoded = name.encode()
+        except UnicodeEncodeError:
+            raise ValueError(f"attribute name {name[:40]!r} is no valid text and cannot be stored") from None
+        if b"\0" in encoded or len(encoded) > 200:
+            raise ValueError(f"attribute name {name[:40]!r} cannot be stored (NUL in it, or over 200 bytes)")
 
 
 def checked_mesh(path: Path, **arrays) -> SplatMesh:
