@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
@@ -133,18 +134,19 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
     if path.is_dir():
         return "splats"
     with open(path, "rb") as file:
-        start = file.read(64)
-        if start.startswith(b"ply"):
+        start = file.read(4096)
+        if re.match(rb"ply[ \t]*[\r\n]", start):
             file.seek(0)
             return "splats" if is_float_splat(read_header(file, path)) else "mesh"
-    if start.startswith((b"glTF", b"PK\x03\x04")):
-        return "mesh"
-    if start.lstrip()[:1] in (b"[", b"{"):
-        return "cameras"
     if not start:
         raise FileFormatError(f"{path}: the file is empty")
+    suffix = path.suffix.lower()
+    if start.startswith((b"glTF", b"PK\x03\x04")) or suffix in (".gltf", ".obj"):
+        return "mesh"
+    if start.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"[", b"{"):
+        return "cameras"
     raise FileFormatError(
-        f"{path}: neither splats (.ply), a mesh (.npz, .ply, .glb) nor cameras (.json);"
+        f"{path}: neither splats (.ply), a mesh (.npz, .ply, .glb, .gltf, .obj) nor cameras (.json);"
         f" it begins with {start[:8]!r}"
     )
 

@@ -1,0 +1,72 @@
+"""compare: scores against a calculation by hand, on pictures from the renderer's own functions."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from meshsplats.camera import orbit
+from meshsplats.comparison import Comparison, ViewScore, compare, compare_views
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render, render_splats
+
+
+def scene() -> tuple[GaussianCloud, SplatMesh, list]:
+    rng = np.random.default_rng(0)
+    n = 60
+    quaternions = rng.normal(size=(n, 4))
+    cloud = GaussianCloud(
+        rng.normal(size=(n, 3)),
+        quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        rng.uniform(0.05, 0.3, (n, 3)),
+        rng.uniform(0.2, 1, n),
+        rng.normal(size=(n, 4, 3)),
+    )
+    vertices = rng.normal(size=(30, 3))
+    mesh = SplatMesh(vertices, np.arange(30).reshape(10, 3), rng.uniform(0, 1, (30, 4)))
+    return cloud, mesh, orbit(cloud, 3, width=40, height=30)
+
+
+def test_scores_are_those_of_the_pictures():
+    cloud, mesh, cameras = scene()
+    options = {"background": (0, 0.5, 1), "samples": 1}
+    views = list(compare_views(cloud, mesh, cameras, sh_degree=0, **options))
+    assert [view.score.name for view in views] == ["view_0000", "view_0001", "view_0002"]
+    for view, camera in zip(views, cameras, strict=True):
+        a = np.clip(render_splats(cloud, camera, sh_degree=0, **options).color, 0, 1)
+        b = np.clip(render(mesh, camera, **options).color, 0, 1)
+        np.testing.assert_array_equal(view.splats, a)
+        np.testing.assert_array_equal(view.mesh, b)
+        error = np.mean((a.astype(float) - b) ** 2)
+        assert view.score.psnr == pytest.approx(-10 * np.log10(error), abs=1e-6)
+        assert -1 <= view.score.ssim < 1
+    result = compare(cloud, mesh, cameras, sh_degree=0, **options)
+    assert result.views == tuple(view.score for view in views)
+    assert result.psnr == pytest.approx(np.mean([view.score.psnr for view in views]))
+    assert result.ssim == pytest.approx(np.mean([view.score.ssim for view in views]))
+
+
+def test_options_reach_the_pictures():
+    cloud, mesh, cameras = scene()
+    full, flat = (next(compare_views(cloud, mesh, cameras, sh_degree=d)) for d in (None, 0))
+    assert np.abs(full.splats - flat.splats).max() > 0.05
+    peeled = next(compare_views(cloud, mesh, cameras, max_layers=1))
+    assert np.abs(peeled.mesh - full.mesh).max() > 0.05
+
+
+def test_equal_pictures_in_json():
+    """JSON has no infinity; a mean over views of which one is perfect has no figure either."""
+    result = Comparison((ViewScore("a", float("inf"), 1.0), ViewScore("b", 30.0, 0.5)))
+    assert json.loads(json.dumps(result.to_dict(), allow_nan=False)) == {
+        "views": [{"name": "a", "psnr": None, "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.5}],
+        "mean": {"psnr": None, "ssim": 0.75},
+    }
+
+
+def test_nothing_to_compare():
+    cloud, mesh, _ = scene()
+    with pytest.raises(ValueError, match="at least one camera"):
+        compare(cloud, mesh, [])
