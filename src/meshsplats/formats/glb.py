@@ -27,6 +27,7 @@ _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _ROWS = 1 << 15
+_MAX_BYTES = (1 << 32) - 1
 
 
 def write_glb(mesh: SplatMesh, path: Path, *, lit: bool = False, color_type: ColorType = "uint16") -> None:
@@ -51,9 +52,9 @@ def write_glb(mesh: SplatMesh, path: Path, *, lit: bool = False, color_type: Col
     text += b" " * (-len(text) % 4)
     binary = document["buffers"][0]["byteLength"]
     total = 12 + 8 + len(text) + 8 + binary
-    if total >= 1 << 32:
+    if total > _MAX_BYTES:
         raise ValueError(
-            f"the mesh would take {total / 2**30:.1f} GiB, a .glb file ends at 4 GiB;"
+            f"the mesh would take {total:,} bytes, a .glb file can hold {_MAX_BYTES:,};"
             " save it as .npz or .ply, or split it"
         )
     with open(path, "wb") as file:

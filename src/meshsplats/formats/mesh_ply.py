@@ -22,6 +22,7 @@ from meshsplats.formats.ply_header import MAX_PROPERTIES, Element, PlyHeader, re
 from meshsplats.formats.ply_table import FloatTable
 from meshsplats.mesh import SplatMesh
 
+_ATTRIBUTE = "attribute_"
 _ROWS = 1 << 15
 _COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
@@ -49,15 +50,15 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
     columns.append(mesh.colors)
     names += ["red", "green", "blue", "alpha"]
     for name, values in mesh.attributes.items():
-        encoded = quote(name, safe="")
+        property_name = _ATTRIBUTE + quote(name, safe="")
         if values.ndim == 1:
-            names.append(f"attribute_{encoded}")
+            names.append(property_name)
             columns.append(values[:, None])
         else:
-            names += [f"attribute_{encoded}:{i}" for i in range(values.shape[1])]
+            names += [f"{property_name}:{i}" for i in range(values.shape[1])]
             columns.append(values)
         width = "-" if values.ndim == 1 else values.shape[1]
-        header.append(f"comment meshsplats attribute {width} {encoded}")
+        header.append(f"comment meshsplats attribute {property_name} {width}")
     if len(names) > MAX_PROPERTIES:
         raise ValueError(f"{len(names)} columns a vertex are more than {MAX_PROPERTIES}; save as .npz")
     header.append(f"element vertex {len(mesh.vertices)}")
@@ -173,14 +174,14 @@ def _notes(
                     ) from None
             case ["blending", space]:
                 settings["blending"] = space
-            case ["attribute", width, encoded]:
-                names: tuple[str, ...] = (f"attribute_{encoded}",)
-                if width.isascii() and width.isdecimal() and int(width) <= MAX_PROPERTIES:
-                    names = tuple(f"attribute_{encoded}:{i}" for i in range(int(width)))
+            case ["attribute", name, width]:
+                names: tuple[str, ...] = (name,)
+                if width.isascii() and width.isdecimal() and len(width) <= 4:
+                    names = tuple(f"{name}:{i}" for i in range(int(width)))
                 missing = [n for n in names if n not in vertex.names]
                 if missing:
                     raise FileFormatError(f"{path}: property {missing[0][:60]!r} of an attribute is missing")
-                attributes[unquote(encoded)] = (width == "-", names)
+                attributes[unquote(name.removeprefix(_ATTRIBUTE))] = (width == "-", names)
             case _:
                 pass  # a later version's, or the version itself
     return attributes, settings
