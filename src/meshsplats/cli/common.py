@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import sys
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, dome, load_cameras, look_around, orbit
+from meshsplats.camera import MAX_SIDE, Camera, dome, load_cameras, look_around, orbit
 from meshsplats.cli import UsageError
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.framing import guess_up
@@ -74,11 +75,15 @@ class ViewOptions:
     def make(self, scene: GaussianCloud | SplatMesh, source: Path, *, count: int, side: int) -> list[Camera]:
         """The cameras; ``count`` views of an orbit, ``side`` pixels wide, where nothing else is asked for."""
         self.check()
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if value is not None and not 1 <= value <= MAX_SIDE:
+                raise ValueError(f"--{name} must be a number of pixels from 1 to {MAX_SIDE}, got {value}")
         if self.cameras is not None:
             cameras = load_cameras(self.cameras)
             return cameras if self.width is None else [c.scaled(self.width / c.width) for c in cameras]
-        width = self.width or self.height or side
-        lens: dict[str, Any] = {"width": width, "height": self.height or width}
+        width = next(v for v in (self.width, self.height, side) if v is not None)
+        lens: dict[str, Any] = {"width": width, "height": width if self.height is None else self.height}
         lens["up"] = parse_up(self.up) if self.up is not None else guess_up(scene, cameras_beside(source))
         if self.look_around is not None:
             lens["elevation"] = 0.0 if self.elevation is None else self.elevation
@@ -213,12 +218,15 @@ def _numbers(text: str) -> tuple[float, ...] | None:
     return numbers if len(numbers) == 3 and np.isfinite(numbers).all() else None
 
 
-def prepare_folder(folder: Path) -> None:
-    """Makes the output folder; its parent must exist, so that a misspelt path does not become a tree of
-    folders."""
+def check_folder(folder: Path) -> None:
+    """Before the work: raises OSError unless ``folder`` is one or can be made in a folder that exists.
+
+    The parent must exist, so that a misspelt path does not become a tree of folders.
+    """
     if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(20, "the output must be a folder here, this is a file", str(folder))
-    folder.mkdir(exist_ok=True)
+        raise NotADirectoryError(errno.ENOTDIR, "must be a folder, this is a file", str(folder))
+    if not folder.exists() and not folder.absolute().parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "the folder above this one does not exist", str(folder))
 
 
 def write_json(path: Path, content: Any) -> None:

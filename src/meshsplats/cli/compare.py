@@ -15,10 +15,10 @@ from meshsplats.cli.common import (
     File,
     Output,
     ViewOptions,
+    check_folder,
     configuration,
     identify,
     parse_color,
-    prepare_folder,
     track,
     view_names,
     write_json,
@@ -65,6 +65,7 @@ class Compare:
         strips = view_names(len(cameras))
         names = (*strips, RESULTS, CAMERAS, CONFIGURATION)
         refuse_existing([self.output / name for name in names], self.force)
+        check_folder(self.output)
         if self.mesh is None:
             from meshsplats.conversion import convert
 
@@ -75,7 +76,6 @@ class Compare:
             if identify(self.mesh) != "mesh":
                 raise FileFormatError(f"{self.mesh}: not a mesh; give splats first, then the mesh")
             mesh = load_mesh(self.mesh)
-        prepare_folder(self.output)
         start = time.perf_counter()
         scores = []
         views = compare_views(
@@ -91,6 +91,7 @@ class Compare:
         captions = ("splats", "mesh", f"error x {self.amplify:g}")
         for name, view in zip(strips, track(views, "comparing", len(cameras)), strict=True):
             scores.append(view.score)
+            self.output.mkdir(exist_ok=True)
             error = amplified_error(view.splats, view.mesh, self.amplify)
             save_png(self.output / name, strip([view.splats, view.mesh, error], captions))
         comparison = Comparison(tuple(scores))

@@ -133,7 +133,9 @@ def _range(values: Sequence[float]) -> list[float]:
 
 
 def _rounded(values: np.ndarray) -> list[float]:
-    return [float(f"{v:.6g}") + 0.0 for v in values]  # + 0.0: no -0
+    """Six digits, and 0 for what is rounding error beside the others."""
+    largest = float(np.abs(values).max())
+    return [float(f"{v:.6g}") if abs(v) > 1e-12 * largest else 0.0 for v in values]
 
 
 def _shown(value: Any) -> str:

@@ -18,11 +18,11 @@ from meshsplats.cli.common import (
     DrawOptions,
     Output,
     ViewOptions,
+    check_folder,
     configuration,
     load_scene,
     parse_color,
     plural,
-    prepare_folder,
     size_of,
     track,
     view_names,
@@ -91,7 +91,7 @@ class Render:
         files = self._files(single, len(cameras))
         refuse_existing(files.every, self.force)
         if not single:
-            prepare_folder(self.output)
+            check_folder(self.output)
         if isinstance(scene, GaussianCloud) and not self.as_splats:
             from meshsplats.conversion import convert
 
@@ -181,6 +181,8 @@ class Render:
                 drawn = render_splats(scene, camera, sh_degree=degree, **options)
             else:
                 drawn = render(scene, camera, max_layers=layers, depth=bool(files.depths), **options)
+            if not files.pictures[i].parent.exists():
+                files.pictures[i].parent.mkdir()  # not before something is there to be written
             picture = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color
             save_png(files.pictures[i], picture)
             if drawn.depth is None:

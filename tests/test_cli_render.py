@@ -1,0 +1,199 @@
+"""``meshsplats render``, run in this process on a small cloud."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from meshsplats.camera import load_cameras, look_at, orbit, save_cameras
+from meshsplats.cli import main
+from meshsplats.formats.meshes import save_mesh
+from meshsplats.formats.splats import load_gaussians, save_gaussians
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.pictures import to_bytes
+from meshsplats.rendering import render, render_splats
+
+
+@pytest.fixture
+def splats(tmp_path):
+    rng = np.random.default_rng(0)
+    n = 40
+    quaternions = rng.normal(size=(n, 4))
+    cloud = GaussianCloud(
+        rng.normal(size=(n, 3)),
+        quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        rng.uniform(0.05, 0.3, (n, 3)),
+        rng.uniform(0.2, 0.95, n),
+        rng.normal(size=(n, 4, 3)),
+    )
+    save_gaussians(cloud, tmp_path / "scene.ply")
+    return tmp_path / "scene.ply"
+
+
+@pytest.fixture
+def triangle(tmp_path):
+    """One half-opaque triangle, red, in the plane z = 0, larger than any picture."""
+    corners = np.array([[-50, -50, 0], [50, -50, 0], [0, 80, 0]])
+    mesh = SplatMesh(corners, np.array([[0, 1, 2]]), np.array([[1, 0, 0, 0.5]] * 3))
+    save_mesh(mesh, tmp_path / "triangle.npz")
+    save_cameras([look_at((0, 0, -4), (0, 0, 0), width=12, height=8)], tmp_path / "one.json")
+    return tmp_path / "triangle.npz"
+
+
+def run(*arguments) -> int:
+    return main(["render", *map(str, arguments)])
+
+
+def picture(path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_one_picture_of_a_mesh(triangle, tmp_path, capsys):
+    out = tmp_path / "a.png"
+    assert run(triangle, "-o", out, "--cameras", tmp_path / "one.json", "--background", "0,0,1") == 0
+    np.testing.assert_array_equal(picture(out), np.full((8, 12, 3), (128, 0, 128)))
+    assert "1 picture of 12 x 8" in capsys.readouterr().out
+    config = json.loads((tmp_path / "a.config.json").read_text())
+    assert config["command"] == "render"
+    assert config["options"]["background"] == "0,0,1"
+    assert len(load_cameras(tmp_path / "a.cameras.json")) == 1
+
+
+def test_transparent_and_depth(triangle, tmp_path):
+    out = tmp_path / "a.png"
+    cameras = ("--cameras", tmp_path / "one.json", "--width", "24")
+    assert run(triangle, "-o", out, *cameras, "--transparent", "--depth", "npy") == 0
+    np.testing.assert_array_equal(picture(out), np.full((16, 24, 4), (255, 0, 0, 128)))
+    depth = np.load(tmp_path / "a.depth.npy", allow_pickle=False)
+    np.testing.assert_allclose(depth, np.full((16, 24), 4.0), rtol=1e-5)
+    assert run(triangle, "-o", out, *cameras, "--transparent", "--depth", "png", "--force") == 0
+    unit = json.loads((tmp_path / "a.config.json").read_text())["depth_unit"]
+    np.testing.assert_allclose(picture(tmp_path / "a.depth.png") * unit, np.full((16, 24), 4.0), atol=unit)
+
+
+def test_orbit_of_splats(splats, tmp_path, capsys):
+    """The pictures are those of the library from the cameras it writes down, and the turntable has them all."""
+    out = tmp_path / "out"
+    size = ("--width", "20", "--height", "16", "--elevation", "30", "--up", "-z", "--samples", "1")
+    assert run(splats, "-o", out, "--as-splats", "--orbit", "3", *size, "--sh-degree", "0", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    pictures = [f"view_000{i}.png" for i in range(3)]
+    assert sorted(p.name for p in out.iterdir()) == [
+        "cameras.json",
+        "config.json",
+        "turntable.webp",
+        *pictures,
+    ]
+    assert result["pictures"] == [str(out / name) for name in pictures]
+    cloud = load_gaussians(splats)
+    expected = orbit(cloud, 3, elevation=30, up=(0, 0, -1), width=20, height=16)
+    for i, (camera, wanted) in enumerate(zip(load_cameras(out / "cameras.json"), expected, strict=True)):
+        np.testing.assert_array_equal(camera.world_to_camera, wanted.world_to_camera)
+        drawn = render_splats(cloud, camera, sh_degree=0)
+        np.testing.assert_array_equal(picture(out / f"view_000{i}.png"), to_bytes(drawn.color))
+    with Image.open(out / "turntable.webp") as image:
+        assert (image.n_frames, image.size) == (3, (20, 16))
+
+
+def test_splats_become_a_mesh_unless_asked(splats, tmp_path):
+    from meshsplats.conversion import convert
+
+    assert run(splats, "-o", tmp_path / "a.png", "--width", "20", "--samples", "1") == 0
+    (camera,) = load_cameras(tmp_path / "a.cameras.json")
+    drawn = render(convert(load_gaussians(splats)), camera)
+    np.testing.assert_array_equal(picture(tmp_path / "a.png"), to_bytes(drawn.color))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--dome", "4"], {"view_0003.png"}),
+        (["--look-around", "4", "--animation", "gif"], {"view_0003.png", "turntable.gif"}),
+        (["--orbit", "4", "--animation", "none", "--depth", "png"], {"view_0003.png", "depth_0003.png"}),
+    ],
+)
+def test_other_placements(splats, tmp_path, options, expected):
+    out = tmp_path / "out"
+    assert run(splats, "-o", out, *options, "--width", "8") == 0
+    names = {p.name for p in out.iterdir()}
+    assert expected <= names
+    assert ("turntable.gif" in names) == ("turntable.gif" in expected)
+    assert len([n for n in names if n.startswith("view")]) == 4
+    assert "turntable.webp" not in names
+
+
+def test_nothing_is_overwritten(triangle, tmp_path, capsys):
+    out = tmp_path / "a.png"
+    out.write_bytes(b"mine")
+    arguments = (triangle, "-o", out, "--cameras", tmp_path / "one.json")
+    assert run(*arguments) == 1
+    assert out.read_bytes() == b"mine"
+    assert "--force" in capsys.readouterr().err
+    assert run(*arguments, "--force") == 0
+    assert out.read_bytes() != b"mine"
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "view_0000.png").write_bytes(b"mine")
+    assert run(triangle, "-o", folder, "--cameras", tmp_path / "one.json") == 1
+    assert [p.name for p in folder.iterdir()] == ["view_0000.png"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--orbit", "2", "--dome", "2"], "--orbit, --dome"),
+        (["--dome", "2", "--elevation", "10"], "--elevation has no effect with --dome"),
+        (["--look-around", "2", "--distance", "2"], "--distance has no effect"),
+        (["--cameras", "x.json", "--up", "-y"], "--up has no effect"),
+        (["--sh-degree", "0"], "--sh-degree is for splats"),
+        (["--as-splats", "--depth", "png"], "--depth is that of a mesh"),
+        (["--as-splats", "--max-layers", "2"], "--max-layers"),
+        (["--transparent", "--background", "black"], "exclude"),
+        (["--transparent", "--animation", "gif"], "GIF"),
+        (["--orbit", "x"], "--orbit"),
+        (["--unknown"], "--unknown"),
+    ],
+)
+def test_wrong_usage(splats, tmp_path, capsys, options, words):
+    assert run(splats, "-o", tmp_path / "out", *options) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--background", "mauve"], "--background must be white"),
+        (["--background", "2,0,0"], "from 0 to 1"),
+        (["--up", "1,2"], "--up must be an axis"),
+        (["--up", "0,0,0"], "--up must be an axis"),
+        (["--orbit", "0"], "count"),
+        (["--fov", "0"], "fov"),
+        (["--samples", "0"], "samples"),
+        (["--width", "0"], "width"),
+        (["--cameras", "missing.json"], "missing.json: No such file"),
+    ],
+)
+def test_bad_values(splats, tmp_path, capsys, options, words):
+    assert run(splats, "-o", tmp_path / "out", *options) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_outputs_and_inputs_that_cannot_be(splats, triangle, tmp_path, capsys):
+    assert run(splats, "-o", tmp_path / "a.jpg") == 2
+    assert run(splats, "-o", tmp_path / "a.png", "--orbit", "3") == 2
+    assert run(triangle, "-o", tmp_path / "b", "--as-splats") == 1
+    assert run(splats, "-o", tmp_path / "no" / "such", "--width", "8") == 1
+    assert run(tmp_path / "one.json", "-o", tmp_path / "b") == 1
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 5
+    for words, line in zip(["end in .png", "do not fit", "is a mesh", "such", "JSON"], errors, strict=True):
+        assert words in line
