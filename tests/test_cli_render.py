@@ -77,7 +77,7 @@ def test_transparent_and_depth(triangle, tmp_path):
 
 
 def test_orbit_of_splats(splats, tmp_path, capsys):
-    """The pictures are those of the library from the cameras it writes down, and the turntable has them all."""
+    """The pictures are those of the library from the cameras written down, and the turntable has them all."""
     out = tmp_path / "out"
     size = ("--width", "20", "--height", "16", "--elevation", "30", "--up", "-z", "--samples", "1")
     assert run(splats, "-o", out, "--as-splats", "--orbit", "3", *size, "--sh-degree", "0", "--json") == 0
@@ -92,10 +92,10 @@ def test_orbit_of_splats(splats, tmp_path, capsys):
     assert result["pictures"] == [str(out / name) for name in pictures]
     cloud = load_gaussians(splats)
     expected = orbit(cloud, 3, elevation=30, up=(0, 0, -1), width=20, height=16)
-    for i, (camera, wanted) in enumerate(zip(load_cameras(out / "cameras.json"), expected, strict=True)):
+    for name, camera, wanted in zip(pictures, load_cameras(out / "cameras.json"), expected, strict=True):
         np.testing.assert_array_equal(camera.world_to_camera, wanted.world_to_camera)
         drawn = render_splats(cloud, camera, sh_degree=0)
-        np.testing.assert_array_equal(picture(out / f"view_000{i}.png"), to_bytes(drawn.color))
+        np.testing.assert_array_equal(picture(out / name), to_bytes(drawn.color))
     with Image.open(out / "turntable.webp") as image:
         assert (image.n_frames, image.size) == (3, (20, 16))
 
