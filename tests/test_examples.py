@@ -1,0 +1,32 @@
+"""The numbered examples run as they are."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+from meshsplats import demo_scene
+
+EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_example_runs(example, tmp_path, monkeypatch, capsys):
+    # A smaller scene takes less time and runs the same lines.
+    small = demo_scene.make_scene(2_000)
+    monkeypatch.setattr(demo_scene, "make_scene", lambda: small)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(example)])
+    runpy.run_path(str(example), run_name="__main__")
+    told = capsys.readouterr().out
+    assert told, "an example says what it did"
+    for written in (tmp_path / "example-output").glob("*"):
+        assert written.stat().st_size > 0
+        assert written.name in told
+
+
+def test_examples_are_here():
+    assert len(EXAMPLES) >= 4
