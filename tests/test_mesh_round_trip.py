@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _meshes import assert_same, random_mesh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,52 +13,6 @@ from meshsplats import SplatMesh, load_mesh, save_mesh
 from meshsplats.formats import glb, meshes
 
 SUFFIXES = (".npz", ".ply", ".glb")
-
-
-def random_mesh(rng, vertices=9, faces=12, *, extras=True, blending="display"):
-    more = {}
-    if extras:
-        normals = rng.normal(size=(vertices, 3))
-        more = {
-            "face_splat": np.sort(rng.integers(0, 5, faces)),
-            "depth_group": rng.integers(-1, 3, faces),
-            "normals": normals / np.linalg.norm(normals, axis=1, keepdims=True),
-            "attributes": {
-                "flat": rng.normal(size=vertices),
-                "one column": rng.normal(size=(vertices, 1)),
-                "FLAT": rng.normal(size=(vertices, 3)),
-                "größe/%20:0": rng.normal(size=(vertices, 4)),
-                "wide": rng.normal(size=(vertices, 7)),
-                "none": np.empty((vertices, 0)),
-                "": rng.normal(size=(vertices, 2)),
-            },
-        }
-    return SplatMesh(
-        rng.normal(size=(vertices, 3)) * 100,
-        rng.integers(0, vertices, (faces, 3)),
-        rng.random((vertices, 4)),
-        up=rng.normal(size=3),
-        blending=blending,
-        **more,
-    )
-
-
-def assert_same(got, mesh, color_error=0.0):
-    """All arrays equal, bit by bit; colours within ``color_error``."""
-    np.testing.assert_array_equal(got.vertices, mesh.vertices)
-    np.testing.assert_array_equal(got.faces, mesh.faces)
-    assert np.abs(got.colors - mesh.colors).max(initial=0) <= color_error
-    for name in ("face_splat", "depth_group", "normals"):
-        if getattr(mesh, name) is None:
-            assert getattr(got, name) is None
-        else:
-            np.testing.assert_array_equal(getattr(got, name), getattr(mesh, name))
-    np.testing.assert_allclose(got.up, mesh.up, atol=1e-6)  # the mesh scales it to unit length again
-    assert got.blending == mesh.blending
-    assert list(got.attributes) == list(mesh.attributes)
-    for name, values in mesh.attributes.items():
-        assert got.attributes[name].shape == values.shape
-        np.testing.assert_array_equal(got.attributes[name], values)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -1,4 +1,5 @@
-"""Mutated files against the splat readers: each gives splats, a FileFormatError or an OSError, soon and small.
+"""Mutated files against the readers: each gives splats or a mesh, a FileFormatError or an OSError, soon.
+small.
 
     python tests/fuzz/fuzz_readers.py [--format ply ...] [--count 20000] [--seed 0] [--keep DIR]
 
@@ -23,10 +24,13 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from fuzz.seeds import SEEDS, Seed
+from fuzz.mesh_seeds import MESH_SEEDS
+from fuzz.seeds import SEEDS as SPLAT_SEEDS
+from fuzz.seeds import Seed
 
-from meshsplats import FileFormatError, load_gaussians
+from meshsplats import FileFormatError
 
+SEEDS = [*SPLAT_SEEDS, *MESH_SEEDS]
 MEMORY = 512 << 20
 SECONDS = 10
 KINDS = np.array([4, 3, 3, 1, 1, 1, 1, 3, 3]) / 20
@@ -113,7 +117,7 @@ def fuzz(seed: Seed, count: int, number: int, keep: Path) -> tuple[Counter[str],
             start = time.perf_counter()
             signal.alarm(SECONDS)
             try:
-                load_gaussians(Path(folder) / seed.opened)
+                seed.load(Path(folder) / seed.opened)
                 outcome = "read"
             except FileFormatError:
                 outcome = "FileFormatError"
@@ -162,7 +166,7 @@ def main() -> int:
         with tempfile.TemporaryDirectory() as folder:
             for name, data in seed.files.items():
                 (Path(folder) / name).write_bytes(data)
-            load_gaussians(Path(folder) / seed.opened)
+            seed.load(Path(folder) / seed.opened)
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     limit = pages * resource.getpagesize() + MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

@@ -9,12 +9,14 @@ from pathlib import Path
 
 from _splat_files import Table, random_splats, splat_table, write_ply
 
+from meshsplats import load_gaussians
+
 Change = Callable[[bytes], bytes]
 
 
 @dataclass(frozen=True)
 class Seed:
-    """A splat file or folder of files."""
+    """A splat or mesh file, or a folder of files."""
 
     name: str
     files: dict[str, bytes]
@@ -22,6 +24,8 @@ class Seed:
     """The path given to the reader, relative to the folder of the files."""
     inside: Callable[[bytes, Change], bytes] | None = None
     """Applies a change to the data inside a compressed file."""
+    load: Callable[[Path], object] = load_gaussians
+    """The reader under test."""
 
 
 def _ply(name: str, encoding: str, degree: int, tables: bool) -> Seed:

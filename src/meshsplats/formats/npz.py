@@ -8,7 +8,9 @@ MeshSplats code, whose files are read as well.
 
 from __future__ import annotations
 
+import ast
 import io
+import re
 import struct
 import zipfile
 import zlib
@@ -36,8 +38,6 @@ _BROKEN_ZIP = (
     OverflowError,
 )
 """What the zip reader raises on broken archives; its own checks do not cover every field."""
-_BROKEN_HEADER = (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, KeyError, AttributeError)
-"""What NumPy raises on broken array headers."""
 _OPTIONAL = ("normals", "face_splat", "depth_group", "up", "blending")
 
 
@@ -150,23 +150,32 @@ def _parse_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str, pa
         text = file.read(length) if length <= _MAX_HEADER else b""
         if len(raw) < width or len(text) < length:
             raise FileFormatError(f"{at} has a broken header")
-    try:
-        header = io.BytesIO(len(text).to_bytes(2, "little") + text)
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(header)
-    except _BROKEN_HEADER as error:
-        raise FileFormatError(f"{at} has a broken header: {str(error)[:100]}") from None
-    if dtype.hasobject:
-        raise FileFormatError(f"{at} holds pickled Python objects, which can run code; refused")
-    wanted = "U" if name == "blending" else "fiu"
-    if dtype.kind not in wanted or dtype.itemsize > 64 or dtype.itemsize == 0:
-        raise FileFormatError(f"{at} must hold {'text' if wanted == 'U' else 'numbers'}, got dtype {dtype}")
+    shape, dtype, fortran = _parse_header(text, name, at)
     size = 8 + width + length + dtype.itemsize * _product(shape)
-    if any(s < 0 for s in shape) or size != info.file_size:
+    if size != info.file_size:
         raise FileFormatError(
             f"{at} of shape {shape} and type {dtype} should take {size:,} bytes,"
             f" the archive holds {info.file_size:,}"
         )
-    return _Member(info, shape, dtype, bool(fortran), 8 + width + length)
+    return _Member(info, shape, dtype, fortran, 8 + width + length)
+
+
+def _parse_header(text: bytes, name: str, at: str) -> tuple[tuple[int, ...], np.dtype, bool]:
+    """Shape, type and whether the first index runs fastest, from the dictionary that a .npy header is."""
+    try:
+        header = ast.literal_eval(text.decode("latin-1"))
+        descr, fortran, shape = header["descr"], header["fortran_order"], header["shape"]
+    except (ValueError, TypeError, SyntaxError, KeyError, RecursionError, MemoryError) as error:
+        raise FileFormatError(f"{at} has a broken header: {str(error)[:100]}") from None
+    if isinstance(descr, str) and "O" in descr:
+        raise FileFormatError(f"{at} holds pickled Python objects, which can run code; refused")
+    wanted = r"[<>=|]?U\d{1,2}" if name == "blending" else r"[<>=|]?(f[248]|[iu][1248])"
+    if not isinstance(descr, str) or not re.fullmatch(wanted, descr, re.ASCII):
+        kind = "text" if name == "blending" else "numbers"
+        raise FileFormatError(f"{at} must hold {kind}, got dtype {str(descr)[:60]}")
+    if not isinstance(shape, tuple) or not all(type(s) is int and s >= 0 for s in shape):
+        raise FileFormatError(f"{at} has a broken shape: {str(shape)[:60]}")
+    return shape, np.dtype(descr), bool(fortran)
 
 
 def _product(shape: tuple[int, ...]) -> int:
