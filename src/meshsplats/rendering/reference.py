@@ -207,7 +207,11 @@ def _fragments(mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray) ->
     homogeneous[:, 0] = camera.fx * points[:, 0] + camera.cx * points[:, 2]
     homogeneous[:, 1] = camera.fy * points[:, 1] + camera.cy * points[:, 2]
 
-    covers = [_cover(corners, x, y, camera.near) for corners in homogeneous[mesh.faces]]
+    corners = homogeneous[mesh.faces]
+    edges, determinants = _edge_functions(corners)
+    covers = [
+        _cover(*triangle, x, y, camera.near) for triangle in zip(corners, edges, determinants, strict=True)
+    ]
     if not covers:
         return _Fragments(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 3)))
     sample, depth, weights = (np.concatenate(parts) for parts in zip(*covers, strict=True))
@@ -219,21 +223,24 @@ def _fragments(mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray) ->
     return _Fragments(sample[order], face[order], depth[order], weights[order])
 
 
+def _edge_functions(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of ``corners`` V (f, 3, 3): V_j x V_k (f, 3, 3), row i opposite corner i, and D = V_0 . (V_1 x V_2) (f,)."""
+    edges = np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]])
+    return edges, (corners[:, 0] * edges[:, 0]).sum(axis=1)
+
+
 def _cover(
-    corners: np.ndarray, x: np.ndarray, y: np.ndarray, near: float
+    corners: np.ndarray, edges: np.ndarray, determinant: float, x: np.ndarray, y: np.ndarray, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Samples that a triangle covers at a depth z >= near, the depth there, and the weights of the corners.
 
-    ``corners`` V are (3, 3) homogeneous pixel positions. With p = (x, y, 1), e_i = p . (V_j x V_k) and D =
-    V_0 . (V_1 x V_2), the ray through p meets the triangle's plane at z p = sum b_i V_i with z = D / sum e
-    and b_i = e_i / sum e (Olano and Greer 1997). This point is in the triangle and in front of the camera if
-    and only if no e_i / D is negative, so corners behind the camera need no clipping.
+    ``corners`` V are (3, 3) homogeneous pixel positions. With p = (x, y, 1), e_i = p . (V_j x V_k) and
+    D = V_0 . (V_1 x V_2), the ray through p meets the triangle's plane at z p = sum b_i V_i, z = D / sum e and
+    b_i = e_i / sum e (Olano and Greer 1997). This point is in the triangle and in front of the camera if and
+    only if no e_i / D is negative, so corners behind the camera need no clipping.
     """
-    edges = np.stack([np.cross(corners[j], corners[k]) for j, k in ((1, 2), (2, 0), (0, 1))])
-    determinant = float(corners[0] @ edges[0])
-    nothing = np.zeros(0, int), np.zeros(0), np.zeros((0, 3))
     if determinant == 0:
-        return nothing
+        return np.zeros(0, int), np.zeros(0), np.zeros((0, 3))
     inside = np.ones(len(x), bool)
     distances = np.empty((len(x), 3))
     for i, (a, b, c) in enumerate(edges if determinant > 0 else -edges):
@@ -268,19 +275,19 @@ def _share_depths(
     depth. For a plane seen edge on, which has no depth on the picture, the nearest vertex stands.
     """
     assert mesh.depth_group is not None
+    corners = homogeneous[mesh.faces]
+    edges, determinants = _edge_functions(corners)
     world = mesh.vertices.astype(np.float64)[mesh.faces]
     areas = np.linalg.norm(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]), axis=1)
     for group in np.unique(mesh.depth_group[mesh.depth_group >= 0]):
         members = np.flatnonzero(mesh.depth_group == group)
         largest = members[np.argmax(areas[members])]
-        v0, v1, v2 = homogeneous[mesh.faces[largest]]
-        determinant = v0 @ np.cross(v1, v2)
-        limits = 1 / np.maximum(near, homogeneous[mesh.faces[members], 2])
+        limits = 1 / np.maximum(near, corners[members, :, 2])
         chosen = np.flatnonzero(mesh.depth_group[face] == group)
-        if determinant == 0:
+        if determinants[largest] == 0:
             nearness[chosen] = limits.max()
             continue
-        a, b, c = (np.cross(v1, v2) + np.cross(v2, v0) + np.cross(v0, v1)) / determinant
+        a, b, c = edges[largest].sum(axis=0) / determinants[largest]
         plane = a * x[sample[chosen]] + b * y[sample[chosen]] + c
         nearness[chosen] = np.clip(plane, limits.min(), limits.max())
 
