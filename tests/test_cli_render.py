@@ -195,5 +195,7 @@ def test_outputs_and_inputs_that_cannot_be(splats, triangle, tmp_path, capsys):
     assert run(tmp_path / "one.json", "-o", tmp_path / "b") == 1
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 5
-    for words, line in zip(["end in .png", "do not fit", "is a mesh", "such", "JSON"], errors, strict=True):
+    for words, line in zip(
+        ["end in .png", "do not fit", "is a mesh", "no: this folder", "JSON"], errors, strict=True
+    ):
         assert words in line

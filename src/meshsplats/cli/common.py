@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import re
 import sys
 import warnings
@@ -218,15 +219,24 @@ def _numbers(text: str) -> tuple[float, ...] | None:
     return numbers if len(numbers) == 3 and np.isfinite(numbers).all() else None
 
 
-def check_folder(folder: Path) -> None:
-    """Before the work: raises OSError unless ``folder`` is one or can be made in a folder that exists.
+def check_outputs(paths: Sequence[Path], force: bool, folder: Path | None = None) -> None:
+    """Before the work: raises OSError if an output exists already (unless ``force``) or cannot be made.
 
-    The parent must exist, so that a misspelt path does not become a tree of folders.
+    ``folder`` holds all of them and is made later, but not the one above it: a misspelt path must not become a
+    tree of folders.
     """
-    if folder.exists() and not folder.is_dir():
+    from meshsplats.formats.atomic import refuse_existing
+
+    refuse_existing(paths, force)
+    if folder is not None and folder.exists() and not folder.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, "must be a folder, this is a file", str(folder))
-    if not folder.exists() and not folder.absolute().parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, "the folder above this one does not exist", str(folder))
+    exists = folder is not None and folder.exists()
+    places = {folder} if exists else {(folder or path).absolute().parent for path in paths}
+    for above in filter(None, places):
+        if not above.is_dir():
+            raise FileNotFoundError(errno.ENOENT, "this folder for the output does not exist", str(above))
+        if not os.access(above, os.W_OK):
+            raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -6,6 +6,7 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -15,7 +16,7 @@ from meshsplats.cli.common import (
     File,
     Output,
     ViewOptions,
-    check_folder,
+    check_outputs,
     configuration,
     identify,
     parse_color,
@@ -25,7 +26,6 @@ from meshsplats.cli.common import (
 )
 from meshsplats.comparison import Comparison, compare_views
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.atomic import refuse_existing
 
 CONFIGURATION, RESULTS, CAMERAS = "config.json", "results.json", "cameras.json"
 
@@ -41,8 +41,8 @@ class Compare:
     """The mesh. Default: the splats converted with --preset for these cameras."""
     output: Output = tyro.MISSING
     """Folder for strips, results.json, cameras.json and config.json."""
-    preset: str = "default"
-    """Preset of the conversion where no mesh is given: default or paper."""
+    preset: Literal["default", "paper"] = "default"
+    """Preset of the conversion where no mesh is given."""
     views: ViewOptions = field(default_factory=ViewOptions)
     """8 views of an orbit, 400 pixels wide, where nothing else is asked for."""
     draw: DrawOptions = field(default_factory=DrawOptions)
@@ -64,12 +64,11 @@ class Compare:
         cameras = self.views.make(cloud, self.splats, count=8, side=400)
         strips = view_names(len(cameras))
         names = (*strips, RESULTS, CAMERAS, CONFIGURATION)
-        refuse_existing([self.output / name for name in names], self.force)
-        check_folder(self.output)
+        check_outputs([self.output / name for name in names], self.force, self.output)
         if self.mesh is None:
             from meshsplats.conversion import convert
 
-            mesh = convert(cloud, preset=self.preset, cameras=cameras)  # type: ignore[arg-type]
+            mesh = convert(cloud, preset=self.preset, cameras=cameras)
         else:
             from meshsplats.formats.meshes import load_mesh
 

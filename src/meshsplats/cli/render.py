@@ -18,7 +18,7 @@ from meshsplats.cli.common import (
     DrawOptions,
     Output,
     ViewOptions,
-    check_folder,
+    check_outputs,
     configuration,
     load_scene,
     parse_color,
@@ -28,7 +28,6 @@ from meshsplats.cli.common import (
     view_names,
     write_json,
 )
-from meshsplats.formats.atomic import refuse_existing
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -89,9 +88,7 @@ class Render:
         if single and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one .png: give -o a folder")
         files = self._files(single, len(cameras))
-        refuse_existing(files.every, self.force)
-        if not single:
-            check_folder(self.output)
+        check_outputs(files.every, self.force, None if single else self.output)
         if isinstance(scene, GaussianCloud) and not self.as_splats:
             from meshsplats.conversion import convert
 

@@ -1,0 +1,126 @@
+"""``meshsplats convert``: splats to a mesh."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from meshsplats.camera import load_cameras, orbit
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import (
+    File,
+    Output,
+    Text,
+    cameras_beside,
+    check_outputs,
+    configuration,
+    identify,
+    parse_up,
+    size_of,
+    write_json,
+)
+from meshsplats.errors import FileFormatError
+from meshsplats.framing import guess_up
+from meshsplats.mesh import SplatMesh
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Turns splats into a mesh of translucent, vertex-coloured triangles: .glb, .ply or .npz by the name
+    given.
+
+    Writes a preview picture and the configuration beside it.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Splat file, or the folder of a trained model."""
+    output: Output
+    """The mesh: .glb for Blender, engines and viewers, .ply, or .npz, which keeps everything."""
+    preset: Literal["default", "paper"] = "default"
+    """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
+    cameras: File = None
+    """Cameras that the mesh will be seen from, for the size of its splats on the picture: a JSON list, a 3DGS
+    trainer's cameras.json, or the model folder that has one. Default: judged from the splats."""
+    up: Text = None
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else -y."""
+    lit: bool = False
+    """.glb: a material that lights and shadows act on, not one that shows the colours as they are."""
+    no_preview: bool = False
+    """Draw no preview."""
+    strict: bool = False
+    """Splats with values that are not finite are an error, not left out with a warning."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.conversion import convert
+        from meshsplats.formats.meshes import MESH_SUFFIXES, save_mesh
+        from meshsplats.formats.splats import load_gaussians
+
+        suffix = self.output.suffix.lower()
+        if suffix not in MESH_SUFFIXES:
+            raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
+        if self.lit and suffix != ".glb":
+            raise UsageError("--lit is for .glb: the other formats have no material")
+        up = None if self.up is None else parse_up(self.up)
+        preview = None if self.no_preview else self.output.with_suffix(".preview.png")
+        config = self.output.with_suffix(".config.json")
+        check_outputs([path for path in (self.output, preview, config) if path], self.force)
+        if identify(self.input) != "splats":
+            raise FileFormatError(f"{self.input}: not splats; convert needs a splat file or a model folder")
+        cameras = load_cameras(self.cameras) if self.cameras is not None else None
+
+        times = [time.perf_counter()]
+        cloud = load_gaussians(self.input, strict=self.strict)
+        times.append(time.perf_counter())
+        mesh = convert(cloud, preset=self.preset, cameras=cameras)
+        if up is None:
+            up = guess_up(None, cameras or cameras_beside(self.input))
+        mesh = replace(mesh, up=up)
+        times.append(time.perf_counter())
+        save_mesh(mesh, self.output, lit=True if self.lit else None)
+        times.append(time.perf_counter())
+        write_json(config, configuration("convert", self))
+        if preview:
+            _draw_preview(mesh, preview)
+        read, made, saved = np.diff(times).round(4).tolist()
+        if self.json:
+            result = {
+                "mesh": str(self.output),
+                "preview": str(preview) if preview else None,
+                "splats": len(cloud),
+                "triangles": len(mesh.faces),
+                "vertices": len(mesh.vertices),
+                "bytes": self.output.stat().st_size,
+                "seconds": {"read": read, "convert": made, "save": saved},
+            }
+            print(json.dumps(result, indent=1))
+            return
+        print(f"{len(cloud):,} splats -> {len(mesh.faces):,} triangles, {len(mesh.vertices):,} vertices")
+        timing = f"read {read:.2f} s, converted {made:.2f} s, saved {saved:.2f} s"
+        print(f"{self.output} ({size_of(self.output)}): {timing}")
+        if preview:
+            print(f"preview: {preview}")
+        print(f"next: {self._next()}")
+
+    def _next(self) -> str:
+        paths = map(shlex.quote, map(str, (self.input, self.output, self.output.with_suffix(""))))
+        splats, mesh, folder = paths
+        return f"meshsplats compare {splats} {mesh} -o {folder}-compare"
+
+
+def _draw_preview(mesh: SplatMesh, path: Path) -> None:
+    from meshsplats.pictures import save_png
+    from meshsplats.rendering import render
+
+    camera = orbit(mesh, 1, width=800, height=800)[0]
+    save_png(path, render(mesh, camera, samples=2).color)
