@@ -1,0 +1,175 @@
+"""What a newcomer meets: imports that are quick, a package that is whole, documents that are true."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import pkgutil
+import re
+import shlex
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import meshsplats
+from meshsplats import cli, demo_scene
+from meshsplats.rendering import core
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(
+    (ROOT / "docs").glob("*.md")
+)
+
+NUMPY_ALONE = """
+import sys
+class OnlyNumpy:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top not in sys.stdlib_module_names and top not in ("numpy", "meshsplats"):
+            raise ImportError(f"{name} is not needed for this")
+sys.meta_path.insert(0, OnlyNumpy())
+"""
+
+
+def run(program: str) -> str:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_import_loads_no_module_of_ours_before_it_is_used():
+    loaded = run("import sys, meshsplats; print(*[m for m in sys.modules if m.startswith('meshsplats')])")
+    assert loaded.split() == ["meshsplats"]
+
+
+def test_everything_public_needs_numpy_alone():
+    """Inside other programs' Python, Blender's say, there is nothing else."""
+    run(NUMPY_ALONE + "import meshsplats\nfor name in meshsplats.__all__: getattr(meshsplats, name)")
+
+
+def test_converting_drawing_and_saving_need_numpy_alone(tmp_path):
+    program = f"""
+import meshsplats as ms
+from meshsplats.demo_scene import make_scene
+cloud = make_scene(200)
+ms.save_gaussians(cloud, {str(tmp_path / "s.ply")!r})
+mesh = ms.convert(ms.load_gaussians({str(tmp_path / "s.ply")!r}))
+for name in ("m.npz", "m.ply", "m.glb"):
+    ms.save_mesh(mesh, {str(tmp_path)!r} + "/" + name)
+    mesh = ms.load_mesh({str(tmp_path)!r} + "/" + name)
+camera = ms.orbit(mesh, 1, width=32, height=32)[0]
+print(ms.psnr(ms.render(mesh, camera).color, ms.render_splats(cloud, camera).color) > 10)
+"""
+    assert run(NUMPY_ALONE + program).strip() == "True"
+
+
+def test_public_names_are_there_and_others_are_not():
+    for name in meshsplats.__all__:
+        assert getattr(meshsplats, name) is not None
+    assert set(meshsplats.__all__) <= set(dir(meshsplats))
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = meshsplats.no_such_name
+
+
+def test_every_module_imports():
+    for module in pkgutil.walk_packages(meshsplats.__path__, "meshsplats."):
+        # The core's variants are libraries for ctypes, not modules, and __main__ runs a command.
+        if not re.search(r"\._core_\w+$|\.__main__$", module.name):
+            importlib.import_module(module.name)
+
+
+def test_package_holds_its_core_and_its_type_marker():
+    assert core.library_path("baseline") is not None
+    assert (Path(meshsplats.__file__).parent / "py.typed").is_file()
+    assert "baseline" in core.available_variants()
+
+
+def test_metadata_asks_for_little_and_caps_nothing():
+    required = [line for line in metadata.requires("meshsplats") or [] if "extra" not in line]
+    names = {re.match(r"[\w.-]+", line)[0].lower() for line in required}  # type: ignore[index]
+    assert names == {"numpy", "pillow", "tyro", "rich"}
+    assert not [line for line in required if "<" in line or "==" in line]
+
+
+# ---- The documents
+
+
+def code_blocks(path: Path, language: str) -> list[str]:
+    text = path.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def resolves(dotted: str) -> bool:
+    """Whether a dotted name can be imported and looked up."""
+    parts = dotted.split(".")
+    for cut in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:cut]))
+        except ImportError:
+            continue
+        for part in parts[cut:]:
+            if not hasattr(found, part) and part not in getattr(found, "__dataclass_fields__", {}):
+                return False
+            found = getattr(found, part, None)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_names_in_documents_exist(path):
+    text = path.read_text(encoding="utf-8")
+    # `meshsplats.module.name`, and `GaussianCloud.colors` of a public class.
+    names = set(re.findall(r"`(meshsplats(?:\.\w+)+)", text))
+    classes = [name for name in meshsplats.__all__ if name[0].isupper()]
+    names |= {"meshsplats." + n for n in re.findall(rf"`((?:{'|'.join(classes)})\.\w+)", text)}
+    assert [name for name in sorted(names) if not resolves(name)] == []
+    # Files of the project by name or link; what commands write is not among them.
+    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text) + re.findall(r'src="([^":]+)"', text)
+    assert [link for link in links if not (path.parent / link).exists()] == []
+
+
+def test_architecture_names_files_that_exist():
+    package = ROOT / "src" / "meshsplats"
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:\w+/)*\w+\.(?:py|h|cpp)|(?:\w+/)+)`", text))
+    assert len(named) > 10
+    assert [n for n in sorted(named) if not (package / n).exists() and not (ROOT / n).exists()] == []
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "scene.ply"
+    demo_scene.main([str(path), "300"])
+    return path
+
+
+def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
+    """One after the other in one folder, on a small scene and with small pictures."""
+    lines = "".join(code_blocks(ROOT / "README.md", "sh")).replace("\\\n", " ").splitlines()
+    commands = [shlex.split(line, comments=True) for line in lines if line.startswith("meshsplats ")]
+    assert {command[1] for command in commands} >= set(cli.COMMANDS)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.ply").write_bytes(scene_file.read_bytes())
+    for command in commands:
+        small = ["--width", "48"] if command[1] in ("render", "compare") and "--width" not in command else []
+        assert cli.main([*command[1:], *small]) == 0, f"{shlex.join(command)}\n{capsys.readouterr().err}"
+
+
+def test_python_of_the_readme_runs(scene_file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.ply").write_bytes(scene_file.read_bytes())
+    blocks = code_blocks(ROOT / "README.md", "python")
+    assert blocks
+    scope: dict = {}
+    for block in blocks:
+        exec(compile(ast.parse(block), "README.md", "exec"), scope)
+
+
+def test_make_targets_of_the_documents_exist():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for path in DOCUMENTS:
+        for target in re.findall(r"(?:^ *|`)make (\w+)", path.read_text(encoding="utf-8"), re.MULTILINE):
+            assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"{path.name} has make {target}"
