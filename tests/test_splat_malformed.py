@@ -35,6 +35,10 @@ MALFORMED = {
         b"ply\nformat ascii 1.0\n" + (b"comment " + b"x" * 1000 + b"\n") * 2000,
         "no 'end_header' line in its first",
     ),
+    "header of 2 MB": (
+        header(before="comment " + "x" * 2_000_000 + "\n") + ROWS,
+        "no 'end_header' line in its first 1048576 bytes",
+    ),
     "endless line": (b"ply\n" + b"x" * 3_000_000, "no 'end_header'"),
     "binary after the magic": (b"ply\n" + bytes(range(256)) * 40, "line 2: expected the 'format' line"),
     "no format": (b"ply\nend_header\n", "no 'format' line"),
@@ -101,6 +105,11 @@ MALFORMED = {
     "lists eat the splats": (
         header(before="element face 1\nproperty list uchar uchar v\n") + b"\x28" + ROWS,
         "the file ends after 72 of them",
+    ),
+    "lists eat what follows": (
+        header(before="element f 1\nproperty list uchar uchar v\n", after="element e 9\nproperty int a\n")
+        + (b"\x05" + bytes(5) + ROWS + bytes(35)),
+        "ends 1 bytes before the end of the elements after 'vertex'",
     ),
     "list in a splat": (
         header(properties=FLOATS + "property list uchar int v\n") + ROWS + bytes(9),
@@ -169,6 +178,17 @@ def test_one_clear_error(tmp_path, name):
     assert str(caught.value).startswith(str(path))
     assert len(str(caught.value)) < 500
     assert peak < 40e6
+
+
+def test_line_numbers_after_a_line_end_across_two_blocks(tmp_path):
+    row = b"1 " * 13 + b"1"
+    # Blocks of 1 MiB are read: the first of them ends between the CR and the LF of a line.
+    lines = [row.ljust(31) + b"\r\n", *[row.ljust(30) + b"\r\n"] * 40_000]
+    assert len(lines[0]) == 33
+    data = header("40002", "ascii") + b"".join(lines) + row.replace(b"1", b"z", 1)
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(FileFormatError, match=f"line {18 + 40_002}: x is not a number: 'z'"):
+        load_gaussians(tmp_path / "a.ply")
 
 
 def test_truncation_anywhere_is_an_error(tmp_path):

@@ -64,9 +64,8 @@ class CloudBuilder:
         turned = norm > 0
         good = finite & turned
         if not good.all():
-            seen = self._kept + self._not_finite + self._zero_quaternions
             if self._first_bad is None:
-                self._first_bad = seen + int(good.argmin())
+                self._first_bad = self._kept + int(good.argmin())
             self._not_finite += int((~finite).sum())
             self._zero_quaternions += int((finite & ~turned).sum())
             m = int(good.sum())

@@ -2,9 +2,10 @@
 
 Each row of element ``vertex`` is a splat: ``x y z``, ``f_dc_0..2`` and ``f_rest_*`` (spherical harmonics,
 channel by channel), ``opacity`` (logit), ``scale_*`` (logarithms) and ``rot_0..3`` (quaternion w x y z of any
-length). 2DGS files have two scales, the flat axis being the third; Mip-Splatting files have ``filter_3D``, the
-width of a smoothing filter that belongs to scales and opacities. Properties are found by name. How splats
-are to be drawn is said by a comment, if at all: ``SplatRenderMode: mip`` (Brush), ``antialiased 1`` (Postshot).
+length). 2DGS files have two scales, the flat axis being the third; Mip-Splatting files have ``filter_3D``,
+the width of a smoothing filter that belongs to scales and opacities. Properties are found by name. How splats
+are to be drawn is said by a comment, if at all: ``SplatRenderMode: mip`` (Brush), ``antialiased 1``
+(Postshot).
 """
 
 from __future__ import annotations

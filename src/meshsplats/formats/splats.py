@@ -46,8 +46,8 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     Opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, are stored as
     sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as 2DGS files
     have it, an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both read back as what
-    they are. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three, with a
-    DataWarning, and reads back as '3dgs'.
+    they are. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three,
+    with a DataWarning, and reads back as '3dgs'.
 
     Raises ValueError for another suffix than .ply or for a cloud without splats.
     """
