@@ -95,6 +95,19 @@ def test_animation(tmp_path, suffix):
     assert frame[20, 20].min() > 250
 
 
+def test_gif_keeps_the_background(tmp_path):
+    """256 colours for thousands: those of the picture may shift a little, the plain background must not."""
+    frame = np.full((64, 64, 3), (250, 253, 251), np.uint8)
+    frame[:24] = RNG.integers(150, 256, (24, 64, 3))
+    save_animation(tmp_path / "a.gif", [frame, frame[:, ::-1]])
+    with Image.open(tmp_path / "a.gif") as image:
+        for i in range(2):
+            image.seek(i)
+            shown = np.asarray(image.convert("RGB"))
+            assert np.median(np.abs(shown[32:].astype(int) - (250, 253, 251))) == 0
+            assert (shown[32:] == (250, 253, 251)).all(axis=2).mean() > 0.95
+
+
 def test_animation_is_brought_to_size_and_keeps_alpha(tmp_path):
     frames = moving_square(3, 100, 4)
     frames[0][50:, :, 3] = 0

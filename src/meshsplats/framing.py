@@ -24,7 +24,7 @@ SURROUNDINGS = 4.0
 an object on its own reach about 2 (a ball's surface: 1; a filled ball: 1.26; the longest object measured:
 3.9)."""
 
-COVERED = 0.99
+COVERED = 0.995
 """Share of the subject's opacity that must be on the picture."""
 MARGIN = 1.08
 """Room left round the subject."""

@@ -174,5 +174,9 @@ def _paletted(image):
 
     if image.mode != "RGB":
         raise ValueError("GIF has no translucency: write a .webp or .png animation of pictures with alpha")
-    palette = image.quantize(256, method=Image.Quantize.MEDIANCUT)
+    palette = image.quantize(255, method=Image.Quantize.MEDIANCUT)
+    # A mean of similar colours tints a plain background: the commonest colour is kept as it is.
+    commonest = max(image.getcolors(image.width * image.height))[1]
+    colors = (palette.getpalette() or [])[: 255 * 3]
+    palette.putpalette([*colors, *[0] * (255 * 3 - len(colors)), *commonest])
     return image.quantize(256, palette=palette, dither=Image.Dither.FLOYDSTEINBERG)

@@ -222,7 +222,7 @@ def _numbers(text: str) -> tuple[float, ...] | None:
 def check_outputs(paths: Sequence[Path], force: bool, folder: Path | None = None) -> None:
     """Before the work: raises OSError if an output exists already (unless ``force``) or cannot be made.
 
-    ``folder`` holds all of them and is made later, but not the one above it: a misspelt path must not become a
+    ``folder`` holds all of them and is made later, but not the one above it: a misspelt path must not make a
     tree of folders.
     """
     from meshsplats.formats.atomic import refuse_existing

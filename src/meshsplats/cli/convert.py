@@ -122,5 +122,5 @@ def _draw_preview(mesh: SplatMesh, path: Path) -> None:
     from meshsplats.pictures import save_png
     from meshsplats.rendering import render
 
-    camera = orbit(mesh, 1, width=800, height=800)[0]
+    camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
     save_png(path, render(mesh, camera, samples=2).color)
