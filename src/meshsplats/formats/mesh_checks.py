@@ -11,6 +11,9 @@ import numpy as np
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.mesh import SplatMesh
 
+_BASE_BYTES = 256 << 20
+_FACTOR = 64
+
 
 class Budget:
     """Bytes that reading one file may take: 256 MiB, and 64 times its size.
@@ -22,13 +25,13 @@ class Budget:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file_bytes = 0
-        self._left = 256 << 20
+        self._left = _BASE_BYTES
         self.extend(os.stat(path).st_size)
 
     def extend(self, file_bytes: int) -> None:
         """Adds the share of a further file that belongs to the first."""
         self._file_bytes += file_bytes
-        self._left += 64 * file_bytes
+        self._left += _FACTOR * file_bytes
 
     def spend(self, count: int, what: str) -> None:
         """Books ``count`` bytes for ``what``; FileFormatError when the budget is exceeded. Call it before

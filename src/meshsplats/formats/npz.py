@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import io
+import os
 import re
 import struct
 import zipfile
@@ -82,12 +83,15 @@ class _BoundedReader(io.BufferedReader):
     """Refuses a single read beyond 16 MiB: a zip directory of that size is an attack, and members are read in
     blocks."""
 
+    _limit = 1 << 24
+
     def read(self, size: int | None = -1) -> bytes:
-        limit = 1 << 24
-        data = super().read(limit + 1 if size is None or size < 0 else min(size, limit + 1))
-        if len(data) > limit:
+        # As many bytes as are asked for would be allocated, even where the file ends before.
+        left = os.fstat(self.fileno()).st_size - self.tell()
+        wanted = left if size is None or size < 0 else min(size, left)
+        if wanted > self._limit:
             raise zipfile.BadZipFile("its directory is absurdly large")
-        return data
+        return super().read(max(wanted, 0))
 
 
 @dataclass(frozen=True)
