@@ -224,7 +224,7 @@ def _fragments(mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray) ->
 
 
 def _edge_functions(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of ``corners`` V (f, 3, 3): V_j x V_k (f, 3, 3), row i opposite corner i, and D = V_0 . (V_1 x V_2) (f,)."""
+    """Of ``corners`` V (f, 3, 3): rows V_j x V_k opposite to corners i, and D = V_0 . (V_1 x V_2) (f,)."""
     edges = np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]])
     return edges, (corners[:, 0] * edges[:, 0]).sum(axis=1)
 
@@ -235,7 +235,7 @@ def _cover(
     """Samples that a triangle covers at a depth z >= near, the depth there, and the weights of the corners.
 
     ``corners`` V are (3, 3) homogeneous pixel positions. With p = (x, y, 1), e_i = p . (V_j x V_k) and
-    D = V_0 . (V_1 x V_2), the ray through p meets the triangle's plane at z p = sum b_i V_i, z = D / sum e and
+    D = V_0 . (V_1 x V_2), the ray through p meets the triangle's plane at z p = sum b_i V_i, z = D / sum e,
     b_i = e_i / sum e (Olano and Greer 1997). This point is in the triangle and in front of the camera if and
     only if no e_i / D is negative, so corners behind the camera need no clipping.
     """
