@@ -184,6 +184,13 @@ def test_antialiased_splats_by_hand():
     assert render_splats(edge_on, splat_camera()).fragments == 0
 
 
+def test_a_flat_splat_seen_edge_on_shows_by_its_dilation_only():
+    edge_on = one_splat(scales=(0, 0.1, 0.1))
+    alpha = render_splats(edge_on, splat_camera()).alpha
+    assert alpha[3, 3] == pytest.approx(0.8 * math.exp(-0.5 * (1 / 0.3 + 1 / 1.3)), abs=1e-7)
+    assert render_splats(edge_on, splat_camera(), dilation=0).fragments == 0
+
+
 def test_flat_splats_by_hand():
     def alpha(**options):
         return render_splats(one_splat(kernel="2dgs", **options), splat_camera()).alpha
