@@ -26,11 +26,16 @@ struct Grid {
     int64_t tiles() const { return (int64_t)tiles_x * tiles_y; }
 };
 
-// Something to draw: what it is, how near it comes, the tiles it may touch.
-struct Item {
+// Something to draw: a run of triangles, or a splat.
+struct Entry {
     float key;  // no sample of it is nearer: compared with 1 / depth, nearest first
-    int32_t number;
-    uint16_t x0, x1, y0, y1;  // tiles, inclusive
+    int32_t first, length;
+};
+
+// The same with the tiles it may touch, inclusive.
+struct Item {
+    Entry entry;
+    uint16_t x0, x1, y0, y1;
 };
 
 // First and last sample whose centre lies in [lo, hi] widened a little, clamped to [0, count).
@@ -48,7 +53,7 @@ inline void sort_items(std::vector<Item> &items) {
     std::vector<Item> other(items.size());
     auto digit = [](const Item &item, int pass) {
         uint32_t bits;
-        std::memcpy(&bits, &item.key, 4);
+        std::memcpy(&bits, &item.entry.key, 4);
         return (~bits >> (11 * pass)) & 2047u;
     };
     std::vector<size_t> start(2048);
@@ -108,12 +113,11 @@ class TileLists {
             int64_t a = bound(total * thread / n), b = bound(total * (thread + 1) / n);
             if (a >= b) return;
             int row_a = (int)(a / grid_.tiles_x), row_b = (int)((b - 1) / grid_.tiles_x);
-            for (size_t i = 0; i < items_.size(); ++i) {
-                const Item &item = items_[i];
+            for (const Item &item : items_) {
                 for (int y = std::max<int>(item.y0, row_a); y <= std::min<int>(item.y1, row_b); ++y) {
                     int64_t row = (int64_t)y * grid_.tiles_x;
                     int64_t first = std::max(row + item.x0, a), last = std::min(row + item.x1, b - 1);
-                    for (int64_t tile = first; tile <= last; ++tile) entries_[fill[tile - begin_]++] = (uint32_t)i;
+                    for (int64_t tile = first; tile <= last; ++tile) entries_[fill[tile - begin_]++] = item.entry;
                 }
             }
         });
@@ -122,11 +126,11 @@ class TileLists {
 
     int64_t begin() const { return begin_; }
     int64_t end() const { return end_; }
-    const uint32_t *list(int64_t tile) const { return entries_.data() + start_[tile - begin_]; }
+    const Entry *list(int64_t tile) const { return entries_.data() + start_[tile - begin_]; }
     int64_t length(int64_t tile) const { return count_[tile]; }
 
   private:
-    static constexpr int64_t budget = 12'000'000;  // entries held at once
+    static constexpr int64_t budget = 4'000'000;  // entries held at once
 
     int64_t bound(int64_t entries) const {
         return begin_ + (std::lower_bound(start_.begin(), start_.end(), entries) - start_.begin());
@@ -137,7 +141,7 @@ class TileLists {
     int threads_;
     std::vector<int32_t> count_;
     std::vector<int64_t> start_;
-    std::vector<uint32_t> entries_;
+    std::vector<Entry> entries_;
     int64_t begin_ = 0, end_ = 0;
 };
 

@@ -35,31 +35,36 @@ class MeshTile {
     MeshTile(const Scene &scene, const MsOptions &options, const MsPicture &picture, const MsCamera &camera)
         : scene_(scene), grid_(scene.grid), options_(options), picture_(picture), camera_(camera),
           extras_(picture, scene.mesh), arena_(new Arena), sums_((size_t)SAMPLES * extras_.channels) {
-        for (int i = 0; i < TILE; ++i) center_[i] = i + 0.5f;
+        for (int i = 0; i < 16; ++i) {
+            lane_x_[i] = i % 4 + 0.5f;
+            lane_y_[i] = i / 4 + 0.5f;
+            block_x_[i] = 4.0f * (i % 4);
+            block_y_[i] = 4.0f * (i / 4);
+        }
     }
 
     int64_t fragments() const { return fragments_; }
 
-    void draw(int tile_x, int tile_y, const uint32_t *list, int64_t length) {
+    void draw(int tile_x, int tile_y, const Entry *list, int64_t length) {
         begin(tile_x, tile_y);
         for (int64_t i = 0; i < length; ++i) {
-            const Item &item = scene_.items[list[i]];
-            if (i + 8 < length) prefetch_faces(scene_.items[list[i + 8]].number);
-            if (i + 4 < length) prefetch_corners(scene_.items[list[i + 4]].number);
-            if (pending_ >= limit_) {
-                if (flush(item.key)) break;
-            }
+            if (i + 8 < length) prefetch_faces(list[i + 8]);
+            if (i + 4 < length) prefetch_corners(list[i + 4]);
+            if (pending_ >= limit_ && flush(list[i].key)) break;
             if (extras_.any)
-                add_group<true>(item.number);
+                add_run<true>(list[i]);
             else
-                add_group<false>(item.number);
+                add_run<false>(list[i]);
         }
         flush(-1);
         finish();
     }
 
   private:
+    // Samples are numbered by blocks of 4 x 4: sample = 16 block + 4 row + column, a block being one wide vector.
     static constexpr int SAMPLES = TILE * TILE;
+    static constexpr int BLOCKS = SAMPLES / 16;
+    static constexpr float SLACK = 0.01f;
     static constexpr int ROOM = 32;       // fragments a sample in the arena; more go to a list on the heap
     static constexpr int PER_SAMPLE = 8;  // mean number of waiting fragments at which they are flushed
 
@@ -78,7 +83,9 @@ class MeshTile {
     };
     // The samples that one triangle covers, side by side.
     struct Found {
-        alignas(64) float x[SAMPLES + W], y[SAMPLES + W], q[SAMPLES + W], z[SAMPLES + W], e[3][SAMPLES + W];
+        alignas(64) int32_t sample[SAMPLES + W];
+        alignas(64) float q[SAMPLES + W], z[SAMPLES + W], e[3][SAMPLES + W];
+        alignas(64) float rgba[SAMPLES + W][4];
     };
     // The fragments of one sample in one piece.
     struct Long {
@@ -98,18 +105,24 @@ class MeshTile {
     Long long_;
     Found found_;
 
-    alignas(64) float center_[TILE];
+    Triangles triangles_;
+    alignas(64) float lane_x_[16], lane_y_[16];           // of a block's samples, from the block's corner
+    alignas(64) float block_x_[BLOCKS], block_y_[BLOCKS];  // of the blocks' corners, from the tile's
     int32_t count_[SAMPLES];
     int32_t layers_[SAMPLES];
     f4 color_[SAMPLES];
     float through_[SAMPLES];
-    uint32_t open_[TILE];  // per row, the samples that still take light
+    uint32_t open_[BLOCKS];  // per block, the samples that still take light
     std::vector<float> sums_;
     std::vector<int32_t> order_, rank_;
     std::vector<Fragment> kept_;
 
     int x0_, y0_, columns_, rows_;  // the tile in samples
     int64_t pending_, limit_, fragments_ = 0;
+
+    static int number(int x, int y) { return (y / 4 * 4 + x / 4) * 16 + y % 4 * 4 + x % 4; }
+    static int column(int sample) { return sample / 16 % 4 * 4 + sample % 4; }
+    static int row(int sample) { return sample / 64 * 4 + sample / 4 % 4; }
 
     void begin(int tile_x, int tile_y) {
         x0_ = tile_x * grid_.side;
@@ -123,126 +136,156 @@ class MeshTile {
             color_[i] = f4{};
             through_[i] = 1;
         }
-        for (int row = 0; row < TILE; ++row) open_[row] = row < rows_ ? (1u << columns_) - 1 : 0;
+        std::fill(open_, open_ + BLOCKS, 0);
+        for (int y = 0; y < rows_; ++y)
+            for (int x = 0; x < columns_; ++x) open_[number(x, y) / 16] |= 1u << number(x, y) % 16;
         std::fill(sums_.begin(), sums_.end(), 0.0f);
         pending_ = 0;
         limit_ = (int64_t)PER_SAMPLE * rows_ * columns_;
     }
 
     // Groups come in the order of depth, which is no order in memory: their data is asked for some groups ahead.
-    void prefetch_faces(int32_t group) const {
-        const int32_t *face = scene_.mesh.faces + 3 * (int64_t)scene_.group_start[group];
+    void prefetch_faces(const Entry &run) const {
+        const int32_t *face = scene_.mesh.faces + 3 * (int64_t)run.first;
         __builtin_prefetch(face);
         __builtin_prefetch(face + 16);
     }
-    void prefetch_corners(int32_t group) const {
-        const int32_t *face = scene_.mesh.faces + 3 * (int64_t)scene_.group_start[group];
-        const int32_t *end = scene_.mesh.faces + 3 * (int64_t)scene_.group_start[group + 1];
-        for (; face < end; face += 3) {
+    void prefetch_corners(const Entry &run) const {
+        const int32_t *face = scene_.mesh.faces + 3 * (int64_t)run.first;
+        for (int i = 0; i < run.length; ++i, face += 3) {
             __builtin_prefetch(&scene_.vertices[face[1]]);
             __builtin_prefetch(scene_.mesh.colors + 4 * (int64_t)face[1]);
         }
     }
 
     template <bool PLACES>
-    void add_group(int32_t group) {
+    void add_run(const Entry &run) {
         const MsMesh &mesh = scene_.mesh;
-        for (int32_t f = scene_.group_start[group]; f < scene_.group_start[group + 1]; ++f) {
-            const int32_t *corner = mesh.faces + 3 * (int64_t)f;
-            Projected p[3];
-            bool crossing = false;
-            double lo_x = 1e300, hi_x = -1e300, lo_y = 1e300, hi_y = -1e300;
-            for (int k = 0; k < 3; ++k) {
-                p[k] = scene_.vertices[corner[k]];
-                p[k].x -= x0_;
-                p[k].y -= y0_;
-                crossing |= !(p[k].w > 0);
-                lo_x = std::min(lo_x, p[k].x);
-                hi_x = std::max(hi_x, p[k].x);
-                lo_y = std::min(lo_y, p[k].y);
-                hi_y = std::max(hi_y, p[k].y);
+        Triangles &t = triangles_;
+        const int32_t end = run.first + run.length;
+        for (int32_t f = run.first; f < end;) {
+            int n = 0;
+            unsigned crossing = 0;
+            for (; f < end && n < Triangles::N; ++f) {
+                const int32_t *corner = mesh.faces + 3 * (int64_t)f;
+                const Projected &p0 = scene_.vertices[corner[0]], &p1 = scene_.vertices[corner[1]],
+                                &p2 = scene_.vertices[corner[2]];
+                bool behind[3] = {!(p0.w > 0), !(p1.w > 0), !(p2.w > 0)};
+                if (behind[0] & behind[1] & behind[2]) continue;
+                const Projected *p[3] = {&p0, &p1, &p2};
+                for (int k = 0; k < 3; ++k) {
+                    t.x[k][n] = p[k]->x - x0_;
+                    t.y[k][n] = p[k]->y - y0_;
+                    t.w[k][n] = p[k]->w;
+                    t.rgba[k][n] = mesh.colors + 4 * (int64_t)corner[k];
+                }
+                t.face[n] = f;
+                if (behind[0] | behind[1] | behind[2]) crossing |= 1u << n;
+                ++n;
             }
-            Triangle t;
-            if (!crossing) {
-                if (!sample_range(lo_x, hi_x, columns_, t.x0, t.x1) || !sample_range(lo_y, hi_y, rows_, t.y0, t.y1))
-                    continue;
-            } else {
-                if (!(p[0].w > 0) && !(p[1].w > 0) && !(p[2].w > 0)) continue;
-                t.x0 = t.y0 = 0;
-                t.x1 = columns_ - 1;
-                t.y1 = rows_ - 1;
+            t.set_up_in_front();
+            for (unsigned rest = crossing; rest; rest &= rest - 1) {
+                int k = __builtin_ctz(rest);
+                Vec3 v[3];
+                scene_.homogeneous(mesh.faces + 3 * (int64_t)t.face[k], x0_, y0_, v);
+                t.set_up_crossing(k, v, scene_.projection.near);
             }
-            const float *rgba[3];
-            for (int k = 0; k < 3; ++k) rgba[k] = mesh.colors + 4 * (int64_t)corner[k];
-            if (rgba[0][3] == 0 && rgba[1][3] == 0 && rgba[2][3] == 0) continue;
-            Vec3 v[3];
-            if (crossing) scene_.homogeneous(corner, x0_, y0_, v);
-            if (!set_up(t, p, crossing ? v : nullptr, scene_.projection.near, rgba)) continue;
-            t.face = f;
-            bool shared_depth = mesh.depth_group && mesh.depth_group[f] >= 0;
-            if (shared_depth) {
-                const DepthPlane &plane = scene_.planes[mesh.depth_group[f]];
-                t.ka = (float)plane.q.a;
-                t.kb = (float)plane.q.b;
-                t.kc = (float)(plane.q.c + plane.q.a * x0_ + plane.q.b * y0_);
-                t.k_min = plane.q_min;
-                t.k_max = plane.q_max;
+            for (int k = 0; k < n; ++k) {
+                // The slack is more than the rounding of an edge function.
+                bool near_tile = (t.area[k] > 0) & (t.low_x[k] < columns_ + SLACK) & (t.high_x[k] > -SLACK) &
+                                 (t.low_y[k] < rows_ + SLACK) & (t.high_y[k] > -SLACK);
+                if (!near_tile) continue;
+                bool shared_depth = mesh.depth_group && mesh.depth_group[t.face[k]] >= 0;
+                bool crosses = crossing >> k & 1;
+                if (crosses || shared_depth || PLACES)
+                    add_triangle<PLACES, true>(k, crosses, shared_depth);
+                else
+                    add_triangle<PLACES, false>(k, false, false);
             }
-            if (crossing || shared_depth || PLACES)
-                add_triangle<PLACES, true>(t, crossing, shared_depth);
-            else
-                add_triangle<PLACES, false>(t, false, false);
         }
     }
 
     // Adds the fragments of a triangle to the lists of the samples it covers.
     template <bool PLACES, bool GENERAL>
-    void add_triangle(const Triangle &t, bool crossing, bool shared_depth) {
-        alignas(64) float base[4][TILE];
-        for (int x = 0; x < TILE; x += W) {
-            vf row = load(center_ + x);
-            for (int i = 0; i < 3; ++i) store(base[i] + x, set1(t.eb[i]) * row + set1(t.ec[i]));
-            store(base[3] + x, set1(t.qb) * row + set1(t.qc));
+    void add_triangle(int k, bool crossing, bool shared_depth) {
+        const Triangles &t = triangles_;
+        // Each linear function is (a x + b y inside a block) + (a x + b y + c at the block's corner).
+        constexpr int PARTS = 16 / W;
+        vf inside_block[4][PARTS];
+        alignas(64) float at_block[4][BLOCKS];
+        unsigned blocks = (1u << BLOCKS) - 1;
+        for (int i = 0; i < 4; ++i) {
+            float a = i < 3 ? t.ea[i][k] : t.qa[k], b = i < 3 ? t.eb[i][k] : t.qb[k], c = i < 3 ? t.ec[i][k] : t.qc[k];
+            vf va = set1(a), vb = set1(b), vc = set1(c);
+            for (int part = 0; part < PARTS; ++part)
+                inside_block[i][part] = va * load(lane_x_ + part * W) + vb * load(lane_y_ + part * W);
+            for (int j = 0; j < BLOCKS; j += W)
+                store(at_block[i] + j, va * load(block_x_ + j) + (vb * load(block_y_ + j) + vc));
+            if (i == 3) continue;
+            // No sample of a block exceeds its corner's value by more than this, rounding included.
+            float most = std::max(a * 0.5f, a * 3.5f) + std::max(b * 0.5f, b * 3.5f);
+            unsigned touched = 0;
+            for (int j = 0; j < BLOCKS; j += W)
+                touched |= at_least(load(at_block[i] + j) + set1(most), set1(t.threshold[i][k])) << j;
+            blocks &= touched;
         }
         int n = 0;
-        for (int x = t.x0 / W * W; x <= t.x1; x += W) {
-            vf column = load(center_ + x), ex[3];
-            for (int i = 0; i < 3; ++i) ex[i] = set1(t.ea[i]) * column;
-            vf qx = set1(t.qa) * column;
-            unsigned columns = ((2u << (t.x1 - x)) - 1) & ((1u << W) - 1);
-            for (int y = t.y0; y <= t.y1; ++y) {
+        vf q_max = set1(t.q_max[k]);
+        for (; blocks; blocks &= blocks - 1) {
+            int block = __builtin_ctz(blocks);
+            for (int part = 0; part < PARTS; ++part) {
                 vf e[3];
-                for (int i = 0; i < 3; ++i) e[i] = ex[i] + set1(base[i][y]);
-                unsigned inside = at_least(e[0], set1(t.threshold[0])) & at_least(e[1], set1(t.threshold[1])) &
-                                  at_least(e[2], set1(t.threshold[2])) & columns & (open_[y] >> x);
-                vf q = qx + set1(base[3][y]);
-                if (GENERAL && crossing) inside &= at_least(set1(t.q_max), q);
-                compress(found_.x + n, column, inside);
+                unsigned inside = open_[block] >> (part * W) & ((1u << W) - 1);
+                for (int i = 0; i < 3; ++i) {
+                    e[i] = inside_block[i][part] + set1(at_block[i][block]);
+                    inside &= at_least(e[i], set1(t.threshold[i][k]));
+                }
+                vf q = inside_block[3][part] + set1(at_block[3][block]);
+                if (GENERAL && crossing) inside &= at_least(q_max, q);
                 compress(found_.q + n, q, inside);
+                compress_numbers(found_.sample + n, block * 16 + part * W, inside);
                 if (PLACES)
-                    for (int i = 0; i < 3; ++i) compress(found_.e[i] + n, e[i] * set1(t.weight[i]), inside);
-                int more = __builtin_popcount(inside);
-                store(found_.y + n, set1(center_[y]));
-                n += more;
+                    for (int i = 0; i < 3; ++i) compress(found_.e[i] + n, e[i] * set1(t.weight[i][k]), inside);
+                n += __builtin_popcount(inside);
             }
         }
         if (n == 0) return;
         pending_ += n;
+
+        f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
+        auto mix = [&](const float s[3][Triangles::N]) {
+            return set4(s[0][k]) * c[0] + set4(s[1][k]) * c[1] + set4(s[2][k]) * c[2];
+        };
+        f4 va = mix(t.sa), vb = mix(t.sb), vc = mix(t.sc);
+        f4 low = min4(min4(c[0], c[1]), c[2]), high = max4(max4(c[0], c[1]), c[2]);
+        vf q_min = set1(t.q_min[k]);
+        typedef int32_t vi __attribute__((vector_size(4 * W)));
         for (int i = 0; i < n; i += W) {
-            vf q = vmin(vmax(load(found_.q + i), set1(t.q_min)), set1(t.q_max));
-            store(found_.z + i, set1(1.0f) / q);
+            vi sample;
+            __builtin_memcpy(&sample, found_.sample + i, sizeof sample);
+            vf x = __builtin_convertvector(((sample >> 2) & 12) + (sample & 3), vf) + set1(0.5f);
+            vf y = __builtin_convertvector(((sample >> 4) & 12) + ((sample >> 2) & 3), vf) + set1(0.5f);
+            vf q = vmin(vmax(load(found_.q + i), q_min), q_max);
+            vf z = set1(1.0f) / q;
+            vf value[4];
+            for (int j = 0; j < 4; ++j) {
+                value[j] = (set1(vc[j]) + set1(vb[j]) * y + set1(va[j]) * x) * z;
+                value[j] = vmin(vmax(value[j], set1(low[j])), set1(high[j]));
+            }
+            interleave4(found_.rgba[i], value[0], value[1], value[2], value[3]);
             if (GENERAL && shared_depth) {
-                q = set1(t.ka) * load(found_.x + i) + (set1(t.kb) * load(found_.y + i) + set1(t.kc));
-                q = vmin(vmax(q, set1(t.k_min)), set1(t.k_max));
+                const DepthPlane &plane = scene_.planes[scene_.mesh.depth_group[t.face[k]]];
+                double corner = plane.q.c + plane.q.a * x0_ + plane.q.b * y0_;
+                q = set1((float)plane.q.a) * x + (set1((float)plane.q.b) * y + set1((float)corner));
+                q = vmin(vmax(q, set1(plane.q_min)), set1(plane.q_max));
             }
             store(found_.q + i, q);
+            if (PLACES) store(found_.z + i, z);
         }
         for (int i = 0; i < n; ++i) {
-            float x = found_.x[i], y = found_.y[i];
-            int sample = (int)y * TILE + (int)x;
-            f4 rgba = (t.vc + t.vb * set4(y) + t.va * set4(x)) * set4(found_.z[i]);
-            rgba = min4(max4(rgba, t.low), t.high);
-            int k = count_[sample]++;
+            int sample = found_.sample[i];
+            f4 rgba = load4(found_.rgba[i]);
+            int waiting = count_[sample]++;
             Place place;
             if (PLACES) {
                 float sum = found_.e[0][i] + found_.e[1][i] + found_.e[2][i];
@@ -250,13 +293,13 @@ class MeshTile {
                 if (sum > 0)
                     for (int j = 0; j < 3; ++j) place.b[j] = found_.e[j][i] / sum;
             }
-            if (__builtin_expect(k < ROOM, 1)) {
-                arena_->key[sample][k] = found_.q[i];
-                arena_->face[sample][k] = t.face;
-                store4(arena_->rgba[sample][k], rgba);
-                if (PLACES) arena_->place[sample][k] = place;
+            if (__builtin_expect(waiting < ROOM, 1)) {
+                arena_->key[sample][waiting] = found_.q[i];
+                arena_->face[sample][waiting] = t.face[k];
+                store4(arena_->rgba[sample][waiting], rgba);
+                if (PLACES) arena_->place[sample][waiting] = place;
             } else {
-                overflow_[sample].push_back({rgba, found_.q[i], t.face, place});
+                overflow_[sample].push_back({rgba, found_.q[i], t.face[k], place});
             }
         }
     }
@@ -265,18 +308,19 @@ class MeshTile {
     bool flush(float key) {
         pending_ = 0;
         uint32_t any_open = 0;
-        for (int y = 0; y < rows_; ++y) {
-            for (uint32_t row = open_[y]; row; row &= row - 1) {
-                int x = __builtin_ctz(row), sample = y * TILE + x;
+        const bool plain = !extras_.any && !options_.max_layers;
+        for (int block = 0; block < BLOCKS; ++block) {
+            for (uint32_t rest = open_[block]; rest; rest &= rest - 1) {
+                int lane = __builtin_ctz(rest), sample = 16 * block + lane;
                 if (count_[sample] == 0) continue;
-                if (blend(sample, key)) {
-                    open_[y] &= ~(1u << x);
+                if (plain ? blend<true>(sample, key) : blend<false>(sample, key)) {
+                    open_[block] &= ~(1u << lane);
                     count_[sample] = 0;
                 } else {
                     pending_ += count_[sample];
                 }
             }
-            any_open |= open_[y];
+            any_open |= open_[block];
         }
         // Fragments that had to wait should not be sorted again and again.
         limit_ = std::max<int64_t>((int64_t)PER_SAMPLE * rows_ * columns_, 2 * pending_);
@@ -320,12 +364,13 @@ class MeshTile {
     }
 
     // Blends the front of one sample's fragments and keeps the rest; true if the sample takes no more light.
+    template <bool PLAIN>
     bool blend(int sample, float nearest_to_come) {
         int n = count_[sample];
         float *key = arena_->key[sample], *rgba = arena_->rgba[sample][0];
         int32_t *face = arena_->face[sample];
         Place *place = arena_->place[sample];
-        if (n > ROOM) {
+        if (__builtin_expect(n > ROOM, 0)) {
             gather(sample);
             key = long_.key.data();
             rgba = long_.rgba.data();
@@ -335,27 +380,28 @@ class MeshTile {
         sort(key, face, n);
         f4 color = color_[sample];
         float through = through_[sample];
-        int done = 0;
+        const float least = options_.min_transmittance;
+        int done = 0, blended = 0;
         bool closed = false;
         for (; done < n; ++done) {
             int i = order_[done];
             if (!(key[i] > nearest_to_come)) break;
             f4 c = load4(rgba + 4 * i);
             float alpha = c[3];
-            if (!(alpha > 0)) continue;
             float weight = through * alpha;
             color += set4(weight) * c;
             through -= weight;
-            ++fragments_;
-            if (extras_.any) add_extras(sample, face[i], place[i], weight);
-            if (options_.max_layers && ++layers_[sample] >= options_.max_layers) closed = true;
-            if (closed || through < options_.min_transmittance) {
-                closed = true;
-                break;
+            blended += alpha > 0;
+            if (!PLAIN && alpha > 0) {
+                if (extras_.any) add_extras(sample, face[i], place[i], weight);
+                closed = options_.max_layers && ++layers_[sample] >= options_.max_layers;
             }
+            closed |= through < least;
+            if (closed) break;
         }
         color_[sample] = color;
         through_[sample] = through;
+        fragments_ += blended;
         if (closed) return true;
 
         // Moves what has to wait to the front, in order.
@@ -421,7 +467,7 @@ class MeshTile {
             }
             // The ray through the sample, in the world.
             const Projection &pr = scene_.projection;
-            double ray[3] = {(x0_ + sample % TILE + 0.5 - pr.cx) / pr.fx, (y0_ + sample / TILE + 0.5 - pr.cy) / pr.fy, 1};
+            double ray[3] = {(x0_ + column(sample) + 0.5 - pr.cx) / pr.fx, (y0_ + row(sample) + 0.5 - pr.cy) / pr.fy, 1};
             double along = 0, length = 0;
             for (int k = 0; k < 3; ++k) {
                 along += n[k] * (pr.m[k] * ray[0] + pr.m[4 + k] * ray[1] + pr.m[8 + k] * ray[2]);
@@ -453,8 +499,8 @@ class MeshTile {
                 float through = 0;
                 for (int j = 0; j < s; ++j)
                     for (int i = 0; i < s; ++i) {
-                        color += color_[(y + j) * TILE + x + i];
-                        through += through_[(y + j) * TILE + x + i];
+                        color += color_[number(x + i, y + j)];
+                        through += through_[number(x + i, y + j)];
                     }
                 color *= set4(share);
                 through *= share;
@@ -467,7 +513,7 @@ class MeshTile {
                         float sum = 0;
                         for (int j = 0; j < s; ++j)
                             for (int i = 0; i < s; ++i)
-                                sum += sums_[(size_t)((y + j) * TILE + x + i) * extras_.channels + channel + c];
+                                sum += sums_[(size_t)number(x + i, y + j) * extras_.channels + channel + c];
                         out[pixel * channels + c] = sum * share;
                     }
                 };

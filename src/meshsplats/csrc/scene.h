@@ -173,8 +173,7 @@ struct Scene {
         int x0, x1, y0, y1;
         if (!sample_range(lo[0], hi[0], grid.width, x0, x1) || !sample_range(lo[1], hi[1], grid.height, y0, y1))
             return false;
-        item = {(float)key,
-                (int32_t)group,
+        item = {{(float)key, group_start[group], group_start[group + 1] - group_start[group]},
                 (uint16_t)(x0 / grid.side),
                 (uint16_t)(x1 / grid.side),
                 (uint16_t)(y0 / grid.side),

@@ -43,6 +43,33 @@ inline f4 min4(f4 a, f4 b) { return a < b ? a : b; }
 inline f4 max4(f4 a, f4 b) { return a > b ? a : b; }
 #endif
 
+// Four vectors of W values, one a channel, to W groups of four channels from `out` on.
+inline void interleave4(float *out, vf r, vf g, vf b, vf a) {
+#if defined(__AVX512F__)
+    __m512 rg0 = _mm512_unpacklo_ps(r, g), rg1 = _mm512_unpackhi_ps(r, g);
+    __m512 ba0 = _mm512_unpacklo_ps(b, a), ba1 = _mm512_unpackhi_ps(b, a);
+    __m512 v[4] = {(__m512)_mm512_unpacklo_pd((__m512d)rg0, (__m512d)ba0), (__m512)_mm512_unpackhi_pd((__m512d)rg0, (__m512d)ba0),
+                   (__m512)_mm512_unpacklo_pd((__m512d)rg1, (__m512d)ba1), (__m512)_mm512_unpackhi_pd((__m512d)rg1, (__m512d)ba1)};
+    for (int i = 0; i < 4; ++i) {
+        _mm_storeu_ps(out + 4 * i, _mm512_castps512_ps128(v[i]));
+        _mm_storeu_ps(out + 4 * (i + 4), _mm512_extractf32x4_ps(v[i], 1));
+        _mm_storeu_ps(out + 4 * (i + 8), _mm512_extractf32x4_ps(v[i], 2));
+        _mm_storeu_ps(out + 4 * (i + 12), _mm512_extractf32x4_ps(v[i], 3));
+    }
+#elif defined(__AVX2__)
+    __m256 rg0 = _mm256_unpacklo_ps(r, g), rg1 = _mm256_unpackhi_ps(r, g);
+    __m256 ba0 = _mm256_unpacklo_ps(b, a), ba1 = _mm256_unpackhi_ps(b, a);
+    __m256 v[4] = {(__m256)_mm256_unpacklo_pd((__m256d)rg0, (__m256d)ba0), (__m256)_mm256_unpackhi_pd((__m256d)rg0, (__m256d)ba0),
+                   (__m256)_mm256_unpacklo_pd((__m256d)rg1, (__m256d)ba1), (__m256)_mm256_unpackhi_pd((__m256d)rg1, (__m256d)ba1)};
+    for (int i = 0; i < 4; ++i) {
+        _mm_storeu_ps(out + 4 * i, _mm256_castps256_ps128(v[i]));
+        _mm_storeu_ps(out + 4 * (i + 4), _mm256_extractf128_ps(v[i], 1));
+    }
+#else
+    for (int i = 0; i < W; ++i) store4(out + 4 * i, f4{r[i], g[i], b[i], a[i]});
+#endif
+}
+
 // at_least(a, b): bit i is set where a[i] >= b[i].
 #if defined(__AVX512F__)
 inline vf vmin(vf a, vf b) { return _mm512_min_ps(a, b); }
@@ -92,5 +119,20 @@ inline void compress(float *out, vf v, unsigned bits) {
         if (bits >> i & 1) *out++ = v[i];
 }
 #endif
+
+
+// Writes first + lane for the lanes whose bit is set, next to each other; `out` has room for W.
+inline void compress_numbers(int *out, int first, unsigned bits) {
+    typedef int vi __attribute__((vector_size(4 * W)));
+    static const vi lane = {0, 1, 2, 3,
+#if defined(__AVX2__)
+                            4, 5, 6, 7,
+#endif
+#if defined(__AVX512F__)
+                            8, 9, 10, 11, 12, 13, 14, 15,
+#endif
+    };
+    compress((float *)out, (vf)(lane + first), bits);
+}
 
 }  // namespace ms

@@ -79,7 +79,7 @@ inline void sh_color(const float *sh, int used, const double d[3], float rgb[3])
 class SplatScene {
   public:
     std::vector<FlatSplat> splats;  // visible ones
-    std::vector<Item> items;        // numbers into `splats`, nearest first
+    std::vector<Item> items;        // runs of one of `splats`, nearest first
 
     SplatScene(const MsSplats &cloud, const MsCamera &camera, const Grid &grid, int threads)
         : cloud_(cloud), camera_(camera), grid_(grid), projection_(camera, grid.samples) {
@@ -103,7 +103,7 @@ class SplatScene {
         });
         for (auto &part : parts) {
             for (size_t i = 0; i < part.items.size(); ++i) {
-                part.items[i].number = (int32_t)splats.size();
+                part.items[i].entry.first = (int32_t)splats.size();
                 splats.push_back(part.splats[i]);
                 items.push_back(part.items[i]);
             }
@@ -156,7 +156,7 @@ class SplatScene {
         length = std::sqrt(length);
         for (double &d : direction) d /= length;
         sh_color(cloud_.sh + 3 * (int64_t)cloud_.sh_stored * i, cloud_.sh_used, direction, out.rgb);
-        item = {(float)(1 / c.z), 0,
+        item = {{(float)(1 / c.z), 0, 1},
                 (uint16_t)(x0 / grid_.side), (uint16_t)(x1 / grid_.side),
                 (uint16_t)(y0 / grid_.side), (uint16_t)(y1 / grid_.side)};
         return true;
@@ -240,7 +240,7 @@ class SplatTile {
 
     int64_t fragments() const { return fragments_; }
 
-    void draw(int tile_x, int tile_y, const uint32_t *list, int64_t length) {
+    void draw(int tile_x, int tile_y, const Entry *list, int64_t length) {
         int x0 = tile_x * grid_.side, y0 = tile_y * grid_.side;
         int columns = std::min(grid_.side, grid_.width - x0), rows = std::min(grid_.side, grid_.height - y0);
         for (int y = 0; y < TILE; ++y)
@@ -250,7 +250,7 @@ class SplatTile {
             }
         for (int y = 0; y < rows; ++y) open_[y] = (1u << columns) - 1;
         for (int64_t i = 0; i < length; ++i) {
-            add(scene_.splats[scene_.items[list[i]].number], x0, y0, rows);
+            add(scene_.splats[list[i].first], x0, y0, rows);
             if ((i & 15) == 15) {
                 uint32_t any = 0;
                 for (int y = 0; y < rows; ++y) any |= open_[y];

@@ -52,90 +52,129 @@ struct Linear {
     double a, b, c;
 };
 
-// One triangle made ready for a tile; positions count from the tile's corner. `value` holds RGBA divided by depth.
-struct Triangle {
-    float ea[3], eb[3], ec[3];  // edge functions, positive inside
-    float threshold[3];         // 0 where samples on the edge belong to this triangle, else the least normal float
-    float qa, qb, qc;           // 1 / depth
-    float q_min, q_max;         // its range over the corners
-    float ka, kb, kc;           // 1 / depth by which fragments are ordered
-    float k_min, k_max;
-    float weight[3];            // b_i is proportional to E_i weight_i
-    int32_t face;
-    int32_t y0, y1, x0, x1;     // samples of the tile that may be covered
-    f4 va, vb, vc;              // RGBA / depth
-    f4 low, high;               // RGBA range over the corners
-};
+// A few triangles made ready for a tile, side by side; positions count from the tile's corner.
+// Everything a sample needs is linear in its position: the edge functions E_i, 1 / depth and RGBA / depth.
+struct Triangles {
+    static constexpr int N = 8;
 
-inline float edge_threshold(double a, double b) {
-    bool top_left = a > 0 || (a == 0 && b > 0);
-    return top_left ? 0.0f : std::numeric_limits<float>::min();
-}
+    // In: corners of projected triangles, relative to the tile.
+    alignas(64) double x[3][N], y[3][N], w[3][N];
+    const float *rgba[3][N];
+    int32_t face[N];
 
-// Fills `t` but for face, box and ordering; false if the triangle has no area on the picture.
-// `p` are the corners relative to the tile. Corners nearer than the near plane (w == 0) need `behind`: all corners
-// in camera space with x and y scaled to samples and moved to the tile, (fx X + (cx - x0) Z, fy Y + (cy - y0) Z, Z).
-inline bool set_up(Triangle &t, const Projected p[3], const Vec3 *behind, double near, const float *const rgba[3]) {
-    Linear e[3];
-    double weight[3];  // makes the e[i] comparable: E_i of the header comment is e_i weight_i
-    double scale;      // 1 / depth = scale * sum of e_i weight_i
-    double flip;
-    if (!behind) {
-        double area = (p[1].x - p[0].x) * (p[2].y - p[0].y) - (p[2].x - p[0].x) * (p[1].y - p[0].y);
-        if (!(area != 0) || !std::isfinite(area)) return false;
-        flip = area < 0 ? -1 : 1;
-        scale = 1 / std::fabs(area);
-        for (int i = 0; i < 3; ++i) weight[i] = p[i].w;
-    } else {
-        const Vec3 *v = behind;
+    // Out.
+    alignas(64) float ea[3][N], eb[3][N], ec[3][N];  // edge functions, positive inside
+    alignas(64) float threshold[3][N];   // 0 where samples on the edge belong to the triangle, else the least normal float
+    alignas(64) float weight[3][N];      // b_i is proportional to E_i weight_i
+    alignas(64) float qa[N], qb[N], qc[N];     // 1 / depth
+    alignas(64) float q_min[N], q_max[N];      // its range over the corners
+    alignas(64) float sa[3][N], sb[3][N], sc[3][N];  // b_i / depth
+    alignas(64) float low_x[N], high_x[N], low_y[N], high_y[N];
+    alignas(64) float area[N];           // 0: no area on the picture, nothing to draw
+
+    // For triangles wholly in front of the near plane; all N slots are computed, whatever they hold.
+    void set_up_in_front() {
+        alignas(64) double scale[N], flip[N];
+        for (int t = 0; t < N; ++t) {
+            double d = (x[1][t] - x[0][t]) * (y[2][t] - y[0][t]) - (x[2][t] - x[0][t]) * (y[1][t] - y[0][t]);
+            double size = std::fabs(d);
+            area[t] = size < 1e300 && size > 1e-300 ? 1.0f : 0.0f;
+            flip[t] = d < 0 ? -1.0 : 1.0;
+            scale[t] = 1 / size;
+        }
+        alignas(64) double qs[3][N];
+        for (int t = 0; t < N; ++t) qs[0][t] = qs[1][t] = qs[2][t] = 0;
+        for (int i = 0; i < 3; ++i) {
+            int j = (i + 1) % 3, k = (i + 2) % 3;
+            for (int t = 0; t < N; ++t) {
+                double a = flip[t] * (y[j][t] - y[k][t]), b = flip[t] * (x[k][t] - x[j][t]),
+                       c = flip[t] * (x[j][t] * y[k][t] - x[k][t] * y[j][t]);
+                double s = w[i][t] * scale[t];
+                ea[i][t] = (float)a;
+                eb[i][t] = (float)b;
+                ec[i][t] = (float)c;
+                weight[i][t] = (float)s;
+                sa[i][t] = (float)(a * s);
+                sb[i][t] = (float)(b * s);
+                sc[i][t] = (float)(c * s);
+                qs[0][t] += a * s;
+                qs[1][t] += b * s;
+                qs[2][t] += c * s;
+            }
+        }
+        for (int t = 0; t < N; ++t) {
+            qa[t] = (float)qs[0][t];
+            qb[t] = (float)qs[1][t];
+            qc[t] = (float)qs[2][t];
+        }
+        for (int i = 0; i < 3; ++i)
+            for (int t = 0; t < N; ++t) threshold[i][t] = edge_threshold(ea[i][t], eb[i][t]);
+        for (int t = 0; t < N; ++t) {
+            float w0 = (float)w[0][t], w1 = (float)w[1][t], w2 = (float)w[2][t];
+            float least = w0 < w1 ? w0 : w1, most = w0 > w1 ? w0 : w1;
+            q_min[t] = least < w2 ? least : w2;
+            q_max[t] = most > w2 ? most : w2;
+            bounds(x, low_x, high_x, t);
+            bounds(y, low_y, high_y, t);
+        }
+    }
+
+    // For a triangle in slot t with one or two corners nearer than the near plane (their w is 0). `v` are all corners
+    // in camera space with x and y scaled to samples, (fx X + (cx - x0) Z, fy Y + (cy - y0) Z, Z).
+    void set_up_crossing(int t, const Vec3 v[3], double near) {
         double det = v[0].x * (v[1].y * v[2].z - v[2].y * v[1].z) - v[0].y * (v[1].x * v[2].z - v[2].x * v[1].z) +
                      v[0].z * (v[1].x * v[2].y - v[2].x * v[1].y);
-        if (!(det != 0) || !std::isfinite(det)) return false;
-        flip = det < 0 ? -1 : 1;
-        scale = 1 / std::fabs(det);
+        double size = std::fabs(det), flip = det < 0 ? -1 : 1, scale = 1 / size, q[3] = {0, 0, 0};
+        area[t] = size < 1e300 && size > 1e-300 ? 1.0f : 0.0f;
         for (int i = 0; i < 3; ++i) {
-            const Projected &a = p[(i + 1) % 3], &b = p[(i + 2) % 3];
-            weight[i] = a.w > 0 && b.w > 0 ? v[(i + 1) % 3].z * v[(i + 2) % 3].z : 1;
+            int j = (i + 1) % 3, k = (i + 2) % 3;
+            double a, b, c, s = scale;
+            if (w[j][t] > 0 && w[k][t] > 0) {
+                // An edge in front: the very function that a neighbour in front computes for it.
+                a = y[j][t] - y[k][t];
+                b = x[k][t] - x[j][t];
+                c = x[j][t] * y[k][t] - x[k][t] * y[j][t];
+                s *= v[j].z * v[k].z;
+            } else {
+                a = v[j].y * v[k].z - v[k].y * v[j].z;
+                b = v[k].x * v[j].z - v[j].x * v[k].z;
+                c = v[j].x * v[k].y - v[k].x * v[j].y;
+            }
+            a *= flip;
+            b *= flip;
+            c *= flip;
+            ea[i][t] = (float)a;
+            eb[i][t] = (float)b;
+            ec[i][t] = (float)c;
+            threshold[i][t] = edge_threshold(ea[i][t], eb[i][t]);
+            weight[i][t] = (float)s;
+            sa[i][t] = (float)(a * s);
+            sb[i][t] = (float)(b * s);
+            sc[i][t] = (float)(c * s);
+            q[0] += a * s;
+            q[1] += b * s;
+            q[2] += c * s;
         }
+        qa[t] = (float)q[0];
+        qb[t] = (float)q[1];
+        qc[t] = (float)q[2];
+        // What is in front reaches from the near plane to the farthest corner.
+        q_min[t] = (float)(1 / std::max({v[0].z, v[1].z, v[2].z}));
+        q_max[t] = (float)(1 / near);
+        low_x[t] = low_y[t] = -std::numeric_limits<float>::infinity();
+        high_x[t] = high_y[t] = std::numeric_limits<float>::infinity();
     }
-    for (int i = 0; i < 3; ++i) {
-        const Projected &a = p[(i + 1) % 3], &b = p[(i + 2) % 3];
-        if (a.w > 0 && b.w > 0) {
-            e[i] = {a.y - b.y, b.x - a.x, a.x * b.y - b.x * a.y};
-        } else {
-            const Vec3 &c = behind[(i + 1) % 3], &d = behind[(i + 2) % 3];
-            e[i] = {c.y * d.z - d.y * c.z, d.x * c.z - c.x * d.z, c.x * d.y - d.x * c.y};
-        }
-        e[i] = {flip * e[i].a, flip * e[i].b, flip * e[i].c};
-        t.ea[i] = (float)e[i].a;
-        t.eb[i] = (float)e[i].b;
-        t.ec[i] = (float)e[i].c;
-        t.threshold[i] = edge_threshold(t.ea[i], t.eb[i]);
-        t.weight[i] = (float)(weight[i] * scale);
-        double s = weight[i] * scale;
-        e[i] = {e[i].a * s, e[i].b * s, e[i].c * s};
+
+  private:
+    static float edge_threshold(float a, float b) {
+        return (a > 0) | ((a == 0) & (b > 0)) ? 0.0f : std::numeric_limits<float>::min();
     }
-    t.qa = (float)(e[0].a + e[1].a + e[2].a);
-    t.qb = (float)(e[0].b + e[1].b + e[2].b);
-    t.qc = (float)(e[0].c + e[1].c + e[2].c);
-    float w[3] = {(float)p[0].w, (float)p[1].w, (float)p[2].w};
-    if (behind) {
-        // The part in front of the near plane reaches from there to the farthest corner.
-        double far_z = std::max({behind[0].z, behind[1].z, behind[2].z});
-        t.q_min = (float)(1 / far_z);
-        t.q_max = (float)(1 / near);
-    } else {
-        t.q_min = std::min({w[0], w[1], w[2]});
-        t.q_max = std::max({w[0], w[1], w[2]});
+    static void bounds(const double p[3][N], float *low, float *high, int t) {
+        float a = (float)p[0][t], b = (float)p[1][t], c = (float)p[2][t];
+        float least = a < b ? a : b, most = a > b ? a : b;
+        low[t] = least < c ? least : c;
+        high[t] = most > c ? most : c;
     }
-    f4 c0 = load4(rgba[0]), c1 = load4(rgba[1]), c2 = load4(rgba[2]);
-    auto mix = [&](double a, double b, double c) { return set4((float)a) * c0 + set4((float)b) * c1 + set4((float)c) * c2; };
-    t.va = mix(e[0].a, e[1].a, e[2].a);
-    t.vb = mix(e[0].b, e[1].b, e[2].b);
-    t.vc = mix(e[0].c, e[1].c, e[2].c);
-    t.low = min4(min4(c0, c1), c2);
-    t.high = max4(max4(c0, c1), c2);
-    return true;
-}
+};
 
 }  // namespace ms
