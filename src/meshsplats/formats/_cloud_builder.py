@@ -93,3 +93,17 @@ class CloudBuilder:
                 array.resize((self._kept, *array.shape[1:]), refcheck=False)  # shrinks in place
         means, quaternions, scales, opacities, sh = self._arrays
         return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
+
+
+def fill_smallest_three(out: np.ndarray, small: np.ndarray, largest: np.ndarray) -> None:
+    """Writes quaternions ``out`` (m, 4) from three components (m, 3) and the index (m,) of the omitted one.
+
+    Of a unit quaternion the component that is largest in magnitude is omitted and taken as positive; the
+    others follow in order.
+    """
+    rest = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", small, small)))
+    for omitted in range(4):
+        chosen = largest == omitted
+        out[chosen, omitted] = rest[chosen]
+        for i, column in enumerate([c for c in range(4) if c != omitted]):
+            out[chosen, column] = small[chosen, i]

@@ -40,10 +40,13 @@ _COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mes
 
 
 class GltfDocument:
-    """``path`` is `.glb` or, beginning with a brace, `.gltf`. Raises FileFormatError."""
+    """``path`` is `.glb` or, beginning with a brace, `.gltf`; a file that requires an extension which is
+    neither known here nor among ``also_known`` is refused. Raises FileFormatError.
+    """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, also_known: frozenset[str] = frozenset()) -> None:
         self.path = path
+        self._also_known = also_known
         self.budget = Budget(path)
         self._chunk: memoryview | None = None
         with open(path, "rb") as file:
@@ -202,7 +205,11 @@ class GltfDocument:
             raise self.error("extensionsRequired must be an array")
         if any(e in _COMPRESSED for e in required if isinstance(e, str)):
             raise self.compressed()
-        unknown = [str(e)[:60] for e in required if not isinstance(e, str) or not _known(e)]
+        unknown = [
+            str(e)[:60]
+            for e in required
+            if not isinstance(e, str) or not (_known(e) or e in self._also_known)
+        ]
         if unknown:
             raise self.error(f"needs the glTF extension {unknown[0]}, which is not supported")
 

@@ -48,7 +48,7 @@ def read_gltf(path: Path) -> SplatMesh:
 
 def _read(document: GltfDocument) -> SplatMesh:
     path = document.path
-    placed = list(_placed_meshes(document))
+    placed = list(placed_meshes(document))
     pieces, skipped, textured = [], 0, 0
     own = placed[0][0] if len(placed) == 1 else {}
     note = _our_note(own)
@@ -75,7 +75,7 @@ def _read(document: GltfDocument) -> SplatMesh:
     return _join(document, pieces, own, note)
 
 
-def _placed_meshes(document: GltfDocument) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+def placed_meshes(document: GltfDocument) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Each mesh of the scene with the (4, 4) matrix from its own to the scene's frame."""
     nodes, scenes = document.items("nodes"), document.items("scenes")
     if scenes:

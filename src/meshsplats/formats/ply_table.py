@@ -1,4 +1,4 @@
-"""Rows of one PLY element as float32 tables, in chunks that fit the processor's cache.
+"""Rows of one PLY element, as they are or as float32 tables, in chunks that fit the processor's cache.
 
 Reading goes through a small buffer and not through a memory map: the file's pages then never count as memory
 of the process, and a file that shrinks meanwhile is an error instead of a bus error.
@@ -20,17 +20,14 @@ MAX_LINE_BYTES = 1 << 18
 """The longest line of ASCII data that is read."""
 
 
-class FloatTable:
+class RowReader:
     """The rows of ``element``, whose properties must all be single values.
 
-    ``names`` are the columns of each chunk: ``wanted`` ones at least, in any order. The constructor finds
-    where the rows begin and compares the count with the size of the file; nothing is allocated before that.
-    Raises FileFormatError, naming byte, line or row.
+    The constructor finds where the rows begin and compares the count with the size of the file; nothing is
+    allocated before that. Raises FileFormatError, naming byte, line or row.
     """
 
-    def __init__(
-        self, file: BinaryIO, header: PlyHeader, element: Element, wanted: Sequence[str], where: object
-    ) -> None:
+    def __init__(self, file: BinaryIO, header: PlyHeader, element: Element, where: object) -> None:
         lists = [p.name for p in element.properties if p.is_list]
         if lists:
             raise FileFormatError(
@@ -39,10 +36,6 @@ class FloatTable:
             )
         self._file, self._header, self._element, self._where = file, header, element, where
         self._size = file.seek(0, io.SEEK_END)
-        dtypes = {p.dtype for p in element.properties}
-        self._common = dtypes.pop() if len(dtypes) == 1 else None
-        uniform = self._common is not None or header.encoding == "ascii"
-        self.names: tuple[str, ...] = element.names if uniform else tuple(wanted)
         self._check_minimum()
         if header.encoding != "ascii":
             self._offset = self._find_rows()
@@ -51,12 +44,21 @@ class FloatTable:
     def __len__(self) -> int:
         return self._element.count
 
-    def chunks(self) -> Iterator[np.ndarray]:
-        """(m, len(names)) float32 tables, all rows in order; each is valid until the next one is asked for.
+    def rows(self, start: int, count: int) -> np.ndarray:
+        """(count,) structured array of binary rows from ``start`` on, in the byte order of the file."""
+        size = self._element.minimum_row_bytes
+        buffer = bytearray(count * size)
+        self._read(start, memoryview(buffer))
+        return np.frombuffer(buffer, self._element.row_dtype, count)
 
-        Values beyond the range of float32 become infinite.
-        """
-        return self._ascii_chunks() if self._header.encoding == "ascii" else self._binary_chunks()
+    def _read(self, start: int, into: memoryview) -> None:
+        self._file.seek(self._offset + start * self._element.minimum_row_bytes)
+        done = 0
+        while done < len(into):
+            got = self._file.readinto(into[done:])  # type: ignore[attr-defined]
+            if not got:
+                raise FileFormatError(f"{self._where}: the file became shorter while it was read")
+            done += got
 
     def _check_minimum(self) -> None:
         """Refuses a count that no file of this size can hold, whatever its lists contain."""
@@ -72,10 +74,8 @@ class FloatTable:
                     f" but {max(left, 0):,} bytes are left for them (file truncated or count wrong)"
                 )
             left -= least
-            if e.count and not e.properties and e is self._element:
+            if e is self._element and e.count and not e.properties:
                 raise FileFormatError(f"{self._where}: element {e.name!r} has no properties")
-
-    # -- binary
 
     def _find_rows(self) -> int:
         """Byte at which the element's rows begin; elements with lists before it are walked through."""
@@ -116,15 +116,36 @@ class FloatTable:
                     f" have {row} bytes); its counts or properties do not fit the data"
                 )
 
+
+class FloatTable(RowReader):
+    """The rows of an element as float32, binary or ASCII.
+
+    ``names`` are the columns of each chunk: ``wanted`` ones at least, in any order.
+    """
+
+    def __init__(
+        self, file: BinaryIO, header: PlyHeader, element: Element, wanted: Sequence[str], where: object
+    ) -> None:
+        super().__init__(file, header, element, where)
+        dtypes = {p.dtype for p in element.properties}
+        self._common = dtypes.pop() if len(dtypes) == 1 else None
+        uniform = self._common is not None or header.encoding == "ascii"
+        self.names: tuple[str, ...] = element.names if uniform else tuple(wanted)
+
+    def chunks(self) -> Iterator[np.ndarray]:
+        """(m, len(names)) float32 tables, all rows in order; each is valid until the next one is asked for.
+
+        Values beyond the range of float32 become infinite.
+        """
+        return self._ascii_chunks() if self._header.encoding == "ascii" else self._binary_chunks()
+
     def _binary_chunks(self) -> Iterator[np.ndarray]:
         e, row = self._element, self._element.minimum_row_bytes
         per_chunk = max(1, CHUNK_BYTES // row)
         buffer = bytearray(min(per_chunk, e.count) * row)
-        self._file.seek(self._offset)
         for start in range(0, e.count, per_chunk):
             m = min(per_chunk, e.count - start)
-            if _read_into(self._file, memoryview(buffer)[: m * row]) < m * row:
-                raise FileFormatError(f"{self._where}: the file became shorter while it was read")
+            self._read(start, memoryview(buffer)[: m * row])
             if self._common is not None:
                 table = np.frombuffer(buffer, self._common, m * len(self.names)).reshape(m, -1)
                 with np.errstate(over="ignore"):
@@ -136,8 +157,6 @@ class FloatTable:
                     for i, name in enumerate(self.names):
                         table[:, i] = rows[name]
                 yield table
-
-    # -- ASCII
 
     def _ascii_chunks(self) -> Iterator[np.ndarray]:
         e, width = self._element, len(self.names)
@@ -193,17 +212,6 @@ class FloatTable:
             raise FileFormatError(f"{self._where}: line {batch[0][0]}: cannot read the rows from here on")
         with np.errstate(over="ignore"):
             return table.astype(np.float32)
-
-
-def _read_into(file: BinaryIO, view: memoryview) -> int:
-    """Fills ``view`` as far as the file goes; the number of bytes read."""
-    done = 0
-    while done < len(view):
-        got = file.readinto(view[done:])  # type: ignore[attr-defined]
-        if not got:
-            break
-        done += got
-    return done
 
 
 def _data_lines(file: BinaryIO, header: PlyHeader, where: object) -> Iterator[tuple[int, str]]:

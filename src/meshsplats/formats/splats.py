@@ -5,39 +5,87 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from typing import BinaryIO, Literal, get_args
+
+import numpy as np
 
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
+from meshsplats.formats.compressed_ply import is_compressed_splat, read_compressed_ply
+from meshsplats.formats.dot_splat import is_dot_splat, read_dot_splat
+from meshsplats.formats.mesh_checks import Budget
 from meshsplats.formats.ply_header import read_header
+from meshsplats.formats.sog import read_sog
+from meshsplats.formats.splat_gltf import read_splat_gltf
 from meshsplats.formats.splat_ply import read_float_ply, write_float_ply
+from meshsplats.formats.spz import is_spz, read_spz
 from meshsplats.gaussians import GaussianCloud
 
+Axes = Literal["auto", "y-down", "y-up"]
+SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "gltf"]
 
-def load_gaussians(path: str | os.PathLike[str], *, strict: bool = False) -> GaussianCloud:
-    """Splats of a file or of a model folder, after activation.
+_CONVERT = "convert it first: npx @playcanvas/splat-transform {name} {stem}.ply"
+_EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
 
-    A folder is a model of the 3D Gaussian Splatting code: the ``point_cloud/iteration_*/point_cloud.ply`` of
-    the highest iteration is read.
+
+def load_gaussians(
+    path: str | os.PathLike[str], *, strict: bool = False, axes: Axes = "auto"
+) -> GaussianCloud:
+    """Splats of a file or folder, after activation. The content decides which format it is, not the name:
+    `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json),
+    glTF and GLB with KHR_gaussian_splatting.
+
+    A folder is a model of the 3D Gaussian Splatting code, of which the
+    ``point_cloud/iteration_*/point_cloud.ply`` of the highest iteration is read, or an unpacked SOG file.
+
+    The cloud has y down and z forward, as float .ply files have it. ``axes`` says what the file has: 'auto'
+    is what its format prescribes ('y-up' for SPZ and glTF, 'y-down' for the others), so that files of one
+    model agree. A 'y-up' file is turned by half a turn, about z if it is glTF, about x otherwise.
 
     Splats with values that are not finite after activation (an infinite opacity logit is finite: 0 or 1), or
     with a zero quaternion, are left out with a DataWarning that counts them; with ``strict`` they are an
     error.
 
     Raises FileNotFoundError, or FileFormatError for a file that is broken, of another kind, or without a
-    single usable splat; the message says what is wrong and where.
+    single usable splat; the message says what is wrong and where. MissingDependencyError for SPZ 4 without
+    Zstandard.
     """
-    file_path = _splat_file(Path(path))
-    with file_path.open("rb") as file:
-        magic = file.read(8)
+    if axes not in get_args(Axes):
+        raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+    found = _splat_file(Path(path))
+    with found.open("rb") as file:
+        kind = _recognised(file, found)
         file.seek(0)
-        if not magic:
-            raise FileFormatError(f"{file_path}: the file is empty")
-        if re.match(rb"ply[ \t]*[\r\n]", magic):
-            header = read_header(file, file_path)
-            return read_float_ply(file, header, file_path, strict=strict)
-    raise FileFormatError(
-        f"{file_path}: not a splat file that is known here, it begins with {magic!r}; expected a .ply with"
-        " splats"
-    )
+        to_y_down, turn = np.eye(3), HALF_TURN_X
+        if kind == "ply":
+            cloud = read_float_ply(file, read_header(file, found), found, strict=strict)
+        elif kind == "compressed.ply":
+            cloud = read_compressed_ply(file, read_header(file, found), found, strict=strict)
+        elif kind == "splat":
+            cloud = read_dot_splat(file, found, strict=strict)
+        elif kind == "spz":
+            cloud, to_y_down = read_spz(file.read(), found, Budget(found), strict=strict)
+        elif kind == "sog":
+            cloud = read_sog(found, strict=strict)
+        else:
+            cloud, to_y_down, turn = read_splat_gltf(found, strict=strict), HALF_TURN_Z, HALF_TURN_Z
+    if axes != "auto":
+        to_y_down = turn if axes == "y-up" else np.eye(3)
+    return transformed(cloud, to_y_down)
+
+
+def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
+    """The splat format of a file or folder by its content, None for anything else, such as a mesh.
+
+    Only the beginning is looked at: the file may still be broken. Raises FileNotFoundError.
+    """
+    source = Path(path)
+    try:
+        found = _splat_file(source)
+        with found.open("rb") as file:
+            return _recognised(file, found)
+    except FileFormatError:
+        return None
 
 
 def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
@@ -59,6 +107,54 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     write_float_ply(cloud, target)
 
 
+def _recognised(file: BinaryIO, path: Path) -> SplatFormat:
+    """The format of an opened file. Raises FileFormatError, saying what it is instead if that is clear."""
+    head = file.read(4096)
+    name = path.name.lower()
+    convert = _CONVERT.format(name=path.name, stem=path.stem)
+    if not head:
+        raise FileFormatError(f"{path}: the file is empty")
+    if re.match(rb"ply[ \t]*[\r\n]", head):
+        file.seek(0)
+        header = read_header(file, path)
+        # A mesh is left to the float reader, which says what is missing.
+        return "compressed.ply" if is_compressed_splat(header) else "ply"
+    if is_spz(head):
+        return "spz"
+    if head[:4] in (b"PK\x03\x04", b"PK\x05\x06"):
+        return "sog"
+    if head[:4] == b"glTF":
+        return "gltf"
+    if re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
+        return _recognised_json(file, path, convert)
+    if name.endswith(".ksplat"):
+        raise FileFormatError(f"{path}: .ksplat files are not read here; {convert}")
+    if is_dot_splat(file) or name.endswith(".splat"):
+        return "splat"
+    if head[:2] == b"\x1f\x8b":
+        raise FileFormatError(f"{path}: a gzip file, but not SPZ; unpack it first")
+    raise FileFormatError(
+        f"{path}: not a splat file that is known here, it begins with {head[:8]!r}; expected {_EXPECTED}"
+    )
+
+
+def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
+    """What a JSON file is, by the words in it; its reader parses it."""
+    file.seek(0)
+    text = file.read(8 << 20)
+    if b'"asset"' in text and b'"lodLevels"' not in text:
+        return "gltf"
+    if b'"lodLevels"' in text:
+        raise FileFormatError(
+            f"{path}: the index of a streamed SOG scene; give the meta.json of one of its parts, or {convert}"
+        )
+    if path.suffix.lower() in (".lcc", ".lcc2") or (b'"splats"' in text and b'"totalLevel"' in text):
+        raise FileFormatError(f"{path}: .lcc scenes are not read here; {convert}")
+    if b'"means"' in text:
+        return "sog"
+    raise FileFormatError(f"{path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
+
+
 def _splat_file(path: Path) -> Path:
     """The file that ``path`` stands for: itself, or the newest one of a model folder."""
     if not path.exists():
@@ -67,6 +163,10 @@ def _splat_file(path: Path) -> Path:
         return path
     if not path.is_dir():
         raise FileFormatError(f"{path}: neither a file nor a folder")
+    if (path / "meta.json").is_file():
+        return path / "meta.json"
+    if (path / "lod-meta.json").is_file():
+        return path / "lod-meta.json"
     for folder in (path / "point_cloud", path):
         iterations = [
             (int(match[1]), found)

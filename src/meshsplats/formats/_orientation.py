@@ -1,0 +1,146 @@
+"""Splats moved, turned and scaled: what node transforms and other axes of files ask for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from meshsplats.gaussians import GaussianCloud
+
+HALF_TURN_X = np.diag([1.0, -1.0, -1.0])
+"""Turns y up into y down and back, z being turned with it."""
+HALF_TURN_Z = np.diag([-1.0, -1.0, 1.0])
+"""Turns y up into y down and back, x being turned with it."""
+
+# Spherical harmonics 1 to 15 are polynomials whose terms all change sign with the axes named here.
+_ODD = ["y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x"]
+
+
+def transformed(cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud:
+    """``cloud`` after the affine map ``matrix``, (3, 3) or (4, 4): world from the file's frame.
+
+    Concretely, a splat of covariance C and mean m gets covariance A C A^T and mean A m + t. Its colour seen
+    from direction d becomes the one that was seen from U^T d, U being the orthogonal factor of A; mirrors are
+    allowed. Raises ValueError for a matrix that is not finite or flattens space.
+    """
+    matrix = np.asarray(matrix, np.float64)
+    a, shift = matrix[:3, :3], matrix[:3, 3:].reshape(-1)
+    reverses_axes = (np.abs(a) == np.eye(3)).all()
+    moved = _mirrored(cloud, np.diag(a)) if reverses_axes else _mapped(cloud, a)
+    if shift.any():
+        moved = replace(moved, means=moved.means + shift.astype(np.float32))
+    return moved
+
+
+def _mirrored(cloud: GaussianCloud, signs: np.ndarray) -> GaussianCloud:
+    """Each axis kept or reversed: only signs change, nothing is rounded."""
+    if (signs > 0).all():
+        return cloud
+    sign = dict(zip("xyz", signs, strict=True))
+    # M R M is a rotation again, with quaternion (w, yz x, xz y, xy z); the splat's own axes may change sign
+    # freely.
+    turn = [1, sign["y"] * sign["z"], sign["x"] * sign["z"], sign["x"] * sign["y"]]
+    harmonics = np.ones((cloud.sh.shape[1], 1), np.float32)
+    for i in range(1, len(harmonics)):
+        harmonics[i] = np.prod([sign[axis] for axis in _ODD[i - 1]])
+    return replace(
+        cloud,
+        means=cloud.means * signs.astype(np.float32),
+        quaternions=cloud.quaternions * np.array(turn, np.float32),
+        sh=cloud.sh * harmonics,
+    )
+
+
+def _mapped(cloud: GaussianCloud, a: np.ndarray) -> GaussianCloud:
+    if not np.isfinite(a).all():
+        raise ValueError("the transform is not finite")
+    u, stretch, vt = np.linalg.svd(a)
+    if stretch[2] <= 1e-12 * stretch[0]:
+        raise ValueError("the transform flattens space")
+    orthogonal = u @ vt
+    proper = orthogonal * np.sign(np.linalg.det(orthogonal))  # a Gaussian does not know x from -x
+    if stretch[0] <= stretch[2] * (1 + 1e-6):
+        quaternions = _product(_quaternions(proper[None])[0], cloud.quaternions.astype(np.float64))
+        scales = cloud.scales * np.float32(stretch.mean())
+    else:
+        # A R S = U D V^T: the new axes are the columns of U, the new scales D, largest first.
+        axes, scales, _ = np.linalg.svd(a @ (cloud.rotations.astype(np.float64) * cloud.scales[:, None]))
+        axes[:, :, 2] *= np.linalg.det(axes)[:, None]
+        quaternions = _quaternions(axes)
+    sh = cloud.sh
+    if sh.shape[1] > 1:
+        sh = np.concatenate([sh[:, :1], harmonics_map(orthogonal, sh.shape[1]) @ sh[:, 1:]], axis=1)
+    means = cloud.means.astype(np.float64) @ a.T
+    return replace(cloud, means=means, quaternions=quaternions, scales=scales, sh=sh)
+
+
+def harmonics_map(orthogonal: np.ndarray, coefficients: int) -> np.ndarray:
+    """(k - 1, k - 1) float32: coefficients 1 to k - 1 of a colour function after it was turned by
+    ``orthogonal``.
+
+    Each degree spans a space that turns into itself, so the map is found exactly by comparing values in some
+    directions.
+    """
+    i = np.arange(64) + 0.5  # directions on a Fibonacci spiral
+    z, angle = 1 - i / 32, i * np.pi * (1 + 5**0.5)
+    r = np.sqrt(1 - z * z)
+    directions = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    before = harmonics(directions @ orthogonal)[:, 1:coefficients]
+    found = np.linalg.lstsq(harmonics(directions)[:, 1:coefficients], before, rcond=None)[0]
+    found[np.abs(found) < 1e-12] = 0
+    return found.astype(np.float32)
+
+
+def harmonics(directions: np.ndarray) -> np.ndarray:
+    """(m, 16) real spherical harmonics of unit ``directions`` (m, 3), in the order and with the signs of
+    3DGS.
+    """
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    pi = np.pi
+    return np.stack(
+        [
+            np.full_like(x, np.sqrt(1 / (4 * pi))),
+            -np.sqrt(3 / (4 * pi)) * y,
+            np.sqrt(3 / (4 * pi)) * z,
+            -np.sqrt(3 / (4 * pi)) * x,
+            np.sqrt(15 / (4 * pi)) * x * y,
+            -np.sqrt(15 / (4 * pi)) * y * z,
+            np.sqrt(5 / (16 * pi)) * (2 * zz - xx - yy),
+            -np.sqrt(15 / (4 * pi)) * x * z,
+            np.sqrt(15 / (16 * pi)) * (xx - yy),
+            -np.sqrt(35 / (32 * pi)) * y * (3 * xx - yy),
+            np.sqrt(105 / (4 * pi)) * x * y * z,
+            -np.sqrt(21 / (32 * pi)) * y * (4 * zz - xx - yy),
+            np.sqrt(7 / (16 * pi)) * z * (2 * zz - 3 * xx - 3 * yy),
+            -np.sqrt(21 / (32 * pi)) * x * (4 * zz - xx - yy),
+            np.sqrt(105 / (16 * pi)) * z * (xx - yy),
+            -np.sqrt(35 / (32 * pi)) * x * (xx - 3 * yy),
+        ],
+        axis=1,
+    )
+
+
+def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """(n, 4) Hamilton products of the quaternion ``p`` with each of ``q``; w, x, y, z."""
+    a, b, c, d = p
+    left = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
+    return q @ left.T
+
+
+def _quaternions(rotations: np.ndarray) -> np.ndarray:
+    """(n, 4) unit quaternions w, x, y, z of proper rotation matrices (n, 3, 3)."""
+    r = rotations
+    trace = np.trace(r, axis1=1, axis2=2)
+    # 4 q q^T, each of whose rows is a multiple of q; the one with the largest diagonal is the most exact.
+    k = np.empty((len(r), 4, 4))
+    k[:, 0, 0] = 1 + trace
+    for i in range(3):
+        j, m = (i + 1) % 3, (i + 2) % 3
+        k[:, 0, i + 1] = k[:, i + 1, 0] = r[:, m, j] - r[:, j, m]
+        k[:, i + 1, i + 1] = 1 - trace + 2 * r[:, i, i]
+        k[:, i + 1, j + 1] = k[:, j + 1, i + 1] = r[:, i, j] + r[:, j, i]
+    best = np.diagonal(k, axis1=1, axis2=2).argmax(axis=1)
+    q = k[np.arange(len(r)), best]
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
