@@ -92,7 +92,9 @@ def test_what_save_mesh_refuses(tmp_path):
     mesh = random_mesh(np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"\.npz, \.ply, \.glb"):
         save_mesh(mesh, tmp_path / "m.stl")
-    with pytest.raises(ValueError, match=r"lit applies to \.glb only, not to \.ply"):
+    with pytest.raises(ValueError, match=r"color_type applies to \.glb only, not to \.ply"):
+        save_mesh(mesh, tmp_path / "m.ply", color_type="uint16")
+    with pytest.raises(ValueError, match=r"lit applies to \.glb, \.usdc, \.usda, \.usd only, not to \.ply"):
         save_mesh(mesh, tmp_path / "m.ply", lit=True)
     with pytest.raises(ValueError, match="color_type must be one of uint16, float32, got 'uint8'"):
         save_mesh(mesh, tmp_path / "m.glb", color_type="uint8")

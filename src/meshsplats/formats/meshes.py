@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.atomic import atomic_path
 from meshsplats.formats.glb import ColorType, write_glb
+from meshsplats.formats.glb_compressed import Compression, write_compressed_glb
 from meshsplats.formats.gltf_reader import read_gltf
 from meshsplats.formats.mesh_ply import read_mesh_ply, write_mesh_ply
 from meshsplats.formats.npz import read_npz, write_npz
-from meshsplats.formats.obj import read_obj
+from meshsplats.formats.obj import read_obj, write_obj
+from meshsplats.formats.usd import write_usd
 from meshsplats.mesh import SplatMesh
 
-_WRITERS = {".npz": write_npz, ".ply": write_mesh_ply, ".glb": write_glb}
+_USD = (".usdc", ".usda", ".usd")
+_WRITERS: dict[str, Callable[..., None]] = {
+    ".npz": write_npz,
+    ".ply": write_mesh_ply,
+    ".glb": write_glb,
+    **dict.fromkeys(_USD, write_usd),
+    ".obj": write_obj,
+}
+_OPTION_SUFFIXES = {"lit": (".glb", *_USD), "color_type": (".glb",), "compression": (".glb",)}
 
 MESH_SUFFIXES = tuple(_WRITERS)
 """Suffixes that ``save_mesh`` knows."""
@@ -44,6 +55,10 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
         return read_mesh_ply(source)
     if head[:4] == b"glTF" or re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
         return read_gltf(source)
+    if head[:8] == b"PXR-USDC" or head[:5] == b"#usda":
+        raise FileFormatError(
+            f"{source}: USD files are written but not read here; load the .glb, .ply or .npz"
+        )
     if b"\0" not in head and (
         source.suffix.lower() == ".obj" or re.search(rb"(^|\n)v[ \t]+[-+.\d]", head) is not None
     ):
@@ -60,18 +75,29 @@ def save_mesh(
     *,
     lit: bool | None = None,
     color_type: ColorType | None = None,
+    compression: Compression | None = None,
 ) -> None:
-    """Writes ``mesh`` in the format that the suffix of ``path`` names, whole or not at all; an older
-    file is replaced.
+    """Writes ``mesh`` in the format that the suffix of ``path`` names, whole or not at all.
 
-    `.npz` and `.ply` keep everything exactly. `.glb` keeps colours as linear values of 16 bits (within
-    1/2000 as display values), everything else exactly; it alone takes options: ``lit`` (default False) for
-    a material that scene lights shade instead of one that shows the colours as they are, ``color_type``
-    (default 'uint16', or 'float32') for how colours are stored.
+    - `.npz`, `.ply` keep everything exactly.
+    - `.glb` keeps colours as linear values of 16 bits (within 1/2000 as display values), the rest exactly.
+    - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat numbers and attributes become
+      primvars. Needs the extra ``usd``. Not read by ``load_mesh``.
+    - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
+
+    Options, each for the formats named; given for another one they are a ValueError:
+
+    - ``lit`` (`.glb`, USD; default False): a material that scene lights shade instead of one that shows the
+      colours as they are.
+    - ``color_type`` (`.glb`; default 'uint16'): 'float32' stores colours exactly, but larger.
+    - ``compression`` (`.glb`): 'meshopt' makes files about a fifth as large, with the external program
+      gltfpack. Each coordinate is moved by at most 1/131070 of the longest side of the mesh's box; triangles
+      change their order a little; splat numbers and attributes are left out. Such files are for viewers;
+      ``load_mesh`` does not read them.
 
     Raises ValueError for an unknown suffix, an option that the format does not have, or a mesh that the
-    format cannot hold, and OSError for a place that cannot be written, all before an older file is
-    touched.
+    format cannot hold, MissingDependencyError where a package or program is missing, and OSError for a place
+    that cannot be written, all before an older file at ``path`` is touched; if all goes well, it is replaced.
     """
     target = Path(path)
     suffix = target.suffix.lower()
@@ -79,9 +105,13 @@ def save_mesh(
     if writer is None:
         known = ", ".join(_WRITERS)
         raise ValueError(f"{target.name!r} does not name a mesh format; choose a name that ends in {known}")
-    given = {"lit": lit, "color_type": color_type}
+    given = {"lit": lit, "color_type": color_type, "compression": compression}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if options and suffix != ".glb":
-        raise ValueError(f"the option {next(iter(options))} applies to .glb only, not to {suffix}")
+    for name in options:
+        if suffix not in _OPTION_SUFFIXES[name]:
+            suffixes = ", ".join(_OPTION_SUFFIXES[name])
+            raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
+    if "compression" in options:
+        writer = write_compressed_glb
     with atomic_path(target) as temporary:
         writer(mesh, temporary, **options)

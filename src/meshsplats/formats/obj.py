@@ -3,31 +3,80 @@ them."""
 
 from __future__ import annotations
 
+import warnings
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from meshsplats.errors import FileFormatError
+from meshsplats.colors import linear_to_srgb
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.mesh_checks import checked_mesh, straight_colors
 from meshsplats.formats.ply_faces import cut_polygons
 from meshsplats.mesh import SplatMesh
 
+_UP_COMMENT = "# meshsplats up"
+_ROWS = 1 << 14
+
+
+def write_obj(mesh: SplatMesh, path: Path) -> None:
+    """Writes positions, display colours behind them and triangles as text; nine digits keep float32
+    exactly.
+
+    The format has no opacity: a mesh that is not opaque is written with a DataWarning that counts its
+    vertices. Positions stay in the mesh's own frame; the up direction stands in a comment, which
+    ``load_mesh`` reads and other programs ignore.
+    """
+    lost = [n for n in ("face_splat", "depth_group") if getattr(mesh, n) is not None] + list(mesh.attributes)
+    translucent = int((mesh.colors[:, 3] < 1).sum())
+    if translucent:
+        more = f"; also left out: {', '.join(n[:40] for n in lost[:8])}" if lost else ""
+        warnings.warn(
+            f"{path.suffix} files have no opacity: {translucent:,} of {len(mesh.vertices):,} vertices are"
+            f" translucent and will look solid{more}. Save as .glb, .ply or .usdc to keep it",
+            DataWarning,
+            stacklevel=3,
+        )
+    rgb = linear_to_srgb(mesh.colors[:, :3]) if mesh.blending == "linear" else mesh.colors[:, :3]
+    up = " ".join(repr(float(u)) for u in mesh.up)
+    corner = "%d" if mesh.normals is None else "%d//%d"
+    with open(path, "wb") as file:
+        file.write(b"# x y z, then red green blue as display values\n")
+        file.write(f"{_UP_COMMENT} {up}\n".encode())
+        _write_rows(file, "v %.9g %.9g %.9g %.9g %.9g %.9g\n", mesh.vertices, rgb)
+        if mesh.normals is not None:
+            _write_rows(file, "vn %.9g %.9g %.9g\n", mesh.normals)
+        columns = [mesh.faces[:, k, None] for k in range(3) for _ in range(corner.count("%"))]
+        _write_rows(file, f"f {corner} {corner} {corner}\n", *columns, plus=1)
+
+
+def _write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: int = 0) -> None:
+    """Writes the (n, c) arrays ``columns`` side by side, each row by the pattern ``line``, ``plus`` added."""
+    for start in range(0, len(columns[0]), _ROWS):
+        rows = np.concatenate([c[start : start + _ROWS] for c in columns], axis=1)
+        if plus:
+            rows = rows + plus
+        file.write((line * len(rows) % tuple(rows.ravel().tolist())).encode())
+
 
 def read_obj(path: Path) -> SplatMesh:
-    """The polygons of all objects and groups as one opaque mesh, cut into triangles; up is +y, the
-    custom of these files.
+    """The polygons of all objects and groups as one opaque mesh, cut into triangles.
 
-    Colours are taken from lines ``v x y z r g b``, display values in [0, 1], if all vertices have them;
-    else the mesh is grey, with a DataWarning. Texture coordinates, normals and materials are left out.
-    Raises FileFormatError naming the line.
+    Up is +y, the custom of these files, unless a comment of ours says otherwise. Colours are taken from
+    lines ``v x y z r g b``, display values in [0, 1], if all vertices have them; else the mesh is grey,
+    with a DataWarning. Texture coordinates, normals and materials are left out. Raises FileFormatError
+    naming the line.
     """
+    up = np.array([0.0, 1.0, 0.0])
     positions, colors, lengths, corners = array("d"), array("d"), array("q"), array("q")
     with open(path, "rb") as file:
         for number, words in _statements(file.read()):
             try:
-                if words[0] == b"v":
+                if words[:3] == _UP_COMMENT.encode().split():
+                    up = np.array([float(u) for u in words[3:6]])
+                elif words[0] == b"v":
                     x, y, z = map(float, words[1:4])
                     positions.extend((x, y, z))
                     if len(words) >= 7:
@@ -51,7 +100,7 @@ def read_obj(path: Path) -> SplatMesh:
         colors=straight_colors(
             stored if len(stored) == len(vertices) else np.empty((len(vertices), 0)), path
         ),
-        up=(0, 1, 0),
+        up=up,
     )
 
 

@@ -1,0 +1,229 @@
+"""Formats that are written for other programs only: USD, .obj, compressed .glb."""
+
+import builtins
+import os
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from _meshes import random_mesh
+
+from meshsplats import DataWarning, FileFormatError, MissingDependencyError, SplatMesh, load_mesh, save_mesh
+from meshsplats.colors import srgb_to_linear
+
+MESH = random_mesh(np.random.default_rng(0), 20, 30)
+
+
+# -- USD
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usd"])
+@pytest.mark.parametrize("lit", [False, True])
+def test_usd(tmp_path, suffix, lit):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdShade
+
+    mesh = replace(MESH, up=(0, 0, 1))
+    path = tmp_path / f"m{suffix}"
+    save_mesh(mesh, path, lit=lit)
+    assert path.read_bytes().startswith(b"#usda" if suffix == ".usda" else b"PXR-USDC")
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    shape = UsdGeom.Mesh(stage.GetDefaultPrim().GetChild("Mesh"))
+    np.testing.assert_array_equal(np.array(shape.GetPointsAttr().Get()), mesh.vertices)
+    np.testing.assert_array_equal(np.array(shape.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3), mesh.faces)
+    assert set(shape.GetFaceVertexCountsAttr().Get()) == {3}
+    assert shape.GetDoubleSidedAttr().Get()
+    assert shape.GetSubdivisionSchemeAttr().Get() == "none"
+    np.testing.assert_array_equal(
+        np.array(shape.GetExtentAttr().Get()), [mesh.vertices.min(0), mesh.vertices.max(0)]
+    )
+    turned = shape.ComputeLocalToWorldTransform(Usd.TimeCode.Default()).Transform((0, 0, 1))
+    np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-7)
+    color, opacity = shape.GetDisplayColorPrimvar(), shape.GetDisplayOpacityPrimvar()
+    assert color.GetInterpolation() == opacity.GetInterpolation() == "vertex"
+    np.testing.assert_allclose(np.array(color.Get()), srgb_to_linear(mesh.colors[:, :3]), atol=1e-7)
+    np.testing.assert_array_equal(np.array(opacity.Get()), mesh.colors[:, 3])
+    np.testing.assert_array_equal(np.array(shape.GetNormalsAttr().Get()), mesh.normals)
+    primvars = UsdGeom.PrimvarsAPI(shape)
+    np.testing.assert_array_equal(np.array(primvars.GetPrimvar("face_splat").Get()), mesh.face_splat)
+    assert primvars.GetPrimvar("face_splat").GetInterpolation() == "uniform"
+    wide = primvars.GetPrimvar("wide")
+    assert wide.GetElementSize() == 7
+    np.testing.assert_array_equal(np.array(wide.Get()).reshape(-1, 7), mesh.attributes["wide"])
+    material, _ = UsdShade.MaterialBindingAPI(shape).ComputeBoundMaterial()
+    surface = material.ComputeSurfaceSource()[0]
+    assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
+    for name, primvar in (
+        ("diffuseColor" if lit else "emissiveColor", "displayColor"),
+        ("opacity", "displayOpacity"),
+    ):
+        source = surface.GetInput(name).GetConnectedSource()[0]
+        reader = UsdShade.Shader(source.GetPrim())
+        assert reader.GetInput("varname").Get() == primvar
+    custom = shape.GetPrim().GetCustomDataByKey("meshsplats")
+    assert custom["blending"] == "display"
+
+
+def test_usd_passes_the_validators_of_usd(tmp_path):
+    pytest.importorskip("pxr")
+    validation = pytest.importorskip("pxr.UsdValidation")
+    from pxr import Usd
+
+    save_mesh(MESH, tmp_path / "m.usda")
+    context = validation.ValidationContext(validation.ValidationRegistry().GetOrLoadAllValidators())
+    errors = context.Validate(Usd.Stage.Open(str(tmp_path / "m.usda")))
+    assert [e.GetMessage() for e in errors] == []
+
+
+def test_usd_of_a_lit_mesh_without_normals_has_some(tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    save_mesh(replace(MESH, normals=None), tmp_path / "m.usdc", lit=True)
+    stage = Usd.Stage.Open(str(tmp_path / "m.usdc"))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/Splats/Mesh"))
+    lengths = np.linalg.norm(np.array(shape.GetNormalsAttr().Get()), axis=1)
+    np.testing.assert_allclose(lengths, 1, atol=1e-6)
+    save_mesh(replace(MESH, normals=None), tmp_path / "n.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "n.usdc"))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/Splats/Mesh"))
+    assert shape.GetNormalsAttr().Get() is None
+
+
+def test_without_usd_core_the_error_names_the_extra(tmp_path, monkeypatch):
+    def no_pxr(name, *args, **kwargs):
+        if name.startswith("pxr"):
+            raise ImportError(name)
+        return importer(name, *args, **kwargs)
+
+    importer = builtins.__import__
+    monkeypatch.setattr(builtins, "__import__", no_pxr)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[usd\]'"):
+        save_mesh(MESH, tmp_path / "m.usdc")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("head", [b"PXR-USDC\0\0", b"#usda 1.0\n"])
+def test_usd_is_not_read(tmp_path, head):
+    (tmp_path / "m.usd").write_bytes(head)
+    with pytest.raises(FileFormatError, match="USD files are written but not read"):
+        load_mesh(tmp_path / "m.usd")
+
+
+# -- .obj
+
+
+def test_obj_keeps_positions_colours_and_up(tmp_path):
+    with pytest.warns(DataWarning, match=r"no opacity: 20 of 20 .*left out: face_splat, depth_group, flat"):
+        save_mesh(MESH, tmp_path / "m.obj")
+    got = load_mesh(tmp_path / "m.obj")
+    np.testing.assert_array_equal(got.vertices, MESH.vertices)
+    np.testing.assert_array_equal(got.faces, MESH.faces)
+    np.testing.assert_array_equal(got.colors[:, :3], MESH.colors[:, :3])
+    assert (got.colors[:, 3] == 1).all()
+    np.testing.assert_allclose(got.up, MESH.up, atol=1e-6)
+
+
+def test_obj_by_hand(tmp_path):
+    mesh = SplatMesh(
+        [[0, 0, 0.1], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [[1, 0, 0.25, 1]] * 3, normals=[[0, 0, 1]] * 3
+    )
+    save_mesh(mesh, tmp_path / "m.obj")  # opaque: no warning
+    lines = (tmp_path / "m.obj").read_text().splitlines()
+    assert [x for x in lines if not x.startswith("#")] == [
+        "v 0 0 0.100000001 1 0 0.25",
+        "v 1 0 0 1 0 0.25",
+        "v 0 1 0 1 0 0.25",
+        *["vn 0 0 1"] * 3,
+        "f 1//1 2//2 3//3",
+    ]
+
+
+def test_obj_of_a_mesh_for_linear_blending_has_display_colours(tmp_path):
+    mesh = SplatMesh(np.eye(3), [[0, 1, 2]], [[0.2158605, 0, 1, 1]] * 3, blending="linear")
+    save_mesh(mesh, tmp_path / "m.obj")
+    np.testing.assert_allclose(load_mesh(tmp_path / "m.obj").colors[0], [128 / 255, 0, 1, 1], atol=1e-6)
+
+
+def test_trimesh_reads_our_obj(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    mesh = replace(MESH, normals=None, colors=np.hstack([MESH.colors[:, :3], np.ones((20, 1))]))
+    save_mesh(mesh, tmp_path / "m.obj")
+    got = trimesh.load(tmp_path / "m.obj", process=False, maintain_order=True)
+    np.testing.assert_array_equal(got.vertices.astype(np.float32), mesh.vertices)
+    np.testing.assert_array_equal(got.faces, mesh.faces)
+    np.testing.assert_allclose(got.visual.vertex_colors / 255, mesh.colors, atol=1 / 255)
+
+
+# -- compressed .glb
+
+
+def gltfpack():
+    """The program, or a reason to skip."""
+    place = os.environ.get("MESHSPLATS_GLTFPACK", "gltfpack")
+    if shutil.which(place) is None:
+        pytest.skip("gltfpack is not installed (npm install -g gltfpack, or set MESHSPLATS_GLTFPACK)")
+    return place
+
+
+def test_compressed_glb(tmp_path):
+    """Unpacked by another program, every triangle is back within the stated error."""
+    tool = Path(gltfpack()).with_name("gltf-transform")
+    if not tool.exists():
+        pytest.skip("gltf-transform, which unpacks, is not beside gltfpack (npm install @gltf-transform/cli)")
+    rng = np.random.default_rng(1)
+    corners = rng.random((400, 1, 3)) * [10, 5, 1] + rng.normal(size=(400, 3, 3)) * 0.05
+    mesh = SplatMesh(
+        corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3), rng.random((1200, 4)), np.arange(400)
+    )
+    save_mesh(mesh, tmp_path / "plain.glb")
+    save_mesh(mesh, tmp_path / "m.glb", compression="meshopt")
+    assert (tmp_path / "m.glb").stat().st_size < (tmp_path / "plain.glb").stat().st_size
+    with pytest.raises(FileFormatError, match="gltf-transform"):
+        load_mesh(tmp_path / "m.glb")
+    subprocess.run(
+        [tool, "copy", tmp_path / "m.glb", tmp_path / "back.glb"], check=True, capture_output=True, timeout=60
+    )
+    back = load_mesh(tmp_path / "back.glb")
+
+    def in_order(vertices, m):
+        """Corners with colours, triangles in the order of their centres along x."""
+        c = np.concatenate([vertices, m.colors], axis=1)[m.faces]
+        rows = np.argsort(c[:, :, 0].mean(axis=1))
+        # The corners of a triangle may have been turned round.
+        first = c[rows, :, 0].argmin(axis=1)
+        return np.stack([np.roll(t, -k, axis=0) for t, k in zip(c[rows], first, strict=True)])
+
+    got, expected = in_order(back.vertices, back), in_order(mesh.vertices * [1, -1, -1], mesh)
+    longest = np.ptp(mesh.vertices, axis=0).max()
+    assert np.abs(got[:, :, :3] - expected[:, :, :3]).max() <= longest / 131070 * 1.05
+    assert np.abs(got[:, :, 3:] - expected[:, :, 3:]).max() < 1 / 5000
+
+
+def test_what_compression_refuses(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="compression must be one of meshopt, got 'zip'"):
+        save_mesh(MESH, tmp_path / "m.glb", compression="zip")
+    with pytest.raises(ValueError, match="compressed colours are of type 'uint16'"):
+        save_mesh(MESH, tmp_path / "m.glb", compression="meshopt", color_type="float32")
+    with pytest.raises(ValueError, match=r"compression applies to \.glb only"):
+        save_mesh(MESH, tmp_path / "m.ply", compression="meshopt")
+    monkeypatch.setenv("MESHSPLATS_GLTFPACK", str(tmp_path / "absent"))
+    with pytest.raises(MissingDependencyError, match="npm install -g gltfpack"):
+        save_mesh(MESH, tmp_path / "m.glb", compression="meshopt")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell script stands in for the program")
+def test_a_failing_gltfpack_leaves_nothing(tmp_path, monkeypatch):
+    fake = tmp_path / "gltfpack"
+    fake.write_text("#!/bin/sh\necho out of luck >&2\nexit 3\n")
+    fake.chmod(0o755)
+    monkeypatch.setenv("MESHSPLATS_GLTFPACK", str(fake))
+    with pytest.raises(RuntimeError, match="status 3: out of luck"):
+        save_mesh(MESH, tmp_path / "m.glb", compression="meshopt")
+    assert os.listdir(tmp_path) == ["gltfpack"]
