@@ -10,14 +10,13 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(wildcard src/meshsplats/csrc/*)
 
-.PHONY: help demo test lint format bench clean
+.PHONY: help demo test lint format clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo    splats to mesh, GLB, pictures and a comparison, in $(DEMO)/'
 	@echo 'make test    the tests'
 	@echo 'make lint    ruff and mypy (make format tidies the source)'
-	@echo 'make bench   the measurements behind benchmarks/RESULTS.md'
 	@echo 'make clean   removes everything that these made'
 
 $(BIN)/python:
@@ -40,7 +39,7 @@ $(VENV)/installed-dev: $(BUILD_INPUTS) | $(BIN)/python
 demo: $(VENV)/installed
 	$(BIN)/python -m meshsplats.demo_scene $(DEMO)/scene.ply
 	$(BIN)/meshsplats convert $(DEMO)/scene.ply -o $(DEMO)/scene.glb --force
-	$(BIN)/meshsplats render $(DEMO)/scene.glb -o $(DEMO)/turntable --orbit 24 --force
+	$(BIN)/meshsplats render $(DEMO)/scene.glb -o $(DEMO)/turntable --orbit 24 --width 480 --force
 	$(BIN)/meshsplats compare $(DEMO)/scene.ply $(DEMO)/scene.glb -o $(DEMO)/compare --force
 	@echo
 	@echo 'Look in $(DEMO)/: scene.glb opens in any glTF viewer, turntable/ shows it turning,'
