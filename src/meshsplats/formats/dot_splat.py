@@ -35,13 +35,8 @@ def is_dot_splat(file: BinaryIO) -> bool:
 
 
 def read_dot_splat(file: BinaryIO, where: object, *, strict: bool) -> GaussianCloud:
-    """The splats of an opened `.splat` file; errors as ``load_gaussians``."""
-    size = file.seek(0, io.SEEK_END)
-    if size % _RECORD.itemsize:
-        raise FileFormatError(
-            f"{where}: {size:,} bytes are no whole number of records of {_RECORD.itemsize} bytes (truncated?)"
-        )
-    count = size // _RECORD.itemsize
+    """The splats of an opened file for which ``is_dot_splat`` holds; errors as ``load_gaussians``."""
+    count = file.seek(0, io.SEEK_END) // _RECORD.itemsize
     builder = CloudBuilder(count, 1, where)
     file.seek(0)
     for start in range(0, count, _AT_ONCE):

@@ -37,13 +37,15 @@ def read_sog(path: Path, *, strict: bool) -> GaussianCloud:
     ``load_gaussians``.
     """
     budget = Budget(path)
-    if zipfile.is_zipfile(path):
-        try:
-            with zipfile.ZipFile(path) as archive:
-                return _Reader(_Archive(archive, path), path, budget).read(strict=strict)
-        except zipfile.BadZipFile as error:
-            raise FileFormatError(f"{path}: a broken zip archive: {error}") from None
-    return _Reader(_Folder(path.parent, path, budget), path, budget).read(strict=strict)
+    with open(path, "rb") as file:
+        zipped = file.read(2) == b"PK"
+    if not zipped:
+        return _Reader(_Folder(path.parent, path, budget), path, budget).read(strict=strict)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _Reader(_Archive(archive, path), path, budget).read(strict=strict)
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
 
 
 class _Folder:
@@ -78,7 +80,7 @@ class _Archive:
             )
         self._meta = min(metas, key=lambda n: (n.count("/"), n))
         # Pictures are compressed already: more than this is a decompression bomb.
-        self._limit = (64 << 20) + 4 * os.stat(path).st_size
+        self._limit = (16 << 20) + 4 * os.stat(path).st_size
 
     def read_meta(self) -> bytes:
         return self._bytes(self._meta, _MAX_META_BYTES)

@@ -129,8 +129,13 @@ def _recognised(file: BinaryIO, path: Path) -> SplatFormat:
         return _recognised_json(file, path, convert)
     if name.endswith(".ksplat"):
         raise FileFormatError(f"{path}: .ksplat files are not read here; {convert}")
-    if is_dot_splat(file) or name.endswith(".splat"):
+    if is_dot_splat(file):
         return "splat"
+    if name.endswith(".splat"):
+        raise FileFormatError(
+            f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
+            f" (it has {path.stat().st_size:,} bytes)"
+        )
     if head[:2] == b"\x1f\x8b":
         raise FileFormatError(f"{path}: a gzip file, but not SPZ; unpack it first")
     raise FileFormatError(

@@ -1,0 +1,353 @@
+"""Splat files of every compressed format, encoded splat by splat as their specifications say."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+from PIL import Image
+
+C0 = 0.28209479177387814
+
+
+def unit_quaternion(values, i):
+    q = np.array([float(values[f"rot_{j}"][i]) for j in range(4)])
+    return q / np.linalg.norm(q)
+
+
+def rest(values, i):
+    """(k - 1, 3) harmonics of splat i beyond the first."""
+    n = sum(key.startswith("f_rest_") for key in values) // 3
+    return np.array([[float(values[f"f_rest_{c * n + j}"][i]) for c in range(3)] for j in range(n)])
+
+
+def byte(x):
+    return int(np.clip(round(x), 0, 255))
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-float(x)))
+
+
+def smallest_three(q):
+    """Index of the largest component and the other three, the largest made positive."""
+    largest = int(np.argmax(np.abs(q)))
+    q = q if q[largest] >= 0 else -q
+    return largest, [q[j] for j in range(4) if j != largest]
+
+
+# -- PlayCanvas compressed .ply
+
+
+def compressed_ply(values, order="little", colors=True, comments=()):
+    n = len(values["x"])
+    chunks, vertices, harmonics = b"", b"", b""
+    fmt = "<" if order == "little" else ">"
+    groups = [("x", "y", "z"), ("scale_0", "scale_1", "scale_2")]
+    rgb = [np.array([float(values[f"f_dc_{c}"][i]) * C0 + 0.5 for i in range(n)]) for c in range(3)]
+    for first in range(0, n, 256):
+        part = range(first, min(first + 256, n))
+        limits = []
+        for group in groups:
+            columns = [values[key][part.start : part.stop].astype(float) for key in group]
+            limits += [(c.min(), c.max()) for c in columns]
+        limits += [(c[part.start : part.stop].min(), c[part.start : part.stop].max()) for c in rgb]
+        floats = []
+        for g in range(3 if colors else 2):
+            floats += [low for low, _ in limits[3 * g : 3 * g + 3]] + [
+                high for _, high in limits[3 * g : 3 * g + 3]
+            ]
+        chunks += struct.pack(f"{fmt}{len(floats)}f", *floats)
+
+        def packed(x, limit, bits):
+            span = limit[1] - limit[0]
+            return round((x - limit[0]) / span * ((1 << bits) - 1)) if span else 0
+
+        for i in part:
+            words = []
+            for g, group in enumerate(groups):
+                a, b, c = (
+                    packed(float(values[group[k]][i]), limits[3 * g + k], (11, 10, 11)[k]) for k in range(3)
+                )
+                words.append(a << 21 | b << 11 | c)
+            largest, others = smallest_three(unit_quaternion(values, i))
+            turn = largest
+            for x in others:
+                turn = turn << 10 | round((x / np.sqrt(2) + 0.5) * 1023)
+            words.insert(1, turn)
+            color = 0
+            for c in range(3):
+                color = color << 8 | (
+                    packed(rgb[c][i], limits[6 + c], 8) if colors else byte(255 * rgb[c][i])
+                )
+            words.append(color << 8 | byte(255 * sigmoid(values["opacity"][i])))
+            vertices += struct.pack(f"{fmt}4I", *words)
+            for x in rest(values, i).T.ravel():
+                harmonics += bytes([int(np.clip((x / 8 + 0.5) * 256, 0, 255))])
+    lines = ["ply", f"format binary_{order}_endian 1.0", *[f"comment {c}" for c in comments]]
+    lines.append(f"element chunk {-(-n // 256)}")
+    for group in ("", "scale_"):
+        lines += [f"property float {end}_{group}{axis}" for end in ("min", "max") for axis in "xyz"]
+    if colors:
+        lines += [f"property float {end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+    lines.append(f"element vertex {n}")
+    lines += [f"property uint packed_{what}" for what in ("position", "rotation", "scale", "color")]
+    if harmonics:
+        lines.append(f"element sh {n}")
+        lines += [f"property uchar f_rest_{i}" for i in range(len(harmonics) // n)]
+    return "\n".join([*lines, "end_header", ""]).encode() + chunks + vertices + harmonics
+
+
+# -- .splat
+
+
+def dot_splat(values):
+    data = b""
+    for i in range(len(values["x"])):
+        data += struct.pack("<3f", *(values[key][i] for key in "xyz"))
+        data += struct.pack("<3f", *(np.exp(float(values[f"scale_{k}"][i])) for k in range(3)))
+        data += bytes(byte(255 * (0.5 + C0 * float(values[f"f_dc_{c}"][i]))) for c in range(3))
+        data += bytes([byte(255 * sigmoid(values["opacity"][i]))])
+        data += bytes(int(np.clip(128 + 128 * x, 0, 255)) for x in unit_quaternion(values, i))
+    return data
+
+
+# -- SPZ
+
+
+def spz_attributes(values, version, bits=12):
+    """The six attributes in file order, in the axes of ``values``."""
+    n = len(values["x"])
+    out = {key: b"" for key in ("positions", "alphas", "colors", "scales", "rotations", "sh")}
+    for i in range(n):
+        for key in "xyz":
+            x = float(values[key][i])
+            if version == 1:
+                out["positions"] += struct.pack("<e", x)
+            else:
+                out["positions"] += round(x * (1 << bits)).to_bytes(3, "little", signed=True)
+        out["alphas"] += bytes([byte(255 * sigmoid(values["opacity"][i]))])
+        out["colors"] += bytes(byte(255 * (0.5 + 0.15 * float(values[f"f_dc_{c}"][i]))) for c in range(3))
+        out["scales"] += bytes(byte(16 * (float(values[f"scale_{k}"][i]) + 10)) for k in range(3))
+        w, x, y, z = unit_quaternion(values, i)
+        if version < 3:
+            sign = -1 if w < 0 else 1
+            out["rotations"] += bytes(byte(127.5 + 127.5 * sign * c) for c in (x, y, z))
+        else:
+            largest, others = smallest_three(np.array([x, y, z, w]))
+            word = largest
+            for c in others:
+                word = word << 10 | (c < 0) << 9 | round(abs(c) * np.sqrt(2) * 511)
+            out["rotations"] += struct.pack("<I", word)
+        out["sh"] += bytes(byte(128 + 128 * c) for c in rest(values, i).ravel())
+    return out
+
+
+def spz_header(values, version, bits=12, flags=0, last=0):
+    degree = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}[sum(key.startswith("f_rest_") for key in values)]
+    return struct.pack("<4sIIBBBB", b"NGSP", version, len(values["x"]), degree, bits, flags, last)
+
+
+def spz(values, version=3, bits=12, flags=0, extensions=b""):
+    """Versions 1 to 3."""
+    body = b"".join(spz_attributes(values, version, bits).values())
+    return gzip.compress(spz_header(values, version, bits, flags) + body + extensions, mtime=0)
+
+
+def spz4(values, compress, bits=12, flags=0, extensions=b""):
+    """Version 4; ``compress`` makes Zstandard frames."""
+    streams = [s for s in spz_attributes(values, 4, bits).values() if s]
+    packed = [compress(s) for s in streams]
+    head = spz_header(values, 4, bits, flags, len(streams))
+    head += struct.pack("<I12x", 32 + len(extensions)) + extensions
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    return head + table + b"".join(packed)
+
+
+# -- SOG
+
+
+def webp(pixels):
+    """A lossless picture of pixels (m, 4), 4 pixels wide, padded with zeros."""
+    height = -(-len(pixels) // 4)
+    padded = np.zeros((height * 4, 4), np.uint8)
+    padded[: len(pixels)] = pixels
+    return picture(padded.reshape(height, 4, 4))
+
+
+def picture(pixels, kind="WEBP"):
+    out = io.BytesIO()
+    options = {"lossless": True, "exact": True} if kind == "WEBP" else {}
+    Image.fromarray(pixels).save(out, kind, **options)
+    return out.getvalue()
+
+
+def nearest(codebook, x):
+    return int(np.argmin(np.abs(codebook - x)))
+
+
+def sog(values, version=2, extra=None):
+    """Files of an unpacked SOG folder."""
+    n = len(values["x"])
+    degree_rest = sum(key.startswith("f_rest_") for key in values) // 3
+    meta = {"version": 2, "count": n} if version == 2 else {}
+    files = {}
+    logs = np.array(
+        [[np.sign(x) * np.log1p(abs(x)) for x in (float(values[k][i]) for k in "xyz")] for i in range(n)]
+    )
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    steps = np.round((logs - low) / (high - low) * 65535).astype(int)
+    alpha = np.full((n, 1), 255)
+    files["means_l.webp"] = webp(np.hstack([steps & 255, alpha]))
+    files["means_u.webp"] = webp(np.hstack([steps >> 8, alpha]))
+    meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]}
+    if version == 1:
+        meta["means"]["shape"] = [n, 3]
+    turns = []
+    for i in range(n):
+        largest, others = smallest_three(unit_quaternion(values, i))
+        turns.append([*(byte(127.5 + 127.5 * np.sqrt(2) * x) for x in others), 252 + largest])
+    files["quats.webp"] = webp(np.array(turns))
+    meta["quats"] = {"files": ["quats.webp"]}
+    scales = np.array([[float(values[f"scale_{k}"][i]) for k in range(3)] for i in range(n)])
+    colors = np.array([[float(values[f"f_dc_{c}"][i]) for c in range(3)] for i in range(n)])
+    logits = np.array([[float(x)] for x in values["opacity"]])
+    if version == 2:
+        book = np.linspace(scales.min(), scales.max(), 256)
+        files["scales.webp"] = webp([[*(nearest(book, x) for x in row), 255] for row in scales])
+        meta["scales"] = {"codebook": book.tolist(), "files": ["scales.webp"]}
+        book = np.linspace(colors.min(), colors.max(), 256)
+        rows = [
+            [*(nearest(book, x) for x in row), byte(255 * sigmoid(o[0]))]
+            for row, o in zip(colors, logits, strict=True)
+        ]
+        files["sh0.webp"] = webp(rows)
+        meta["sh0"] = {"codebook": book.tolist(), "files": ["sh0.webp"]}
+    else:
+        for name, table in (("scales", scales), ("sh0", np.hstack([colors, logits]))):
+            low, high = table.min(axis=0), table.max(axis=0)
+            pixels = np.round((table - low) / (high - low) * 255)
+            files[f"{name}.webp"] = webp(np.hstack([pixels, alpha])[:, :4])
+            meta[name] = {"mins": low.tolist(), "maxs": high.tolist(), "files": [f"{name}.webp"]}
+    if degree_rest:
+        # Each splat has an entry of its own in the palette, in reverse.
+        table = np.stack([rest(values, i) for i in range(n)])[::-1]
+        rows = -(-n // 64)
+        palette = np.zeros((rows, 64 * degree_rest, 4), np.uint8)
+        palette[..., 3] = 255
+        book = np.linspace(table.min(), table.max(), 256)
+        for entry in range(n):
+            for j in range(degree_rest):
+                palette[entry // 64, entry % 64 * degree_rest + j, :3] = [
+                    nearest(book, x) for x in table[entry, j]
+                ]
+        files["shN_centroids.webp"] = picture(palette)
+        labels = np.arange(n)[::-1]
+        files["shN_labels.webp"] = webp(
+            np.stack([labels & 255, labels >> 8, 0 * labels, 255 + 0 * labels], axis=1)
+        )
+        meta["shN"] = {"files": ["shN_centroids.webp", "shN_labels.webp"]}
+        if version == 2:
+            bands = {3: 1, 8: 2, 15: 3}[degree_rest]
+            meta["shN"] |= {"count": n, "bands": bands, "codebook": book.tolist()}
+        else:
+            meta["shN"] |= {"mins": float(table.min()), "maxs": float(table.max()), "quantization": 8}
+    meta |= extra or {}
+    files["meta.json"] = json.dumps(meta).encode()
+    return files
+
+
+def bundle(files, folder="", compression=zipfile.ZIP_STORED):
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", compression) as archive:
+        for name, data in files.items():
+            archive.writestr(folder + name, data)
+    return out.getvalue()
+
+
+# -- glTF
+
+
+def splat_accessors(values, log_scales=False):
+    """Attributes of KHR_gaussian_splatting: name -> (n, columns) float arrays, in the axes of ``values``."""
+    n = len(values["x"])
+    quaternions = np.array([unit_quaternion(values, i) for i in range(n)])
+    scales = np.array([[float(values[f"scale_{k}"][i]) for k in range(3)] for i in range(n)])
+    prefix = "KHR_gaussian_splatting:"
+    out = {
+        "POSITION": np.array([[float(values[k][i]) for k in "xyz"] for i in range(n)]),
+        prefix + "ROTATION": quaternions[:, [1, 2, 3, 0]],
+        prefix + "SCALE": scales if log_scales else np.exp(scales),
+        prefix + "OPACITY": np.array([[sigmoid(x)] for x in values["opacity"]]),
+        prefix + "SH_DEGREE_0_COEF_0": np.array(
+            [[float(values[f"f_dc_{c}"][i]) for c in range(3)] for i in range(n)]
+        ),
+    }
+    table = np.array([rest(values, i) for i in range(n)])
+    j = 0
+    for degree in (1, 2, 3):
+        for coefficient in range(2 * degree + 1):
+            if table.ndim == 3 and j < table.shape[1]:
+                out[f"{prefix}SH_DEGREE_{degree}_COEF_{coefficient}"] = table[:, j]
+                j += 1
+    return out
+
+
+def gltf(accessors=None, spz_data=None, nodes=None, kind="glb", properties=None):
+    """A file of one mesh with splats: `.glb`, or `.gltf` with its data inside."""
+    data = b""
+    views, entries, attributes = [], [], {}
+    for name, array in (accessors or {}).items():
+        array = np.asarray(array)
+        stored = array.astype("<f4") if array.dtype.kind == "f" else array
+        columns = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.shape[1]]
+        component = {"f": 5126, "i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123}
+        code = component["f"] if array.dtype.kind == "f" else component[array.dtype.str[1:]]
+        row = stored.tobytes()
+        data += b"\0" * (-len(data) % 4)
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(row)})
+        entry = {"bufferView": len(entries), "componentType": code, "count": len(array), "type": columns}
+        entries.append(entry | ({} if code == 5126 else {"normalized": True}))
+        attributes[name] = len(attributes)
+        data += row
+    splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"} | (properties or {})
+    used = ["KHR_gaussian_splatting"]
+    if spz_data is not None:
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(spz_data)})
+        data += spz_data
+        name = "KHR_gaussian_splatting_compression_spz_2"
+        splatting["extensions"] = {name: {"bufferView": len(views) - 1}}
+        used.append(name)
+    document = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": used,
+        "extensionsRequired": used,
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": nodes or [{"mesh": 0}],
+        "meshes": [
+            {
+                "primitives": [
+                    {"mode": 0, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": splatting}}
+                ]
+            }
+        ],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": views,
+        "accessors": entries,
+    }
+    if kind == "gltf":
+        document["buffers"][0]["uri"] = (
+            "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+        )
+        return json.dumps(document).encode()
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

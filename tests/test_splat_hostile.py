@@ -1,0 +1,260 @@
+"""Compressed splat files that are broken, absurd or meant to harm: one clear error, in little memory."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import struct
+import tracemalloc
+import zipfile
+
+import _splat_encoders as encode
+import numpy as np
+import pytest
+from _splat_files import random_splats
+
+from meshsplats import FileFormatError, load_gaussians
+
+VALUES = random_splats(9, degree=1)
+SPZ = encode.spz(VALUES)
+SOG = encode.sog(VALUES)
+PLY = encode.compressed_ply(VALUES)
+ACCESSORS = encode.splat_accessors(VALUES)
+ROTATION = "KHR_gaussian_splatting:ROTATION"
+
+
+def spz_body(version=3, count=9, degree=1, bits=12, flags=0, rest=b""):
+    return gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, bits, flags, 0) + rest)
+
+
+def spz4(
+    version=4,
+    count=9,
+    degree=0,
+    streams=5,
+    table=32,
+    sizes=(81, 9, 27, 27, 36),
+    packed=(4,) * 5,
+    rest=bytes(20),
+):
+    data = struct.pack("<4sIIBBBBI12x", b"NGSP", version, count, degree, 12, 0, streams, table)
+    return data + b"".join(struct.pack("<QQ", p, s) for p, s in zip(packed, sizes, strict=True)) + rest
+
+
+def meta(**changes):
+    """The SOG folder with entries of its meta.json replaced; a value of None removes one."""
+    parsed = json.loads(SOG["meta.json"])
+    for key, value in changes.items():
+        owner, _, inner = key.partition("__")
+        where, name = (parsed[owner], inner) if inner else (parsed, owner)
+        where[name] = value
+        if value is None:
+            del where[name]
+    return SOG | {"meta.json": json.dumps(parsed).encode()}
+
+
+def bomb_picture():
+    """A picture of 4000 x 4000 equal pixels in a few kilobytes."""
+    return encode.picture(np.zeros((4000, 4000, 4), np.uint8), "PNG")
+
+
+def attributes(**changes):
+    names = {
+        key if key == "POSITION" else "KHR_gaussian_splatting:" + key: value for key, value in changes.items()
+    }
+    return {k: v for k, v in (ACCESSORS | names).items() if v is not None}
+
+
+FILES = {
+    # SPZ, versions 1 to 3
+    "gzip of text.spz": (gzip.compress(b"Hello" * 100), "a gzip file, but not SPZ"),
+    "cut gzip.spz": (SPZ[:-30], "truncated"),
+    "cut after the magic.spz": (gzip.compress(b"NGSP\3\0\0\0"), "truncated SPZ header of 8 bytes"),
+    "flipped bits.spz": (SPZ[:60] + bytes(20) + SPZ[80:], "gzip stream is broken|truncated|longer"),
+    "version 0.spz": (spz_body(0), "SPZ version 0 in a container of version 1 to 3"),
+    "version 4 in gzip.spz": (spz_body(4), "SPZ version 4 in a container"),
+    "degree 9.spz": (spz_body(degree=9), "degree 9"),
+    "200 fractional bits.spz": (spz_body(bits=200), "200 fractional bits"),
+    "no splats.spz": (spz_body(count=0), "no splats"),
+    "4 billion splats.spz": (spz_body(count=2**32 - 1), "its 4,294,967,295 splats would take"),
+    "a million splats.spz": (spz_body(count=1_000_000), "1,000,000 splats take .* the stream gave 0"),
+    "bomb.spz": (spz_body(count=10**7, degree=0, rest=bytes(20_000_000)), "decompression bomb"),
+    "bomb behind one splat.spz": (spz_body(count=1, rest=bytes(40_000_000)), "longer than its header says"),
+    "bytes behind.spz": (gzip.compress(gzip.decompress(SPZ) + b"more"), "4 bytes follow the 9 splats"),
+    "unknown axes.spz": (
+        encode.spz(VALUES, flags=2, extensions=struct.pack("<III", 0xADBE0003, 4, 99)),
+        "unknown SPZ coordinate system 99",
+    ),
+    # SPZ, version 4
+    "cut.spz": (spz4()[:20], "truncated SPZ header of 20 bytes"),
+    "version 5.spz": (spz4(version=5), "SPZ version 5 in a container of version 4"),
+    "streams missing.spz": (spz4(streams=3), "a table of 3 streams|an SPZ table of 3 streams"),
+    "table beyond the file.spz": (spz4(table=5000), "at byte 5,000"),
+    "table in the header.spz": (spz4(table=0), "at byte 0"),
+    "wrong size.spz": (spz4(sizes=(82, 9, 27, 27, 36)), "the stream of positions has 4 bytes for 82; 81 are"),
+    "huge stream.spz": (spz4(packed=(2**63, 4, 4, 4, 4)), "are left in the file"),
+    "4 billion splats, 4.spz": (spz4(count=2**32 - 1), "its 4,294,967,295 splats would take"),
+    # compressed .ply
+    "no chunks.ply": (PLY.replace(b"element chunk", b"element chump"), "without the element 'chunk'"),
+    "too few chunks.ply": (
+        PLY.replace(b"element chunk 1", b"element chunk 0"),
+        "9 splats need 1 chunks of 256",
+    ),
+    "no range.ply": (PLY.replace(b"float max_y", b"float mix_y"), "need the property 'max_y' of type float"),
+    "wrong type.ply": (PLY.replace(b"uint packed_scale", b"int packed_scale"), "'packed_scale' of type uint"),
+    "harmonics missing.ply": (PLY.replace(b"element sh 9", b"element sh 8"), "8 rows of element 'sh' for 9"),
+    "8 harmonics.ply": (PLY.replace(b"property uchar f_rest_8\n", b""), "'sh' has 8 properties"),
+    "ASCII.ply": (PLY.replace(b"binary_little_endian", b"ascii"), "must be binary"),
+    "cut.ply": (PLY[:-1], "claims 9 rows of element 'sh'"),
+    "no splats.ply": (
+        encode.compressed_ply(VALUES)
+        .replace(b"chunk 1", b"chunk 0")
+        .replace(b"vertex 9", b"vertex 0")
+        .replace(b"sh 9", b"sh 0"),
+        "no splats|bytes follow",
+    ),
+    # .splat
+    "cut.splat": (encode.dot_splat(VALUES)[:-1], "not records of 32 bytes"),
+    "text.splat": (
+        b"This is a letter, of 32 letters.\n"[:32] * 40,
+        "not records of 32 bytes whose rotations",
+    ),
+    "zeros.splat": (bytes(3200), "rotations are unit quaternions"),
+    # SOG archives
+    "no meta.sog": (encode.bundle({"a.webp": b""}), "without meta.json is no SOG file"),
+    "cut.sog": (encode.bundle(SOG)[:-100], "zip"),
+    "broken entry.sog": (
+        encode.bundle(SOG, compression=zipfile.ZIP_DEFLATED).replace(b"PK\1\2", b"PK\1\3", 1),
+        "zip",
+    ),
+    "long meta.sog": (
+        encode.bundle({"meta.json": b" " * 50_000_000}, "", zipfile.ZIP_DEFLATED),
+        "unpacks to over",
+    ),
+    "picture bomb.sog": (
+        encode.bundle(SOG | {"quats.webp": bytes(40_000_000)}, "", zipfile.ZIP_DEFLATED),
+        "'quats.webp' unpacks to over",
+    ),
+    "missing file.sog": (
+        encode.bundle({k: v for k, v in SOG.items() if k != "sh0.webp"}),
+        "'sh0.webp' .* not in",
+    ),
+    "up and out.sog": (
+        encode.bundle(meta(quats={"files": ["../quats.webp"]}) | {"../quats.webp": SOG["quats.webp"]}),
+        "no plain file name; refused",
+    ),
+    # glTF
+    "no rotation.glb": (encode.gltf(attributes(ROTATION=None)), f"need the attribute {ROTATION}"),
+    "one short.glb": (
+        encode.gltf(attributes(ROTATION=np.ones((8, 4)))),
+        r"must have shape \(9, 4\), got \(8, 4\)",
+    ),
+    "three numbers.glb": (
+        encode.gltf(attributes(ROTATION=np.ones((9, 3)))),
+        r"must have shape \(9, 4\), got \(9, 3\)",
+    ),
+    "half a degree.glb": (encode.gltf(attributes(SH_DEGREE_1_COEF_1=None)), "SH_DEGREE_1_COEF_1"),
+    "all flat.glb": (encode.gltf(attributes(ROTATION=np.zeros((9, 4)))), "no usable splats"),
+    "a mesh.glb": (
+        encode.gltf({"POSITION": np.zeros((3, 3))}).replace(b"gaussian_splatting", b"gaussian_SPLATTING"),
+        "gl",
+    ),
+    "cut.glb": (encode.gltf(ACCESSORS)[:-50], "truncated"),
+    "spz of junk.glb": (encode.gltf(spz_data=b"junk" * 20), "gzip stream is broken"),
+    "deep.gltf": (b'{"asset": ' + b"[" * 100_000, "JSON"),
+    # anything else
+    "numbers.json": (b"[1, 2, 3]", "not a splat file"),
+    "other.json": (b'{"hello": "world"}', "neither SOG nor glTF"),
+}
+
+FOLDERS = {
+    "not JSON": (SOG | {"meta.json": b'{"means": '}, "cannot be read"),
+    "an array": (
+        SOG | {"meta.json": b'{"x": [], "means": []}'.replace(b"{", b" {", 1)},
+        "give a number of splats|needs",
+    ),
+    "deep": (SOG | {"meta.json": b'{"means": ' + b"[" * 200_000}, "cannot be read"),
+    "version 3": (meta(version=3), "SOG version 3"),
+    "no count": (meta(count=None), "number of splats .* got None"),
+    "count of text": (meta(count="9"), "number of splats"),
+    "negative count": (meta(count=-1), "number of splats"),
+    "no splats": (meta(count=0), "no splats"),
+    "a billion splats": (meta(count=10**9), "number of splats up to 268,435,456"),
+    "200 million splats": (meta(count=200_000_000), "its 200,000,000 splats would take"),
+    "more splats than pixels": (meta(count=1000), "too few for 1,000 splats"),
+    "no scales": (meta(scales=None), "no object 'scales'"),
+    "means of text": (meta(means="hello"), "no object 'means'"),
+    "one file of means": (meta(means__files=["means_l.webp"]), r"must name 2 file\(s\) of 'means'"),
+    "short codebook": (meta(sh0__codebook=[0.0] * 255), "sh0.codebook in meta.json must be 256 numbers"),
+    "codebook of text": (meta(sh0__codebook=["0"] * 256), "must be 256 numbers"),
+    "huge numbers": (meta(means__maxs=[10**400, 0, 0]), "means.maxs in meta.json must be 3 numbers"),
+    "NaN": (meta(means__mins=[float("nan"), 0, 0]), "means.mins in meta.json must be 3 numbers"),
+    "bands do not fit": (meta(shN__bands=2), "does not fit 2 bands"),
+    "bands of list": (meta(shN__bands=[1]), "does not fit"),
+    "palette too long": (meta(shN__count=65), "a palette of 65 harmonics in a picture of 64"),
+    "missing": (meta(quats={"files": ["other.webp"]}), "'other.webp' that it names is missing"),
+    "absolute path": (meta(quats={"files": ["/etc/passwd"]}), "no plain file name; refused"),
+    "parent folder": (meta(quats={"files": ["../secret.webp"]}), "no plain file name; refused"),
+    "windows path": (meta(quats={"files": ["C:\\secret.webp"]}), "no plain file name; refused"),
+    "dots": (meta(quats={"files": [".."]}), "no plain file name; refused"),
+    "not a picture": (SOG | {"quats.webp": b"hello"}, "the picture of quats cannot be read"),
+    "half a picture": (SOG | {"quats.webp": SOG["quats.webp"][:40]}, "the picture of quats cannot be read"),
+    "large picture": (SOG | {"quats.webp": bomb_picture()}, "4000 x 4000 pixels, expected at most"),
+    "large palette": (
+        SOG | {"shN_centroids.webp": encode.picture(np.zeros((9000, 1920, 3), np.uint8), "PNG")},
+        "9000",
+    ),
+}
+
+
+def check(path, message):
+    tracemalloc.start()
+    with pytest.raises(FileFormatError, match=message) as caught:
+        load_gaussians(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(str(caught.value)) < 500
+    assert str(path.parent) in str(caught.value)
+    assert peak < 90e6
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_files(tmp_path, name):
+    data, message = FILES[name]
+    (tmp_path / name).write_bytes(data)
+    check(tmp_path / name, message)
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_sog_folders(tmp_path, name):
+    files, message = FOLDERS[name]
+    (tmp_path / "secret.webp").write_bytes(SOG["quats.webp"])
+    (tmp_path / "scene").mkdir()
+    for file_name, data in files.items():
+        (tmp_path / "scene" / file_name).write_bytes(data)
+    check(tmp_path / "scene", message)
+
+
+def test_frames_that_unpack_to_more(tmp_path):
+    zstandard = pytest.importorskip("zstandard", reason="install meshsplats[formats]")
+    compress = zstandard.ZstdCompressor().compress
+    for size, message in ((100_000_000, "does not unpack to 81 bytes"), (80, "does not unpack to 81 bytes")):
+        packed = [compress(bytes(n)) for n in (size, 9, 27, 27, 36)]
+        data = spz4(packed=tuple(map(len, packed)), rest=b"".join(packed))
+        (tmp_path / "a.spz").write_bytes(data)
+        check(tmp_path / "a.spz", message)
+    (tmp_path / "a.spz").write_bytes(spz4())
+    check(tmp_path / "a.spz", "the stream of positions is broken")
+
+
+def test_truncation_anywhere_is_an_error(tmp_path):
+    for name, data in (
+        ("a.spz", SPZ),
+        ("a.sog", encode.bundle(SOG)),
+        ("a.ply", PLY),
+        ("a.glb", encode.gltf(ACCESSORS)),
+    ):
+        for size in range(0, len(data), max(1, len(data) // 60)):
+            (tmp_path / name).write_bytes(data[:size])
+            with pytest.raises(FileFormatError):
+                load_gaussians(tmp_path / name)
