@@ -34,7 +34,7 @@ class MeshTile {
   public:
     MeshTile(const Scene &scene, const MsOptions &options, const MsPicture &picture, const MsCamera &camera)
         : scene_(scene), grid_(scene.grid), options_(options), picture_(picture), camera_(camera),
-          extras_(picture, scene.mesh), arena_(new Arena), sums_((size_t)SAMPLES * extras_.channels) {
+          extras_(picture, scene.mesh), arena_(new Arena()), sums_((size_t)SAMPLES * extras_.channels) {
         for (int i = 0; i < 16; ++i) {
             lane_x_[i] = i % 4 + 0.5f;
             lane_y_[i] = i / 4 + 0.5f;
@@ -66,17 +66,23 @@ class MeshTile {
     static constexpr int BLOCKS = SAMPLES / 16;
     static constexpr float SLACK = 0.01f;
     static constexpr int ROOM = 32;       // fragments a sample in the arena; more go to a list on the heap
+    static constexpr int SIDE_BY_SIDE = 16;  // fragments a sample at most where W samples are sorted at once
     static constexpr int PER_SAMPLE = 8;  // mean number of waiting fragments at which they are flushed
 
-    // The waiting fragments of all samples.
+    // The waiting fragments of all samples, the k-th of every sample side by side. Rows are padded: rows that start a
+    // power of two apart would compete for the same few lines of the cache.
+    struct Layer {
+        alignas(64) float key[SAMPLES + 16];
+        alignas(64) float rgba[4][SAMPLES + 16];
+        alignas(64) int32_t face[SAMPLES + 16];
+    };
+    // Zeroed when made: what lies beyond a list is multiplied by a weight of 0 and must be finite.
     struct Arena {
-        alignas(64) float key[SAMPLES][ROOM];
-        alignas(64) int32_t face[SAMPLES][ROOM];
-        alignas(64) float rgba[SAMPLES][ROOM][4];
-        Place place[SAMPLES][ROOM];
+        Layer layer[ROOM];
+        Place place[ROOM][SAMPLES];
     };
     struct Fragment {
-        f4 rgba;
+        float rgba[4];
         float key;
         int32_t face;
         Place place;
@@ -85,15 +91,8 @@ class MeshTile {
     struct Found {
         alignas(64) int32_t sample[SAMPLES + W];
         alignas(64) float q[SAMPLES + W], z[SAMPLES + W], e[3][SAMPLES + W];
-        alignas(64) float rgba[SAMPLES + W][4];
+        alignas(64) float rgba[4][SAMPLES + W];
     };
-    // The fragments of one sample in one piece.
-    struct Long {
-        std::vector<float> key, rgba;
-        std::vector<int32_t> face;
-        std::vector<Place> place;
-    };
-
     const Scene &scene_;
     const Grid &grid_;
     const MsOptions &options_;
@@ -102,7 +101,7 @@ class MeshTile {
     Extras extras_;
     std::unique_ptr<Arena> arena_;
     std::vector<Fragment> overflow_[SAMPLES];
-    Long long_;
+    std::vector<Fragment> long_;
     Found found_;
 
     Triangles triangles_;
@@ -110,12 +109,11 @@ class MeshTile {
     alignas(64) float block_x_[BLOCKS], block_y_[BLOCKS];  // of the blocks' corners, from the tile's
     int32_t count_[SAMPLES];
     int32_t layers_[SAMPLES];
-    f4 color_[SAMPLES];
-    float through_[SAMPLES];
+    alignas(64) float color_[3][SAMPLES];
+    alignas(64) float through_[SAMPLES];
     uint32_t open_[BLOCKS];  // per block, the samples that still take light
     std::vector<float> sums_;
-    std::vector<int32_t> order_, rank_;
-    std::vector<Fragment> kept_;
+    std::vector<int32_t> order_;
 
     int x0_, y0_, columns_, rows_;  // the tile in samples
     int64_t pending_, limit_, fragments_ = 0;
@@ -133,7 +131,7 @@ class MeshTile {
             overflow_[i].clear();
             count_[i] = 0;
             layers_[i] = 0;
-            color_[i] = f4{};
+            color_[0][i] = color_[1][i] = color_[2][i] = 0;
             through_[i] = 1;
         }
         std::fill(open_, open_ + BLOCKS, 0);
@@ -267,12 +265,10 @@ class MeshTile {
             vf y = __builtin_convertvector(((sample >> 4) & 12) + ((sample >> 2) & 3), vf) + set1(0.5f);
             vf q = vmin(vmax(load(found_.q + i), q_min), q_max);
             vf z = set1(1.0f) / q;
-            vf value[4];
             for (int j = 0; j < 4; ++j) {
-                value[j] = (set1(vc[j]) + set1(vb[j]) * y + set1(va[j]) * x) * z;
-                value[j] = vmin(vmax(value[j], set1(low[j])), set1(high[j]));
+                vf value = (set1(vc[j]) + set1(vb[j]) * y + set1(va[j]) * x) * z;
+                store(found_.rgba[j] + i, vmin(vmax(value, set1(low[j])), set1(high[j])));
             }
-            interleave4(found_.rgba[i], value[0], value[1], value[2], value[3]);
             if (GENERAL && shared_depth) {
                 const DepthPlane &plane = scene_.planes[scene_.mesh.depth_group[t.face[k]]];
                 double corner = plane.q.c + plane.q.a * x0_ + plane.q.b * y0_;
@@ -284,7 +280,6 @@ class MeshTile {
         }
         for (int i = 0; i < n; ++i) {
             int sample = found_.sample[i];
-            f4 rgba = load4(found_.rgba[i]);
             int waiting = count_[sample]++;
             Place place;
             if (PLACES) {
@@ -294,153 +289,160 @@ class MeshTile {
                     for (int j = 0; j < 3; ++j) place.b[j] = found_.e[j][i] / sum;
             }
             if (__builtin_expect(waiting < ROOM, 1)) {
-                arena_->key[sample][waiting] = found_.q[i];
-                arena_->face[sample][waiting] = t.face[k];
-                store4(arena_->rgba[sample][waiting], rgba);
-                if (PLACES) arena_->place[sample][waiting] = place;
+                arena_->layer[waiting].key[sample] = found_.q[i];
+                for (int j = 0; j < 4; ++j) arena_->layer[waiting].rgba[j][sample] = found_.rgba[j][i];
+                arena_->layer[waiting].face[sample] = t.face[k];
+                if (PLACES) arena_->place[waiting][sample] = place;
             } else {
-                overflow_[sample].push_back({rgba, found_.q[i], t.face[k], place});
+                overflow_[sample].push_back(
+                    {{found_.rgba[0][i], found_.rgba[1][i], found_.rgba[2][i], found_.rgba[3][i]}, found_.q[i], t.face[k], place});
             }
         }
     }
 
     // Blends all waiting fragments nearer than anything with 1 / depth <= key; true once no sample takes more light.
     bool flush(float key) {
+        const bool plain = !extras_.any && !options_.max_layers;
         pending_ = 0;
         uint32_t any_open = 0;
-        const bool plain = !extras_.any && !options_.max_layers;
-        for (int block = 0; block < BLOCKS; ++block) {
-            for (uint32_t rest = open_[block]; rest; rest &= rest - 1) {
-                int lane = __builtin_ctz(rest), sample = 16 * block + lane;
-                if (count_[sample] == 0) continue;
-                if (plain ? blend<true>(sample, key) : blend<false>(sample, key)) {
-                    open_[block] &= ~(1u << lane);
-                    count_[sample] = 0;
-                } else {
-                    pending_ += count_[sample];
-                }
-            }
-            any_open |= open_[block];
+        for (int first = 0; first < SAMPLES; first += W) {
+            uint32_t open = open_[first / 16] >> (first % 16) & ((1u << W) - 1);
+            int longest = 0;
+            for (int i = 0; i < W; ++i) longest = std::max(longest, count_[first + i]);
+            if (longest > 0 && !(plain && longest <= SIDE_BY_SIDE && blend_side_by_side(first, longest, key)))
+                for (uint32_t rest = open; rest; rest &= rest - 1) blend(first + __builtin_ctz(rest), key);
+            for (int i = 0; i < W; ++i) pending_ += count_[first + i];
+            any_open |= open_[first / 16];
         }
         // Fragments that had to wait should not be sorted again and again.
         limit_ = std::max<int64_t>((int64_t)PER_SAMPLE * rows_ * columns_, 2 * pending_);
         return any_open == 0;
     }
 
-    // Writes the order of n fragments to order_: nearest first, equal depths by face number.
-    // `key` must be readable up to a multiple of W.
-    void sort(const float *key, const int32_t *face, int n) {
-        size_t padded = (n + W - 1) / W * W;
-        if (order_.size() < padded) {
-            order_.resize(padded);
-            rank_.resize(padded);
-        }
-        if (n > 128) {
-            for (int i = 0; i < n; ++i) order_[i] = i;
-            std::sort(order_.begin(), order_.begin() + n,
-                      [&](int a, int b) { return key[a] != key[b] ? key[a] > key[b] : face[a] < face[b]; });
-            return;
-        }
-        typedef int32_t vi __attribute__((vector_size(4 * W)));
-        for (int j = 0; j < n; j += W) {
-            vf mine = load(key + j);
-            vi rank = {};
-            for (int i = 0; i < n; ++i) rank -= set1(key[i]) > mine;
-            __builtin_memcpy(&rank_[j], &rank, sizeof rank);
-        }
-        int total = 0;
-        for (int i = 0; i < n; ++i) {
-            order_[rank_[i]] = i;
-            total += rank_[i];
-        }
-        // Without ties each pair adds one to the sum of ranks.
-        if (total != n * (n - 1) / 2) {
-            for (int i = 0; i < n; ++i) {
-                int rank = 0;
-                for (int k = 0; k < n; ++k) rank += key[k] > key[i] || (key[k] == key[i] && face[k] < face[i]);
-                order_[rank] = i;
-            }
-        }
+    void close(int sample) {
+        open_[sample / 16] &= ~(1u << sample % 16);
+        count_[sample] = 0;
     }
 
-    // Blends the front of one sample's fragments and keeps the rest; true if the sample takes no more light.
-    template <bool PLAIN>
-    bool blend(int sample, float nearest_to_come) {
-        int n = count_[sample];
-        float *key = arena_->key[sample], *rgba = arena_->rgba[sample][0];
-        int32_t *face = arena_->face[sample];
-        Place *place = arena_->place[sample];
-        if (__builtin_expect(n > ROOM, 0)) {
-            gather(sample);
-            key = long_.key.data();
-            rgba = long_.rgba.data();
-            face = long_.face.data();
-            place = long_.place.data();
+    // Sorts and blends the fragments of W samples at once, at most `longest` each. Equal depths at a sample need the
+    // face numbers to decide: then nothing is done and false returned.
+    bool blend_side_by_side(int first, int longest, float nearest_to_come) {
+        vf key[SIDE_BY_SIDE], rank[SIDE_BY_SIDE];
+        alignas(64) float counts[W];
+        for (int i = 0; i < W; ++i) counts[i] = (float)count_[first + i];
+        const vf count = load(counts), one = set1(1), none = set1(-1);
+        for (int i = 0; i < longest; ++i) {
+            key[i] = pick(greater(count, set1((float)i)), load(arena_->layer[i].key + first), none);
+            rank[i] = set1((float)i);
+            for (int j = 0; j < i; ++j) {
+                vm nearer = greater(key[i], key[j]);
+                rank[i] = add_where(rank[i], nearer, none);
+                rank[j] = add_where(rank[j], nearer, one);
+            }
         }
-        sort(key, face, n);
-        f4 color = color_[sample];
-        float through = through_[sample];
-        const float least = options_.min_transmittance;
-        int done = 0, blended = 0;
-        bool closed = false;
-        for (; done < n; ++done) {
-            int i = order_[done];
-            if (!(key[i] > nearest_to_come)) break;
-            f4 c = load4(rgba + 4 * i);
-            float alpha = c[3];
-            float weight = through * alpha;
-            color += set4(weight) * c;
+        vf color[3], through = load(through_ + first), blended = set1(0), last = none;
+        for (int c = 0; c < 3; ++c) color[c] = load(color_[c] + first);
+        const vf least = set1(options_.min_transmittance), limit = set1(nearest_to_come), below = set1(-0.5f);
+        unsigned tie = 0;
+        int64_t fragments = 0;
+        for (int r = 0; r < longest; ++r) {
+            vf mine = none, rgba[4] = {set1(0), set1(0), set1(0), set1(0)};
+            for (int i = 0; i < longest; ++i) {
+                vm here = equal(rank[i], set1((float)r));
+                mine = pick(here, key[i], mine);
+                for (int c = 0; c < 4; ++c) rgba[c] = pick(here, load(arena_->layer[i].rgba[c] + first), rgba[c]);
+            }
+            tie |= bits(both(equal(mine, last), greater(mine, below)));
+            last = mine;
+            vm blends = both(greater(mine, limit), not_less(through, least));
+            unsigned any = bits(blends);
+            if (!any) {
+                    break;
+            }
+            vf weight = pick(blends, through * rgba[3], set1(0));
+            for (int c = 0; c < 3; ++c) color[c] += weight * rgba[c];
             through -= weight;
-            blended += alpha > 0;
-            if (!PLAIN && alpha > 0) {
-                if (extras_.any) add_extras(sample, face[i], place[i], weight);
-                closed = options_.max_layers && ++layers_[sample] >= options_.max_layers;
-            }
-            closed |= through < least;
-            if (closed) break;
+            blended = add_where(blended, blends, one);
+            fragments += __builtin_popcount(bits(greater(weight, set1(0))));
         }
-        color_[sample] = color;
-        through_[sample] = through;
-        fragments_ += blended;
-        if (closed) return true;
+        if (tie) return false;
+        fragments_ += fragments;
+        for (int c = 0; c < 3; ++c) store(color_[c] + first, color[c]);
+        store(through_ + first, through);
 
-        // Moves what has to wait to the front, in order.
-        int left = n - done;
-        count_[sample] = left;
-        if (n > ROOM) overflow_[sample].clear();
-        if (left == 0 || (done == 0 && n <= ROOM)) return false;
-        if ((int)kept_.size() < left) kept_.resize(left);
-        for (int i = 0; i < left; ++i) {
-            int from = order_[done + i];
-            kept_[i].rgba = load4(rgba + 4 * from);
-            kept_[i].key = key[from];
-            kept_[i].face = face[from];
-            if (extras_.any) kept_[i].place = place[from];
+        unsigned closed = bits(greater(least, through));
+        for (unsigned rest = closed; rest; rest &= rest - 1) close(first + __builtin_ctz(rest));
+        alignas(64) float ranks[SIDE_BY_SIDE][W];
+        for (int i = 0; i < longest; ++i) store(ranks[i], rank[i]);
+        alignas(64) float gone[W];
+        store(gone, blended);
+        // Closes the gaps in the lists of the samples where something has to wait.
+        for (unsigned rest = bits(greater(count, blended)) & ~closed; rest; rest &= rest - 1) {
+            int lane = __builtin_ctz(rest), sample = first + lane, n = count_[sample], to = 0;
+            for (int i = 0; i < n; ++i) {
+                if (ranks[i][lane] < gone[lane]) continue;
+                if (to != i) {
+                    arena_->layer[to].key[sample] = arena_->layer[i].key[sample];
+                    arena_->layer[to].face[sample] = arena_->layer[i].face[sample];
+                    for (int c = 0; c < 4; ++c) arena_->layer[to].rgba[c][sample] = arena_->layer[i].rgba[c][sample];
+                }
+                ++to;
+            }
         }
-        for (int i = 0; i < std::min(left, ROOM); ++i) {
-            store4(arena_->rgba[sample][i], kept_[i].rgba);
-            arena_->key[sample][i] = kept_[i].key;
-            arena_->face[sample][i] = kept_[i].face;
-            if (extras_.any) arena_->place[sample][i] = kept_[i].place;
-        }
-        if (left > ROOM) overflow_[sample].assign(kept_.begin() + ROOM, kept_.begin() + left);
-        return false;
+        for (int i = 0; i < W; ++i)
+            if (!(closed >> i & 1)) count_[first + i] -= (int)gone[i];
+        return true;
     }
 
-    // Copies all fragments of a sample that has more than the arena holds to long_.
-    void gather(int sample) {
-        int n = count_[sample];
-        long_.key.resize((n + W - 1) / W * W);
-        long_.face.resize(n);
-        long_.rgba.resize(4 * (size_t)n);
-        long_.place.resize(n);
-        for (int i = 0; i < n; ++i) {
-            const bool inside = i < ROOM;
-            const Fragment *f = inside ? nullptr : &overflow_[sample][i - ROOM];
-            long_.key[i] = inside ? arena_->key[sample][i] : f->key;
-            long_.face[i] = inside ? arena_->face[sample][i] : f->face;
-            store4(&long_.rgba[4 * (size_t)i], inside ? load4(arena_->rgba[sample][i]) : f->rgba);
-            if (extras_.any) long_.place[i] = inside ? arena_->place[sample][i] : f->place;
+    // The same for one sample, whatever it needs and however long its list is.
+    void blend(int sample, float nearest_to_come) {
+        const int n = count_[sample];
+        if (n == 0) return;
+        std::vector<Fragment> &list = long_;
+        list.resize(n);
+        for (int i = 0; i < std::min(n, ROOM); ++i) {
+            for (int c = 0; c < 4; ++c) list[i].rgba[c] = arena_->layer[i].rgba[c][sample];
+            list[i].key = arena_->layer[i].key[sample];
+            list[i].face = arena_->layer[i].face[sample];
+            if (extras_.any) list[i].place = arena_->place[i][sample];
+        }
+        if (n > ROOM) {
+            std::copy(overflow_[sample].begin(), overflow_[sample].end(), list.begin() + ROOM);
+            overflow_[sample].clear();
+        }
+        order_.resize(n);
+        for (int i = 0; i < n; ++i) order_[i] = i;
+        std::sort(order_.begin(), order_.end(), [&](int a, int b) {
+            return list[a].key != list[b].key ? list[a].key > list[b].key : list[a].face < list[b].face;
+        });
+        int done = 0;
+        for (; done < n; ++done) {
+            const Fragment &f = list[order_[done]];
+            if (!(f.key > nearest_to_come)) break;
+            float weight = through_[sample] * f.rgba[3];
+            for (int c = 0; c < 3; ++c) color_[c][sample] += weight * f.rgba[c];
+            through_[sample] -= weight;
+            bool last = through_[sample] < options_.min_transmittance;
+            if (weight > 0) {
+                ++fragments_;
+                if (extras_.any) add_extras(sample, f.face, f.place, weight);
+                last |= options_.max_layers && ++layers_[sample] >= options_.max_layers;
+            }
+            if (last) return close(sample);
+        }
+        // What has to wait, in order.
+        count_[sample] = n - done;
+        for (int i = done; i < n; ++i) {
+            const Fragment &f = list[order_[i]];
+            int to = i - done;
+            if (to >= ROOM) {
+                overflow_[sample].push_back(f);
+                continue;
+            }
+            for (int c = 0; c < 4; ++c) arena_->layer[to].rgba[c][sample] = f.rgba[c];
+            arena_->layer[to].key[sample] = f.key;
+            arena_->layer[to].face[sample] = f.face;
+            if (extras_.any) arena_->place[to][sample] = f.place;
         }
     }
 
@@ -495,17 +497,16 @@ class MeshTile {
         for (int y = 0; y < rows_; y += s) {
             for (int x = 0; x < columns_; x += s) {
                 int64_t pixel = (int64_t)((y0_ + y) / s) * camera_.width + (x0_ + x) / s;
-                f4 color = {};
-                float through = 0;
+                float color[3] = {0, 0, 0}, through = 0;
                 for (int j = 0; j < s; ++j)
                     for (int i = 0; i < s; ++i) {
-                        color += color_[number(x + i, y + j)];
-                        through += through_[number(x + i, y + j)];
+                        int sample = number(x + i, y + j);
+                        for (int c = 0; c < 3; ++c) color[c] += color_[c][sample];
+                        through += through_[sample];
                     }
-                color *= set4(share);
                 through *= share;
                 const float *background = options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
-                for (int c = 0; c < 3; ++c) picture_.color[3 * pixel + c] = color[c] + through * background[c];
+                for (int c = 0; c < 3; ++c) picture_.color[3 * pixel + c] = color[c] * share + through * background[c];
                 picture_.alpha[pixel] = 1 - through;
                 if (!extras_.any) continue;
                 auto average = [&](float *out, int channel, int channels) {

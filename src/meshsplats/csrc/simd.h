@@ -43,32 +43,35 @@ inline f4 min4(f4 a, f4 b) { return a < b ? a : b; }
 inline f4 max4(f4 a, f4 b) { return a > b ? a : b; }
 #endif
 
-// Four vectors of W values, one a channel, to W groups of four channels from `out` on.
-inline void interleave4(float *out, vf r, vf g, vf b, vf a) {
+// Masks, one flag a lane.
 #if defined(__AVX512F__)
-    __m512 rg0 = _mm512_unpacklo_ps(r, g), rg1 = _mm512_unpackhi_ps(r, g);
-    __m512 ba0 = _mm512_unpacklo_ps(b, a), ba1 = _mm512_unpackhi_ps(b, a);
-    __m512 v[4] = {(__m512)_mm512_unpacklo_pd((__m512d)rg0, (__m512d)ba0), (__m512)_mm512_unpackhi_pd((__m512d)rg0, (__m512d)ba0),
-                   (__m512)_mm512_unpacklo_pd((__m512d)rg1, (__m512d)ba1), (__m512)_mm512_unpackhi_pd((__m512d)rg1, (__m512d)ba1)};
-    for (int i = 0; i < 4; ++i) {
-        _mm_storeu_ps(out + 4 * i, _mm512_castps512_ps128(v[i]));
-        _mm_storeu_ps(out + 4 * (i + 4), _mm512_extractf32x4_ps(v[i], 1));
-        _mm_storeu_ps(out + 4 * (i + 8), _mm512_extractf32x4_ps(v[i], 2));
-        _mm_storeu_ps(out + 4 * (i + 12), _mm512_extractf32x4_ps(v[i], 3));
-    }
-#elif defined(__AVX2__)
-    __m256 rg0 = _mm256_unpacklo_ps(r, g), rg1 = _mm256_unpackhi_ps(r, g);
-    __m256 ba0 = _mm256_unpacklo_ps(b, a), ba1 = _mm256_unpackhi_ps(b, a);
-    __m256 v[4] = {(__m256)_mm256_unpacklo_pd((__m256d)rg0, (__m256d)ba0), (__m256)_mm256_unpackhi_pd((__m256d)rg0, (__m256d)ba0),
-                   (__m256)_mm256_unpacklo_pd((__m256d)rg1, (__m256d)ba1), (__m256)_mm256_unpackhi_pd((__m256d)rg1, (__m256d)ba1)};
-    for (int i = 0; i < 4; ++i) {
-        _mm_storeu_ps(out + 4 * i, _mm256_castps256_ps128(v[i]));
-        _mm_storeu_ps(out + 4 * (i + 4), _mm256_extractf128_ps(v[i], 1));
-    }
+typedef __mmask16 vm;
+inline vm greater(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }
+inline vm equal(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_EQ_OQ); }
+inline vm not_less(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+inline vm both(vm a, vm b) { return a & b; }
+inline unsigned bits(vm m) { return m; }
+inline vf pick(vm m, vf yes, vf no) { return _mm512_mask_blend_ps(m, no, yes); }
+inline vf add_where(vf a, vm m, vf b) { return _mm512_mask_add_ps(a, m, a, b); }
 #else
-    for (int i = 0; i < W; ++i) store4(out + 4 * i, f4{r[i], g[i], b[i], a[i]});
+typedef int vm __attribute__((vector_size(4 * W)));
+inline vm greater(vf a, vf b) { return a > b; }
+inline vm equal(vf a, vf b) { return a == b; }
+inline vm not_less(vf a, vf b) { return a >= b; }
+inline vm both(vm a, vm b) { return a & b; }
+#if defined(__AVX2__)
+inline unsigned bits(vm m) { return _mm256_movemask_ps((__m256)m); }
+inline vf pick(vm m, vf yes, vf no) { return _mm256_blendv_ps(no, yes, (__m256)m); }
+#else
+#if defined(__SSE2__)
+inline unsigned bits(vm m) { return _mm_movemask_ps((__m128)m); }
+#else
+inline unsigned bits(vm m) { return (m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8); }
 #endif
-}
+inline vf pick(vm m, vf yes, vf no) { return (vf)((m & (vm)yes) | (~m & (vm)no)); }
+#endif
+inline vf add_where(vf a, vm m, vf b) { return a + (vf)(m & (vm)b); }
+#endif
 
 // at_least(a, b): bit i is set where a[i] >= b[i].
 #if defined(__AVX512F__)

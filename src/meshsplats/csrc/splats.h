@@ -273,17 +273,14 @@ class SplatTile {
     uint32_t open_[TILE];
     int64_t fragments_ = 0;
 
-    // Per lane: b where the sign bit of the mask's comparison holds, else a. Plain arithmetic keeps it portable.
-    static vf pick(unsigned bits, vf yes, vf no) {
+    static vf pick(unsigned chosen, vf yes, vf no) {
 #if defined(__AVX512F__)
-        return _mm512_mask_blend_ps((__mmask16)bits, no, yes);
+        return ms::pick((vm)chosen, yes, no);
 #else
-        alignas(64) float a[W], b[W];
-        store(a, no);
-        store(b, yes);
-        for (int i = 0; i < W; ++i)
-            if (bits >> i & 1) a[i] = b[i];
-        return load(a);
+        typedef int vi __attribute__((vector_size(4 * W)));
+        vi lane;
+        for (int i = 0; i < W; ++i) lane[i] = (chosen >> i & 1) ? -1 : 0;
+        return ms::pick((vm)lane, yes, no);
 #endif
     }
 
