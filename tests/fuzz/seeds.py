@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import gzip
+import importlib.util
+import io
 import tempfile
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import _splat_encoders as encode
 from _splat_files import Table, random_splats, splat_table, write_ply
 
 from meshsplats import load_gaussians
@@ -37,8 +42,51 @@ def _ply(name: str, encoding: str, degree: int, tables: bool) -> Seed:
         return Seed(name, {"a.ply": path.read_bytes()}, "a.ply")
 
 
+def _in_gzip(data: bytes, change: Change) -> bytes:
+    return gzip.compress(change(gzip.decompress(data)), mtime=0)
+
+
+def _in_archive(data: bytes, change: Change) -> bytes:
+    """One of the files changed, which one depends on the others' sizes; the archive around them whole."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    changed = {name: change(content) for name, content in files.items()}
+    chosen = sorted(files)[sum(map(len, changed.values())) % len(files)]
+    return encode.bundle(files | {chosen: changed[chosen]})
+
+
+def _zstandard_seeds() -> list[Seed]:
+    """SPZ 4, where the package zstandard is installed; each stream is compressed again after its change."""
+    if importlib.util.find_spec("zstandard") is None:
+        return []
+    import zstandard
+
+    compress = zstandard.ZstdCompressor().compress
+    extensions = bytes([3, 0, 0xBE, 0xAD, 4, 0, 0, 0, 4, 0, 0, 0])
+    whole = encode.spz4(_VALUES, compress, flags=3, extensions=extensions)
+
+    def inside(_: bytes, change: Change) -> bytes:
+        return encode.spz4(_VALUES, lambda stream: compress(change(stream)))
+
+    return [Seed("spz-4", {"a.spz": whole}, "a.spz", inside)]
+
+
+_VALUES = random_splats(9, degree=1)
+_SPZ = {version: encode.spz(_VALUES, version, extensions=bytes(8), flags=2) for version in (1, 2, 3)}
+_GLB = encode.gltf(encode.splat_accessors(_VALUES), nodes=[{"mesh": 0, "scale": [1, 2, 3]}])
+
 SEEDS = [
     _ply("ply", "binary_little_endian", 1, False),
     _ply("ply-lists", "binary_big_endian", 0, True),
     _ply("ply-ascii", "ascii", 0, True),
+    Seed("compressed-ply", {"a.ply": encode.compressed_ply(_VALUES)}, "a.ply"),
+    Seed("splat", {"a.splat": encode.dot_splat(_VALUES)}, "a.splat"),
+    *(Seed(f"spz-{version}", {"a.spz": data}, "a.spz", _in_gzip) for version, data in _SPZ.items()),
+    *_zstandard_seeds(),
+    Seed("sog", {"a.sog": encode.bundle(encode.sog(_VALUES))}, "a.sog", _in_archive),
+    Seed("sog-folder", encode.sog(_VALUES), "."),
+    Seed("sog-folder-1", encode.sog(_VALUES, version=1), "meta.json"),
+    Seed("splat-glb", {"a.glb": _GLB}, "a.glb"),
+    Seed("splat-gltf", {"a.gltf": encode.gltf(encode.splat_accessors(_VALUES), kind="gltf")}, "a.gltf"),
+    Seed("spz-glb", {"a.glb": encode.gltf(spz_data=_SPZ[3])}, "a.glb"),
 ]
