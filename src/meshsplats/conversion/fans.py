@@ -4,137 +4,188 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
-CHUNK = 1 << 14
+from meshsplats.conversion.profiles import Profile
+
+CHUNK = 1 << 13
 """Splats built at a time: the blocks of a chunk stay in the processor's cache."""
+
+PLANES = {"flat": [(0, 1)], "crossed": [(0, 1), (0, 2)], "3d": [(0, 1), (1, 2), (0, 2)]}
+"""Axes that span the ellipses of each mode, in the order of their triangles."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
     """How the vertices of one splat hang on its semi-axes.
 
-    Concretely, vertex i of a splat with centre m and semi-axes ``A`` (a rows, one for every ring and axis) is at
-    ``m + coefficients[i] @ A`` and takes the opacity of ``level[i]``: 0 the centre, 1 the innermost ring, and so on.
+    Concretely, vertex i of a splat with centre m and one-sigma semi-axes ``A`` (a, 3) is at
+    ``m + radius[level[i]] * directions[i] @ A`` and takes the opacity of ``level[i]``.
     """
 
-    coefficients: np.ndarray
-    """(m, rings * axes) float64; columns are ordered ring by ring, within a ring by axis."""
+    directions: np.ndarray
+    """(m, a) float64 points of the unit circles; 0 for the centre. a is 2 for one ellipse, else 3."""
     level: np.ndarray
     """(m,) int: 0 for the centre, j for ring j; the last ring is the rim."""
     faces: np.ndarray
-    """(t, 3) int32, all with the same winding in each ellipse; those round the centre list the centre first."""
-    rings: int
-    axes: int
-    """2 for a flat fan, 3 for three crossed ellipses."""
+    """(t, 3) int32, all with the same winding in each ellipse; those round the centre list the centre
+    first."""
+    ellipses: int
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A pattern and the profile of its rings."""
+
+    pattern: Pattern
+    profile: Profile
 
 
 @lru_cache(maxsize=64)
 def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
-    """The fan of ``sides`` triangles, with ``rings`` concentric rings of vertices (the last one is the rim).
+    """Ellipses of ``sides`` triangles round the centre, with ``rings`` concentric rings of vertices (the last
+    is the rim).
 
-    ``mode='flat'``: one ellipse, ``1 + rings * sides`` vertices and ``(2 * rings - 1) * sides`` triangles; rim vertex i
-    is at the angle ``-pi + 2 pi i / sides`` from the first axis towards the second. ``mode='3d'``: ellipses in the
-    planes of axes 1-2, 2-3 and 1-3 whose common points on the axes are one vertex; with one ring
-    ``3 * sides - 5`` vertices and ``3 * sides`` triangles. ``sides`` must be a multiple of 4 there.
+    ``mode='flat'``: one ellipse, ``1 + rings * sides`` vertices and ``(2 * rings - 1) * sides`` triangles;
+    rim vertex i is at the angle ``-pi + 2 pi i / sides`` from the first axis towards the second.
+    ``mode='crossed'``: a second one of the first and third axis; ``mode='3d'``: three, in the planes of axes
+    1-2, 2-3 and 1-3. Their centre and the vertices that meet on an axis are one: '3d' has, with one ring,
+    ``3 * sides - 5`` vertices and ``3 * sides`` triangles where ``sides`` is a multiple of 4; 'crossed' has
+    ``2 * sides - 1`` and ``2 * sides`` where it is even.
     """
-    planes = [(0, 1)] if mode == "flat" else [(0, 1), (1, 2), (0, 2)]
-    axes = 2 if mode == "flat" else 3
+    planes = PLANES[mode]
+    axes = max(map(max, planes)) + 1
     turns = np.arange(sides) / sides - 0.5
     cos, sin = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
-    # Exact zeros and ones on the axes: there the ellipses meet.
+    # Exact zeros on the axes: there the ellipses meet.
     cos[np.abs(cos) < 1e-12] = 0
     sin[np.abs(sin) < 1e-12] = 0
     number: dict[tuple, int] = {}
-    coefficients = [np.zeros(rings * axes)]
+    directions = [np.zeros(axes)]
     level = [0]
 
     def vertex(ring: int, plane: tuple[int, int], i: int) -> int:
-        direction = [0.0] * axes
+        direction = np.zeros(axes)
         direction[plane[0]], direction[plane[1]] = cos[i], sin[i]
-        key = (ring, *np.round(direction, 9) + 0.0)
+        key = (ring, *(np.round(direction, 9) + 0.0))
         if key not in number:
-            number[key] = len(coefficients)
-            row = np.zeros(rings * axes)
-            row[(ring - 1) * axes : ring * axes] = direction
-            coefficients.append(row)
+            number[key] = len(directions)
+            directions.append(direction)
             level.append(ring)
         return number[key]
 
+    ids = [
+        [[vertex(ring, plane, i) for i in range(sides)] for plane in planes] for ring in range(1, rings + 1)
+    ]
     faces = []
-    for plane in planes:
-        ids = [[vertex(ring, plane, i) for i in range(sides)] for ring in range(1, rings + 1)]
-        following = [[row[(i + 1) % sides] for i in range(sides)] for row in ids]
-        faces += [(0, ids[0][i], following[0][i]) for i in range(sides)]
-        for inner in range(rings - 1):
-            outer = inner + 1
+    for ellipse in range(len(planes)):
+        for i in range(sides):
+            j = (i + 1) % sides
+            faces.append((0, ids[0][ellipse][i], ids[0][ellipse][j]))
+        for inner, outer in pairwise(ids):
             for i in range(sides):
-                faces.append((ids[inner][i], ids[outer][i], following[outer][i]))
-                faces.append((ids[inner][i], following[outer][i], following[inner][i]))
-    return Pattern(np.array(coefficients), np.array(level), np.array(faces, np.int32), rings, axes)
+                j = (i + 1) % sides
+                faces.append((inner[ellipse][i], outer[ellipse][i], outer[ellipse][j]))
+                faces.append((inner[ellipse][i], outer[ellipse][j], inner[ellipse][j]))
+    return Pattern(np.array(directions), np.array(level), np.array(faces, np.int32), len(planes))
+
+
+def semi_axes(quaternions: np.ndarray, order: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) float32 one-sigma semi-axes in the world frame; row k is ``sigma[:, k]`` along axis
+    ``order[:, k]``."""
+    w, x, y, z = np.ascontiguousarray(quaternions.T)
+    two = np.float32(2)
+    columns = np.empty((3, 3, len(w)), np.float32)
+    columns[0] = 1 - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)
+    columns[1] = two * (x * y - w * z), 1 - two * (x * x + z * z), two * (y * z + w * x)
+    columns[2] = two * (x * z + w * y), two * (y * z - w * x), 1 - two * (x * x + y * y)
+    own = np.ascontiguousarray(columns.transpose(2, 0, 1))
+    own = own[np.arange(len(w))[:, None], order]
+    own *= sigma[:, :, None]
+    return own
 
 
 def build(
-    patterns: list[Pattern],
+    shapes: list[Shape],
     choice: np.ndarray,
     centers: np.ndarray,
-    axes: np.ndarray,
-    radii: np.ndarray,
+    quaternions: np.ndarray,
+    order: np.ndarray,
+    sigma: np.ndarray,
     rgb: np.ndarray,
-    alpha: np.ndarray,
+    opacity: np.ndarray,
+    limit: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (v, 3), faces (f, 3), colours (v, 4) and the owner (f,) of each face, splat after splat.
 
-    ``choice`` (n,) numbers each splat's pattern; ``axes`` (n, a, 3) are one-sigma semi-axes; ``radii`` (n, rings) the
-    radius of each ring in sigma and ``alpha`` (n, rings + 1) the opacity of the centre and of each ring, both padded
-    to the longest pattern; ``rgb`` is (n, 3).
+    ``choice`` (n,) numbers each splat's shape; ``order`` (n, 3) and ``sigma`` (n, 3) give its axes as in
+    ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the product is clamped to 1. A fan whose area
+    is more than that of a circle of ``limit`` (n,) standard deviations is shrunk to it.
     """
     n = len(centers)
-    vertex_count = np.array([len(p.level) for p in patterns], np.int64)[choice]
-    face_count = np.array([len(p.faces) for p in patterns], np.int64)[choice]
-    vertex_end, face_end = np.cumsum(vertex_count), np.cumsum(face_count)
-    v, f = (int(vertex_end[-1]), int(face_end[-1])) if n else (0, 0)
+    vertex_count = np.array([len(s.pattern.level) for s in shapes])[choice]
+    face_count = np.array([len(s.pattern.faces) for s in shapes])[choice]
+    vertex_start, face_start = np.cumsum(vertex_count) - vertex_count, np.cumsum(face_count) - face_count
+    v, f = int(vertex_count.sum()), int(face_count.sum())
     if max(v, f) > np.iinfo(np.int32).max:
-        raise ValueError(f"the mesh would have {v} vertices and {f} triangles, more than 2^31: use max_triangles")
+        raise ValueError(
+            f"the mesh would have {v} vertices and {f} triangles, more than 2^31: use max_triangles"
+        )
     vertices = np.empty((v, 3), np.float32)
     colors = np.empty((v, 4), np.float32)
     faces = np.empty((f, 3), np.int32)
     owner = np.repeat(np.arange(n, dtype=np.int32), face_count)
+    recipes = [_recipe(shape) for shape in shapes]
     for begin in range(0, n, CHUNK):
-        chunk = slice(begin, min(begin + CHUNK, n))
-        for number, shape in enumerate(patterns):
-            rows = np.flatnonzero(choice[chunk] == number) + begin
+        end = min(begin + CHUNK, n)
+        for number, (shape, (place, tint)) in enumerate(zip(shapes, recipes, strict=True)):
+            rows = np.flatnonzero(choice[begin:end] == number) + begin
             if not len(rows):
                 continue
-            m, t, k = len(shape.level), len(shape.faces), len(rows)
-            # One matrix product places all vertices: columns are the centre and the scaled semi-axes of every ring.
-            place = np.zeros((1 + shape.rings * shape.axes, m, 3, 3))
-            place[0] = np.eye(3)
-            place[1:] = np.einsum("mq,xy->qmxy", shape.coefficients, np.eye(3))
-            parts = np.empty((k, 1 + shape.rings * shape.axes, 3), np.float32)
-            parts[:, 0] = centers[rows]
-            own = axes[rows]
-            for ring in range(shape.rings):
-                span = slice(1 + ring * shape.axes, 1 + (ring + 1) * shape.axes)
-                np.multiply(own, radii[rows, ring, None, None], out=parts[:, span])
-            matrix = np.ascontiguousarray(place.transpose(0, 2, 1, 3), np.float32).reshape(-1, 3 * m)
-            block = parts.reshape(k, -1) @ matrix
-            # The same for colours: each output number is one of r, g, b or one of the opacity levels.
-            source = np.zeros((3 + shape.rings + 1, m, 4), np.float32)
-            source[[0, 1, 2], :, [0, 1, 2]] = 1
-            source[3 + shape.level, np.arange(m), 3] = 1
-            tint = np.concatenate([rgb[rows], alpha[rows, : shape.rings + 1]], axis=1) @ source.reshape(-1, 4 * m)
-            first_vertex = vertex_end[rows] - vertex_count[rows]
-            first_face = face_end[rows] - face_count[rows]
-            corners = (first_vertex.astype(np.int32)[:, None] + shape.faces.reshape(1, -1)).reshape(-1, 3)
-            if k == chunk.stop - chunk.start:  # one pattern: the chunk's rows lie together
-                vertices[first_vertex[0] : first_vertex[0] + k * m] = block.reshape(-1, 3)
-                colors[first_vertex[0] : first_vertex[0] + k * m] = tint.reshape(-1, 4)
-                faces[first_face[0] : first_face[0] + k * t] = corners
+            whole = len(rows) == end - begin
+            own = slice(begin, end) if whole else rows
+            sides, radii = shape.profile.sides, shape.profile.radii
+            sizes = sigma[own]
+            if limit is not None:
+                round_radius = radii[-1] * np.sqrt(sides / (2 * np.pi) * np.sin(2 * np.pi / sides))
+                sizes = sizes * np.minimum(1, limit[own] / np.float32(round_radius))[:, None]
+            axes = semi_axes(quaternions[own], order[own], sizes)
+            used = shape.pattern.directions.shape[1]
+            parts = np.concatenate([centers[own], axes[:, :used].reshape(len(rows), -1)], axis=1)
+            levels = np.minimum(
+                opacity[own][:, None] * np.array(shape.profile.opacities, np.float32), np.float32(1)
+            )
+            points = (parts @ place).reshape(-1, 3)
+            paint = (np.concatenate([rgb[own], levels], axis=1) @ tint).reshape(-1, 4)
+            local = shape.pattern.faces
+            corners = (vertex_start[own].astype(np.int32)[:, None] + local.reshape(1, -1)).reshape(-1, 3)
+            if whole:  # the rows lie together
+                first, last = vertex_start[begin], vertex_start[begin] + len(points)
+                vertices[first:last], colors[first:last] = points, paint
+                faces[face_start[begin] : face_start[begin] + len(corners)] = corners
             else:
-                into = (first_vertex[:, None] + np.arange(m)).ravel()
-                vertices[into] = block.reshape(-1, 3)
-                colors[into] = tint.reshape(-1, 4)
-                faces[(first_face[:, None] + np.arange(t)).ravel()] = corners
+                into = (vertex_start[own][:, None] + np.arange(len(shape.pattern.level))).ravel()
+                vertices[into], colors[into] = points, paint
+                faces[(face_start[own][:, None] + np.arange(len(local))).ravel()] = corners
     return vertices, faces, colors, owner
+
+
+def _recipe(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Two matrices that do a splat's vertices in one product each.
+
+    (3 + 3 a, 3 m) from centre and semi-axes to positions; (3 + rings + 1, 4 m), of ones and zeros, from r, g,
+    b and the opacities of centre and rings to RGBA.
+    """
+    directions, level = shape.pattern.directions, shape.pattern.level
+    m, a = directions.shape
+    radius = np.array((0.0, *shape.profile.radii))[level]
+    place = np.zeros((1 + a, 3, m, 3))
+    for axis in range(3):
+        place[0, axis, :, axis] = 1
+        place[1:, axis, :, axis] = (radius[:, None] * directions).T
+    tint = np.zeros((3 + len(shape.profile.opacities), m, 4), np.float32)
+    tint[[0, 1, 2], :, [0, 1, 2]] = 1
+    tint[3 + level, np.arange(m), 3] = 1
+    return place.reshape(-1, 3 * m).astype(np.float32), tint.reshape(-1, 4 * m)

@@ -1,0 +1,185 @@
+"""How large a pixel is at each splat, and the low-pass filter of that size which splats were trained with.
+
+3DGS adds 0.3 px^2 to the covariance of every splat on the picture, 2DGS never draws one narrower than a
+standard deviation of sqrt(1/2) px. A mesh has no such filter: its triangles must be wide enough from the
+start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.conversion.options import ConversionOptions
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.spherical_harmonics import sh_basis
+
+FILTER_PX2 = {"3dgs": 0.4, "antialiased": 0.4, "2dgs": 0.5}
+"""Variance of the filter in square pixels by the kernel of the cloud. 3DGS adds 0.3; 0.4 is nearer to its
+pictures also from farther away than the cameras given."""
+
+MAX_CAMERAS = 32
+"""Of more cameras, so many are used, evenly spaced in their order."""
+
+SPACING_SHARE = 0.35
+"""Pixel size as a share of the spacing of the splats, where nothing else is known."""
+
+_CHUNK = 1 << 14
+
+
+class Views:
+    """What the cameras see of each splat: weights (f / d)^2, the pixels that a unit of area at the splat
+    covers."""
+
+    def __init__(self, means: np.ndarray, cameras: Sequence[Camera]) -> None:
+        chosen = np.unique(
+            np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS)).round().astype(int)
+        )
+        self.cameras = [cameras[i] for i in chosen]
+        self.means = means
+        # Differences of nearby positions lose nothing in float32, positions far from the origin would.
+        self.origin = (
+            means[:: max(1, len(means) // 1000)].mean(axis=0, dtype=np.float64) if len(means) else np.zeros(3)
+        )
+
+    def chunks(self):
+        """Yields a slice of splats, (k, c, 3) offsets from each camera's centre and (k, c) weights; 0: not
+        seen."""
+        rotations = np.stack([camera.world_to_camera[:3, :3] for camera in self.cameras])
+        centers = np.stack([camera.center for camera in self.cameras]) - self.origin
+        matrix = np.ascontiguousarray(rotations.reshape(-1, 3).T, np.float32)
+        shift = -np.einsum("cij,cj->ci", rotations, centers).astype(np.float32).reshape(-1)
+        fx, fy, cx, cy, width, height, near = (
+            np.array([getattr(camera, name) for camera in self.cameras], np.float32)
+            for name in ("fx", "fy", "cx", "cy", "width", "height", "near")
+        )
+        for begin in range(0, len(self.means), _CHUNK):
+            part = slice(begin, min(begin + _CHUNK, len(self.means)))
+            seen_from = (self.means[part] - self.origin).astype(np.float32) @ matrix + shift
+            x, y, z = seen_from.reshape(len(seen_from), -1, 3).transpose(2, 0, 1)
+            inside = z > near
+            # On the picture: |fx x / z + cx - w / 2| <= w / 2, without the division.
+            inside &= np.abs(fx * x + (cx - width / 2) * z) <= width / 2 * z
+            inside &= np.abs(fy * y + (cy - height / 2) * z) <= height / 2 * z
+            square = np.maximum(x * x + y * y + z * z, np.float32(1e-30))
+            yield part, seen_from, np.where(inside, fx * fy / square, np.float32(0))
+
+    def pixel_sizes(self) -> np.ndarray:
+        """(n,) float32 size of a pixel at each splat in scene units: d / f with 1 / d^2 averaged over the
+        cameras that see it, so that near views, where it covers more pixels, count for more. 0 where no
+        camera sees the splat."""
+        sizes = np.empty(len(self.means), np.float32)
+        for part, _, weight in self.chunks():
+            count = (weight > 0).sum(axis=1)
+            total = weight.sum(axis=1)
+            sizes[part] = np.sqrt(np.divide(count, total, out=np.zeros_like(total), where=count > 0))
+        return sizes
+
+    def mean_colors(self, sh: np.ndarray) -> np.ndarray:
+        """(n, 3) display colour of coefficients ``sh`` (n, k, 3) averaged over the cameras that see each
+        splat, in [0, 1].
+
+        Views count by the pixels that the splat covers. Averaged first, clipped after. Degree 0 for unseen
+        splats.
+        """
+        degree = int(sh.shape[1] ** 0.5) - 1
+        colors = np.empty((len(sh), 3), np.float32)
+        rotations = [camera.world_to_camera[:3, :3].astype(np.float32) for camera in self.cameras]
+        for part, seen_from, weight in self.chunks():
+            offsets = seen_from.reshape(len(seen_from), -1, 3)
+            mean = np.zeros((len(weight), sh.shape[1]), np.float32)
+            for c, rotation in enumerate(rotations):
+                rows = np.flatnonzero(weight[:, c])
+                ray = offsets[rows, c] @ rotation
+                ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+                mean[rows] += weight[rows, c, None] * sh_basis(ray, degree)
+            total = weight.sum(axis=1)
+            mean /= np.where(total > 0, total, 1)[:, None]
+            mean[total == 0, 0] = sh_basis(np.zeros((1, 3), np.float32), 0)[0, 0]
+            colors[part] = np.clip(0.5 + np.einsum("nk,nkc->nc", mean, sh[part]), 0, 1)
+        return colors
+
+
+def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
+    """(n,) float32 spacing of ``points`` (n, 3) round each of them, in their units.
+
+    Concretely, the points are sorted into a cubic grid of halving cells; a point's spacing is ``side /
+    sqrt(count)`` of the smallest cell round it that holds at least ``share`` points, as if these lay on a
+    surface. Points in one spot have the spacing of the smallest cell, 2^-20 of the extent.
+    """
+    levels = 20
+    low = points.min(axis=0).astype(np.float64)
+    extent = float((points.max(axis=0) - low).max())
+    n = len(points)
+    if n == 1 or extent == 0:
+        return np.zeros(n, np.float32)
+    cells = ((points - low) * ((1 << levels) * (1 - 1e-9) / extent)).astype(np.uint64)
+    code = np.zeros(n, np.uint64)
+    for axis in range(3):
+        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
+    order = np.argsort(code, kind="stable")
+    code = code[order]
+    found = np.full(n, extent / np.sqrt(n), np.float32)
+    settled = np.zeros(n, bool)
+    for level in range(levels + 1):
+        parent = code >> np.uint64(3 * level)
+        starts = np.flatnonzero(np.concatenate([[True], parent[1:] != parent[:-1]]))
+        counts = np.diff(np.append(starts, n))
+        enough = np.repeat(counts >= share, counts) & ~settled
+        if enough.any():
+            side = extent / (1 << (levels - level))
+            found[enough] = np.repeat(side / np.sqrt(counts), counts)[enough]
+            settled |= enough
+            if settled.all():
+                break
+    result = np.empty(n, np.float32)
+    result[order] = found
+    return result
+
+
+def _every_third_bit(values: np.ndarray) -> np.ndarray:
+    """21-bit numbers with two zero bits after each bit."""
+    v = values.astype(np.uint64)
+    for shift, mask in [
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ]:
+        v = (v | (v << np.uint64(shift))) & np.uint64(mask)
+    return v
+
+
+def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views | None) -> np.ndarray | None:
+    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none'.
+
+    Splats that no camera sees take the median of the others.
+    """
+    if options.footprint == "none":
+        return None
+    if options.footprint == "distance":
+        return np.full(len(cloud), options.viewing_distance / options.focal, np.float32)  # type: ignore[operator]
+    if options.footprint == "density":
+        return np.float32(SPACING_SHARE) * spacing(cloud.means)
+    assert views is not None
+    sizes = views.pixel_sizes()
+    seen = sizes > 0
+    if not seen.any():
+        raise ValueError(
+            f"none of the {len(views.cameras)} cameras sees any of the {len(cloud)} splats: are they of the same scene?"
+            " Choose footprint='density' or 'none' to go without them"
+        )
+    return np.where(seen, sizes, np.median(sizes[seen]))
+
+
+def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str) -> np.ndarray:
+    """(n, 3) standard deviations with the filter of variance ``px2`` square pixels applied, as ``kernel``
+    does it."""
+    if pixel is None:
+        return scales
+    low_pass = (px2 * np.square(pixel, dtype=np.float32))[:, None]
+    square = np.square(scales)
+    return np.sqrt(np.maximum(square, low_pass) if kernel == "2dgs" else square + low_pass)

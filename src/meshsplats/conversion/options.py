@@ -1,0 +1,190 @@
+"""The choices of a conversion, its presets, and what can be told wrong before any work is done."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, fields, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+Mode = Literal["crossed", "flat", "3d"]
+Footprint = Literal["cameras", "distance", "density", "none"]
+Colors = Literal["degree0", "cameras"]
+
+
+@dataclass(frozen=True)
+class ConversionOptions:
+    """Every choice of ``convert``. None leaves it to the preset; lengths called radius are standard
+    deviations."""
+
+    mode: Mode | None = None
+    """flat: one ellipse in the two largest axes of each splat. crossed: a second one, upright on it along the
+    longest axis, so that no splat vanishes edge-on; a splat flatter than ``flat_below`` gets one finer
+    ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3."""
+    scale_mul: float | None = None
+    """Radius of the rim in standard deviations, 0.1 to 10. Default: calibrated; paper: 2.7."""
+    no_triag: int | None = None
+    """Triangles round the centre of an ellipse, 3 to 64 (3d: a multiple of 4; crossed: even). Default: 8 for
+    flat, else 4; paper: 8."""
+    opac_mul: float | None = None
+    """Opacity of the rim as a fraction of the splat's, 0 to 1. Default: 0; paper: 0.2."""
+    center_mul: float | None = None
+    """Opacity of the centre as a multiple of the splat's, above 0 to 2; the product is clamped to 1. Default:
+    calibrated; paper: 1."""
+    rings: int | None = None
+    """Rings of vertices in an ellipse, 1 to 4; the last is the rim. More follow the Gaussian closer: 2 rings
+    draw 3 * no_triag triangles an ellipse. Default and paper: 1."""
+    flat_below: float | None = None
+    """crossed: a splat whose smallest standard deviation (with its footprint) is less than this fraction of
+    the middle one is drawn as one ellipse of twice as many triangles, 0 to 1."""
+    compensation: float | None = None
+    """0 to 1. 1 scales a splat's opacity so that its ellipses cover, on average over all directions, as much
+    opacity times area as the splat itself; 0 leaves the opacity; between, a power of that factor. Paper:
+    0."""
+    footprint: Footprint | None = None
+    """Where the size of a pixel at each splat comes from, for the low-pass filter that splats were trained
+    with: the cameras, one stated distance, the spacing of the splats (scenes seen from where such detail was
+    recorded), or none (a model trained without the filter). Default: cameras if there are any, else distance
+    if stated, else density."""
+    footprint_px2: float | None = None
+    """Variance of that filter in square pixels, 0 to 100; every standard deviation s becomes
+    sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats trained as 2DGS."""
+    viewing_distance: float | None = None
+    """Distance the mesh will be seen from, scene units; for footprint = distance."""
+    focal: float | None = None
+    """Focal length in pixels of the pictures taken from ``viewing_distance``. Default: 1000, such as 1000
+    pixels over 53 degrees."""
+    min_opacity: float | None = None
+    """Splats of less opacity than this are left out, 0 to 1. Default: 1/255, below which they do not show;
+    paper: 0."""
+    shrink_faint: bool | None = None
+    """Limit the ellipses of faint splats to where the splat reaches an opacity of 1/255. Paper: no."""
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Box x0 y0 z0 x1 y1 z1 in scene units: splats with their centre outside are left out."""
+    max_splats: int | None = None
+    """Keep at most so many splats, the most important by opacity times visible area."""
+    max_triangles: int | None = None
+    """Keep the most important splats whose triangles number at most so many."""
+    colors: Colors | None = None
+    """degree0: the view-independent part of the colour. cameras: the mean of the colours that the cameras
+    see, where the splats have spherical harmonics."""
+
+    def resolved(self, preset: str, *, has_cameras: bool) -> ConversionOptions:
+        """With the preset's values where nothing was said, checked.
+
+        Raises ValueError for an unknown preset, values out of range and choices that contradict each other.
+        """
+        if preset not in PRESETS:
+            raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+        defaults = PRESETS[preset]
+        given = {f.name for f in fields(self) if getattr(self, f.name) is not None}
+        full = replace(
+            self, **{f.name: getattr(defaults, f.name) for f in fields(self) if f.name not in given}
+        )
+        if full.no_triag is None:
+            full = replace(full, no_triag=8 if full.mode == "flat" else 4)
+        if full.footprint is None:
+            source: Footprint = "cameras" if has_cameras else "density"
+            full = replace(full, footprint=source if self.viewing_distance is None else "distance")
+        full._check(given, has_cameras)
+        return full
+
+    def _check(self, given: set[str], has_cameras: bool) -> None:
+        for name, kind in [("mode", Mode), ("footprint", Footprint), ("colors", Colors)]:
+            if getattr(self, name) not in get_args(kind):
+                raise ValueError(
+                    f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}"
+                )
+        for name, low, high, whole in _RANGES:
+            value = getattr(self, name)
+            if value is None:
+                continue
+            number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+            if not number or not low <= value <= high or (whole and int(value) != value):
+                what = "a whole number" if whole else "a number"
+                raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
+        if self.mode == "3d" and self.no_triag % 4:  # type: ignore[operator]
+            raise ValueError(f"no_triag must be a multiple of 4 in mode '3d', got {self.no_triag}")
+        if self.mode == "crossed" and self.no_triag % 2:  # type: ignore[operator]
+            raise ValueError(f"no_triag must be even in mode 'crossed', got {self.no_triag}")
+        if "flat_below" in given and self.mode != "crossed":
+            raise ValueError(f"flat_below is for mode 'crossed', got mode {self.mode!r}")
+        if self.footprint == "cameras" and not has_cameras:
+            raise ValueError(
+                "footprint='cameras' needs cameras: give some, or choose distance, density or none"
+            )
+        if self.footprint == "distance" and self.viewing_distance is None:
+            raise ValueError("footprint='distance' needs viewing_distance, in scene units")
+        if self.footprint != "distance" and given & {"viewing_distance", "focal"}:
+            named = " and ".join(sorted(given & {"viewing_distance", "focal"}))
+            raise ValueError(f"{named} is for footprint='distance', got footprint={self.footprint!r}")
+        if self.footprint == "none" and "footprint_px2" in given:
+            raise ValueError("footprint_px2 says how wide the footprint is, but footprint is 'none'")
+        if self.colors == "cameras" and not has_cameras:
+            raise ValueError("colors='cameras' needs cameras")
+        if self.crop is not None:
+            box = np.asarray(self.crop, np.float64)
+            if box.shape != (6,) or not np.isfinite(box).all() or not (box[:3] <= box[3:]).all():
+                raise ValueError(
+                    f"crop must be x0 y0 z0 x1 y1 z1 with each minimum <= its maximum, got {self.crop}"
+                )
+
+
+_RANGES: list[tuple[str, float, float, bool]] = [
+    ("scale_mul", 0.1, 10, False),
+    ("no_triag", 3, 64, True),
+    ("opac_mul", 0, 1, False),
+    ("center_mul", 1e-3, 2, False),
+    ("rings", 1, 4, True),
+    ("flat_below", 0, 1, False),
+    ("compensation", 0, 1, False),
+    ("footprint_px2", 0, 100, False),
+    ("viewing_distance", 1e-30, 1e30, False),
+    ("focal", 1e-3, 1e9, False),
+    ("min_opacity", 0, 1, False),
+    ("max_splats", 1, 2**31 - 1, True),
+    ("max_triangles", 1, 2**31 - 1, True),
+]
+
+PRESETS = {
+    "default": ConversionOptions(
+        mode="crossed",
+        opac_mul=0.0,
+        rings=1,
+        flat_below=0.15,
+        compensation=1.0,
+        focal=1000.0,
+        min_opacity=1 / 255,
+        shrink_faint=True,
+        colors="degree0",
+    ),
+    "paper": ConversionOptions(
+        mode="flat",
+        scale_mul=2.7,
+        no_triag=8,
+        opac_mul=0.2,
+        center_mul=1.0,
+        rings=1,
+        flat_below=0.0,
+        compensation=0.0,
+        footprint="none",
+        focal=1000.0,
+        min_opacity=0.0,
+        shrink_faint=False,
+        colors="degree0",
+    ),
+}
+"""default: calibrated to look like the splats. paper: arXiv 2502.07754 with its published code's opac_mul and
+no_triag."""
+
+
+def make_options(named: dict) -> ConversionOptions:
+    """``ConversionOptions(**named)``; a misspelt name is a TypeError that says which names there are."""
+    known = [f.name for f in fields(ConversionOptions)]
+    for name in named:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
+            raise TypeError(f"convert has no option {name!r}{hint}")
+    return ConversionOptions(**named)
