@@ -76,6 +76,11 @@ def test_compressed_ply_without_colour_ranges(tmp_path):
     )
 
 
+def test_compressed_ply_kernel(tmp_path):
+    (tmp_path / "a.ply").write_bytes(encode.compressed_ply(some_splats(), comments=["SplatRenderMode: mip"]))
+    assert load_gaussians(tmp_path / "a.ply").kernel == "antialiased"
+
+
 def test_compressed_ply_by_hand(tmp_path):
     """One splat with its fields typed out: a quarter turn about z, at three fifths of the range of x."""
     names = [f"{end}_{kind}{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
@@ -156,6 +161,17 @@ def test_spz_positions_by_hand(tmp_path):
     (tmp_path / "a.spz").write_bytes(encode.gzip.compress(body))
     cloud = load_gaussians(tmp_path / "a.spz", axes="y-down")
     np.testing.assert_array_equal(cloud.means, [[1, -1 / 256, -32768], [32768 - 1 / 256, 1 / 256, 0.5]])
+
+
+def test_rotations_too_long_for_their_largest_component(tmp_path):
+    """Three components of sqrt(1/2) leave less than nothing for the fourth: it is 0, and the rest is"""
+    values = some_splats(1, degree=0)
+    data = encode.spz_attributes(values, 3)
+    data["rotations"] = struct.pack("<I", 3 << 30 | 511 << 20 | 511 << 10 | 511)
+    body = encode.spz_header(values, 3) + b"".join(data.values())
+    (tmp_path / "a.spz").write_bytes(encode.gzip.compress(body))
+    cloud = load_gaussians(tmp_path / "a.spz", axes="y-down", strict=True)
+    np.testing.assert_allclose(cloud.quaternions, [[0, 3**-0.5, 3**-0.5, 3**-0.5]], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("flags", "kernel"), [(0, "3dgs"), (1, "antialiased")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import struct
 import tracemalloc
 import zipfile
@@ -209,20 +210,23 @@ FOLDERS = {
 
 def check(path, message):
     tracemalloc.start()
-    with pytest.raises(FileFormatError, match=message) as caught:
+    with pytest.raises(FileFormatError) as caught:
         load_gaussians(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert len(str(caught.value)) < 500
-    assert str(path.parent) in str(caught.value)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    assert re.search(message, text[len(str(path)) :]), text  # the path may hold the words looked for
+    assert len(text) < 500
     assert peak < 90e6
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_files(tmp_path, name):
     data, message = FILES[name]
-    (tmp_path / name).write_bytes(data)
-    check(tmp_path / name, message)
+    path = tmp_path / f"a.{name.rsplit('.')[-1]}"
+    path.write_bytes(data)
+    check(path, message)
 
 
 @pytest.mark.parametrize("name", FOLDERS)

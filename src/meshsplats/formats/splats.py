@@ -75,9 +75,10 @@ def load_gaussians(
 
 
 def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
-    """The splat format of a file or folder by its content, None for anything else, such as a mesh.
+    """The splat format that a file or folder has by its beginning, None if it has none.
 
-    Only the beginning is looked at: the file may still be broken. Raises FileNotFoundError.
+    Some containers serve meshes too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to hold one, and any
+    file may be broken. Raises FileNotFoundError.
     """
     source = Path(path)
     try:
