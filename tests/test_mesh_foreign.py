@@ -133,12 +133,12 @@ def test_gltf_strips_and_fans(tmp_path, mode, faces, index_type):
 def test_gltf_positions_in_integers_and_interleaved(tmp_path):
     """KHR_mesh_quantization, with a stride of 12 bytes and an offset."""
     rows = np.zeros((3, 6), "<i2")
-    rows[:, 1:4] = [[0, 0, 0], [32767, 0, 0], [0, -32767, 16384]]
+    rows[:, 1:4] = [[0, 0, 0], [32767, 0, 0], [-32768, -32767, 16384]]  # both of the last are -1
     document = gltf([(rows, "VEC4", True)], extensionsRequired=["KHR_mesh_quantization"])
     document["bufferViews"][0]["byteStride"] = 12
     document["accessors"][0] |= {"type": "VEC3", "byteOffset": 2}
     got = load(tmp_path, document).vertices
-    np.testing.assert_allclose(got, [[0, 0, 0], [1, 0, 0], [0, -1, 16384 / 32767]], rtol=1e-6)
+    np.testing.assert_allclose(got, [[0, 0, 0], [1, 0, 0], [-1, -1, 16384 / 32767]], rtol=1e-6)
 
 
 def test_gltf_buffers_beside_the_file(tmp_path):

@@ -162,6 +162,13 @@ def test_npz_headers_that_lie(tmp_path):
     data[data.index(TRIANGLE.tobytes()) + 12] ^= 1
     path.write_bytes(data)
     refused(path, "CRC")
+    for compressed in (False, True):
+        wrong = bytearray(npz(path, compressed=compressed).read_bytes())
+        with zipfile.ZipFile(path) as archive:
+            check_sum = archive.getinfo("vertices.npy").CRC.to_bytes(4, "little")
+        assert wrong.count(check_sum) == 2
+        path.write_bytes(wrong.replace(check_sum, b"\0\0\0\0"))
+        refused(path, "CRC")
     path.write_bytes(b"PK\x03\x04" + bytes(100))
     refused(path, "not a zip file")
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as odd, zipfile.ZipFile(good) as source:

@@ -10,12 +10,11 @@ import os
 import shutil
 import subprocess
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
 from meshsplats.errors import MissingDependencyError
-from meshsplats.formats.glb import ColorType, write_glb
+from meshsplats.formats.glb import Alpha, ColorType, write_glb
 from meshsplats.mesh import SplatMesh
 
 Compression = Literal["meshopt"]
@@ -32,6 +31,7 @@ def write_compressed_glb(
     compression: Compression,
     lit: bool = False,
     color_type: ColorType = "uint16",
+    alpha: Alpha = "blend",
 ) -> None:
     """Writes ``mesh`` to ``path`` with positions and colours of 16 bits, compressed.
 
@@ -52,10 +52,9 @@ def write_compressed_glb(
             "compression needs the program gltfpack: npm install -g gltfpack, or a binary from"
             " https://github.com/zeux/meshoptimizer/releases on the PATH or named by MESHSPLATS_GLTFPACK"
         )
-    bare = replace(mesh, face_splat=None, depth_group=None, attributes={})
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         plain, packed = Path(folder) / "plain.glb", Path(folder) / "packed.glb"
-        write_glb(bare, plain, lit=lit)
+        write_glb(mesh, plain, lit=lit, alpha=alpha, extras=False)
         precision = ["-vp", str(_BITS), "-vc", "16", "-vn", "12"]
         done = subprocess.run(
             [program, "-i", plain, "-o", packed, "-cc", *precision, "-ke", "-km", "-kn"],

@@ -212,7 +212,7 @@ def _join(
         "up": (0, 1, 0),
     }
     if note and len(own["primitives"]) == 1:
-        arrays |= _restore(document, own, note, len(arrays["faces"]), int(counts[-1]))
+        arrays |= _restore(document, own, note, len(arrays["faces"]), colors)
     return checked_mesh(document.path, **arrays)
 
 
@@ -238,12 +238,13 @@ def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
 
 
 def _restore(
-    document: GltfDocument, mesh: dict[str, Any], note: dict[str, Any], f: int, v: int
+    document: GltfDocument, mesh: dict[str, Any], note: dict[str, Any], f: int, colors: np.ndarray
 ) -> dict[str, Any]:
     """Constructor arguments from our note. What another program has dropped or renumbered is left out, with a
     DataWarning: better no splat numbers than wrong ones."""
     result: dict[str, Any] = {"up": note["up"], "blending": note["blending"]}
     lost: list[str] = []
+    v = len(colors)
     for name in ("face_splat", "depth_group"):
         if name in note:
             values = _raw(document, _dict(note[name]), "<i4", f)
@@ -251,6 +252,14 @@ def _restore(
                 lost.append(name)
             else:
                 result[name] = values
+    if isinstance(note.get("alpha"), str):
+        true_alpha = _attribute(
+            document, mesh["primitives"][0]["attributes"], {"semantic": note["alpha"]}, v, 1
+        )
+        if true_alpha is None:
+            lost.append("opacities")
+        else:
+            result["colors"] = np.concatenate([colors[:, :3], np.clip(true_alpha, 0, 1)], axis=1)
     attributes: dict[str, np.ndarray] = {}
     stored = _dict(mesh["primitives"][0]["attributes"])
     entries = note.get("attributes", [])

@@ -10,7 +10,7 @@ from typing import Any
 
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.atomic import atomic_path
-from meshsplats.formats.glb import ColorType, write_glb
+from meshsplats.formats.glb import Alpha, ColorType, write_glb
 from meshsplats.formats.glb_compressed import Compression, write_compressed_glb
 from meshsplats.formats.gltf_reader import read_gltf
 from meshsplats.formats.mesh_ply import read_mesh_ply, write_mesh_ply
@@ -27,7 +27,8 @@ _WRITERS: dict[str, Callable[..., None]] = {
     **dict.fromkeys(_USD, write_usd),
     ".obj": write_obj,
 }
-_OPTION_SUFFIXES = {"lit": (".glb", *_USD), "color_type": (".glb",), "compression": (".glb",)}
+_GLB = (".glb",)
+_OPTION_SUFFIXES = {"lit": (*_GLB, *_USD), "color_type": _GLB, "alpha": _GLB, "compression": _GLB}
 
 MESH_SUFFIXES = tuple(_WRITERS)
 """Suffixes that ``save_mesh`` knows."""
@@ -75,6 +76,7 @@ def save_mesh(
     *,
     lit: bool | None = None,
     color_type: ColorType | None = None,
+    alpha: Alpha | None = None,
     compression: Compression | None = None,
 ) -> None:
     """Writes ``mesh`` in the format that the suffix of ``path`` names, whole or not at all.
@@ -90,6 +92,8 @@ def save_mesh(
     - ``lit`` (`.glb`, USD; default False): a material that scene lights shade instead of one that shows the
       colours as they are.
     - ``color_type`` (`.glb`; default 'uint16'): 'float32' stores colours exactly, but larger.
+    - ``alpha`` (`.glb`; default 'blend'): 'mask' or 'hash-friendly' for viewers that do not sort; they are
+      drawn solid where opacity reaches a cutoff, one for all or one for each splat.
     - ``compression`` (`.glb`): 'meshopt' makes files about a fifth as large, with the external program
       gltfpack. Each coordinate is moved by at most 1/131070 of the longest side of the mesh's box; triangles
       change their order a little; splat numbers and attributes are left out. Such files are for viewers;
@@ -105,7 +109,7 @@ def save_mesh(
     if writer is None:
         known = ", ".join(_WRITERS)
         raise ValueError(f"{target.name!r} does not name a mesh format; choose a name that ends in {known}")
-    given = {"lit": lit, "color_type": color_type, "compression": compression}
+    given = {"lit": lit, "color_type": color_type, "alpha": alpha, "compression": compression}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     for name in options:
         if suffix not in _OPTION_SUFFIXES[name]:
