@@ -57,6 +57,35 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
     assert lines[-1].startswith("next: meshsplats compare '")  # the space in the name is quoted
 
 
+def test_options_reach_the_conversion(splats, tmp_path):
+    options = {"mode": "flat", "no_triag": 6, "rings": 2, "max_splats": 20, "crop": (-1.0, -1, -1, 1, 1, 1)}
+    flags = [f"--{name.replace('_', '-')}" for name in options]
+    given = []
+    for flag, value in zip(flags, options.values(), strict=True):
+        given += [flag, *(value if isinstance(value, tuple) else (value,))]
+    assert run(splats, "-o", tmp_path / "mesh.npz", "--no-preview", *given) == 0
+    expected = convert(load_gaussians(splats), **options)
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+    np.testing.assert_array_equal(mesh.colors, expected.colors)
+    stored = json.loads((tmp_path / "mesh.config.json").read_text())["options"]
+    assert (stored["no_triag"], stored["scale_mul"], stored["crop"]) == (6, None, [-1, -1, -1, 1, 1, 1])
+
+
+def test_cameras_of_a_model_folder_are_used(splats, tmp_path):
+    folder = tmp_path / "model" / "point_cloud" / "iteration_1"
+    folder.mkdir(parents=True)
+    (folder / "point_cloud.ply").write_bytes(splats.read_bytes())
+    cameras = orbit(load_gaussians(splats), 3, up=(0, 0, 1), width=100)
+    save_cameras(cameras, tmp_path / "model" / "cameras.json")
+    assert run(tmp_path / "model", "-o", tmp_path / "mesh.npz", "--no-preview") == 0
+    expected = convert(load_gaussians(splats), cameras=cameras)
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+    assert not np.array_equal(mesh.vertices, convert(load_gaussians(splats)).vertices)
+    np.testing.assert_allclose(mesh.up, (0, 0, 1), atol=1e-6)
+
+
 def test_json(splats, tmp_path, capsys):
     assert run(splats, "-o", tmp_path / "mesh.npz", "--json", "--no-preview") == 0
     result = json.loads(capsys.readouterr().out)
@@ -96,12 +125,15 @@ def test_nothing_is_overwritten(splats, tmp_path, capsys, taken):
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["-o", "mesh.obj"], 2, ".glb"),
+        (["-o", "mesh.stl"], 2, ".glb"),
         (["-o", "mesh"], 2, ".glb"),
         (["-o", "mesh.npz", "--lit"], 2, "--lit"),
+        (["-o", "mesh.npz", "--color-type", "float32"], 2, "--color-type"),
         (["-o", "mesh.npz", "--preset", "best"], 2, "--preset"),
         ([], 2, "output"),
         (["-o", "mesh.npz", "--up", "w"], 1, "--up"),
+        (["-o", "mesh.npz", "--no-triag", "2"], 1, "no_triag"),
+        (["-o", "mesh.npz", "--footprint", "cameras"], 1, "cameras"),
         (["-o", "mesh.npz", "--cameras", "none.json"], 1, "none.json: No such file"),
         (["-o", "no/such/mesh.npz"], 1, "no/such"),
     ],

@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import warnings
+import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -37,6 +38,21 @@ NAMED_COLORS = {
     "grey": (0.5, 0.5, 0.5),
     "gray": (0.5, 0.5, 0.5),
 }
+
+
+@dataclass(frozen=True)
+class SplatOptions:
+    """How splat files are read."""
+
+    axes: Literal["auto", "y-down", "y-up"] = "auto"
+    """What points up in the file; auto: as its format prescribes. The scene has y down after reading."""
+    strict: bool = False
+    """Splats with values that are not finite are an error, not left out with a warning."""
+
+    def load(self, path: Path) -> GaussianCloud:
+        from meshsplats.formats.splats import load_gaussians
+
+        return load_gaussians(path, strict=self.strict, axes=self.axes)
 
 
 @dataclass(frozen=True)
@@ -133,31 +149,52 @@ class DrawOptions:
 
 
 def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
-    """What kind of thing ``path`` is, by its content. Raises FileFormatError if it is none of them."""
+    """What kind of thing ``path`` is, by its content. Raises FileFormatError if it is none of them.
+
+    Four kinds of file may hold either splats or a mesh: .ply, .glb and .gltf, and zip archives (.sog, .npz).
+    """
     from meshsplats.formats.ply_header import read_header
+    from meshsplats.formats.splat_gltf import has_splats
     from meshsplats.formats.splat_ply import is_float_splat
+    from meshsplats.formats.splats import splat_format
 
     if path.is_dir():
         return "splats"
     with open(path, "rb") as file:
         start = file.read(4096)
-        if re.match(rb"ply[ \t]*[\r\n]", start):
-            file.seek(0)
+        file.seek(0)
+        found = splat_format(path)
+        if found == "ply":
             return "splats" if is_float_splat(read_header(file, path)) else "mesh"
+    if found == "sog" and start.startswith(b"PK"):
+        return "mesh" if _holds_arrays(path) else "splats"
+    if found == "gltf":
+        return "splats" if has_splats(path) else "mesh"
+    text = b"\0" not in start
+    if text and (path.suffix.lower() == ".obj" or re.search(rb"(^|\n)v[ \t]+[-+.\d]", start)):
+        return "mesh"
+    if found is not None:
+        return "splats"
+    if text and re.match(rb"(\xef\xbb\xbf)?\s*[\[{]", start):
+        return "cameras"
     if not start:
         raise FileFormatError(f"{path}: the file is empty")
-    suffix = path.suffix.lower()
-    if start.startswith((b"glTF", b"PK\x03\x04")) or suffix in (".gltf", ".obj"):
-        return "mesh"
-    if start.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"[", b"{"):
-        return "cameras"
     raise FileFormatError(
-        f"{path}: neither splats (.ply), a mesh (.npz, .ply, .glb, .gltf, .obj) nor cameras (.json);"
-        f" it begins with {start[:8]!r}"
+        f"{path}: neither splats, a mesh nor cameras as known here; it begins with {start[:8]!r}"
     )
 
 
-def load_scene(path: Path, *, strict: bool = False) -> GaussianCloud | SplatMesh:
+def _holds_arrays(path: Path) -> bool:
+    """Whether a zip archive is an .npz."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith(".npy") for name in archive.namelist())
+    except (zipfile.BadZipFile, ValueError, OSError):
+        # Broken: the name decides which reader says so.
+        return path.suffix.lower() == ".npz"
+
+
+def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:
     """The splats or the mesh at ``path``."""
     kind = identify(path)
     if kind == "cameras":
@@ -165,9 +202,7 @@ def load_scene(path: Path, *, strict: bool = False) -> GaussianCloud | SplatMesh
             f"{path}: a JSON file; expected splats or a mesh (cameras are given with --cameras)"
         )
     if kind == "splats":
-        from meshsplats.formats.splats import load_gaussians
-
-        return load_gaussians(path, strict=strict)
+        return reading.load(path)
     from meshsplats.formats.meshes import load_mesh
 
     return load_mesh(path)

@@ -15,6 +15,7 @@ from meshsplats.cli.common import (
     DrawOptions,
     File,
     Output,
+    SplatOptions,
     ViewOptions,
     check_outputs,
     configuration,
@@ -46,6 +47,7 @@ class Compare:
     views: ViewOptions = field(default_factory=ViewOptions)
     """8 views of an orbit, 400 pixels wide, where nothing else is asked for."""
     draw: DrawOptions = field(default_factory=DrawOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
     amplify: float = 4.0
     """Factor that makes the error visible in the strips."""
     json: bool = False
@@ -54,13 +56,12 @@ class Compare:
     """Overwrite existing outputs."""
 
     def run(self) -> None:
-        from meshsplats.formats.splats import load_gaussians
         from meshsplats.pictures import amplified_error, save_png, strip
 
         if not self.amplify > 0:
             raise ValueError(f"--amplify must be positive, got {self.amplify}")
         background = parse_color(self.draw.background)
-        cloud = load_gaussians(self.splats)
+        cloud = self.reading.load(self.splats)
         cameras = self.views.make(cloud, self.splats, count=8, side=400)
         strips = view_names(len(cameras))
         names = (*strips, RESULTS, CAMERAS, CONFIGURATION)

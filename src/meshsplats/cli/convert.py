@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,7 @@ from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     File,
     Output,
+    SplatOptions,
     Text,
     cameras_beside,
     check_outputs,
@@ -26,8 +27,8 @@ from meshsplats.cli.common import (
     size_of,
     write_json,
 )
+from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.errors import FileFormatError
-from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh
 
 
@@ -42,52 +43,60 @@ class Convert:
     input: tyro.conf.Positional[Path]
     """Splat file, or the folder of a trained model."""
     output: Output
-    """The mesh: .glb for Blender, engines and viewers, .ply, or .npz, which keeps everything."""
+    """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
     cameras: File = None
-    """Cameras that the mesh will be seen from, for the size of its splats on the picture: a JSON list, a 3DGS
-    trainer's cameras.json, or the model folder that has one. Default: judged from the splats."""
+    """Where the mesh will be seen from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the
+    model folder that has one. Default: the cameras of the input where it is a model folder, else none."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else -y."""
     lit: bool = False
-    """.glb: a material that lights and shadows act on, not one that shows the colours as they are."""
+    """.glb, .usd: a material that lights and shadows act on, not one that shows the colours as they are."""
+    color_type: Literal["uint16", "float32"] = "uint16"
+    """.glb: how colours are stored."""
+    compression: Literal["none", "meshopt"] = "none"
+    """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
     no_preview: bool = False
     """Draw no preview."""
-    strict: bool = False
-    """Splats with values that are not finite are an error, not left out with a warning."""
+    conversion: ConversionOptions = field(default_factory=ConversionOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
     def run(self) -> None:
-        from meshsplats.conversion import convert
         from meshsplats.formats.meshes import MESH_SUFFIXES, save_mesh
-        from meshsplats.formats.splats import load_gaussians
 
         suffix = self.output.suffix.lower()
         if suffix not in MESH_SUFFIXES:
             raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
-        if self.lit and suffix != ".glb":
-            raise UsageError("--lit is for .glb: the other formats have no material")
+        if self.lit and suffix != ".glb" and not suffix.startswith(".usd"):
+            raise UsageError(f"--lit is for .glb and .usd files: {suffix} has no material")
+        if suffix != ".glb" and (self.color_type, self.compression) != ("uint16", "none"):
+            raise UsageError("--color-type and --compression are for .glb files")
         up = None if self.up is None else parse_up(self.up)
         preview = None if self.no_preview else self.output.with_suffix(".preview.png")
         config = self.output.with_suffix(".config.json")
         check_outputs([path for path in (self.output, preview, config) if path], self.force)
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; convert needs a splat file or a model folder")
-        cameras = load_cameras(self.cameras) if self.cameras is not None else None
+        cameras = cameras_beside(self.input) if self.cameras is None else load_cameras(self.cameras)
+        self.conversion.resolved(self.preset, has_cameras=bool(cameras))  # mistakes are told before the work
 
         times = [time.perf_counter()]
-        cloud = load_gaussians(self.input, strict=self.strict)
+        cloud = self.reading.load(self.input)
         times.append(time.perf_counter())
-        mesh = convert(cloud, preset=self.preset, cameras=cameras)
-        if up is None:
-            up = guess_up(None, cameras or cameras_beside(self.input))
-        mesh = replace(mesh, up=up)
+        mesh = convert(cloud, preset=self.preset, cameras=cameras, up=up, **asdict(self.conversion))
         times.append(time.perf_counter())
-        save_mesh(mesh, self.output, lit=True if self.lit else None)
+        save_mesh(
+            mesh,
+            self.output,
+            lit=True if self.lit else None,
+            color_type=None if self.color_type == "uint16" else self.color_type,
+            compression=None if self.compression == "none" else self.compression,
+        )
         times.append(time.perf_counter())
         write_json(config, configuration("convert", self))
         if preview:
@@ -113,9 +122,11 @@ class Convert:
         print(f"next: {self._next()}")
 
     def _next(self) -> str:
-        paths = map(shlex.quote, map(str, (self.input, self.output, self.output.with_suffix(""))))
-        splats, mesh, folder = paths
-        return f"meshsplats compare {splats} {mesh} -o {folder}-compare"
+        splats, mesh, folder = (
+            shlex.quote(str(path)) for path in (self.input, self.output, self.output.with_suffix(""))
+        )
+        readable = self.output.suffix.lower() in (".npz", ".ply", ".glb") and self.compression == "none"
+        return f"meshsplats compare {splats} {mesh + ' ' if readable else ''}-o {folder}-compare"
 
 
 def _draw_preview(mesh: SplatMesh, path: Path) -> None:

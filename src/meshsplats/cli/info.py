@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from meshsplats.camera import Camera, load_cameras
-from meshsplats.cli.common import cameras_beside, identify
+from meshsplats.cli.common import SplatOptions, cameras_beside, identify
 from meshsplats.framing import guess_up, scene_bounds
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -27,13 +27,12 @@ class Info:
 
     input: tyro.conf.Positional[Path]
     """The file or folder."""
-    strict: bool = False
-    """Splats with values that are not finite are an error, not left out with a warning."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
     """Print it as JSON."""
 
     def run(self) -> None:
-        findings = describe(self.input, strict=self.strict)
+        findings = describe(self.input, self.reading)
         if self.json:
             print(json.dumps(findings, indent=1, allow_nan=False))
             return
@@ -42,16 +41,14 @@ class Info:
             print(f"{key.replace('_', ' '):<{width}}  {_shown(value)}")
 
 
-def describe(path: Path, *, strict: bool = False) -> dict[str, Any]:
+def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
     """Findings about ``path``, ready for JSON. Lengths are in scene units."""
     kind = identify(path)
     found: dict[str, Any] = {"path": str(path), "kind": kind}
     if path.is_file():
         found["bytes"] = path.stat().st_size
     if kind == "splats":
-        from meshsplats.formats.splats import load_gaussians
-
-        found |= _splats(load_gaussians(path, strict=strict))
+        found |= _splats(reading.load(path))
         if cameras := cameras_beside(path):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
     elif kind == "mesh":
@@ -67,7 +64,10 @@ def _splats(cloud: GaussianCloud) -> dict[str, Any]:
     from meshsplats.conversion import convert
 
     sample = cloud.select(np.arange(0, len(cloud), -(-len(cloud) // TRIED)))
-    tried = convert(sample)
+    try:
+        tried = convert(sample)
+    except ValueError:  # nothing that would be worth drawing
+        tried = SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 4)))
     share = len(cloud) / len(sample)
     ordered = np.sort(cloud.scales, axis=1).astype(np.float64)
     flatness = ordered[:, 0] / np.maximum(ordered[:, 1], 1e-30)

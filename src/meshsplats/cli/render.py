@@ -17,6 +17,7 @@ from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     DrawOptions,
     Output,
+    SplatOptions,
     ViewOptions,
     check_outputs,
     configuration,
@@ -64,6 +65,7 @@ class Render:
     """Draw the splats themselves, not the mesh made of them."""
     views: ViewOptions = field(default_factory=ViewOptions)
     draw: DrawOptions = field(default_factory=DrawOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
     transparent: bool = False
     """No background: pictures with an alpha channel."""
     depth: Literal["none", "png", "npy"] = "none"
@@ -82,7 +84,7 @@ class Render:
         single = self.output.suffix.lower() == ".png"
         self._check(single)
         start = time.perf_counter()
-        scene = load_scene(self.input)
+        scene = load_scene(self.input, self.reading)
         self._check_scene(scene)
         cameras = self.views.make(scene, self.input, count=1 if single else 60, side=800)
         if single and len(cameras) > 1:
