@@ -169,8 +169,8 @@ def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views |
     seen = sizes > 0
     if not seen.any():
         raise ValueError(
-            f"none of the {len(views.cameras)} cameras sees any of the {len(cloud)} splats: are they of the same scene?"
-            " Choose footprint='density' or 'none' to go without them"
+            f"none of the {len(views.cameras)} cameras sees any of the {len(cloud)} splats: are they of one"
+            " scene? Choose footprint='density' or 'none' to go without them"
         )
     return np.where(seen, sizes, np.median(sizes[seen]))
 
