@@ -1,0 +1,143 @@
+// Draws .glb files with three.js and Babylon.js in a headless Chromium, from given cameras.
+//
+//   node viewers.mjs jobs.json      jobs: [{viewer, glb, cameras, out, hash, near, far}, ...]
+//
+// Runs in a folder where `npm install three babylonjs babylonjs-loaders puppeteer-core` was run; CHROMIUM names
+// the browser. `out` receives one PNG a camera. See viewers.py.
+
+import fs from 'fs';
+import http from 'http';
+import path from 'path';
+import { createRequire } from 'module';
+import { pathToFileURL } from 'url';
+
+const modules = path.join(process.cwd(), 'node_modules');
+const require = createRequire(path.join(process.cwd(), 'index.js'));
+const { default: puppeteer } = await import(pathToFileURL(require.resolve('puppeteer-core')).href);
+
+// Cameras are OpenCV pinholes in the mesh's own frame: x right, y down, z forward. Both viewers get the same
+// OpenGL matrices, column by column, and the inverse of the node's rotation in front.
+const MATRICES = `
+function projection(k, n, f) {
+  const { width: w, height: h } = k;
+  return [2*k.fx/w, 0, 0, 0,  0, 2*k.fy/h, 0, 0,  1-2*k.cx/w, 2*k.cy/h-1, -(f+n)/(f-n), -1,  0, 0, -2*f*n/(f-n), 0];
+}
+function view(k) {
+  const m = k.world_to_camera, s = [1, -1, -1, 1], out = [];
+  for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) out.push(s[r] * m[r][c]);
+  return out;
+}`;
+
+const THREE_PAGE = `<!doctype html><link rel="icon" href="data:,"><canvas id="c"></canvas>
+<script type="importmap">{"imports": {"three": "/modules/three/build/three.module.js",
+  "three/addons/": "/modules/three/examples/jsm/"}}</script>
+<script type="module">
+import * as THREE from 'three';
+import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+${MATRICES}
+const canvas = document.getElementById('c');
+const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
+window.draw = async (url, cameras, near, far, hash) => {
+  const gltf = await new GLTFLoader().loadAsync(url);
+  const scene = new THREE.Scene();
+  scene.background = new THREE.Color(1, 1, 1);
+  scene.add(gltf.scene);
+  scene.updateMatrixWorld(true);
+  let mesh;
+  gltf.scene.traverse(o => { if (o.isMesh) mesh = o; });
+  mesh.frustumCulled = false;
+  if (hash) Object.assign(mesh.material, { alphaHash: true, transparent: false, depthWrite: true, needsUpdate: true });
+  const pictures = [];
+  for (const k of cameras) {
+    renderer.setSize(k.width, k.height, false);
+    const camera = new THREE.PerspectiveCamera();
+    camera.matrixAutoUpdate = camera.matrixWorldAutoUpdate = false;
+    camera.matrixWorldInverse.fromArray(view(k)).multiply(mesh.matrixWorld.clone().invert());
+    camera.matrixWorld.copy(camera.matrixWorldInverse).invert();
+    camera.projectionMatrix.fromArray(projection(k, near, far));
+    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+    renderer.render(scene, camera);
+    pictures.push(canvas.toDataURL('image/png'));
+  }
+  return pictures;
+};
+window.version = 'three.js r' + THREE.REVISION;
+</script>`;
+
+const BABYLON_PAGE = `<!doctype html><link rel="icon" href="data:,"><canvas id="c"></canvas>
+<script src="/modules/babylonjs/babylon.js"></script>
+<script src="/modules/babylonjs-loaders/babylonjs.loaders.min.js"></script>
+<script>
+${MATRICES}
+const canvas = document.getElementById('c');
+window.draw = async (url, cameras, near, far) => {
+  canvas.width = cameras[0].width; canvas.height = cameras[0].height;
+  const engine = new BABYLON.Engine(canvas, false, { preserveDrawingBuffer: true, useHighPrecisionMatrix: true });
+  const scene = new BABYLON.Scene(engine);
+  scene.useRightHandedSystem = true;
+  scene.clearColor = new BABYLON.Color4(1, 1, 1, 1);
+  const camera = new BABYLON.FreeCamera('camera', BABYLON.Vector3.Zero(), scene);
+  await BABYLON.SceneLoader.AppendAsync('', url, scene, undefined, '.glb');
+  const mesh = scene.meshes.find(m => m.getTotalVertices() > 0);
+  mesh.alwaysSelectAsActiveMesh = true;
+  await scene.whenReadyAsync();
+  const back = mesh.computeWorldMatrix(true).clone().invert();
+  const pictures = [];
+  for (const k of cameras) {
+    // Babylon writes matrices for row vectors: its array of a product reads left to right.
+    const matrix = back.multiply(BABYLON.Matrix.FromArray(view(k)));
+    camera.getViewMatrix = () => matrix;
+    camera._computedViewMatrix = matrix;
+    camera.freezeProjectionMatrix(BABYLON.Matrix.FromArray(projection(k, near, far)));
+    scene.render();
+    pictures.push(canvas.toDataURL('image/png'));
+  }
+  engine.dispose();
+  return pictures;
+};
+window.version = 'Babylon.js ' + BABYLON.Engine.Version;
+</script>`;
+
+const jobs = JSON.parse(fs.readFileSync(process.argv[2]));
+const files = Object.fromEntries(jobs.map((job, i) => ['/glb/' + i, job.glb]));
+const server = http.createServer((request, response) => {
+  const url = decodeURIComponent(request.url);
+  try {
+    if (url === '/three' || url === '/babylon') {
+      response.setHeader('content-type', 'text/html');
+      response.end(url === '/three' ? THREE_PAGE : BABYLON_PAGE);
+    } else {
+      if (url.endsWith('.js')) response.setHeader('content-type', 'text/javascript');
+      response.end(fs.readFileSync(files[url] ?? path.join(modules, url.replace('/modules', ''))));
+    }
+  } catch {
+    response.statusCode = 404;
+    response.end();
+  }
+}).listen(0);
+const home = 'http://localhost:' + server.address().port;
+const browser = await puppeteer.launch({
+  executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
+  headless: true,
+  protocolTimeout: 600000,
+  args: ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
+});
+for (const viewer of new Set(jobs.map(job => job.viewer))) {
+  const page = await browser.newPage();
+  page.on('pageerror', error => console.error(String(error)));
+  await page.goto(home + '/' + viewer);
+  await page.waitForFunction('window.version');
+  console.log(viewer + '=' + await page.evaluate('window.version'));
+  for (const [i, job] of jobs.entries()) {
+    if (job.viewer !== viewer) continue;
+    const cameras = JSON.parse(fs.readFileSync(job.cameras));
+    const pictures = await page.evaluate(
+      (...args) => window.draw(...args), home + '/glb/' + i, cameras, job.near, job.far, job.hash);
+    fs.mkdirSync(job.out, { recursive: true });
+    pictures.forEach((p, n) => fs.writeFileSync(
+      path.join(job.out, n + '.png'), Buffer.from(p.split(',')[1], 'base64')));
+  }
+  await page.close();
+}
+await browser.close();
+server.close();

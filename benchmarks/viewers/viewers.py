@@ -1,0 +1,101 @@
+"""What web viewers make of our .glb files: PSNR against the exact picture of the same mesh.
+
+    npm install three babylonjs babylonjs-loaders puppeteer-core    (in some folder; Chromium installed)
+    python benchmarks/viewers/viewers.py SPLATS CAMERAS --node-folder FOLDER [--views 4] [--keep DIR]
+
+Prints a table: each way of writing opacity, in each viewer, against the sorted mesh and against the splats
+it was made from. The table of docs/viewers.md comes from here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from meshsplats import convert, load_cameras, load_gaussians, psnr, render, render_splats, save_mesh
+
+WAYS = {
+    "three": {"blend": ("blend", False), "blend, alphaHash on": ("blend", True)},
+    "babylon": {"blend": ("blend", False)},
+}
+for _ways in WAYS.values():
+    _ways.update({"mask": ("mask", False), "hash-friendly": ("hash-friendly", False)})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("splats", type=Path)
+    parser.add_argument("cameras", type=Path)
+    parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
+    parser.add_argument("--views", type=int, default=4, help="the first so many cameras")
+    parser.add_argument("--keep", type=Path, help="keep files and pictures here")
+    args = parser.parse_args()
+
+    cloud = load_gaussians(args.splats)
+    mesh = convert(cloud)
+    cameras = load_cameras(args.cameras)[: args.views]
+    exact = [render(mesh, camera).color for camera in cameras]
+    splats = [render_splats(cloud, camera, sh_degree=0).color for camera in cameras]
+    reach = np.linalg.norm(mesh.vertices, axis=1).max() + max(
+        np.linalg.norm(np.linalg.inv(c.world_to_camera)[:3, 3]) for c in cameras
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = args.keep or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        listed = json.loads(args.cameras.read_text())[: args.views]
+        (folder / "cameras.json").write_text(json.dumps(listed))
+        jobs = []
+        for viewer, ways in WAYS.items():
+            for name, (alpha, hashed) in ways.items():
+                glb = folder / f"{alpha}.glb"
+                if not glb.exists():
+                    save_mesh(mesh, glb, alpha=alpha)
+                jobs.append(
+                    {
+                        "viewer": viewer,
+                        "name": name,
+                        "glb": str(glb.resolve()),
+                        "cameras": str((folder / "cameras.json").resolve()),
+                        "out": str((folder / f"{viewer} {name}").resolve()),
+                        "hash": hashed,
+                        "near": float(reach) / 1000,
+                        "far": float(reach) * 2,
+                    }
+                )
+        (folder / "jobs.json").write_text(json.dumps(jobs))
+        done = subprocess.run(
+            ["node", Path(__file__).with_name("viewers.mjs").resolve(), (folder / "jobs.json").resolve()],
+            cwd=args.node_folder,
+            env=os.environ,
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
+        titles = dict(line.split("=") for line in done.stdout.splitlines() if "=" in line)
+        print(f"{args.splats.name}: {mesh.splat_count:,} splats, {len(mesh.faces):,} triangles")
+        print("| viewer | alpha | against the exact mesh, dB | against the splats, dB |\n|---|---|---|---|")
+        for job in jobs:
+            pictures = [
+                np.asarray(Image.open(Path(job["out"]) / f"{i}.png").convert("RGB"), np.float32) / 255
+                for i in range(len(cameras))
+            ]
+            figures = [
+                np.mean([psnr(a, b) for a, b in zip(pictures, truth, strict=True)])
+                for truth in (exact, splats)
+            ]
+            print(f"| {titles[job['viewer']]} | {job['name']} | {figures[0]:.1f} | {figures[1]:.1f} |")
+        best = np.mean([psnr(a, b) for a, b in zip(exact, splats, strict=True)])
+        print(f"| exact renderer | sorted | - | {best:.1f} |")
+
+
+if __name__ == "__main__":
+    main()
