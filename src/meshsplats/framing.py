@@ -140,21 +140,19 @@ def middle(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
 def fit_pictures(
     bounds: Bounds, target: np.ndarray, rotations: Sequence[np.ndarray], slopes: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """Point to look at, near ``target``, and the least distance from it at which every view shows the
-    subject.
+    """Point to look at, near ``target``, and the least distance from it at which every view shows it all.
 
-    ``rotations`` (3, 3) turn the world's axes into the views' (OpenCV axes), all upright in the same sense;
+    ``rotations`` (3, 3) turn the world's axes into the views' (OpenCV axes);
     ``slopes`` are x / z and y / z at the right and the lower edge of the picture.
     """
-    # What is near looks larger: from above, the middle of the box is not the middle of the picture. Two steps
-    # bring it there within a few pixels; a dozen of the views are enough to know.
+    # What is near looks larger: the middle of the box is not the middle of a picture. Two steps of least
+    # squares over the views bring it there within a few pixels; a dozen of the views are enough to know.
     some = rotations[:: -(-len(rotations) // 12)]
-    up = -np.mean([rotation[1] for rotation in some], axis=0)
-    length = float(np.linalg.norm(up))
-    for _ in range(2 if length > 0.1 else 0):
+    across = np.concatenate([rotation[:2] for rotation in some])
+    for _ in range(2):
         away = max(_fitting_distance(bounds, target, rotation, slopes) for rotation in some)
-        rise = np.mean([_middle_height(bounds, target, rotation, away) for rotation in some])
-        target = target + rise * up / length
+        aside = np.concatenate([_seen_aside(bounds, target, rotation, away) for rotation in some])
+        target = target + np.linalg.lstsq(across, aside, rcond=1e-6)[0]
     return target, max(_fitting_distance(bounds, target, rotation, slopes) for rotation in rotations)
 
 
@@ -168,13 +166,15 @@ def _fitting_distance(
     return max(weighted_quantile(needed, bounds.weights, COVERED) * MARGIN, 0.1 * bounds.radius)
 
 
-def _middle_height(bounds: Bounds, target: np.ndarray, rotation: np.ndarray, away: float) -> float:
-    """How far above the picture's centre the subject's middle is seen, as a length at the target."""
-    _, y, z = rotation @ (bounds.points - target).T
+def _seen_aside(bounds: Bounds, target: np.ndarray, rotation: np.ndarray, away: float) -> np.ndarray:
+    """(2,) how far right of and below the picture's centre the subject's middle is seen, as lengths at the
+    target."""
+    x, y, z = rotation @ (bounds.points - target).T
     seen = z > -0.9 * away
     if not seen.any():
-        return 0.0
-    return -_middle_of(y[seen] / (z[seen] + away), bounds.weights[seen]) * away
+        return np.zeros(2)
+    depth, weights = z[seen] + away, bounds.weights[seen]
+    return np.array([_middle_of(x[seen] / depth, weights), _middle_of(y[seen] / depth, weights)]) * away
 
 
 def _middle_of(values: np.ndarray, weights: np.ndarray) -> float:

@@ -175,8 +175,12 @@ def _paletted(image):
     if image.mode != "RGB":
         raise ValueError("GIF has no translucency: write a .webp or .png animation of pictures with alpha")
     palette = image.quantize(255, method=Image.Quantize.MEDIANCUT)
-    # A mean of similar colours tints a plain background: the commonest colour is kept as it is.
+    numbers = np.array(image.quantize(255, palette=palette, dither=Image.Dither.FLOYDSTEINBERG))
+    # A plain background would be tinted by a mean of similar colours: the commonest colour gets a number of
+    # its own.
     commonest = max(image.getcolors(image.width * image.height))[1]
+    numbers[(np.asarray(image) == commonest).all(axis=2)] = 255
     colors = (palette.getpalette() or [])[: 255 * 3]
-    palette.putpalette([*colors, *[0] * (255 * 3 - len(colors)), *commonest])
-    return image.quantize(256, palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
+    result = Image.fromarray(numbers)
+    result.putpalette([*colors, *[0] * (255 * 3 - len(colors)), *commonest])
+    return result
