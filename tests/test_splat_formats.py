@@ -164,7 +164,7 @@ def test_spz_positions_by_hand(tmp_path):
 
 
 def test_rotations_too_long_for_their_largest_component(tmp_path):
-    """Three components of sqrt(1/2) leave less than nothing for the fourth: it is 0, and the rest is"""
+    """Three components of sqrt(1/2) leave less than nothing for the fourth, which is 0."""
     values = some_splats(1, degree=0)
     data = encode.spz_attributes(values, 3)
     data["rotations"] = struct.pack("<I", 3 << 30 | 511 << 20 | 511 << 10 | 511)
@@ -257,6 +257,12 @@ def test_sog(tmp_path, version, degree, form):
         dc=step("f_dc_"),
         rest=np.ptp(np.stack(rest)) * HALF_BYTE if rest else 0,
     )
+
+
+def test_sog_bundle_is_read_by_its_outermost_meta(tmp_path):
+    inner = {f"parts/{name}": data for name, data in encode.sog(some_splats(3)).items()}
+    (tmp_path / "a.sog").write_bytes(encode.bundle(inner | encode.sog(some_splats(9))))
+    assert len(load_gaussians(tmp_path / "a.sog")) == 9
 
 
 @pytest.mark.parametrize(

@@ -178,6 +178,7 @@ FOLDERS = {
     "version 3": (meta(version=3), "SOG version 3"),
     "no count": (meta(count=None), "number of splats .* got None"),
     "count of text": (meta(count="9"), "number of splats"),
+    "count of truth": (meta(count=True), "number of splats .* got True"),
     "negative count": (meta(count=-1), "number of splats"),
     "no splats": (meta(count=0), "no splats"),
     "a billion splats": (meta(count=10**9), "number of splats up to 268,435,456"),
@@ -249,6 +250,8 @@ def test_frames_that_unpack_to_more(tmp_path):
         check(tmp_path / "a.spz", message)
     (tmp_path / "a.spz").write_bytes(spz4())
     check(tmp_path / "a.spz", "the stream of positions is broken")
+    (tmp_path / "a.spz").write_bytes(encode.spz4(VALUES, compress) + b"more")
+    check(tmp_path / "a.spz", "4 bytes follow the last SPZ stream")
 
 
 def test_truncation_anywhere_is_an_error(tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.spherical_harmonics import sh_basis
 
 HALF_TURN_X = np.diag([1.0, -1.0, -1.0])
 """Turns y up into y down and back, z being turned with it."""
@@ -70,12 +71,12 @@ def _mapped(cloud: GaussianCloud, a: np.ndarray) -> GaussianCloud:
         quaternions = _quaternions(axes)
     sh = cloud.sh
     if sh.shape[1] > 1:
-        sh = np.concatenate([sh[:, :1], harmonics_map(orthogonal, sh.shape[1]) @ sh[:, 1:]], axis=1)
+        sh = np.concatenate([sh[:, :1], harmonics_map(orthogonal, cloud.sh_degree) @ sh[:, 1:]], axis=1)
     means = cloud.means.astype(np.float64) @ a.T
     return replace(cloud, means=means, quaternions=quaternions, scales=scales, sh=sh)
 
 
-def harmonics_map(orthogonal: np.ndarray, coefficients: int) -> np.ndarray:
+def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:
     """(k - 1, k - 1) float32: coefficients 1 to k - 1 of a colour function after it was turned by
     ``orthogonal``.
 
@@ -86,40 +87,10 @@ def harmonics_map(orthogonal: np.ndarray, coefficients: int) -> np.ndarray:
     z, angle = 1 - i / 32, i * np.pi * (1 + 5**0.5)
     r = np.sqrt(1 - z * z)
     directions = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-    before = harmonics(directions @ orthogonal)[:, 1:coefficients]
-    found = np.linalg.lstsq(harmonics(directions)[:, 1:coefficients], before, rcond=None)[0]
+    before = sh_basis(directions @ orthogonal, degree)[:, 1:]
+    found = np.linalg.lstsq(sh_basis(directions, degree)[:, 1:], before, rcond=None)[0]
     found[np.abs(found) < 1e-12] = 0
     return found.astype(np.float32)
-
-
-def harmonics(directions: np.ndarray) -> np.ndarray:
-    """(m, 16) real spherical harmonics of unit ``directions`` (m, 3), in the order and with the signs of
-    3DGS.
-    """
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    pi = np.pi
-    return np.stack(
-        [
-            np.full_like(x, np.sqrt(1 / (4 * pi))),
-            -np.sqrt(3 / (4 * pi)) * y,
-            np.sqrt(3 / (4 * pi)) * z,
-            -np.sqrt(3 / (4 * pi)) * x,
-            np.sqrt(15 / (4 * pi)) * x * y,
-            -np.sqrt(15 / (4 * pi)) * y * z,
-            np.sqrt(5 / (16 * pi)) * (2 * zz - xx - yy),
-            -np.sqrt(15 / (4 * pi)) * x * z,
-            np.sqrt(15 / (16 * pi)) * (xx - yy),
-            -np.sqrt(35 / (32 * pi)) * y * (3 * xx - yy),
-            np.sqrt(105 / (4 * pi)) * x * y * z,
-            -np.sqrt(21 / (32 * pi)) * y * (4 * zz - xx - yy),
-            np.sqrt(7 / (16 * pi)) * z * (2 * zz - 3 * xx - 3 * yy),
-            -np.sqrt(21 / (32 * pi)) * x * (4 * zz - xx - yy),
-            np.sqrt(105 / (16 * pi)) * z * (xx - yy),
-            -np.sqrt(35 / (32 * pi)) * x * (xx - 3 * yy),
-        ],
-        axis=1,
-    )
 
 
 def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
