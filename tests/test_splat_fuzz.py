@@ -1,4 +1,4 @@
-"""A hundred mutated files of each format; tests/fuzz/fuzz_readers.py runs as many as wanted."""
+"""Sixty mutated files of each format; tests/fuzz/fuzz_readers.py runs as many as wanted."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_mutated_files_give_an_answer(tmp_path):
         sys.executable,
         Path(__file__).parent / "fuzz" / "fuzz_readers.py",
         "--count",
-        "100",
+        "60",
         "--keep",
         tmp_path,
     ]
