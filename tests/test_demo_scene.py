@@ -7,8 +7,9 @@ import pytest
 from numpy.polynomial.legendre import legval
 
 from meshsplats import demo_scene, load_gaussians
-from meshsplats._demo_light import KEY_LIGHT, Patch, _sh_basis, spherical_harmonics
+from meshsplats._demo_light import KEY_LIGHT, Patch, spherical_harmonics
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.spherical_harmonics import sh_basis
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +97,7 @@ def test_basis_obeys_the_addition_theorem():
     rng = np.random.default_rng(6)
     a, b = rng.standard_normal((2, 40, 3))
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (a, b))
-    product = _sh_basis(a) * _sh_basis(b)
+    product = sh_basis(a, 3) * sh_basis(b, 3)
     for level in range(4):
         found = product[:, level**2 : (level + 1) ** 2].sum(axis=1)
         expected = (2 * level + 1) / (4 * np.pi) * legval((a * b).sum(axis=1), np.eye(4)[level])
@@ -112,7 +113,7 @@ def test_highlight_is_seen_in_the_mirrored_direction():
     angles = np.linspace(-1.4, 1.4, 281)
     across = KEY_LIGHT * [1, 0, 1] / np.linalg.norm(KEY_LIGHT[[0, 2]])
     to_viewer = np.cos(angles)[:, None] * n + np.sin(angles)[:, None] * -across
-    seen = 0.5 + _sh_basis(-to_viewer) @ sh[0, :, 0]  # stored by the direction in which one looks
+    seen = 0.5 + sh_basis(-to_viewer, 3) @ sh[0, :, 0]  # stored by the direction in which one looks
     brightest = to_viewer[np.argmax(seen)]
     mirrored = -across * np.linalg.norm(KEY_LIGHT[[0, 2]]) + n[0] * -KEY_LIGHT[1]
     assert brightest @ mirrored > np.cos(np.radians(6))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshsplats.gaussians import SH_C0
+from meshsplats.spherical_harmonics import sh_basis
 
 KEY_LIGHT = np.array([-0.60, -0.70, -0.40]) / np.linalg.norm([-0.60, -0.70, -0.40])
 """(3,) unit direction towards the key light: above, left of and before the table."""
@@ -81,37 +82,14 @@ def spherical_harmonics(patch: Patch, color: np.ndarray) -> np.ndarray:
     # 1 - t^2 = 2/3 P_0 - 2/3 P_2
     sheen = np.array([2 / 3, 0, -2 / 3, 0])
     tint = np.array([1.0, 0.97, 0.90])
+    toward_light, toward_normal = sh_basis(-mirrored, 3), sh_basis(-patch.normals, 3)
     for level in range(4):
         band = slice(level**2, (level + 1) ** 2)
         weight = 4 * np.pi / (2 * level + 1)
-        one = highlight[level] * column(patch.gloss * facing) * _sh_basis(-mirrored)[:, band]
-        other = 0.2 * patch.gloss * sheen[level] * _sh_basis(-patch.normals)[:, band]
+        one = highlight[level] * column(patch.gloss * facing) * toward_light[:, band]
+        other = 0.2 * patch.gloss * sheen[level] * toward_normal[:, band]
         sh[:, band] += (weight * (one + other))[:, :, None] * tint
     return sh
-
-
-def _sh_basis(directions: np.ndarray) -> np.ndarray:
-    """(n, 16) real spherical harmonics at unit directions, in the order and with the signs of splat files."""
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    return np.stack(
-        [
-            np.full_like(x, SH_C0),
-            *(0.4886025119029199 * v for v in (-y, z, -x)),
-            *(1.0925484305920792 * v for v in (x * y, -y * z)),
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ],
-        axis=1,
-    )
 
 
 def column(values: np.ndarray) -> np.ndarray:
