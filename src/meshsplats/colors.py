@@ -24,7 +24,7 @@ def srgb_to_linear(display: np.ndarray) -> np.ndarray:
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Display values of ``linear`` light in [0, 1], any shape; float32, in [0, 1]. Inverse of ``srgb_to_linear``.
+    """Display values of ``linear`` light in [0, 1], any shape; float32. Inverse of ``srgb_to_linear``.
 
     Concretely, ``12.92 v`` up to 0.0031308 and ``1.055 v ** (1 / 2.4) - 0.055`` above. Values outside [0, 1]
     follow the same two formulas.
