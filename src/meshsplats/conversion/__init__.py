@@ -98,7 +98,7 @@ def convert(
     everything = bool(keep.all())
     pick = (lambda array: array) if everything else (lambda array: array[keep])
     limit = _visible_radius(pick(part.opacities)) if chosen.shrink_faint else None
-    vertices, faces, rgba, owner = build(
+    vertices, faces, rgba, face_count = build(
         shapes,
         pick(choice),
         pick(part.means),
@@ -109,7 +109,7 @@ def convert(
         pick(opacity),
         limit,
     )
-    return SplatMesh(vertices, faces, rgba, face_splat=pick(rows)[owner], up=direction)
+    return SplatMesh(vertices, faces, rgba, face_splat=np.repeat(pick(rows), face_count), up=direction)
 
 
 def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:

@@ -118,58 +118,81 @@ def build(
     opacity: np.ndarray,
     limit: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (v, 3), faces (f, 3), colours (v, 4) and the owner (f,) of each face, splat after splat.
+    """Vertices (v, 3), faces (f, 3), colours (v, 4) and (n,) how many of the faces each splat has, in order.
 
     ``choice`` (n,) numbers each splat's shape; ``order`` (n, 3) and ``sigma`` (n, 3) give its axes as in
     ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the product is clamped to 1. A fan whose area
     is more than that of a circle of ``limit`` (n,) standard deviations is shrunk to it.
     """
     n = len(centers)
-    vertex_count = np.array([len(s.pattern.level) for s in shapes])[choice]
-    face_count = np.array([len(s.pattern.faces) for s in shapes])[choice]
-    vertex_start, face_start = np.cumsum(vertex_count) - vertex_count, np.cumsum(face_count) - face_count
+    vertex_count = np.array([len(s.pattern.level) for s in shapes], np.int64)[choice]
+    face_count = np.array([len(s.pattern.faces) for s in shapes], np.int64)[choice]
     v, f = int(vertex_count.sum()), int(face_count.sum())
     if max(v, f) > np.iinfo(np.int32).max:
-        raise ValueError(
-            f"the mesh would have {v} vertices and {f} triangles, more than 2^31: use max_triangles"
-        )
+        raise ValueError(f"the mesh would have {v} vertices and {f} triangles, too many: use max_triangles")
     vertices = np.empty((v, 3), np.float32)
     colors = np.empty((v, 4), np.float32)
     faces = np.empty((f, 3), np.int32)
-    owner = np.repeat(np.arange(n, dtype=np.int32), face_count)
     recipes = [_recipe(shape) for shape in shapes]
+    first_vertex = first_face = 0
     for begin in range(0, n, CHUNK):
-        end = min(begin + CHUNK, n)
+        part = slice(begin, min(begin + CHUNK, n))
+        own_vertices, own_faces, own_choice = vertex_count[part], face_count[part], choice[part]
+        start = first_vertex + np.cumsum(own_vertices) - own_vertices
+        blocks: list[tuple[np.ndarray, ...]] = []
+        sequence = []
         for number, (shape, (place, tint)) in enumerate(zip(shapes, recipes, strict=True)):
-            rows = np.flatnonzero(choice[begin:end] == number) + begin
+            rows = np.flatnonzero(own_choice == number)
             if not len(rows):
                 continue
-            whole = len(rows) == end - begin
-            own = slice(begin, end) if whole else rows
-            sides, radii = shape.profile.sides, shape.profile.radii
+            sequence.append(rows)
+            own = rows + begin
+            profile = shape.profile
             sizes = sigma[own]
             if limit is not None:
-                round_radius = radii[-1] * np.sqrt(sides / (2 * np.pi) * np.sin(2 * np.pi / sides))
-                sizes = sizes * np.minimum(1, limit[own] / np.float32(round_radius))[:, None]
+                sizes *= np.minimum(1, limit[own] / np.float32(_round_radius(profile)))[:, None]
             axes = semi_axes(quaternions[own], order[own], sizes)
             used = shape.pattern.directions.shape[1]
-            parts = np.concatenate([centers[own], axes[:, :used].reshape(len(rows), -1)], axis=1)
+            parts = np.concatenate([centers[own], axes[:, :used].reshape(len(own), -1)], axis=1)
             levels = np.minimum(
-                opacity[own][:, None] * np.array(shape.profile.opacities, np.float32), np.float32(1)
+                opacity[own][:, None] * np.array(profile.opacities, np.float32), np.float32(1)
             )
-            points = (parts @ place).reshape(-1, 3)
-            paint = (np.concatenate([rgb[own], levels], axis=1) @ tint).reshape(-1, 4)
-            local = shape.pattern.faces
-            corners = (vertex_start[own].astype(np.int32)[:, None] + local.reshape(1, -1)).reshape(-1, 3)
-            if whole:  # the rows lie together
-                first, last = vertex_start[begin], vertex_start[begin] + len(points)
-                vertices[first:last], colors[first:last] = points, paint
-                faces[face_start[begin] : face_start[begin] + len(corners)] = corners
-            else:
-                into = (vertex_start[own][:, None] + np.arange(len(shape.pattern.level))).ravel()
-                vertices[into], colors[into] = points, paint
-                faces[(face_start[own][:, None] + np.arange(len(local))).ravel()] = corners
-    return vertices, faces, colors, owner
+            paint = np.concatenate([rgb[own], levels], axis=1) @ tint
+            corners = start[rows].astype(np.int32)[:, None] + shape.pattern.faces.reshape(1, -1)
+            blocks.append(((parts @ place).reshape(-1, 3), corners.reshape(-1, 3), paint.reshape(-1, 4)))
+        end_vertex, end_face = first_vertex + int(own_vertices.sum()), first_face + int(own_faces.sum())
+        points, corners, paint = zip(*blocks, strict=True)
+        _weave(points, sequence, own_vertices, vertices[first_vertex:end_vertex])
+        _weave(paint, sequence, own_vertices, colors[first_vertex:end_vertex])
+        _weave(corners, sequence, own_faces, faces[first_face:end_face])
+        first_vertex, first_face = end_vertex, end_face
+    return vertices, faces, colors, face_count
+
+
+def _round_radius(profile: Profile) -> float:
+    """Radius of the circle as large as the rim's polygon, in standard deviations."""
+    return profile.radii[-1] * float(np.sqrt(profile.sides / (2 * np.pi) * np.sin(2 * np.pi / profile.sides)))
+
+
+def _weave(
+    blocks: tuple[np.ndarray, ...], sequence: list[np.ndarray], count: np.ndarray, out: np.ndarray
+) -> None:
+    """Writes the rows of ``blocks`` to ``out``, splat after splat.
+
+    Block i holds the splats ``sequence[i]``, each with its ``count`` rows.
+    """
+    if len(blocks) == 1:
+        out[:] = blocks[0]
+        return
+    splats = np.concatenate(sequence)
+    length = count[splats]
+    source = np.empty(len(count), np.int64)
+    source[splats] = np.cumsum(length) - length
+    shift = source - (np.cumsum(count) - count)
+    rows = np.repeat(shift, count)
+    rows += np.arange(len(rows))
+    # Much quicker than to assign to scattered rows.
+    np.take(np.concatenate(blocks), rows, axis=0, out=out, mode="clip")
 
 
 def _recipe(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
