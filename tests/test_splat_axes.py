@@ -120,6 +120,14 @@ def test_flat_axis_stays_the_third():
     assert stretched.kernel == "2dgs"
 
 
+def test_splats_along_the_axes_are_stretched():
+    """Their singular vectors are a mirror, not a rotation, unless one of them is turned round."""
+    cloud = some_cloud()
+    cloud.quaternions[:] = [1, 0, 0, 0]
+    cloud.scales[:] = [1, 2, 3]
+    assert_mapped(cloud, transformed(cloud, np.diag([1.0, 5, 2])), np.diag([1.0, 5, 2]))
+
+
 @pytest.mark.parametrize("matrix", [np.diag([1.0, 1, 0]), np.full((3, 3), np.nan), np.diag([1, np.inf, 1])])
 def test_impossible_maps_are_refused(matrix):
     with pytest.raises(ValueError, match="the transform"):
