@@ -16,6 +16,7 @@ namespace {
 // Draws every tile with one `Tile` a thread; returns the number of fragments blended.
 template <class MakeTile>
 int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int threads, MakeTile make_tile) {
+    threads = (int)std::min<int64_t>(threads, grid.tiles());
     std::vector<decltype(make_tile())> workers(threads);
     ms::TileLists lists(grid, items, threads);
     while (lists.next()) {

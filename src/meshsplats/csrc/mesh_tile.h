@@ -90,7 +90,7 @@ class MeshTile {
     // The samples that one triangle covers, side by side.
     struct Found {
         alignas(64) int32_t sample[SAMPLES + W];
-        alignas(64) float q[SAMPLES + W], z[SAMPLES + W], e[3][SAMPLES + W];
+        alignas(64) float q[SAMPLES + W], z[SAMPLES + W], b[3][SAMPLES + W];
         alignas(64) float rgba[4][SAMPLES + W];
     };
     const Scene &scene_;
@@ -242,8 +242,6 @@ class MeshTile {
                 if (GENERAL && crossing) inside &= at_least(q_max, q);
                 compress(found_.q + n, q, inside);
                 compress_numbers(found_.sample + n, block * 16 + part * W, inside);
-                if (PLACES)
-                    for (int i = 0; i < 3; ++i) compress(found_.e[i] + n, e[i] * set1(t.weight[i][k]), inside);
                 n += __builtin_popcount(inside);
             }
         }
@@ -265,6 +263,13 @@ class MeshTile {
             vf y = __builtin_convertvector(((sample >> 4) & 12) + ((sample >> 2) & 3), vf) + set1(0.5f);
             vf q = vmin(vmax(load(found_.q + i), q_min), q_max);
             vf z = set1(1.0f) / q;
+            if (PLACES) {
+                store(found_.z + i, z);
+                for (int j = 0; j < 3; ++j) {
+                    vf b = (set1(t.sc[j][k]) + set1(t.sb[j][k]) * y + set1(t.sa[j][k]) * x) * z;
+                    store(found_.b[j] + i, vmin(vmax(b, set1(0.0f)), set1(1.0f)));
+                }
+            }
             for (int j = 0; j < 4; ++j) {
                 vf value = (set1(vc[j]) + set1(vb[j]) * y + set1(va[j]) * x) * z;
                 store(found_.rgba[j] + i, vmin(vmax(value, set1(low[j])), set1(high[j])));
@@ -276,17 +281,16 @@ class MeshTile {
                 q = vmin(vmax(q, set1(plane.q_min)), set1(plane.q_max));
             }
             store(found_.q + i, q);
-            if (PLACES) store(found_.z + i, z);
         }
         for (int i = 0; i < n; ++i) {
             int sample = found_.sample[i];
             int waiting = count_[sample]++;
             Place place;
             if (PLACES) {
-                float sum = found_.e[0][i] + found_.e[1][i] + found_.e[2][i];
+                float sum = found_.b[0][i] + found_.b[1][i] + found_.b[2][i];
                 place = {{1, 0, 0}, found_.z[i]};
                 if (sum > 0)
-                    for (int j = 0; j < 3; ++j) place.b[j] = found_.e[j][i] / sum;
+                    for (int j = 0; j < 3; ++j) place.b[j] = found_.b[j][i] / sum;
             }
             if (__builtin_expect(waiting < ROOM, 1)) {
                 arena_->layer[waiting].key[sample] = found_.q[i];
@@ -430,20 +434,29 @@ class MeshTile {
             }
             if (last) return close(sample);
         }
-        // What has to wait, in order.
-        count_[sample] = n - done;
+        // What has to wait, in order. What is surely hidden behind it goes: else a pile of triangles that all begin near
+        // the camera, where nothing can be blended before the last has come, would fill the memory.
+        const float least = std::max(0.5f * options_.min_transmittance, 1e-30f);
+        float through = through_[sample];
+        int to = 0, layers_left = options_.max_layers ? options_.max_layers - layers_[sample] : n;
         for (int i = done; i < n; ++i) {
             const Fragment &f = list[order_[i]];
-            int to = i - done;
+            // Half: more in front can only lower the light, but for the rounding of the last bit.
+            if (through < least || to >= layers_left) break;
+            if (!(f.rgba[3] > 0)) continue;
+            through -= through * f.rgba[3];
             if (to >= ROOM) {
                 overflow_[sample].push_back(f);
+                ++to;
                 continue;
             }
             for (int c = 0; c < 4; ++c) arena_->layer[to].rgba[c][sample] = f.rgba[c];
             arena_->layer[to].key[sample] = f.key;
             arena_->layer[to].face[sample] = f.face;
             if (extras_.any) arena_->place[to][sample] = f.place;
+            ++to;
         }
+        count_[sample] = to;
     }
 
     void add_extras(int sample, int32_t face, const Place &place, float weight) {

@@ -65,7 +65,6 @@ struct Triangles {
     // Out.
     alignas(64) float ea[3][N], eb[3][N], ec[3][N];  // edge functions, positive inside
     alignas(64) float threshold[3][N];   // 0 where samples on the edge belong to the triangle, else the least normal float
-    alignas(64) float weight[3][N];      // b_i is proportional to E_i weight_i
     alignas(64) float qa[N], qb[N], qc[N];     // 1 / depth
     alignas(64) float q_min[N], q_max[N];      // its range over the corners
     alignas(64) float sa[3][N], sb[3][N], sc[3][N];  // b_i / depth
@@ -93,7 +92,6 @@ struct Triangles {
                 ea[i][t] = (float)a;
                 eb[i][t] = (float)b;
                 ec[i][t] = (float)c;
-                weight[i][t] = (float)s;
                 sa[i][t] = (float)(a * s);
                 sb[i][t] = (float)(b * s);
                 sc[i][t] = (float)(c * s);
@@ -147,7 +145,6 @@ struct Triangles {
             eb[i][t] = (float)b;
             ec[i][t] = (float)c;
             threshold[i][t] = edge_threshold(ea[i][t], eb[i][t]);
-            weight[i][t] = (float)s;
             sa[i][t] = (float)(a * s);
             sb[i][t] = (float)(b * s);
             sc[i][t] = (float)(c * s);
