@@ -62,42 +62,32 @@ def convert(
     views = None
     if cameras and (chosen.footprint == "cameras" or chosen.colors == "cameras"):
         views = Views(part.means, cameras)
-    pixel = pixel_sizes(part, chosen, views)
-    px2 = FILTER_PX2[cloud.kernel] if chosen.footprint_px2 is None else chosen.footprint_px2
-    sigma = widen(part.scales, pixel, px2, cloud.kernel)
-
+    pixel, seen = pixel_sizes(part, chosen, views)
     axes = _axis_order(part, chosen)
-    sigma = np.take_along_axis(sigma, axes, axis=1)
+    sigma, opacity = _drawn_gaussians(part, chosen, pixel, axes)
     areas = disc_areas(sigma)
     shadow = mean_shadow(areas)
     shapes, choice = _shapes(sigma, chosen)
-    opacity = part.opacities
-    if cloud.kernel == "antialiased" and pixel is not None:
-        # That kernel lowers the opacity by as much as its filter widens the splat.
-        before = mean_shadow(disc_areas(np.take_along_axis(part.scales, axes, axis=1)))
-        opacity = opacity * np.divide(before, shadow, out=np.zeros_like(shadow), where=shadow > 0)
+    triangles = np.array([len(shape.pattern.faces) for shape in shapes])[choice]
+
+    keep = areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(part), bool)
+    if not keep.any():
+        raise ValueError(f"none of the {len(part)} splats has a visible area")
+    if chosen.max_splats is not None or chosen.max_triangles is not None:
+        importance = opacity * shadow
+        if seen is not None and pixel is not None:
+            importance = np.where(seen, importance / np.square(pixel), 0)
+        # Splats without area last of all.
+        importance[~keep] = -1
+        keep &= most_important(importance, triangles, chosen.max_splats, chosen.max_triangles)
     if chosen.compensation:
         opacity = opacity * _missing(areas, shadow, shapes, choice) ** np.float32(chosen.compensation)
-
-    visible = opacity * shadow if pixel is None else opacity * shadow / np.square(np.maximum(pixel, 1e-30))
-    if chosen.min_opacity:
-        has_area = areas[:, 0] > 0
-        if not has_area.any():
-            raise ValueError(f"none of the {len(part)} splats has an area: two scales of each are 0")
-    else:
-        has_area = np.ones(len(part), bool)
-    triangles = np.array([len(shape.pattern.faces) for shape in shapes])[choice]
-    keep = has_area
-    if chosen.max_splats is not None or chosen.max_triangles is not None:
-        importance = np.where(has_area, visible, -1)
-        keep = keep & most_important(importance, triangles, chosen.max_splats, chosen.max_triangles)
 
     colors = part.colors
     if chosen.colors == "cameras" and part.sh_degree > 0 and views is not None:
         colors = views.mean_colors(part.sh)
     everything = bool(keep.all())
     pick = (lambda array: array) if everything else (lambda array: array[keep])
-    limit = _visible_radius(pick(part.opacities)) if chosen.shrink_faint else None
     vertices, faces, rgba, face_count = build(
         shapes,
         pick(choice),
@@ -107,7 +97,6 @@ def convert(
         pick(sigma),
         pick(colors),
         pick(opacity),
-        limit,
     )
     return SplatMesh(vertices, faces, rgba, face_splat=np.repeat(pick(rows), face_count), up=direction)
 
@@ -128,6 +117,25 @@ def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarr
                 f" below min_opacity {options.min_opacity:.4g}"
             )
     return np.flatnonzero(keep).astype(np.int32)
+
+
+def _drawn_gaussians(
+    cloud: GaussianCloud, options: ConversionOptions, pixel: np.ndarray | None, axes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) standard deviations along ``axes`` and (n,) opacities of the splats as a renderer draws them."""
+    px2 = FILTER_PX2[cloud.kernel] if options.footprint_px2 is None else options.footprint_px2
+    sigma = np.take_along_axis(widen(cloud.scales, pixel, px2, cloud.kernel), axes, axis=1)
+    opacity = cloud.opacities
+    if cloud.kernel == "antialiased" and pixel is not None:
+        # That kernel lowers the opacity by as much as its filter widens the splat.
+        before = mean_shadow(disc_areas(np.take_along_axis(cloud.scales, axes, axis=1)))
+        after = mean_shadow(disc_areas(sigma))
+        opacity = opacity * np.divide(before, after, out=np.zeros_like(after), where=after > 0)
+    if options.shrink_faint:
+        # Of a Gaussian's integrated opacity, the share 1 - 1 / (255 o) lies within the radius sqrt(2 ln(255 o))
+        # at which it has fallen to 1/255, where 3DGS stops drawing.
+        sigma = sigma * np.sqrt(1 - 1 / np.maximum(255 * cloud.opacities, 1))[:, None]
+    return sigma, opacity
 
 
 def _axis_order(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:
@@ -186,9 +194,3 @@ def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice:
         own = choice == number
         drawn[own] = 0.5 * areas[own][:, : shape.pattern.ellipses].sum(axis=1)
     return np.divide(shadow, drawn, out=np.ones_like(shadow), where=drawn > 0)
-
-
-def _visible_radius(opacity: np.ndarray) -> np.ndarray:
-    """(n,) standard deviations at which ``opacity * exp(-r^2 / 2)`` has fallen to 1/255, where 3DGS stops
-    drawing."""
-    return np.sqrt(2 * np.log(np.maximum(255 * opacity, 1)))

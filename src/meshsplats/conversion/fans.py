@@ -116,13 +116,11 @@ def build(
     sigma: np.ndarray,
     rgb: np.ndarray,
     opacity: np.ndarray,
-    limit: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (v, 3), faces (f, 3), colours (v, 4) and (n,) how many of the faces each splat has, in order.
 
     ``choice`` (n,) numbers each splat's shape; ``order`` (n, 3) and ``sigma`` (n, 3) give its axes as in
-    ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the product is clamped to 1. A fan whose area
-    is more than that of a circle of ``limit`` (n,) standard deviations is shrunk to it.
+    ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the product is clamped to 1.
     """
     n = len(centers)
     vertex_count = np.array([len(s.pattern.level) for s in shapes], np.int64)[choice]
@@ -148,10 +146,7 @@ def build(
             sequence.append(rows)
             own = rows + begin
             profile = shape.profile
-            sizes = sigma[own]
-            if limit is not None:
-                sizes *= np.minimum(1, limit[own] / np.float32(_round_radius(profile)))[:, None]
-            axes = semi_axes(quaternions[own], order[own], sizes)
+            axes = semi_axes(quaternions[own], order[own], sigma[own])
             used = shape.pattern.directions.shape[1]
             parts = np.concatenate([centers[own], axes[:, :used].reshape(len(own), -1)], axis=1)
             levels = np.minimum(
@@ -167,11 +162,6 @@ def build(
         _weave(corners, sequence, own_faces, faces[first_face:end_face])
         first_vertex, first_face = end_vertex, end_face
     return vertices, faces, colors, face_count
-
-
-def _round_radius(profile: Profile) -> float:
-    """Radius of the circle as large as the rim's polygon, in standard deviations."""
-    return profile.radii[-1] * float(np.sqrt(profile.sides / (2 * np.pi) * np.sin(2 * np.pi / profile.sides)))
 
 
 def _weave(

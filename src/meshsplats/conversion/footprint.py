@@ -158,21 +158,26 @@ def _every_third_bit(values: np.ndarray) -> np.ndarray:
     return v
 
 
-def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views | None) -> np.ndarray | None:
-    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none'.
+def pixel_sizes(
+    cloud: GaussianCloud, options: ConversionOptions, views: Views | None
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``, and (n,) bool which splats
+    the cameras see; each None where that is not known.
 
     Splats that no camera sees take the median of the others.
     """
     if options.footprint == "none":
-        return None
+        return None, None
     if options.footprint == "distance":
-        return np.full(len(cloud), options.viewing_distance / options.focal, np.float32)  # type: ignore[operator]
+        pixel = options.viewing_distance / options.focal  # type: ignore[operator]
+        return np.full(len(cloud), pixel, np.float32), None
     if options.footprint == "density":
         local = spacing(cloud.means)
         typical = np.median(local)
         relative = np.divide(local, typical, out=np.ones_like(local), where=typical > 0)
-        return np.float32(SPACING_SHARE) * typical * np.power(relative, np.float32(SPACING_POWER))
-    assert views is not None
+        return np.float32(SPACING_SHARE) * typical * np.power(relative, np.float32(SPACING_POWER)), None
+    if views is None:
+        raise ValueError("footprint='cameras' needs cameras")
     sizes = views.pixel_sizes()
     seen = sizes > 0
     if not seen.any():
@@ -180,7 +185,7 @@ def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views |
             f"none of the {len(views.cameras)} cameras sees any of the {len(cloud)} splats: are they of one"
             " scene? Choose footprint='density' or 'none' to go without them"
         )
-    return np.where(seen, sizes, np.median(sizes[seen]))
+    return np.where(seen, sizes, np.median(sizes[seen])), seen
 
 
 def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str) -> np.ndarray:

@@ -56,10 +56,11 @@ class ConversionOptions:
     """Focal length in pixels of the pictures taken from ``viewing_distance``. Default: 1000, such as 1000
     pixels over 53 degrees."""
     min_opacity: float | None = None
-    """Splats of less opacity than this are left out, 0 to 1. Default: 1/255, below which they do not show;
-    paper: 0."""
+    """Splats of less opacity than this are left out, 0 to 1; above 0 also those without any area. Default:
+    1/255, below which they do not show; paper: 0."""
     shrink_faint: bool | None = None
-    """Limit the ellipses of faint splats to where the splat reaches an opacity of 1/255. Paper: no."""
+    """Draw faint splats smaller, with as much area as they keep where 3DGS cuts their opacity off, at 1/255:
+    the share 1 - 1 / (255 opacity). Paper: no."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 in scene units: splats with their centre outside are left out."""
     max_splats: int | None = None
@@ -104,6 +105,8 @@ class ConversionOptions:
             if not number or not low <= value <= high or (whole and int(value) != value):
                 what = "a whole number" if whole else "a number"
                 raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
+        if not isinstance(self.shrink_faint, bool):
+            raise ValueError(f"shrink_faint must be True or False, got {self.shrink_faint!r}")
         if self.mode == "3d" and self.no_triag % 4:  # type: ignore[operator]
             raise ValueError(f"no_triag must be a multiple of 4 in mode '3d', got {self.no_triag}")
         if self.mode == "crossed" and self.no_triag % 2:  # type: ignore[operator]

@@ -1,0 +1,77 @@
+"""The basis: orthonormal on the sphere, the signs and order of splat files, and SciPy's values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshsplats.spherical_harmonics import sh_basis
+
+
+def sphere(n: int) -> np.ndarray:
+    v = np.random.default_rng(n).normal(size=(n, 3))
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def test_orthonormal():
+    # Gauss-Legendre in z and even steps round it integrate polynomials of this degree exactly.
+    z, weight = np.polynomial.legendre.leggauss(8)
+    turn = 2 * np.pi * np.arange(16) / 16
+    radius = np.sqrt(1 - z * z)[:, None]
+    v = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.repeat(z[:, None], 16, axis=1)], axis=2)
+    y = sh_basis(v.reshape(-1, 3), 3)
+    gram = (y * np.repeat(weight * 2 * np.pi / 16, 16)[:, None]).T @ y
+    np.testing.assert_allclose(gram, np.eye(16), atol=1e-12)
+
+
+def test_signs_of_the_first_degree():
+    c1 = 0.4886025119029199
+    np.testing.assert_allclose(
+        sh_basis(np.eye(3), 1)[:, 1:], [[0, 0, -c1], [-c1, 0, 0], [0, c1, 0]], atol=1e-15
+    )
+
+
+def test_one_direction_by_hand():
+    # The polynomials of the 3DGS trainer with its published constants, at (2, -3, 6) / 7.
+    x, y, z = 2 / 7, -3 / 7, 6 / 7
+    expected = [
+        0.28209479177387814,
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    np.testing.assert_allclose(sh_basis(np.array([[x, y, z]]), 3)[0], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_lower_degrees_are_the_beginning(degree):
+    v = sphere(20)
+    np.testing.assert_array_equal(sh_basis(v, degree), sh_basis(v, 3)[:, : (degree + 1) ** 2])
+    assert sh_basis(v.astype(np.float32), degree).dtype == np.float32
+
+
+def test_same_as_the_renderer():
+    from meshsplats.rendering import reference
+
+    v = sphere(50)
+    names = [name for name in dir(reference) if "harmonic" in name or name.endswith("sh_basis")]
+    assert names, "the reference renderer has no basis of its own any more"
+    np.testing.assert_allclose(getattr(reference, names[0])(v, 3), sh_basis(v, 3), atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [-1, 4, 1.5])
+def test_unknown_degree(degree):
+    with pytest.raises(ValueError, match="degree must be 0, 1, 2 or 3"):
+        sh_basis(np.eye(3), degree)
