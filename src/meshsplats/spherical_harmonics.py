@@ -18,7 +18,8 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     if degree not in (0, 1, 2, 3):
         raise ValueError(f"degree must be 0, 1, 2 or 3, got {degree}")
     directions = np.asarray(directions)
-    values = np.empty((len(directions), (degree + 1) ** 2), np.result_type(directions, np.float32))
+    # Each coefficient's values lie together in memory, as they are written.
+    values = np.empty(((degree + 1) ** 2, len(directions)), np.result_type(directions, np.float32)).T
     values[:, 0] = _norm(1, 4)
     if degree == 0:
         return values

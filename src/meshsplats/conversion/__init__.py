@@ -123,7 +123,7 @@ def _drawn_gaussians(
     cloud: GaussianCloud, options: ConversionOptions, pixel: np.ndarray | None, axes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) standard deviations along ``axes`` and (n,) opacities of the splats as a renderer draws them."""
-    px2 = FILTER_PX2[cloud.kernel] if options.footprint_px2 is None else options.footprint_px2
+    px2 = FILTER_PX2 if options.footprint_px2 is None else options.footprint_px2
     sigma = np.take_along_axis(widen(cloud.scales, pixel, px2, cloud.kernel), axes, axis=1)
     opacity = cloud.opacities
     if cloud.kernel == "antialiased" and pixel is not None:
@@ -132,7 +132,7 @@ def _drawn_gaussians(
         after = mean_shadow(disc_areas(sigma))
         opacity = opacity * np.divide(before, after, out=np.zeros_like(after), where=after > 0)
     if options.shrink_faint:
-        # Of a Gaussian's integrated opacity, the share 1 - 1 / (255 o) lies within the radius sqrt(2 ln(255 o))
+        # Of its integrated opacity, the share 1 - 1 / (255 o) lies within the radius sqrt(2 ln(255 o))
         # at which it has fallen to 1/255, where 3DGS stops drawing.
         sigma = sigma * np.sqrt(1 - 1 / np.maximum(255 * cloud.opacities, 1))[:, None]
     return sigma, opacity
