@@ -70,9 +70,7 @@ VARIATIONS: list[tuple[str, dict]] = [
     ("opac_mul 0.05", dict(opac_mul=0.05)),
     ("half the triangles, by importance", dict(max_triangles="half")),
 ]
-GRID = dict(
-    scale_mul=(2.0, 2.7, 3.3), no_triag=(4, 8, 12), opac_mul=(0.0, 0.2), footprint=("none", "cameras")
-)
+GRID = dict(scale_mul=(2.0, 2.7, 3.3), no_triag=(4, 8), opac_mul=(0.0, 0.2), footprint=("none", "cameras"))
 
 
 @dataclass

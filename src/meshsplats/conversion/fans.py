@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from meshsplats.conversion.products import thin_product
 from meshsplats.conversion.profiles import Profile
 
 CHUNK = 1 << 13
@@ -152,9 +153,11 @@ def build(
             levels = np.minimum(
                 opacity[own][:, None] * np.array(profile.opacities, np.float32), np.float32(1)
             )
-            paint = np.concatenate([rgb[own], levels], axis=1) @ tint
+            paint = thin_product(np.concatenate([rgb[own], levels], axis=1), tint)
             corners = start[rows].astype(np.int32)[:, None] + shape.pattern.faces.reshape(1, -1)
-            blocks.append(((parts @ place).reshape(-1, 3), corners.reshape(-1, 3), paint.reshape(-1, 4)))
+            blocks.append(
+                (thin_product(parts, place).reshape(-1, 3), corners.reshape(-1, 3), paint.reshape(-1, 4))
+            )
         end_vertex, end_face = first_vertex + int(own_vertices.sum()), first_face + int(own_faces.sum())
         points, corners, paint = zip(*blocks, strict=True)
         _weave(points, sequence, own_vertices, vertices[first_vertex:end_vertex])

@@ -13,6 +13,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.conversion.options import ConversionOptions
+from meshsplats.conversion.products import thin_product
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
 
@@ -62,7 +63,8 @@ class Views:
         )
         for begin in range(0, len(self.means), _CHUNK):
             part = slice(begin, min(begin + _CHUNK, len(self.means)))
-            seen_from = (self.means[part] - self.origin).astype(np.float32) @ matrix + shift
+            offsets = (self.means[part] - self.origin).astype(np.float32)
+            seen_from = thin_product(offsets, matrix) + shift
             x, y, z = seen_from.reshape(len(seen_from), -1, 3).transpose(2, 0, 1)
             inside = z > near
             # On the picture: |fx x / z + cx - w / 2| <= w / 2, without the division.
@@ -97,7 +99,7 @@ class Views:
             # Coefficient by coefficient, as sh_basis lays them out.
             mean = np.zeros((sh.shape[1], len(weight)), np.float32).T
             for c, rotation in enumerate(rotations):
-                ray = offsets[:, c] @ rotation
+                ray = thin_product(offsets[:, c], rotation)
                 ray /= np.sqrt(np.einsum("ni,ni->n", ray, ray) + np.float32(1e-30))[:, None]
                 basis = sh_basis(ray, degree)
                 basis *= weight[:, c, None]
