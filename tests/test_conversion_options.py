@@ -80,10 +80,13 @@ class TestSelection:
         assert kept(convert(cloud, cameras=[CAMERA], max_splats=1)) == [0]
         assert kept(convert(cloud, footprint="none", max_splats=1)) == [1]
 
-    def test_splats_that_no_camera_sees_go_first(self):
-        cloud = replace(row_of([0.9, 0.1]), means=[[0, 0, -10], [0, 0, 10]])
-        assert kept(convert(cloud, cameras=[CAMERA], max_splats=1)) == [1]
-        assert kept(convert(cloud, cameras=[CAMERA])) == [0, 1]
+    def test_splats_that_no_camera_sees_count_as_at_the_median_distance(self):
+        # Seen at 5, 10 and 20, and one behind the camera as if at 10: 4, 1.1, 1/4 and 1 times its area.
+        cloud = row_of([0.5, 0.55, 0.5, 0.5])
+        cloud = replace(cloud, means=[[0, 0, 5], [0, 0, 10], [0, 0, 20], [0, 0, -50]])
+        options = dict(cameras=[CAMERA], footprint_px2=0)
+        assert kept(convert(cloud, **options, max_splats=2)) == [0, 1]
+        assert kept(convert(cloud, **options, max_splats=3)) == [0, 1, 3]
 
     def test_max_triangles(self):
         cloud = row_of([0.2, 0.8, 0.6, 0.4])

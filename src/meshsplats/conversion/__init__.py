@@ -62,7 +62,7 @@ def convert(
     views = None
     if cameras and (chosen.footprint == "cameras" or chosen.colors == "cameras"):
         views = Views(part.means, cameras)
-    pixel, seen = pixel_sizes(part, chosen, views)
+    pixel = pixel_sizes(part, chosen, views)
     axes = _axis_order(part, chosen)
     sigma, opacity = _drawn_gaussians(part, chosen, pixel, axes)
     areas = disc_areas(sigma)
@@ -75,8 +75,8 @@ def convert(
         raise ValueError(f"none of the {len(part)} splats has a visible area")
     if chosen.max_splats is not None or chosen.max_triangles is not None:
         importance = opacity * shadow
-        if seen is not None and pixel is not None:
-            importance = np.where(seen, importance / np.square(pixel), 0)
+        if chosen.footprint == "cameras" and pixel is not None:
+            importance = importance / np.square(pixel)
         # Splats without area last of all.
         importance[~keep] = -1
         keep &= most_important(importance, triangles, chosen.max_splats, chosen.max_triangles)

@@ -162,24 +162,21 @@ def _every_third_bit(values: np.ndarray) -> np.ndarray:
     return v
 
 
-def pixel_sizes(
-    cloud: GaussianCloud, options: ConversionOptions, views: Views | None
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``, and (n,) bool which splats
-    the cameras see; each None where that is not known.
+def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views | None) -> np.ndarray | None:
+    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none'.
 
     Splats that no camera sees take the median of the others.
     """
     if options.footprint == "none":
-        return None, None
+        return None
     if options.footprint == "distance":
         pixel = options.viewing_distance / options.focal  # type: ignore[operator]
-        return np.full(len(cloud), pixel, np.float32), None
+        return np.full(len(cloud), pixel, np.float32)
     if options.footprint == "density":
         local = spacing(cloud.means)
         typical = np.median(local)
         relative = np.divide(local, typical, out=np.ones_like(local), where=typical > 0)
-        return np.float32(SPACING_SHARE) * typical * np.power(relative, np.float32(SPACING_POWER)), None
+        return np.float32(SPACING_SHARE) * typical * np.power(relative, np.float32(SPACING_POWER))
     if views is None:
         raise ValueError("footprint='cameras' needs cameras")
     sizes = views.pixel_sizes()
@@ -189,7 +186,7 @@ def pixel_sizes(
             f"none of the {len(views.cameras)} cameras sees any of the {len(cloud)} splats: are they of one"
             " scene? Choose footprint='density' or 'none' to go without them"
         )
-    return np.where(seen, sizes, np.median(sizes[seen])), seen
+    return np.where(seen, sizes, np.median(sizes[seen]))
 
 
 def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str) -> np.ndarray:

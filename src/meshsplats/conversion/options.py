@@ -64,7 +64,9 @@ class ConversionOptions:
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 in scene units: splats with their centre outside are left out."""
     max_splats: int | None = None
-    """Keep at most so many splats, the most important by opacity times visible area."""
+    """Keep at most so many splats, the most important by opacity times visible area: that on the pictures of
+    the cameras where there are any (splats that none of them sees count as at the median distance), else that
+    in scene units."""
     max_triangles: int | None = None
     """Keep the most important splats whose triangles number at most so many."""
     colors: Colors | None = None
