@@ -15,12 +15,20 @@ namespace ms {
 constexpr float ALPHA_CUT = 1.0f / 255, ALPHA_MOST = 0.99f, LIGHT_LEFT = 1e-4f;
 
 struct FlatSplat {
-    double x, y;           // projected centre, samples
-    float a, b, c;         // inverse covariance in samples: a dx^2 + 2 b dx dy + c dy^2
-    float above, below;    // rows reached, from the centre
+    double x, y;  // projected centre, samples
+    // The squared distance in standard deviations is (m[0] dx + m[1] dy)^2 + (m[2] dy)^2: a sum of squares stays exact
+    // for thin splats, where the usual quadratic form cancels. Not used by 2dgs.
+    double m[3];
+    float low, high;  // rows reached
     float opacity;
     float rgb[3];
-    float u[2], v[2], w[3];  // 2dgs: rows of the map from the splat's plane to the picture, seen from the centre
+};
+
+// 2dgs: the ray through the centre plus (dx, dy) meets the splat's plane at u = m[0] . (dx, dy, 1) / m[2] . (dx, dy, 1)
+// standard deviations along the first axis, v likewise with m[1], at the depth w . (u, v, 1).
+struct FlatPlane {
+    double m[3][3];
+    float w[3];
 };
 
 // exp of x <= 0, relative error about 2e-7; the same bits at every vector width.
@@ -79,6 +87,7 @@ inline void sh_color(const float *sh, int used, const double d[3], float rgb[3])
 class SplatScene {
   public:
     std::vector<FlatSplat> splats;  // visible ones
+    std::vector<FlatPlane> planes;  // theirs, for 2dgs only
     std::vector<Item> items;        // runs of one of `splats`, nearest first
 
     SplatScene(const MsSplats &cloud, const MsCamera &camera, const Grid &grid, int threads)
@@ -88,16 +97,19 @@ class SplatScene {
         constexpr int64_t block = 1 << 13;
         struct Part {
             std::vector<FlatSplat> splats;
+            std::vector<FlatPlane> planes;
             std::vector<Item> items;
         };
         std::vector<Part> parts((cloud.count + block - 1) / block);
         parallel_blocks(threads, cloud.count, block, [&](int64_t a, int64_t b, int) {
             Part &part = parts[a / block];
             FlatSplat splat;
+            FlatPlane plane;
             Item item;
             for (int64_t i = a; i < b; ++i)
-                if (project(i, splat, item)) {
+                if (project(i, splat, plane, item)) {
                     part.splats.push_back(splat);
+                    if (cloud_.kernel == 2) part.planes.push_back(plane);
                     part.items.push_back(item);
                 }
         });
@@ -107,6 +119,7 @@ class SplatScene {
                 splats.push_back(part.splats[i]);
                 items.push_back(part.items[i]);
             }
+            planes.insert(planes.end(), part.planes.begin(), part.planes.end());
             part = Part();
         }
         sort_items(items);
@@ -119,7 +132,7 @@ class SplatScene {
     Projection projection_;
     double position_[3] = {0, 0, 0};
 
-    bool project(int64_t i, FlatSplat &out, Item &item) const {
+    bool project(int64_t i, FlatSplat &out, FlatPlane &on_plane, Item &item) const {
         const float *mean = cloud_.means + 3 * i, *q = cloud_.quaternions + 4 * i, *scale = cloud_.scales + 3 * i;
         Vec3 c = projection_.to_camera(mean);
         if (!(c.z >= projection_.near)) return false;
@@ -141,13 +154,14 @@ class SplatScene {
         out.x = projection_.fx * c.x / c.z + projection_.cx;
         out.y = projection_.fy * c.y / c.z + projection_.cy;
         double lo[2], hi[2];
-        bool visible = cloud_.kernel == 2 ? plane(c, axes, opacity, out, lo, hi) : footprint(c, axes, opacity, out, lo, hi);
+        bool visible = cloud_.kernel == 2 ? plane(c, axes, opacity, out, on_plane, lo, hi)
+                                          : footprint(c, axes, opacity, out, lo, hi);
         int x0, x1, y0, y1;
         if (!visible || !sample_range(lo[0], hi[0], grid_.width, x0, x1) || !sample_range(lo[1], hi[1], grid_.height, y0, y1))
             return false;
         out.opacity = (float)opacity;
-        out.above = (float)(lo[1] - out.y);
-        out.below = (float)(hi[1] - out.y);
+        out.low = (float)lo[1];
+        out.high = (float)hi[1];
         double direction[3], length = 0;
         for (int k = 0; k < 3; ++k) {
             direction[k] = mean[k] - position_[k];
@@ -169,52 +183,67 @@ class SplatScene {
         auto limit = [](double v, double low, double high) { return v < low ? low : v > high ? high : v; };
         double tx = limit(c.x / c.z, -camera_.cx / fx - margin_x, (camera_.width - camera_.cx) / fx + margin_x);
         double ty = limit(c.y / c.z, -camera_.cy / fy - margin_y, (camera_.height - camera_.cy) / fy + margin_y);
-        double cov[3] = {0, 0, 0};
+        double jx[3], jy[3], cov[3] = {0, 0, 0}, det_before = 0;
         for (int k = 0; k < 3; ++k) {
-            double jx = fx / c.z * (axes[0][k] - tx * axes[2][k]), jy = fy / c.z * (axes[1][k] - ty * axes[2][k]);
-            cov[0] += jx * jx;
-            cov[1] += jx * jy;
-            cov[2] += jy * jy;
+            jx[k] = fx / c.z * (axes[0][k] - tx * axes[2][k]);
+            jy[k] = fy / c.z * (axes[1][k] - ty * axes[2][k]);
+            cov[0] += jx[k] * jx[k];
+            cov[1] += jx[k] * jy[k];
+            cov[2] += jy[k] * jy[k];
         }
-        double det_before = cov[0] * cov[2] - cov[1] * cov[1];
-        cov[0] += cloud_.dilation;
-        cov[2] += cloud_.dilation;
-        double det = cov[0] * cov[2] - cov[1] * cov[1];
+        // The determinant by Lagrange's identity: a sum of squares again.
+        for (int k = 0; k < 3; ++k) {
+            double area = jx[k] * jy[(k + 1) % 3] - jx[(k + 1) % 3] * jy[k];
+            det_before += area * area;
+        }
+        double widening = cloud_.dilation, det = det_before + widening * (cov[0] + cov[2] + widening);
+        cov[0] += widening;
+        cov[2] += widening;
         if (!(det > 0) || !std::isfinite(det)) return false;
         if (cloud_.kernel == 1) {
             opacity *= std::sqrt(std::max(0.0, det_before / det));
             if (!(opacity >= ALPHA_CUT)) return false;
         }
-        out.a = (float)(cov[2] / det / (s * s));
-        out.b = (float)(-cov[1] / det / (s * s));
-        out.c = (float)(cov[0] / det / (s * s));
+        double along = 1 / (s * std::sqrt(cov[2])), across = along / std::sqrt(det);
+        if (!std::isfinite(along) || !std::isfinite(across)) return false;
+        out.m[0] = across * cov[2];
+        out.m[1] = -across * cov[1];
+        out.m[2] = along;
         double radius2 = 2 * std::log(255 * opacity) + 1e-6;
         double rx = s * std::sqrt(radius2 * cov[0]), ry = s * std::sqrt(radius2 * cov[2]);
         lo[0] = out.x - rx, hi[0] = out.x + rx, lo[1] = out.y - ry, hi[1] = out.y + ry;
         return true;
     }
 
-    bool plane(const Vec3 &c, const double axes[3][3], double opacity, FlatSplat &out, double lo[2], double hi[2]) const {
+    bool plane(const Vec3 &c, const double axes[3][3], double opacity, const FlatSplat &splat, FlatPlane &out, double lo[2],
+               double hi[2]) const {
         // Columns of the map (u, v, 1) -> picture; x and y counted from the projected centre.
         double center[3] = {c.x, c.y, c.z}, row[3][3];
         for (int k = 0; k < 3; ++k) {
             double column[3];
             for (int i = 0; i < 3; ++i) column[i] = k < 2 ? axes[i][k] : center[i];
-            row[0][k] = projection_.fx * column[0] + (projection_.cx - out.x) * column[2];
-            row[1][k] = projection_.fy * column[1] + (projection_.cy - out.y) * column[2];
+            row[0][k] = projection_.fx * column[0] + (projection_.cx - splat.x) * column[2];
+            row[1][k] = projection_.fy * column[1] + (projection_.cy - splat.y) * column[2];
             row[2][k] = column[2];
         }
-        for (int k = 0; k < 2; ++k) {
-            out.u[k] = (float)row[0][k];
-            out.v[k] = (float)row[1][k];
-        }
+        // The inverse of that map, but for a factor, which is chosen to keep the numbers small.
+        double largest = 0;
+        for (int k = 0; k < 3; ++k)
+            for (int i = 0; i < 3; ++i) {
+                const double *a = row[(i + 1) % 3], *b = row[(i + 2) % 3];
+                out.m[k][i] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3];
+                if (k == 2) largest = std::max(largest, std::fabs(out.m[k][i]));
+            }
+        if (largest > 0)
+            for (auto &numbers : out.m)
+                for (double &number : numbers) number /= largest;
         for (int k = 0; k < 3; ++k) out.w[k] = (float)row[2][k];
         // Box of the disc u^2 + v^2 <= radius^2 on the picture, and of the low pass round the centre.
         double radius2 = 2 * std::log(255 * opacity) + 1e-6;
         double low_pass = std::sqrt(radius2 / 2) * grid_.samples;
         double d = radius2 * (row[2][0] * row[2][0] + row[2][1] * row[2][1]) - row[2][2] * row[2][2];
         for (int i = 0; i < 2; ++i) {
-            double at = i ? out.y : out.x, middle = 0, half = 1e9;
+            double at = i ? splat.y : splat.x, middle = 0, half = std::numeric_limits<double>::infinity();
             if (d < 0) {
                 double cross = radius2 * (row[i][0] * row[2][0] + row[i][1] * row[2][1]) - row[i][2] * row[2][2];
                 double square = radius2 * (row[i][0] * row[i][0] + row[i][1] * row[i][1]) - row[i][2] * row[i][2];
@@ -250,7 +279,7 @@ class SplatTile {
             }
         for (int y = 0; y < rows; ++y) open_[y] = (1u << columns) - 1;
         for (int64_t i = 0; i < length; ++i) {
-            add(scene_.splats[list[i].first], x0, y0, rows);
+            add(list[i].first, x0, y0, rows);
             if ((i & 15) == 15) {
                 uint32_t any = 0;
                 for (int y = 0; y < rows; ++y) any |= open_[y];
@@ -273,6 +302,11 @@ class SplatTile {
     uint32_t open_[TILE];
     int64_t fragments_ = 0;
 
+    // A FlatPlane counted from the corner of a tile, which is at (x, y) from the splat's centre.
+    struct Plane {
+        float x, y, m[3][3], w[3];
+    };
+
     static vf pick(unsigned chosen, vf yes, vf no) {
 #if defined(__AVX512F__)
         return ms::pick((vm)chosen, yes, no);
@@ -284,23 +318,48 @@ class SplatTile {
 #endif
     }
 
-    void add(const FlatSplat &splat, int x0, int y0, int rows) {
-        float mx = (float)(splat.x - x0), my = (float)(splat.y - y0);
+    void add(int32_t number, int x0, int y0, int rows) {
+        const FlatSplat &splat = scene_.splats[number];
+        // Counted from the tile's corner in double, so that what is left is small where the centre is far away.
+        const double dx = x0 - splat.x, dy = y0 - splat.y;
+        float a = 0, b = 0, c = 0, d = 0, e = 0;
+        Plane plane;
+        if (planar_) {
+            const FlatPlane &from = scene_.planes[number];
+            for (int k = 0; k < 3; ++k) {
+                plane.m[k][0] = (float)from.m[k][0];
+                plane.m[k][1] = (float)from.m[k][1];
+                plane.m[k][2] = (float)(from.m[k][0] * dx + from.m[k][1] * dy + from.m[k][2]);
+                plane.w[k] = from.w[k];
+            }
+            plane.x = (float)dx;
+            plane.y = (float)dy;
+        } else {
+            a = (float)splat.m[0];
+            b = (float)splat.m[1];
+            c = (float)(splat.m[0] * dx + splat.m[1] * dy);
+            d = (float)splat.m[2];
+            e = (float)(splat.m[2] * dy);
+        }
         vf opacity = set1(splat.opacity);
-        float top = my + splat.above - 1, bottom = my + splat.below;
-        int first = top > 0 ? (int)top : 0, last = bottom < rows ? (int)std::max(bottom, -1.0f) : rows - 1;
+        // A row more on either side, for rounding.
+        int first = (int)std::min(std::max(splat.low - y0 - 1, 0.0f), (float)rows);
+        int last = (int)std::max(std::min(splat.high - y0, rows - 1.0f), -1.0f);
         for (int y = first; y <= last; ++y) {
             if (!open_[y]) continue;
-            float dy = (y + 0.5f) - my;
+            const float v = d * (y + 0.5f) + e, row_u = b * (y + 0.5f) + c, row_v2 = v * v;
             for (int x = 0; x < TILE; x += W) {
                 unsigned open = (open_[y] >> x) & ((1u << W) - 1);
                 if (!open) continue;
-                vf dx = load(center_ + x) - set1(mx);
-                vf power = planar_ ? on_plane(splat, dx, dy)
-                                   : set1(-0.5f) * (set1(splat.a) * dx * dx + set1(splat.c * dy * dy)) -
-                                         set1(splat.b * dy) * dx;
+                vf power;
+                if (planar_) {
+                    power = on_plane(plane, load(center_ + x), y + 0.5f);
+                } else {
+                    vf u = set1(a) * load(center_ + x) + set1(row_u);
+                    power = set1(-0.5f) * (u * u + set1(row_v2));
+                }
                 // A bound cheaper than exp: below it alpha is under the cut.
-                open &= at_least(power, set1(-5.6f)) & at_least(set1(0.0f), power);
+                open &= at_least(power, set1(-5.6f));
                 if (!open) continue;
                 vf alpha = vmin(opacity * exp_negative(power), set1(ALPHA_MOST));
                 open &= at_least(alpha, set1(ALPHA_CUT));
@@ -320,24 +379,17 @@ class SplatTile {
         }
     }
 
-    vf on_plane(const FlatSplat &s, vf dx, float dy) const {
-        vf k0 = dx * set1(s.w[0]) - set1(s.u[0]), k1 = dx * set1(s.w[1]) - set1(s.u[1]), k2 = dx * set1(s.w[2]);
-        float l0 = dy * s.w[0] - s.v[0], l1 = dy * s.w[1] - s.v[1], l2 = dy * s.w[2];
-        vf p0 = k1 * set1(l2) - k2 * set1(l1), p1 = k2 * set1(l0) - k0 * set1(l2), p2 = k0 * set1(l1) - k1 * set1(l0);
-        vf rho = set1(low_pass_) * (dx * dx + set1(dy * dy));
-        alignas(64) float u[W], v[W], d[W], out[W];
-        store(u, p0);
-        store(v, p1);
-        store(d, p2);
-        store(out, rho);
-        for (int i = 0; i < W; ++i) {
-            if (d[i] == 0) continue;
-            float a = u[i] / d[i], b = v[i] / d[i];
-            float depth = a * s.w[0] + b * s.w[1] + s.w[2];
-            float square = a * a + b * b;
-            if (depth >= near_ && square < out[i]) out[i] = square;
-        }
-        return set1(-0.5f) * load(out);
+    vf on_plane(const Plane &s, vf x, float y) const {
+        vf p[3];
+        for (int k = 0; k < 3; ++k) p[k] = set1(s.m[k][0]) * x + set1(s.m[k][1] * y + s.m[k][2]);
+        vf u = p[0] / p[2], v = p[1] / p[2], square = u * u + v * v;
+        vf depth = set1(s.w[0]) * u + set1(s.w[1]) * v + set1(s.w[2]);
+        vf dx = x + set1(s.x);
+        float dy = y + s.y;
+        vf low_pass = set1(low_pass_) * (dx * dx + set1(dy * dy));
+        // Where the ray meets no plane the square is no number, which is not less than anything.
+        vm met = both(not_less(depth, set1(near_)), greater(low_pass, square));
+        return set1(-0.5f) * ms::pick(met, square, low_pass);
     }
 
     void finish(int x0, int y0, int columns, int rows) {

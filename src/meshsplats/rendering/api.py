@@ -74,11 +74,13 @@ def render(
     """
     keep = _Alive()
     options = _options(keep, camera, background, samples, threads)
-    if max_layers is not None and not 1 <= max_layers <= np.iinfo(np.int32).max:
-        raise ValueError(f"max_layers must be at least 1, got {max_layers}")
+    if max_layers is not None and not (
+        isinstance(max_layers, (int, np.integer)) and 1 <= max_layers <= np.iinfo(np.int32).max
+    ):
+        raise ValueError(f"max_layers must be a whole number from 1 to 2^31 - 1, got {max_layers!r}")
     if not 0 <= min_transmittance < 1:
         raise ValueError(f"min_transmittance must lie in [0, 1), got {min_transmittance}")
-    options.max_layers = max_layers or 0
+    options.max_layers = int(max_layers or 0)
     options.min_transmittance = min_transmittance
 
     values, widths = None, {}
@@ -86,7 +88,8 @@ def render(
         for name in attributes:
             if name not in mesh.attributes:
                 raise ValueError(f"the mesh has no attribute {name!r}; it has: {', '.join(mesh.attributes) or 'none'}")
-        columns = {name: mesh.attributes[name].reshape(len(mesh.vertices), -1) for name in attributes}
+        chosen = {name: mesh.attributes[name] for name in attributes}
+        columns = {name: value if value.ndim == 2 else value[:, None] for name, value in chosen.items()}
         widths = {name: column.shape[1] for name, column in columns.items()}
         values = np.ascontiguousarray(np.concatenate(list(columns.values()), axis=1))
     subject = core.MeshStruct(
@@ -156,7 +159,7 @@ def render_splats(
         raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
     if not (np.isfinite(dilation) and dilation >= 0):
         raise ValueError(f"dilation must be a variance in square pixels, >= 0, got {dilation}")
-    degree = cloud.sh_degree if sh_degree is None else min(sh_degree, cloud.sh_degree)
+    degree = cloud.sh_degree if sh_degree is None else min(int(sh_degree), cloud.sh_degree)
     subject = core.SplatsStruct(
         count=len(cloud),
         means=keep(cloud.means),
@@ -209,7 +212,7 @@ def _options(keep: _Alive, camera: Camera, background, samples: int, threads: in
         raise ValueError("background must be finite")
     assert max(camera.width, camera.height) <= MAX_SIDE
     return core.OptionsStruct(
-        samples=samples,
+        samples=int(samples),
         max_layers=0,
         threads=min(int(threads) if threads else processors(), 256),
         min_transmittance=0,
