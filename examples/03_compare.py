@@ -13,7 +13,7 @@ from meshsplats.demo_scene import make_scene
 cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()
 cameras = ms.dome(cloud, 6, width=240, height=240)
 # Degree 0 compares like with like: a mesh has one colour a vertex, whatever the view.
-splats = [ms.render_splats(cloud, camera, samples=2, sh_degree=0).color.clip(0, 1) for camera in cameras]
+splats = [ms.render_splats(cloud, camera, sh_degree=0).color.clip(0, 1) for camera in cameras]
 
 for preset in ("paper", "default"):
     mesh = ms.convert(cloud, preset=preset, cameras=cameras if preset == "default" else None)

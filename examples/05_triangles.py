@@ -36,7 +36,7 @@ triangles = replace(
 )
 
 pictures = [
-    ms.render_splats(cloud, camera, samples=3).color,
+    ms.render_splats(cloud, camera).color,
     ms.render(mesh, camera, samples=3).color,
     ms.render(triangles, camera, samples=3).color,
 ]

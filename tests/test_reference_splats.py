@@ -270,6 +270,10 @@ def test_colour_depends_on_the_direction_from_the_camera_to_the_splat():
         splat_colors(cloud, Camera(pose, 1, 1, 0, 0, 1, 1), 0), [(0.5, 0.5, 0)], atol=1e-7
     )
     bright = render_splats(one_splat(sh=np.full((1, 1, 3), 9.0)), splat_camera(), background=BLACK)
+    np.testing.assert_allclose(bright.color[2, 2], 0.8, rtol=1e-6)  # degree 0 alone: what a vertex can carry
+    sh = np.zeros((1, 4, 3))
+    sh[:, 0] = 9.0
+    bright = render_splats(one_splat(sh=sh), splat_camera(), background=BLACK)
     np.testing.assert_allclose(bright.color[2, 2], 0.8 * (0.5 + 9 * SH_C0), rtol=1e-6)
 
 

@@ -72,21 +72,23 @@ def compare_views(
 ) -> Iterator[ComparedView]:
     """The views one by one, so that only one pair of pictures is in memory.
 
+    The splats are drawn as their trainer draws them, at the centres of the pixels with a filter of a pixel's size;
+    a mesh has no such filter and needs several samples a pixel instead.
+
     Parameters
     ----------
     sh_degree: spherical harmonics of the splats up to this degree; all by default. A mesh has one colour a
-        vertex:
-        0 leaves the change of colour with the view out of the comparison.
-    background, samples, max_layers, threads: as in ``render``; pictures are clipped to [0, 1] as they are
-        when saved.
+        vertex: 0 leaves the change of colour with the view out of the comparison.
+    background, threads: as in ``render``; pictures are clipped to [0, 1] as they are when saved.
+    samples, max_layers: as in ``render``, for the mesh.
     """
     from meshsplats.metrics import psnr, ssim
     from meshsplats.rendering import render, render_splats
 
     for i, camera in enumerate(cameras):
-        common: dict[str, Any] = {"background": background, "samples": samples, "threads": threads}
+        common: dict[str, Any] = {"background": background, "threads": threads}
         a = np.clip(render_splats(cloud, camera, sh_degree=sh_degree, **common).color, 0, 1)
-        b = np.clip(render(mesh, camera, max_layers=max_layers, **common).color, 0, 1)
+        b = np.clip(render(mesh, camera, samples=samples, max_layers=max_layers, **common).color, 0, 1)
         yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))
 
 

@@ -84,7 +84,7 @@ class Compare:
             cameras,
             sh_degree=self.draw.sh_degree,
             background=background,
-            samples=self.draw.samples,
+            samples=2 if self.draw.samples is None else self.draw.samples,
             max_layers=self.draw.max_layers,
             threads=self.draw.threads,
         )

@@ -169,9 +169,12 @@ class Render:
         from meshsplats.rendering import render, render_splats
 
         background = (0.0, 0.0, 0.0) if self.transparent else parse_color(self.draw.background)
+        samples = self.draw.samples
+        if samples is None:
+            samples = 1 if isinstance(scene, GaussianCloud) else 2
         options: dict[str, Any] = {
             "background": background,
-            "samples": self.draw.samples,
+            "samples": samples,
             "threads": self.draw.threads,
         }
         layers, degree = self.draw.max_layers, self.draw.sh_degree

@@ -47,7 +47,8 @@ inline vf exp_negative(vf x) {
     return p * two;
 }
 
-// Display colour seen along the unit direction d: max(0, 1/2 + sum of coefficients times real spherical harmonics).
+// Display colour seen along the unit direction d: max(0, 1/2 + sum of coefficients times real spherical harmonics);
+// of degree 0 alone, the colour that a vertex can carry, at most 1.
 inline void sh_color(const float *sh, int used, const double d[3], float rgb[3]) {
     double x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
     double basis[16];
@@ -80,7 +81,7 @@ inline void sh_color(const float *sh, int used, const double d[3], float rgb[3])
     for (int channel = 0; channel < 3; ++channel) {
         double sum = 0.5;
         for (int i = 0; i < used; ++i) sum += basis[i] * sh[3 * i + channel];
-        rgb[channel] = (float)std::max(0.0, sum);
+        rgb[channel] = (float)std::max(0.0, used == 1 ? std::min(1.0, sum) : sum);
     }
 }
 

@@ -145,7 +145,8 @@ def render_splats(
         camera: from where; splats whose centres are nearer than ``camera.near`` are left out.
         background: RGB, (3,) or (h, w, 3).
         samples: side of the grid of samples in each pixel, 1 to 16; the widening stays that of whole pixels.
-        sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default.
+        sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default. Colour is kept
+            from falling below 0, as in 3DGS; that of degree 0 alone is ``cloud.colors``, kept in [0, 1].
         dilation: variance added to the projected covariance, square pixels; models trained otherwise need theirs.
         threads: at most this many; all processors by default. The picture does not depend on it.
 

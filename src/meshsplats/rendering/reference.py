@@ -374,7 +374,8 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 def splat_colors(cloud: GaussianCloud, camera: Camera, degree: int) -> np.ndarray:
     """(n, 3) RGB of every splat seen from the camera: max(0, 0.5 + SH), direction camera centre to splat.
 
-    Degrees above the stored one are not there to be used. There is no upper limit, as in 3DGS.
+    Degrees above the stored one are not there to be used. There is no upper limit, as in 3DGS, except that degree 0
+    alone gives ``cloud.colors``, the colour that a vertex can carry, at most 1.
     """
     degree = min(degree, cloud.sh_degree)
     directions = cloud.means.astype(np.float64) - camera.center
@@ -382,7 +383,7 @@ def splat_colors(cloud: GaussianCloud, camera: Camera, degree: int) -> np.ndarra
     directions = np.divide(directions, length, out=np.zeros_like(directions), where=length > 0)
     basis = sh_basis(directions, degree)
     sh = cloud.sh[:, : basis.shape[1]].astype(np.float64)
-    return np.maximum(0, 0.5 + np.einsum("nk,nkc->nc", basis, sh))
+    return np.clip(0.5 + np.einsum("nk,nkc->nc", basis, sh), 0, 1 if degree == 0 else None)
 
 
 def _rotations(cloud: GaussianCloud) -> np.ndarray:
