@@ -2,8 +2,10 @@
 #include <cstdio>
 #include <new>
 
+#include "adam.h"
 #include "mesh_tile.h"
 #include "splats.h"
+#include "ssim.h"
 
 #if defined(_WIN32)
 #define MS_EXPORT __declspec(dllexport)
@@ -91,6 +93,14 @@ MS_EXPORT int ms_render_splats(const MsSplats *splats, const MsCamera *camera, c
             return std::make_unique<ms::SplatTile>(scene, grid, *options, *picture, *camera, *splats);
         });
     });
+}
+
+MS_EXPORT int ms_compare_pictures(MsComparison *comparison, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::compare_pictures(*comparison); });
+}
+
+MS_EXPORT int ms_adam_rows(const MsAdam *adam, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::adam_rows(*adam); });
 }
 
 }  // extern "C"
