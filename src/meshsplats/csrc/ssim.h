@@ -1,4 +1,5 @@
 // Sums of |x - y| and of SSIM (Wang et al. 2004) over two sets of pictures, and the gradient with respect to x.
+// SSIM costs most of the time and is left out where its rate is 0.
 //
 // Windows are 11 x 11 Gaussians, sigma 1.5, one a pixel; outside the picture, and where the mask is 0, are zeros. With
 // m = (x + y) / 2, d = x - y and G the window's mean, the usual quotient of SSIM is
@@ -65,19 +66,33 @@ class ComparisonTile {
         length_ = (right - left) * step_;
         inner_ = whole(length_), middle_ = whole(length_ + 2 * RADIUS * step_);
         outer_ = whole(middle_ + 2 * RADIUS * step_);
-        const int reach = all_.gradient ? 2 * RADIUS : RADIUS;
         Sum l1, ssim;
+        if (all_.ssim_rate == 0) {
+            for (int row = top; row < bottom; ++row) {
+                read(row, 0);
+                for (int64_t i = 0; i < inner_; i += W) store(&d_[i], load(&x_[i]) - load(&y_[i]));
+                l1.add(&d_[0], length_, [](float d) { return std::fabs(d); });
+                if (all_.gradient) write_gradient(row, false);
+            }
+            sums[0] += l1.total();
+            return;
+        }
+        const int reach = all_.gradient ? 2 * RADIUS : RADIUS;
         for (int row = top - reach; row < bottom + reach; ++row) {
             load_row(row);
-            if (row >= top && row < bottom) l1.add(&d_[2 * RADIUS * step_], length_, [](float d) { return std::fabs(d); });
+            if (row >= top && row < bottom)
+                l1.add(&d_[2 * RADIUS * step_], length_, [](float d) { return std::fabs(d); });
             filter_row(row);
             const int center = row - RADIUS;
             if (center < top - reach + RADIUS) continue;
             compare(center);
-            if (center >= top && center < bottom) ssim.add(&value_[RADIUS * step_], length_, [](float s) { return s; });
+            if (center >= top && center < bottom)
+                ssim.add(&value_[RADIUS * step_], length_, [](float s) { return s; });
             if (all_.gradient) {
                 filter_slopes(center);
-                if (center - RADIUS >= top) write_gradient(center - RADIUS);
+                if (center - RADIUS < top) continue;
+                read(center - RADIUS, 0);
+                write_gradient(center - RADIUS, true);
             }
         }
         sums[0] += l1.total();
@@ -222,24 +237,24 @@ class ComparisonTile {
         }
     }
 
-    void write_gradient(int row) {
+    // From x_, y_ and inside_ of the row, without margins.
+    void write_gradient(int row, bool with_ssim) {
         const float *rows[TAPS];
-        ordered(slope_ring_, row, rows);
-        read(row, 0);
+        if (with_ssim) ordered(slope_ring_, row, rows);
         float *out = all_.gradient + ((number_ * all_.height + row) * all_.width + left_) * (int64_t)step_;
         typedef int vi __attribute__((vector_size(4 * W)));
         const vf rate = set1(all_.ssim_rate), two = set1(2), half = set1(0.5f);
         const vi l1 = (vi)set1(all_.l1_rate);
         for (int64_t i = 0; i < length_; i += W) {
             const vf x = load(&x_[i]), y = load(&y_[i]), d = x - y, m = (x + y) * half - half;
-            const vf ssim =
-                filter(rows, i) + two * d * filter(rows, i + inner_) + m * filter(rows, i + 2 * inner_);
-            const vf sign = (vf)((vi)(d > vf{}) & l1) - (vf)((vi)(d < vf{}) & l1);
-            const vf result = (rate * ssim + sign) * load(&inside_[i]);
+            vf sum = (vf)((vi)(d > vf{}) & l1) - (vf)((vi)(d < vf{}) & l1);
+            if (with_ssim)
+                sum += rate * (filter(rows, i) + two * d * filter(rows, i + inner_) + m * filter(rows, i + 2 * inner_));
+            sum *= load(&inside_[i]);
             if (i + W <= length_)
-                store(out + i, result);
+                store(out + i, sum);
             else
-                std::memcpy(out + i, &result, (length_ - i) * sizeof(float));
+                std::memcpy(out + i, &sum, (length_ - i) * sizeof(float));
         }
     }
 
