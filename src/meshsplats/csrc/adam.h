@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cmath>
+#include <cstring>
 #include <stdexcept>
 #include <string>
 
@@ -56,6 +57,14 @@ inline void adam_run(const MsAdam &a, int64_t begin, int64_t end) {
     }
 }
 
+// The first place from `at` on where the mask is not 0, or `end`.
+inline int64_t skip_zeros(const uint8_t *mask, int64_t at, int64_t end) {
+    uint64_t eight;
+    while (at + 8 <= end && (std::memcpy(&eight, mask + at, 8), eight == 0)) at += 8;
+    while (at < end && !mask[at]) ++at;
+    return at;
+}
+
 // Calls adam_run for each unbroken run of rows. Throws before any value changes if row numbers are not increasing
 // numbers of rows.
 inline void adam_rows(const MsAdam &a) {
@@ -76,7 +85,7 @@ inline void adam_rows(const MsAdam &a) {
         parallel_blocks(a.threads, a.rows, SHARE, [&](int64_t begin, int64_t end, int) {
             for (int64_t row = begin, next; row < end; row = next) {
                 if (!a.mask[row]) {
-                    next = row + 1;
+                    next = skip_zeros(a.mask, row, end);
                     continue;
                 }
                 for (next = row + 1; next < end && a.mask[next];) ++next;

@@ -102,14 +102,14 @@ class RowAdam:
             )
         chosen = _checked_rows(rows, len(self._array))
         steps = self.steps + 1
-        corrections = math.sqrt(1 - self.betas[1] ** steps) / (1 - self.betas[0] ** steps)
+        step = self.lr * math.sqrt(1 - self.betas[1] ** steps) / (1 - self.betas[0] ** steps)
         adam_rows(
             self._array,
             self.mean,
             self.square,
             array,
             chosen,
-            step=self.lr * corrections,
+            step=step,
             betas=self.betas,
             eps=self.eps,
             scale=self.scale,
@@ -163,7 +163,10 @@ class RowAdam:
         if index.ndim != 1 or index.dtype.kind not in "iu":
             raise TypeError(f"rows must be row numbers or a mask, got {index.dtype} of shape {index.shape}")
         if index.size and not (index.min() >= 0 and index.max() < len(self._array)):
-            raise ValueError(f"rows must lie in [0, {len(self._array)}), got up to {index.max()}")
+            raise ValueError(f"rows must lie in [0, {len(self._array)}), got {index.min()} to {index.max()}")
+        wanted = (len(index), self._array.shape[1])
+        if np.shape(_array(values)) != wanted:
+            raise ValueError(f"values must have shape {wanted}, got {np.shape(_array(values))}")
         result = RowAdam(
             values,
             lr=self.lr,
@@ -173,9 +176,6 @@ class RowAdam:
             bounds=self.bounds,
             threads=self.threads,
         )
-        wanted = (len(index), self._array.shape[1])
-        if result.mean.shape != wanted:
-            raise ValueError(f"values must have shape {wanted}, got {result.mean.shape}")
         result.mean, result.square, result.steps = self.mean[index], self.square[index], self.steps
         return result
 
