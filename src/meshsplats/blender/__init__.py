@@ -1,0 +1,114 @@
+"""Pictures and scenes of splat meshes by Blender: exact ones, and lit ones with shadows, mirrors and glass.
+
+Blender runs as a process of its own, as the module bpy of this environment or as an installed program.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.options import MAX_LAYERS, Engine, Ground, LightOptions, SceneOptions
+from meshsplats.camera import Camera
+from meshsplats.errors import DataWarning
+from meshsplats.mesh import SplatMesh
+
+__all__ = ["BlenderError", "Engine", "Ground", "LightOptions", "SceneOptions", "draw"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "BlenderError":
+        from meshsplats.blender.launch import BlenderError
+
+        return BlenderError
+    raise AttributeError(f"module 'meshsplats.blender' has no attribute {name!r}")
+
+
+def draw(
+    mesh: SplatMesh,
+    cameras: Sequence[Camera],
+    *,
+    pictures: Sequence[str | os.PathLike[str]] = (),
+    blend: str | os.PathLike[str] | None = None,
+    options: SceneOptions | None = None,
+    executable: str | os.PathLike[str] | None = None,
+    progress: Callable[[], object] | None = None,
+) -> dict[str, Any]:
+    """Has Blender render ``mesh`` from ``cameras``, or save the scene, or both; existing files are replaced.
+
+    Unlit (``options.light`` None), Cycles draws what ``meshsplats.render`` draws, and the values of an .exr are
+    those of ``Rendering.color``, in the space of the mesh's colours. Lit, colours are turned to linear light; an
+    .exr holds that, a .png is shown through Blender's view transform Standard (sRGB).
+
+    Args:
+        mesh: what to draw.
+        cameras: at least one for pictures; in a .blend, each is a camera and a frame of the timeline.
+        pictures: .png (8 bits) or .exr (32 bits) to write, one a camera.
+        blend: Blender file to write: mesh, material, cameras, light, world, in named collections.
+        options: how; unlit in Cycles by default.
+        executable: an installed Blender, 4.2 or newer; the module bpy of this environment by default.
+        progress: called after each picture.
+
+    Returns:
+        ``{"blender": its version, "build_seconds": float, "picture_seconds": [float, ...], "layers": most layers
+        behind each other, "bounce_limit": int}``.
+
+    Raises:
+        ValueError: options out of range, another suffix, pictures that do not match the cameras, an empty mesh.
+        MissingDependencyError: neither bpy nor an executable, or no OpenGL libraries for EEVEE.
+        BlenderError: Blender failed; the message holds what it said.
+
+    Warns with a DataWarning if more layers lie behind each other than Blender can follow (1024).
+    """
+    from meshsplats.blender import launch, subject
+
+    options = options or SceneOptions()
+    options.check()
+    targets = [Path(path) for path in pictures]
+    for path in targets:
+        if path.suffix.lower() not in (".png", ".exr"):
+            raise ValueError(f"{path.name!r}: Blender's pictures end in .png or .exr")
+    if blend is not None and Path(blend).suffix.lower() != ".blend":
+        raise ValueError(f"{Path(blend).name!r}: a Blender file ends in .blend")
+    if targets and len(targets) != len(cameras):
+        raise ValueError(f"{len(targets)} pictures for {len(cameras)} cameras: there must be one a camera")
+    if len(mesh.faces) == 0:
+        raise ValueError("the mesh has no triangles: there is nothing to draw")
+    launch.command(None if executable is None else Path(executable))  # told before the work
+    layers, limit = subject.count(mesh, cameras, options)
+    if layers > MAX_LAYERS:
+        _warn(mesh, cameras, layers, options)
+    arrays, facts = subject.prepare(mesh, cameras, options, layers)
+    result = launch.run_job(
+        arrays,
+        facts,
+        cameras,
+        options,
+        limit=limit,
+        pictures=targets,
+        blend=None if blend is None else Path(blend),
+        executable=None if executable is None else Path(executable),
+        progress=progress,
+    )
+    return result | {"layers": layers, "bounce_limit": limit}
+
+
+def _warn(mesh: SplatMesh, cameras: Sequence[Camera], layers: int, options: SceneOptions) -> None:
+    if options.engine == "eevee":  # counts no bounces
+        return
+    from meshsplats.blender.layers import hidden_by_limit
+
+    shares = [hidden_by_limit(mesh, camera, threads=options.threads) for camera in cameras[:8]]
+    share = float(np.max(shares)) if shares else 0.0
+    warnings.warn(
+        f"up to {layers} triangles lie behind each other, and Cycles follows a ray through {MAX_LAYERS}: beyond, it is"
+        f" black ({share:.2%} of the pixels of a view are touched); draw fewer with --max-triangles on conversion or"
+        " a smaller part",
+        DataWarning,
+        stacklevel=3,
+    )

@@ -1,0 +1,46 @@
+"""From the world of a splat file to Blender's, where z points up. NumPy only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.framing import front_axes
+
+
+def to_blender(up: np.ndarray) -> np.ndarray:
+    """(3, 3) float64 rotation from the world frame to Blender's for a unit ``up``: the scene stands upright, its
+    front towards -y, where Blender's front view looks from."""
+    right, upward, forward = front_axes(np.asarray(up, np.float64))
+    return np.stack([right, forward, upward])
+
+
+def camera_pose(camera: Camera, rotation: np.ndarray) -> np.ndarray:
+    """(4, 4) float64 camera-to-world matrix in Blender's frame; Blender's cameras look along -z with y up."""
+    world_to_camera = camera.world_to_camera[:3, :3]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation @ world_to_camera.T @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = rotation @ camera.center
+    return pose
+
+
+def lens(camera: Camera, sensor_width: float = 36.0) -> dict[str, Any]:
+    """Blender's settings for the camera's lens, sensor fit HORIZONTAL: ``lens`` in mm, ``shift_x``, ``shift_y``,
+    ``pixel_aspect_x``, ``pixel_aspect_y`` (these two belong to the scene)."""
+    aspect = (camera.fy / camera.fx, 1.0) if camera.fy >= camera.fx else (1.0, camera.fx / camera.fy)
+    ratio = aspect[1] / aspect[0]
+    return {
+        "lens": camera.fx * sensor_width / camera.width,
+        "shift_x": (camera.width / 2 - camera.cx) / camera.width,
+        "shift_y": (camera.cy - camera.height / 2) * ratio / camera.width,
+        "pixel_aspect_x": aspect[0],
+        "pixel_aspect_y": aspect[1],
+    }
+
+
+def sun_direction(azimuth: float, elevation: float) -> np.ndarray:
+    """(3,) unit vector to the sun in Blender's frame, from degrees as in ``LightOptions.sun``."""
+    a, e = np.radians(azimuth), np.radians(elevation)
+    return np.array([np.cos(e) * np.sin(a), -np.cos(e) * np.cos(a), np.sin(e)])

@@ -1,0 +1,164 @@
+"""Materials: the splat mesh's own, unlit and lit, and those of ground, mirror and glass."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+from meshsplats.blender.inside import versions
+from meshsplats.blender.inside.meshes import COLOR, NORMAL
+
+SELF_SHADOW = "Self-shadow distance"
+"""Name and label of the node that holds the distance within which layers do not shade each other."""
+
+
+class _Tree:
+    """A node tree with nodes placed from left to right."""
+
+    def __init__(self, owner: Any) -> None:
+        self.tree = versions.node_tree(owner)
+
+    def node(self, kind: str, x: int, y: int = 0, **settings: Any) -> Any:
+        node = self.tree.nodes.new(kind)
+        node.location = (x * 220, -y * 180)
+        for name, value in settings.items():
+            setattr(node, name, value)
+        return node
+
+    def link(self, output: Any, target: Any) -> None:
+        self.tree.links.new(output, target)
+
+    def math(self, operation: str, x: int, y: int, a: Any, b: Any) -> Any:
+        """Output of a Math node; a and b are sockets or numbers."""
+        node = self.node("ShaderNodeMath", x, y, operation=operation)
+        for place, value in enumerate((a, b)):
+            if isinstance(value, (int, float)):
+                node.inputs[place].default_value = value
+            else:
+                self.link(value, node.inputs[place])
+        return node.outputs[0]
+
+
+def unlit(name: str = "Splats, unlit") -> Any:
+    """Shows the colours as they are, composited by opacity: from any side, in mirrors and through glass."""
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=COLOR)
+    emission = tree.node("ShaderNodeEmission", 2, 1)
+    tree.link(color.outputs["Color"], emission.inputs["Color"])
+    _translucent(tree, material, color.outputs["Alpha"], emission.outputs[0])
+    return material
+
+
+def lit(
+    name: str = "Splats, lit",
+    *,
+    self_shadow: float,
+    roughness: float = 1.0,
+    specular: float = 0.0,
+    smooth: bool = True,
+) -> Any:
+    """A surface that lights and shadows act on.
+
+    Many translucent layers make one surface, and each is shaded as if it lay in that surface: by the smoothed
+    normal in the attribute ``splat_normal`` (``smooth`` False: by the triangle's own). A ray that starts on one
+    layer does not see the others within ``self_shadow`` (scene units): they would shade it by chance, half of it
+    on average. Shadows of things farther off than that are not touched.
+    """
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=COLOR)
+    surface = tree.node("ShaderNodeBsdfDiffuse", 3, 1)
+    tree.link(color.outputs["Color"], surface.inputs["Color"])
+    shader = surface.outputs[0]
+    if smooth:
+        normal = tree.node("ShaderNodeAttribute", 0, 3, attribute_name=NORMAL)
+        turned = tree.node(
+            "ShaderNodeVectorTransform", 1, 3, vector_type="NORMAL", convert_from="OBJECT", convert_to="WORLD"
+        )
+        tree.link(normal.outputs["Vector"], turned.inputs[0])
+        tree.link(turned.outputs[0], surface.inputs["Normal"])
+        # The correction for bump maps darkens wherever the shading normal leaves the triangle's own.
+        versions.set_if_there(material.cycles, use_bump_map_correction=False)
+    if specular > 0:
+        gloss = tree.node("ShaderNodeBsdfGlossy", 3, 2)
+        gloss.inputs["Roughness"].default_value = roughness
+        if smooth:
+            tree.link(turned.outputs[0], gloss.inputs["Normal"])
+        coat = tree.node("ShaderNodeMixShader", 4, 2)
+        # As in the Principled shader: 0.5 stands for 4 % reflected head on, the index of refraction 1.5.
+        versions.socket(coat.inputs, "Fac", "Factor").default_value = 0.08 * specular
+        tree.link(shader, coat.inputs[1])
+        tree.link(gloss.outputs[0], coat.inputs[2])
+        shader = coat.outputs[0]
+    path = tree.node("ShaderNodeLightPath", 0, 5)
+    distance = tree.node("ShaderNodeValue", 0, 7, name=SELF_SHADOW, label=SELF_SHADOW)
+    distance.outputs[0].default_value = self_shadow
+    seen = tree.math("GREATER_THAN", 1, 5, path.outputs["Ray Length"], distance.outputs[0])
+    alpha = tree.math("MULTIPLY", 2, 5, color.outputs["Alpha"], seen)
+    _translucent(tree, material, alpha, shader)
+    return material
+
+
+def _translucent(tree: _Tree, material: Any, alpha: Any, shader: Any) -> None:
+    """Ends ``material`` with ``shader`` over what is behind it, by ``alpha``."""
+    clear = tree.node("ShaderNodeBsdfTransparent", 5, 3)
+    mix = tree.node("ShaderNodeMixShader", 6, 1)
+    out = tree.node("ShaderNodeOutputMaterial", 7, 1)
+    tree.link(alpha, versions.socket(mix.inputs, "Fac", "Factor"))
+    tree.link(clear.outputs[0], mix.inputs[1])
+    tree.link(shader, mix.inputs[2])
+    tree.link(mix.outputs[0], out.inputs["Surface"])
+    # 'AUTO' would make every triangle a light: minutes of set-up and twice the memory at millions of them.
+    material.cycles.emission_sampling = "NONE"
+    # EEVEE: blended in the order of the faces, seen from both sides, all layers.
+    material.surface_render_method = "BLENDED"
+    versions.set_if_there(
+        material, use_transparency_overlap=True, show_transparent_back=True, use_transparent_shadow=True
+    )
+
+
+def plain(name: str, color: tuple[float, float, float]) -> Any:
+    """A matt surface of linear ``color``."""
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    surface = tree.node("ShaderNodeBsdfDiffuse", 0)
+    surface.inputs["Color"].default_value = (*color, 1)
+    out = tree.node("ShaderNodeOutputMaterial", 1)
+    tree.link(surface.outputs[0], out.inputs["Surface"])
+    return material
+
+
+def mirror(name: str = "Mirror") -> Any:
+    """A perfect mirror that keeps 95 % of the light."""
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    surface = tree.node("ShaderNodeBsdfPrincipled", 0)
+    surface.inputs["Base Color"].default_value = (0.95, 0.95, 0.95, 1)
+    surface.inputs["Metallic"].default_value = 1
+    surface.inputs["Roughness"].default_value = 0
+    out = tree.node("ShaderNodeOutputMaterial", 2)
+    tree.link(surface.outputs[0], out.inputs["Surface"])
+    return material
+
+
+def glass(name: str = "Glass") -> Any:
+    """Clear glass of refractive index 1.45, whose shadow lets light through."""
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    surface = tree.node("ShaderNodeBsdfGlass", 0)
+    surface.inputs["Roughness"].default_value = 0
+    surface.inputs["IOR"].default_value = 1.45
+    # Light that reaches a place through glass is a caustic, which path tracing finds late: let shadows rays pass.
+    path = tree.node("ShaderNodeLightPath", 0, 2)
+    clear = tree.node("ShaderNodeBsdfTransparent", 0, 1)
+    clear.inputs[0].default_value = (0.9, 0.9, 0.9, 1)
+    mix = tree.node("ShaderNodeMixShader", 1)
+    tree.link(path.outputs["Is Shadow Ray"], versions.socket(mix.inputs, "Fac", "Factor"))
+    tree.link(surface.outputs[0], mix.inputs[1])
+    tree.link(clear.outputs[0], mix.inputs[2])
+    out = tree.node("ShaderNodeOutputMaterial", 2)
+    tree.link(mix.outputs[0], out.inputs["Surface"])
+    versions.set_if_there(material, use_raytrace_refraction=True)
+    return material

@@ -1,0 +1,77 @@
+"""Meshes in Blender from arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import numpy as np
+
+from meshsplats.blender.inside import versions
+
+COLOR = "Color"
+"""Attribute with RGBA: display values where the picture is unlit, linear light where it is lit."""
+NORMAL = "splat_normal"
+"""Attribute with the shading normal, in the object's own frame."""
+SPLAT = "splat"
+"""Attribute of the faces: number of the splat that each was made from."""
+
+
+def make_mesh(
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    *,
+    normals: np.ndarray | None = None,
+    face_splat: np.ndarray | None = None,
+    edges: bool = True,
+) -> Any:
+    """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored as they are.
+
+    ``edges`` False leaves out the edges, which renderers do not need but editing does.
+    """
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
+    mesh.loops.add(3 * len(faces))
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
+    color = mesh.attributes.new(COLOR, "FLOAT_COLOR", "POINT")
+    color.data.foreach_set("color", np.ascontiguousarray(colors, np.float32).ravel())
+    if normals is not None:
+        attribute = mesh.attributes.new(NORMAL, "FLOAT_VECTOR", "POINT")
+        attribute.data.foreach_set("vector", np.ascontiguousarray(normals, np.float32).ravel())
+    if face_splat is not None:
+        attribute = mesh.attributes.new(SPLAT, "INT", "FACE")
+        attribute.data.foreach_set("value", np.ascontiguousarray(face_splat, np.int32))
+    mesh.color_attributes.active_color = mesh.color_attributes[COLOR]
+    mesh.color_attributes.render_color_index = mesh.color_attributes.find(COLOR)
+    mesh.update(calc_edges=edges)
+    if normals is not None:
+        # Cycles lights no side of a surface that its own normal, as smooth as the mesh says, does not face.
+        versions.set_normals(mesh, normals)
+    return mesh
+
+
+def make_object(mesh: Any, name: str, rotation: np.ndarray, collection: Any) -> Any:
+    """An object of ``mesh`` in ``collection``, turned by the (3, 3) ``rotation``."""
+    from mathutils import Matrix
+
+    thing = bpy.data.objects.new(name, mesh)
+    thing.matrix_world = Matrix(np.asarray(rotation, np.float64).tolist()).to_4x4()
+    collection.objects.link(thing)
+    return thing
+
+
+def set_faces(mesh: Any, faces: np.ndarray) -> None:
+    """Puts the faces of ``mesh``, made without edges, in another order."""
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
+    mesh.update()
+
+
+def far_to_near(vertices: np.ndarray, faces: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
+    """(f,) order of the faces for a painter: descending depth of their middles. Frame: that of the vertices."""
+    depth = vertices @ world_to_camera[2, :3].astype(np.float32)
+    return np.argsort(-depth[faces].sum(axis=1), kind="stable")

@@ -1,0 +1,157 @@
+"""Render settings of Blender, and pictures from it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from meshsplats.blender.inside import versions
+
+
+def exact_settings(scene: Any, engine: str) -> None:
+    """Colours come out as they went in: no view transform, no dither, one sample at each pixel's centre."""
+    _common(scene, engine)
+    scene.view_settings.view_transform = "Raw"
+    scene.view_settings.look = "None"
+    scene.view_settings.exposure = 0
+    scene.view_settings.gamma = 1
+    if engine == "cycles":
+        cycles = scene.cycles
+        cycles.samples = 1
+        cycles.pixel_filter_type = "GAUSSIAN"
+        # The first sample lies at the pixel's centre; so narrow a filter keeps it there.
+        cycles.filter_width = 0.01
+        cycles.max_bounces = 0
+        _layers(scene, 1024)
+        cycles.use_denoising = False
+    else:
+        scene.eevee.taa_render_samples = 1
+        scene.render.filter_size = 0.0
+
+
+def lit_settings(scene: Any, engine: str, samples: int, limit: int, bounces: int, denoise: bool) -> None:
+    """Linear light, shown with the view transform Standard (sRGB); ``limit`` layers may lie behind each other."""
+    _common(scene, engine)
+    scene.view_settings.view_transform = "Standard"
+    scene.view_settings.look = "None"
+    scene.view_settings.exposure = 0
+    scene.view_settings.gamma = 1
+    if engine == "cycles":
+        cycles = scene.cycles
+        cycles.samples = samples
+        cycles.use_adaptive_sampling = False
+        cycles.pixel_filter_type = "BLACKMAN_HARRIS"
+        cycles.filter_width = 1.5
+        cycles.max_bounces = bounces
+        cycles.diffuse_bounces = bounces
+        cycles.glossy_bounces = max(bounces, 4)
+        cycles.transmission_bounces = max(bounces, 8)
+        cycles.max_bounces = max(bounces, 8)
+        cycles.caustics_reflective = False
+        cycles.caustics_refractive = False
+        _layers(scene, limit)
+        cycles.use_denoising = denoise
+        # The light tree leaves out lights behind a triangle, though its smoothed normal may face them.
+        cycles.use_light_tree = False
+    else:
+        scene.eevee.taa_render_samples = samples
+        scene.render.filter_size = 1.5
+        versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=True, shadow_ray_count=2)
+
+
+def _layers(scene: Any, limit: int) -> None:
+    # A ray that passes more layers than the limit turns black. A minimum below it would end rays by chance.
+    scene.cycles.transparent_max_bounces = limit
+    scene.cycles.min_transparent_bounces = limit
+
+
+def _common(scene: Any, engine: str) -> None:
+    scene.render.engine = versions.engine_name(engine)
+    scene.render.dither_intensity = 0
+    scene.display_settings.display_device = "sRGB"
+    scene.render.use_compositing = False
+    scene.render.use_sequencer = False
+    scene.render.use_border = False
+    if engine == "cycles":
+        scene.cycles.device = "CPU"
+        scene.cycles.seed = 0
+
+
+def render_to(scene: Any, path: Path, factor: int = 1) -> None:
+    """Renders to ``path``, .png (8 bits) or .exr (32 bits). ``factor`` > 1: the mean of that many squared pixels
+    becomes one."""
+    transparent = scene.render.film_transparent
+    picture = scene.render.image_settings
+    picture.color_mode = "RGBA" if transparent else "RGB"
+    if factor == 1:
+        _format(picture, path.suffix)
+        _render(scene, path)
+        return
+    large = path.with_name(f"{path.stem}.large.exr")
+    try:
+        _format(picture, ".exr")
+        _render(scene, large)
+        small = _mean(read_pixels(large), factor)
+    finally:
+        if large.exists():
+            large.unlink()
+    _format(picture, path.suffix)
+    _save(small, path, scene)
+
+
+def _format(picture: Any, suffix: str) -> None:
+    if suffix == ".exr":
+        picture.file_format = "OPEN_EXR"
+        picture.color_depth = "32"
+        picture.exr_codec = "ZIP"
+    else:
+        picture.file_format = "PNG"
+        picture.color_depth = "8"
+        picture.compression = 50
+
+
+def _render(scene: Any, path: Path) -> None:
+    scene.render.use_file_extension = False
+    scene.render.use_overwrite = True
+    scene.render.filepath = os.fspath(path)
+    bpy.ops.render.render(write_still=True)
+    if not path.exists() or path.stat().st_size == 0:
+        raise OSError(f"{path}: Blender wrote no picture")
+
+
+def read_pixels(path: Path) -> np.ndarray:
+    """(h, w, 4) float32 values of an EXR file as stored, rows from top to bottom."""
+    image = bpy.data.images.load(os.fspath(path))
+    try:
+        image.colorspace_settings.name = "Non-Color"
+        width, height = image.size
+        pixels = np.empty(width * height * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+    finally:
+        bpy.data.images.remove(image)
+    return pixels.reshape(height, width, 4)[::-1]
+
+
+def _mean(pixels: np.ndarray, factor: int) -> np.ndarray:
+    height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
+    return (
+        pixels.reshape(height, factor, width, factor, 4)
+        .mean(axis=(1, 3), dtype=np.float64)
+        .astype(np.float32)
+    )
+
+
+def _save(pixels: np.ndarray, path: Path, scene: Any) -> None:
+    height, width = pixels.shape[:2]
+    image = bpy.data.images.new("mean", width, height, alpha=True, float_buffer=True)
+    try:
+        image.colorspace_settings.name = "Non-Color"
+        image.alpha_mode = "PREMUL"
+        image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())
+        image.save_render(os.fspath(path), scene=scene)
+    finally:
+        bpy.data.images.remove(image)

@@ -1,0 +1,160 @@
+"""A whole Blender scene of a mesh: what the command line renders and saves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+import numpy as np
+
+from meshsplats.blender.inside import frame, materials, meshes, pictures, stage, versions
+from meshsplats.blender.options import LightOptions, SceneOptions
+from meshsplats.camera import Camera
+from meshsplats.colors import srgb_to_linear
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """The mesh as Blender gets it, and what was found out about it."""
+
+    vertices: np.ndarray
+    """(v, 3) float32, world frame of the splats."""
+    faces: np.ndarray
+    """(f, 3) int32."""
+    colors: np.ndarray
+    """(v, 4) float32: linear light where lit, else as composited."""
+    up: np.ndarray
+    """(3,) direction that points up in the world frame."""
+    center: np.ndarray
+    """(3,) middle of the subject, world frame."""
+    radius: float
+    """Distance from there within which most of it lies, scene units."""
+    floor: float
+    """Height of its lowest part along ``up``, scene units."""
+    reach: float
+    """Distance from ``center`` within which everything lies, scene units."""
+    layers: int
+    """Most layers behind each other."""
+    self_shadow: float
+    """Distance within which layers do not shade each other, scene units."""
+    normals: np.ndarray | None = None
+    """(v, 3) float32 unit shading normals, where lit."""
+    face_splat: np.ndarray | None = None
+    """(f,) int32."""
+    name: str = "Splats"
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """What was made."""
+
+    scene: Any
+    thing: Any
+    """The object of the splats."""
+    cameras: list[Any]
+    rotation: np.ndarray
+    """(3, 3) from the splats' world to Blender's."""
+
+
+def build(
+    subject: Subject, cameras: Sequence[Camera], options: SceneOptions, limit: int, *, edges: bool
+) -> Built:
+    """An empty file with the subject, its cameras and surroundings, ready to render.
+
+    ``limit`` is that of transparent bounces; ``edges`` as in ``meshes.make_mesh``.
+    """
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    versions.enable_cycles()
+    scene = bpy.context.scene
+    scene.name = "MeshSplats"
+    rotation = frame.to_blender(subject.up)
+    splats = stage.collection("Splats")
+    mesh = meshes.make_mesh(
+        subject.name,
+        subject.vertices,
+        subject.faces,
+        subject.colors,
+        normals=subject.normals,
+        face_splat=subject.face_splat,
+        edges=edges,
+    )
+    thing = meshes.make_object(mesh, subject.name, rotation, splats)
+    center = rotation @ subject.center
+    home = stage.collection("Cameras")
+    made = []
+    for i, camera in enumerate(cameras):
+        away = float(np.linalg.norm(camera.center - subject.center))
+        reach = 2 * (away + subject.reach) + 1000 * subject.radius * (options.light is not None)
+        made.append(stage.add_camera(camera, camera.name or f"view_{i:04d}", rotation, reach, home))
+    light = options.light
+    if light is None:
+        mesh.materials.append(materials.unlit())
+        stage.even_world(options.background or (0, 0, 0))
+        pictures.exact_settings(scene, options.engine)
+    else:
+        material = materials.lit(
+            self_shadow=subject.self_shadow,
+            roughness=light.roughness,
+            specular=light.specular,
+            smooth=subject.normals is not None,
+        )
+        mesh.materials.append(material)
+        _light(subject, light, center, made[0].matrix_world.translation if made else None, options)
+        pictures.lit_settings(scene, options.engine, options.samples, limit, light.bounces, options.denoise)
+    catcher = light is not None and light.ground == "catcher"
+    scene.render.film_transparent = options.background is None or catcher
+    if options.threads is not None:
+        scene.render.threads_mode = "FIXED"
+        scene.render.threads = min(options.threads, 1024)
+    _timeline(scene, made)
+    if made:
+        stage.aim(scene, cameras[0], made[0])
+    bpy.context.view_layer.objects.active = thing
+    return Built(scene, thing, made, rotation)
+
+
+def _light(
+    subject: Subject, light: LightOptions, center: np.ndarray, viewer: Any, options: SceneOptions
+) -> None:
+    """Sun, world, ground, mirror and glass round the subject, placed for someone at ``viewer``."""
+    radius = subject.radius
+    if light.sun_strength > 0:
+        stage.add_sun(
+            frame.sun_direction(*light.sun), light.sun_strength, light.sun_size, stage.collection("Lights")
+        )
+    if light.hdri is not None:
+        stage.environment_world(str(light.hdri), light.hdri_strength, light.hdri_rotation)
+    else:
+        seen = None if options.background is None else srgb_to_linear(np.array(options.background)).tolist()
+        stage.even_world((light.sky,) * 3, seen)
+    home = stage.collection("Surroundings")
+    floor = np.array([center[0], center[1], subject.floor])
+    if light.ground != "none":
+        stage.add_ground(floor, 100 * radius, light.ground == "catcher", home)
+    towards = np.array([0.0, -1.0, 0.0])
+    if viewer is not None:
+        level = np.array([viewer[0] - center[0], viewer[1] - center[1], 0.0])
+        if np.linalg.norm(level) > 1e-6 * radius:
+            towards = level / np.linalg.norm(level)
+    right = np.array([-towards[1], towards[0], 0.0])
+    if light.mirror:
+        # A little to the left and turned to the viewer, so that the back of the subject shows in it.
+        place = floor - 1.9 * radius * towards - 0.9 * radius * right
+        facing = towards + 0.45 * right
+        stage.add_mirror(place, facing / np.linalg.norm(facing), 3.2 * radius, 3.0 * radius, home)
+    if light.glass:
+        size = 0.45 * radius
+        place = floor + 0.9 * radius * towards + 0.95 * radius * right + [0, 0, 1.001 * size]
+        stage.add_glass_ball(place, size, home)
+
+
+def _timeline(scene: Any, cameras: Sequence[Any]) -> None:
+    """One frame a camera, so that the timeline steps through the views."""
+    scene.frame_start, scene.frame_end = 0, max(len(cameras) - 1, 0)
+    if len(cameras) > 1:
+        for i, camera in enumerate(cameras):
+            marker = scene.timeline_markers.new(camera.name, frame=i)
+            marker.camera = camera
+    scene.frame_set(0)

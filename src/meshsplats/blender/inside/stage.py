@@ -1,0 +1,159 @@
+"""What surrounds the mesh in Blender: cameras, sun, sky, ground, mirror, glass ball, each in a named collection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+from meshsplats.blender.inside import frame, materials, versions
+from meshsplats.camera import Camera
+
+GREY = (0.6, 0.6, 0.6)
+"""Linear colour of the ground."""
+
+
+def collection(name: str) -> Any:
+    """A new collection in the scene."""
+    made = bpy.data.collections.new(name)
+    bpy.context.scene.collection.children.link(made)
+    return made
+
+
+def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
+    """A Blender camera like ``camera``; what is farther than ``reach`` is cut off. Its pixel aspect is the scene's:
+    see ``aim``."""
+    data = bpy.data.cameras.new(name)
+    settings = frame.lens(camera)
+    data.sensor_fit = "HORIZONTAL"
+    data.sensor_width = 36.0
+    for key in ("lens", "shift_x", "shift_y"):
+        setattr(data, key, settings[key])
+    data.clip_start = camera.near
+    data.clip_end = reach
+    thing = bpy.data.objects.new(name, data)
+    thing.matrix_world = Matrix(frame.camera_pose(camera, rotation).tolist())
+    home.objects.link(thing)
+    return thing
+
+
+def aim(scene: Any, camera: Camera, thing: Any, factor: int = 1) -> None:
+    """Renders are taken by ``thing``, the Blender camera of ``camera``, at ``factor`` times its pixels."""
+    settings = frame.lens(camera)
+    scene.camera = thing
+    scene.render.resolution_x = camera.width * factor
+    scene.render.resolution_y = camera.height * factor
+    scene.render.resolution_percentage = 100
+    scene.render.pixel_aspect_x = settings["pixel_aspect_x"]
+    scene.render.pixel_aspect_y = settings["pixel_aspect_y"]
+
+
+def add_sun(direction: np.ndarray, strength: float, size: float, home: Any) -> Any:
+    """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees."""
+    data = bpy.data.lights.new("Sun", "SUN")
+    data.energy = strength
+    data.angle = float(np.radians(size))
+    # Shadows of EEVEE: as fine as they go, soft as the sun's size says.
+    versions.set_if_there(data, use_shadow=True, use_shadow_jitter=True, shadow_maximum_resolution=0.0005)
+    thing = bpy.data.objects.new("Sun", data)
+    thing.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
+    thing.location = (direction * 5).tolist()
+    home.objects.link(thing)
+    return thing
+
+
+def even_world(light: Sequence[float], seen: Sequence[float] | None = None) -> Any:
+    """A world that gives ``light`` (3,) from everywhere and, to the camera, looks like ``seen`` (3,)."""
+    world = bpy.data.worlds.new("World")
+    tree = versions.node_tree(world)
+    out = tree.nodes.new("ShaderNodeOutputWorld")
+    lit = _background(tree, light)
+    if seen is None or tuple(seen) == tuple(light):
+        tree.links.new(lit.outputs[0], out.inputs["Surface"])
+    else:
+        mix = tree.nodes.new("ShaderNodeMixShader")
+        path = tree.nodes.new("ShaderNodeLightPath")
+        tree.links.new(path.outputs["Is Camera Ray"], versions.socket(mix.inputs, "Fac", "Factor"))
+        tree.links.new(lit.outputs[0], mix.inputs[1])
+        tree.links.new(_background(tree, seen).outputs[0], mix.inputs[2])
+        tree.links.new(mix.outputs[0], out.inputs["Surface"])
+    bpy.context.scene.world = world
+    return world
+
+
+def _background(tree: Any, color: Sequence[float]) -> Any:
+    node = tree.nodes.new("ShaderNodeBackground")
+    node.inputs["Color"].default_value = (*color, 1)
+    return node
+
+
+def environment_world(path: str, strength: float, rotation: float) -> Any:
+    """A world lit by the environment picture at ``path``, packed into the file, turned by ``rotation`` degrees."""
+    image = bpy.data.images.load(path)
+    if 0 in image.size:
+        raise ValueError(f"{path}: Blender cannot read this environment picture")
+    image.pack()
+    world = bpy.data.worlds.new("World")
+    tree = versions.node_tree(world)
+    place = tree.nodes.new("ShaderNodeTexCoord")
+    turn = tree.nodes.new("ShaderNodeMapping")
+    turn.inputs["Rotation"].default_value[2] = float(np.radians(rotation))
+    picture = tree.nodes.new("ShaderNodeTexEnvironment")
+    picture.image = image
+    light = tree.nodes.new("ShaderNodeBackground")
+    light.inputs["Strength"].default_value = strength
+    out = tree.nodes.new("ShaderNodeOutputWorld")
+    tree.links.new(place.outputs["Generated"], turn.inputs["Vector"])
+    tree.links.new(turn.outputs[0], picture.inputs["Vector"])
+    tree.links.new(picture.outputs[0], light.inputs["Color"])
+    tree.links.new(light.outputs[0], out.inputs["Surface"])
+    bpy.context.scene.world = world
+    return world
+
+
+def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> Any:
+    """A level square at ``center`` (3,) that reaches ``radius`` in each direction."""
+    corners = [(-radius, -radius, 0), (radius, -radius, 0), (radius, radius, 0), (-radius, radius, 0)]
+    thing = _faces("Ground", corners, [(0, 1, 2, 3)], home)
+    thing.location = center.tolist()
+    thing.data.materials.append(materials.plain("Ground", GREY))
+    thing.is_shadow_catcher = catcher
+    return thing
+
+
+def add_mirror(center: np.ndarray, facing: np.ndarray, width: float, height: float, home: Any) -> Any:
+    """An upright mirror, its lower edge's middle at ``center`` (3,), that faces the level direction ``facing``."""
+    corners = [(-width / 2, 0, 0), (width / 2, 0, 0), (width / 2, 0, height), (-width / 2, 0, height)]
+    thing = _faces("Mirror", corners, [(0, 1, 2, 3)], home)
+    thing.location = center.tolist()
+    thing.rotation_euler[2] = float(np.arctan2(facing[0], -facing[1]))
+    thing.data.materials.append(materials.mirror())
+    return thing
+
+
+def add_glass_ball(center: np.ndarray, radius: float, home: Any) -> Any:
+    """A smooth ball of glass."""
+    import bmesh
+
+    mesh = bpy.data.meshes.new("Glass ball")
+    shape = bmesh.new()
+    bmesh.ops.create_uvsphere(shape, u_segments=96, v_segments=48, radius=radius)
+    shape.to_mesh(mesh)
+    shape.free()
+    mesh.shade_smooth()
+    thing = bpy.data.objects.new("Glass ball", mesh)
+    thing.location = center.tolist()
+    home.objects.link(thing)
+    mesh.materials.append(materials.glass())
+    return thing
+
+
+def _faces(name: str, corners: Sequence, faces: Sequence, home: Any) -> Any:
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(corners, [], faces)
+    thing = bpy.data.objects.new(name, mesh)
+    home.objects.link(thing)
+    return thing

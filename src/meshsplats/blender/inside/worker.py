@@ -1,0 +1,93 @@
+"""Carries out a job inside Blender: ``python -m meshsplats.blender.inside.worker job.json``, or Blender itself with
+``--python worker.py -- job.json``. ``meshsplats.blender.launch`` writes the job and reads the result."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+if __package__ in (None, ""):  # run as a file by Blender, whose Python does not know this package
+    sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
+
+MARK = "@meshsplats "
+"""Begins the lines of output that are meant for the parent process."""
+
+
+def tell(**message: object) -> None:
+    print(MARK + json.dumps(message), flush=True)
+
+
+def main(job_path: str) -> None:
+    import bpy
+    import numpy as np
+
+    from meshsplats.blender.inside import meshes, pictures, stage, versions
+    from meshsplats.blender.inside.scene import Subject, build
+    from meshsplats.blender.options import LightOptions, SceneOptions
+    from meshsplats.camera import Camera
+    from meshsplats.formats.atomic import atomic_path
+
+    if bpy.app.version < versions.OLDEST:
+        raise ValueError(f"Blender 4.2 or newer is needed, this is {bpy.app.version_string}")
+    job = json.loads(Path(job_path).read_text(encoding="utf-8"))
+    arrays = {name: np.load(file, allow_pickle=False) for name, file in job["arrays"].items()}
+    subject = Subject(**arrays, **job["subject"])
+    light = job["options"].pop("light")
+    if light is not None:
+        light["hdri"] = Path(light["hdri"]) if light["hdri"] else None
+        light = LightOptions(**light)
+    options = SceneOptions(light=light, **job["options"])
+    cameras = [Camera(np.array(c.pop("world_to_camera")), **c) for c in job["cameras"]]
+    blend, targets = job["blend"], [Path(target) for target in job["pictures"]]
+
+    start = time.perf_counter()
+    sort = options.engine == "eevee"
+    if sort and cameras:
+        subject = _for_painter(subject, cameras[0])
+    built = build(subject, cameras, options, job["limit"], edges=bool(blend))
+    tell(built=round(time.perf_counter() - start, 3), blender=bpy.app.version_string)
+    if blend:
+        bpy.context.preferences.filepaths.save_version = 0
+        with atomic_path(blend) as temporary:
+            bpy.ops.wm.save_as_mainfile(
+                filepath=str(temporary), copy=True, compress=True, check_existing=False
+            )
+        tell(saved=blend)
+    factor = options.samples if light is None else 1
+    for i, target in enumerate(targets):
+        camera, thing = cameras[i], built.cameras[i]
+        if sort and i > 0:
+            order = meshes.far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
+            meshes.set_faces(built.thing.data, subject.faces[order])
+        built.scene.frame_set(i)  # where the timeline puts camera i before the lens
+        stage.aim(built.scene, camera, thing, factor)
+        start = time.perf_counter()
+        with atomic_path(target) as temporary:
+            pictures.render_to(built.scene, temporary, factor)
+        tell(picture=str(target), seconds=round(time.perf_counter() - start, 3))
+    tell(done=True)
+
+
+def _for_painter(subject, camera):
+    """``subject`` with its faces in the order in which EEVEE has to draw them for ``camera``."""
+    from dataclasses import replace
+
+    from meshsplats.blender.inside.meshes import far_to_near
+
+    order = far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
+    owners = None if subject.face_splat is None else subject.face_splat[order]
+    return replace(subject, faces=subject.faces[order], face_splat=owners)
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    try:
+        main(arguments[0])
+    except Exception as error:
+        import traceback
+
+        traceback.print_exc()
+        tell(error=f"{type(error).__name__}: {error}")
+        sys.exit(1)

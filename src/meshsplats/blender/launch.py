@@ -1,0 +1,198 @@
+"""Blender as a process of its own: a crash, its chatter and its memory stay out of ours."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.inside import worker
+from meshsplats.blender.options import SceneOptions
+from meshsplats.camera import Camera
+from meshsplats.errors import MissingDependencyError
+
+OLDEST = (4, 2)
+
+
+class BlenderError(ChildProcessError):
+    """Blender could not do its job; the message holds what it said."""
+
+
+def command(executable: Path | None) -> list[str]:
+    """The command line that runs the worker, without its argument.
+
+    Raises MissingDependencyError if there is no bpy (and no executable was named), FileNotFoundError or
+    ValueError for an executable that is missing, no Blender, or too old.
+    """
+    if executable is None:
+        if importlib.util.find_spec("bpy") is None:
+            raise MissingDependencyError(
+                "Blender's Python module bpy is not installed in this environment. Make one for it, as it needs"
+                f" Python 3.11 and a NumPy of its own (this is Python {sys.version_info[0]}.{sys.version_info[1]}):"
+                " python3.11 -m venv blender-env && blender-env/bin/pip install 'meshsplats[blender]'; or name an"
+                " installed Blender: --executable /path/to/blender"
+            )
+        return [sys.executable, "-m", worker.__name__]
+    found = shutil.which(executable)
+    if found is None:
+        raise FileNotFoundError(f"{executable}: there is no such program; --executable names Blender's own")
+    try:
+        told = subprocess.run([found, "--version"], capture_output=True, text=True, timeout=60).stdout
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ValueError(f"{found}: cannot be run as Blender ({error})") from None
+    version = re.search(r"Blender (\d+)\.(\d+)", told)
+    if version is None:
+        raise ValueError(f"{found}: not Blender; asked for its version, it says {told.strip()[:80]!r}")
+    if (int(version[1]), int(version[2])) < OLDEST:
+        raise ValueError(f"{found}: Blender {version[1]}.{version[2]} is too old; 4.2 or newer is needed")
+    flags = ["--background", "--factory-startup", "--python-exit-code", "1", "--python"]
+    return [found, *flags, str(Path(worker.__file__).resolve()), "--"]
+
+
+def run_job(
+    arrays: dict[str, np.ndarray],
+    subject: dict[str, Any],
+    cameras: Sequence[Camera],
+    options: SceneOptions,
+    *,
+    limit: int,
+    pictures: Sequence[Path] = (),
+    blend: Path | None = None,
+    executable: Path | None = None,
+    progress: Callable[[], object] | None = None,
+) -> dict[str, Any]:
+    """Has Blender build the scene, save ``blend`` and render ``pictures``, one a camera.
+
+    ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called after each picture.
+    Returns ``{"blender": version, "build_seconds": s, "picture_seconds": [s, ...]}``.
+
+    Raises BlenderError with Blender's own words if it fails, besides what ``command`` raises. Ctrl-C ends Blender too.
+    """
+    start = command(executable)
+    if options.engine == "eevee":
+        _check_graphics()
+    with tempfile.TemporaryDirectory(prefix="meshsplats-blender-") as folder:
+        files = {}
+        for name, array in arrays.items():
+            files[name] = os.path.join(folder, f"{name}.npy")
+            np.save(files[name], array, allow_pickle=False)
+        job = {
+            "arrays": files,
+            "subject": subject,
+            "cameras": [_plain_camera(camera) for camera in cameras],
+            "options": _plain_options(options),
+            "limit": limit,
+            "blend": None if blend is None else os.path.abspath(blend),
+            "pictures": [os.path.abspath(path) for path in pictures],
+        }
+        path = Path(folder) / "job.json"
+        path.write_text(json.dumps(job), encoding="utf-8")
+        return _watch([*start, str(path)], options, progress)
+
+
+def _watch(
+    arguments: list[str], options: SceneOptions, progress: Callable[[], object] | None
+) -> dict[str, Any]:
+    environment = dict(os.environ)
+    if arguments[1] == "-m":
+        # The worker must be this very package, wherever this process found it.
+        places = [str(Path(worker.__file__).resolve().parents[3]), environment.get("PYTHONPATH", "")]
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
+    result: dict[str, Any] = {"picture_seconds": []}
+    said: deque[str] = deque(maxlen=40)
+    finished, failure = False, None
+    process = subprocess.Popen(
+        arguments,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=environment,
+        text=True,
+        errors="replace",
+    )
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if not line.startswith(worker.MARK):
+                said.append(line.rstrip())
+                continue
+            message = json.loads(line[len(worker.MARK) :])
+            if "built" in message:
+                result |= {"blender": message["blender"], "build_seconds": message["built"]}
+            elif "picture" in message:
+                result["picture_seconds"].append(message["seconds"])
+                if progress is not None:
+                    progress()
+            finished |= "done" in message
+            failure = message.get("error", failure)
+        status = process.wait()
+    except BaseException:
+        process.terminate()
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        raise
+    if failure is not None:
+        raise BlenderError(f"Blender stopped: {failure}")
+    if not finished:
+        raise BlenderError(_post_mortem(status, said, options))
+    return result
+
+
+def _post_mortem(status: int, said: Sequence[str], options: SceneOptions) -> str:
+    words = " / ".join(line for line in list(said)[-6:] if line) or "nothing"
+    how = f"with exit code {status}" if status >= 0 else f"by signal {signal.Signals(-status).name}"
+    advice = ""
+    if status == -signal.SIGKILL:
+        advice = " The system ends programs that need more memory than there is: use fewer triangles."
+    elif options.engine == "eevee":
+        advice = (
+            " EEVEE needs OpenGL 4.3, with or without a screen; on Debian and Ubuntu:"
+            " apt install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri. --engine cycles needs none of it."
+        )
+    return f"Blender ended {how} before it was done.{advice} It said: {words}"
+
+
+def _check_graphics() -> None:
+    """Raises MissingDependencyError where EEVEE cannot start for want of libraries (Linux)."""
+    if not sys.platform.startswith("linux"):
+        return
+    import ctypes
+
+    for name in ("libEGL.so.1", "libGL.so.1"):
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            raise MissingDependencyError(
+                f"EEVEE draws with OpenGL, and {name} is not on this system; on Debian and Ubuntu:"
+                " apt install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri. --engine cycles needs none of it"
+            ) from None
+
+
+def _plain_camera(camera: Camera) -> dict[str, Any]:
+    fields = ("fx", "fy", "cx", "cy", "width", "height", "near", "name")
+    return {name: getattr(camera, name) for name in fields} | {
+        "world_to_camera": camera.world_to_camera.tolist()
+    }
+
+
+def _plain_options(options: SceneOptions) -> dict[str, Any]:
+    plain = asdict(options)
+    if options.light is not None and options.light.hdri is not None:
+        plain["light"]["hdri"] = os.path.abspath(options.light.hdri)
+    return plain

@@ -1,0 +1,76 @@
+"""How many layers lie behind each other: what Blender's limit on transparent bounces must allow for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from meshsplats.camera import Camera, look_at
+from meshsplats.framing import front_axes, scene_bounds
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render
+
+_PROBE = 2.0**-12
+_PROBE_SIDE = 192
+"""Longer side in pixels of the pictures in which layers are counted: the count changes slowly over a picture."""
+
+
+def count_layers(mesh: SplatMesh, camera: Camera, *, threads: int | None = None) -> np.ndarray:
+    """(h, w) int32: how many triangles each pixel's centre is covered by, hidden ones too.
+
+    Every triangle is drawn with the same tiny opacity a; n of them let (1 - a)^n of the light through, which
+    tells n, to one in a thousand.
+    """
+    colors = np.empty_like(mesh.colors)
+    colors[:] = (0, 0, 0, _PROBE)
+    probe = replace(mesh, colors=colors, attributes={}, normals=None)
+    seen = render(probe, camera, min_transmittance=0.0, threads=threads).alpha.astype(np.float64)
+    return np.rint(np.log1p(-np.minimum(seen, 1 - 1e-12)) / np.log1p(-_PROBE)).astype(np.int32)
+
+
+def most_layers(
+    mesh: SplatMesh,
+    cameras: Sequence[Camera] = (),
+    directions: Sequence[np.ndarray] = (),
+    *,
+    threads: int | None = None,
+) -> int:
+    """The largest number of layers met from up to eight of the ``cameras`` and along ``directions``.
+
+    ``directions`` are (3,) unit vectors in the world frame from the subject to a far light; the scene's own six
+    axis directions stand for all the other ways that light takes.
+    """
+    if len(mesh.faces) == 0:
+        return 0
+    some = list(cameras[:: -(-len(cameras) // 8)]) if cameras else []
+    probes = [camera.scaled(min(1.0, _PROBE_SIDE / max(camera.width, camera.height))) for camera in some]
+    bounds = scene_bounds(mesh)
+    reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max()) or bounds.radius
+    axes = front_axes(mesh.up.astype(np.float64))
+    for direction in [*directions, axes[0], axes[1], axes[2]]:
+        # From so far off that rays are nearly parallel, as a sun's are; both ways along a line meet the same.
+        away = 20 * reach
+        angle = 2 * np.degrees(np.arctan(reach / away))
+        center = bounds.center + away * np.asarray(direction, np.float64)
+        side = {"width": _PROBE_SIDE, "height": _PROBE_SIDE}
+        probes.append(
+            look_at(center, bounds.center, up=axes[1], fov=max(angle, 1.0), near=away / 100, **side)
+        )
+    return max(int(count_layers(mesh, camera, threads=threads).max()) for camera in probes)
+
+
+def bounce_limit(layers: int, largest: int = 1024) -> int:
+    """A limit on transparent bounces for a scene of so many layers: a quarter more, as not every ray was tried."""
+    return int(min(largest, max(64, -(-layers * 5 // 4))))
+
+
+def hidden_by_limit(
+    mesh: SplatMesh, camera: Camera, limit: int = 1024, *, threads: int | None = None
+) -> float:
+    """Share of the pixels (0 to 1) that change by more than half a step of 8 bits if only ``limit`` layers count."""
+    probe = camera.scaled(min(1.0, 2 * _PROBE_SIDE / max(camera.width, camera.height)))
+    whole = render(mesh, probe, threads=threads).alpha
+    cut = render(mesh, probe, max_layers=limit, threads=threads).alpha
+    return float(np.mean(np.abs(whole - cut) > 0.5 / 255))

@@ -1,0 +1,201 @@
+"""Shading normals of splat meshes: smooth, and pointing outwards.
+
+The layers of a splat mesh are tilted by chance, and crossed ones stand upright on the surface; lit by their own
+normals they look mottled. Here each splat takes the normal of the surface that it and its neighbours form: their
+centres lie in it, and the largest of their discs lie along it. Which side is out is decided by looking: the side
+from which cameras round the scene see the splat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshsplats.camera import Camera, dome
+from meshsplats.conversion.footprint import spacing
+from meshsplats.framing import guess_up
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render
+
+CELL = 2.5
+"""Side of the cells in which neighbours are sought, in spacings: measured on splats of a known surface, clean and
+noisy, where 2 to 3 give the least error (see docs/blender.md)."""
+VIEWS = 24
+_SIDE = 160
+"""Pixels of the square pictures that decide what is seen."""
+_SOLID = 0.3
+"""Opacity from which a pixel counts as covered."""
+_CHUNK = 1 << 16
+
+
+def shading_normals(
+    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
+) -> np.ndarray:
+    """(v, 3) float32 unit normals for lighting the surface that the splats of ``mesh`` form, pointing outwards.
+
+    All vertices of a splat share one. A mesh with normals of its own keeps them; without ``face_splat``, each
+    triangle counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` are places from which the
+    scene is seen, besides 24 round it: a room is seen from inside only.
+    """
+    if mesh.normals is not None:
+        return mesh.normals
+    if len(mesh.faces) == 0:
+        return np.zeros_like(mesh.vertices)
+    owner, centers, weights, spread = _splats(mesh)
+    cell = CELL * typical_spacing(mesh, centers)
+    around = _Neighbours(centers, cell)
+    tensors = np.stack([spread[:, i, j] for i, j in _PAIRS], axis=1)
+    normals = np.empty((len(centers), 3))
+    moments = np.column_stack(
+        [weights, weights[:, None] * centers, weights[:, None] * _products(centers), tensors]
+    )
+    for part, total in around.sums(moments, 1.0):
+        weight = np.maximum(total[:, :1], 1e-300)
+        mean = total[:, 1:4] / weight
+        scatter = _symmetric(total[:, 4:10] / weight - _products(mean))
+        size = np.trace(scatter, axis1=1, axis2=2)[:, None, None]
+        discs = _symmetric(total[:, 10:16] / weight)
+        # Both have trace 1: discs are large along the normal, the scatter of the centres is small along it.
+        both = discs - np.divide(scatter, size, out=np.zeros_like(scatter), where=size > 0)
+        normals[part] = np.linalg.eigh(both)[1][:, :, 2]
+    outward = _seen_from(mesh, centers, cell, cameras, threads)
+    side = np.einsum("ij,ij->i", normals, outward)
+    normals *= np.where(side < 0, -1.0, 1.0)[:, None]
+    # Splats that nothing sees have no say here, and take over the side of those next to them.
+    say = np.where(side == 0, 1e-3, 1.0) * weights
+    smooth = np.empty_like(normals)
+    for part, total in around.sums(say[:, None] * normals, 0.7):
+        smooth[part] = total
+    flipped = np.einsum("ij,ij->i", normals, smooth) < 0
+    smooth[flipped & (side != 0)] *= -1
+    return _to_vertices(mesh, owner, _unit(smooth, normals))
+
+
+def typical_spacing(mesh: SplatMesh, centers: np.ndarray | None = None) -> float:
+    """Median spacing of the splats of ``mesh``, scene units, > 0."""
+    if centers is None:
+        centers = _splats(mesh)[1]
+    median = float(np.median(spacing(centers.astype(np.float32)))) if len(centers) else 0.0
+    return median if median > 0 else max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-6) / 100
+
+
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def _products(vectors: np.ndarray) -> np.ndarray:
+    """(n, 6) products of the components of (n, 3) vectors."""
+    return np.stack([vectors[:, i] * vectors[:, j] for i, j in _PAIRS], axis=1)
+
+
+def _symmetric(six: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) symmetric matrices from their six components."""
+    full = np.empty((len(six), 3, 3))
+    for k, (i, j) in enumerate(_PAIRS):
+        full[:, i, j] = full[:, j, i] = six[:, k]
+    return full
+
+
+def _unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), instead)
+
+
+def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Number of the splat that each face belongs to (f,), and of the n splats: centres (n, 3), weights (n,), area
+    times opacity, and (n, 3, 3) sums of weight times normal times normal over their triangles."""
+    if mesh.face_splat is None:
+        starts = np.arange(len(mesh.faces))
+    else:
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) != 0]))
+    owner = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(mesh.faces))))
+    weights = np.empty(len(starts))
+    centers = np.empty((len(starts), 3))
+    spread = np.empty((len(starts), 3, 3))
+    for begin in range(0, len(starts), _CHUNK):
+        some = slice(begin, begin + _CHUNK)
+        first = starts[begin]
+        last = starts[begin + _CHUNK] if begin + _CHUNK < len(starts) else len(mesh.faces)
+        faces, heads = mesh.faces[first:last], starts[some] - first
+        corners = mesh.vertices[faces].astype(np.float64)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        double = np.linalg.norm(cross, axis=1)
+        weight = 0.5 * double * mesh.colors[faces, 3].mean(axis=1) + 1e-300  # nothing divides by zero
+        normal = cross / np.maximum(double, 1e-300)[:, None]
+        weights[some] = np.add.reduceat(weight, heads)
+        middles = np.add.reduceat(weight[:, None] * corners.mean(axis=1), heads)
+        centers[some] = middles / weights[some, None]
+        products = normal[:, :, None] * normal[:, None, :]
+        spread[some] = np.add.reduceat(weight[:, None, None] * products, heads)
+    return owner, centers, weights / weights.max(), spread / weights.max()
+
+
+class _Neighbours:
+    """Points (n, 3) sorted into cubic cells; sums over the 27 cells round each of them."""
+
+    def __init__(self, points: np.ndarray, side: float) -> None:
+        self.points, self.side = points, side
+        low = points.min(axis=0)
+        # Strays far away must not make so many cells that their numbers overflow.
+        steps = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64) + 1
+        self.keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
+        self.cells, self.cell_of = np.unique(self.keys, return_inverse=True)
+        self.cell_of = self.cell_of.reshape(-1)
+
+    def sums(self, values: np.ndarray, width: float):
+        """Yields slices of points and (c, k) sums of ``values`` (n, k), weighted by a Gaussian of the distance to
+        each cell's middle with standard deviation ``width`` cells."""
+        count = len(self.cells)
+        held = [np.bincount(self.cell_of, values[:, k], count) for k in range(values.shape[1])]
+        cell_values = np.stack(held, axis=1)
+        sizes = np.bincount(self.cell_of, minlength=count)
+        middles = [np.bincount(self.cell_of, self.points[:, k], count) / sizes for k in range(3)]
+        middle = np.stack(middles, axis=1)
+        steps = [(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
+        for begin in range(0, len(self.points), _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            points, keys = self.points[part], self.keys[part]
+            total = np.zeros((len(points), values.shape[1]))
+            for step in steps:
+                found = np.minimum(np.searchsorted(self.cells, keys + step), count - 1)
+                there = self.cells[found] == keys + step
+                near, row = found[there], np.flatnonzero(there)
+                square = np.square(middle[near] - points[row]).sum(axis=1)
+                share = np.exp(-square / (2 * (width * self.side) ** 2))
+                total[row] += share[:, None] * cell_values[near]
+            yield part, total
+
+
+def _seen_from(
+    mesh: SplatMesh, centers: np.ndarray, tolerance: float, cameras: Sequence[Camera], threads: int | None
+) -> np.ndarray:
+    """(n, 3) sum of the unit directions from each centre to the cameras that see it; zero where none does."""
+    views = dome(mesh, VIEWS, whole=True, up=guess_up(mesh), width=_SIDE, height=_SIDE)
+    some = cameras[:: -(-len(cameras) // 16)] if cameras else ()
+    views += [camera.scaled(min(1.0, _SIDE / max(camera.width, camera.height))) for camera in some]
+    seen = np.zeros_like(centers)
+    for camera in views:
+        picture = render(mesh, camera, depth=True, threads=threads)
+        assert picture.depth is not None
+        solid = picture.alpha > _SOLID
+        surface = np.where(solid, picture.depth / np.where(solid, picture.alpha, 1), np.inf)
+        x, y, z = camera.world_to_camera[:3, :3] @ centers.T + camera.world_to_camera[:3, 3:]
+        front = z > camera.near
+        z = np.where(front, z, 1)
+        column = camera.fx * x / z + camera.cx
+        row = camera.fy * y / z + camera.cy
+        inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        place = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
+        visible = inside & (z < surface[place] + tolerance)
+        away = camera.center - centers[visible]
+        seen[visible] += away / np.linalg.norm(away, axis=1, keepdims=True)
+    return seen
+
+
+def _to_vertices(mesh: SplatMesh, owner: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(v, 3) float32 means of the normals of the splats that use each vertex; vertices without one: up."""
+    sums = np.zeros((len(mesh.vertices), 3))
+    for corner in range(3):
+        for axis in range(3):
+            sums[:, axis] += np.bincount(mesh.faces[:, corner], normals[owner, axis], len(sums))
+    return _unit(sums, np.broadcast_to(mesh.up.astype(np.float64), sums.shape)).astype(np.float32)

@@ -1,0 +1,118 @@
+"""What a Blender scene holds besides the mesh: the engine, light, ground, mirror and glass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import numpy as np
+
+Engine = Literal["cycles", "eevee"]
+Ground = Literal["plane", "catcher", "none"]
+
+MAX_LAYERS = 1024
+"""Blender's largest limit on transparent bounces: a ray that meets more layers turns black in Cycles."""
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """Light and surroundings of lit pictures. Lengths follow the subject's size."""
+
+    sun: tuple[float, float] = (-50.0, 45.0)
+    """Where the sun stands: azimuth (0 behind the viewer of the front, 90 on that viewer's right) and elevation,
+    degrees."""
+    sun_strength: float = 2.5
+    """Irradiance of a surface that faces the sun, W/m^2; at pi, a white one has radiance 1. 0: no sun."""
+    sun_size: float = 2.0
+    """Degrees that the sun's disc spans: the larger, the softer shadows are."""
+    sky: float = 0.35
+    """Radiance of the even white sky; not used with --hdri."""
+    hdri: Path | None = None
+    """Environment picture (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
+    hdri_strength: float = 1.0
+    """Factor on the environment picture."""
+    hdri_rotation: float = 0.0
+    """Degrees that the environment is turned round the up direction."""
+    ground: Ground = "plane"
+    """What the subject stands on: a grey plane; a catcher, seen only where shadows fall (Cycles); or nothing."""
+    mirror: bool = False
+    """A mirror behind the subject."""
+    glass: bool = False
+    """A glass ball beside the subject."""
+    roughness: float = 1.0
+    """Roughness of the splats' surface, 0 to 1; it shows with --specular."""
+    specular: float = 0.0
+    """Highlights of the splats' surface, 0 to 1; 0.5 is plastic. Splats have their own highlights painted on."""
+    bounces: int = 4
+    """How often light is scattered on its way, 0 to 64; layers that it passes through are not counted."""
+
+    def check(self) -> None:
+        """Raises ValueError for a value out of range, FileNotFoundError for a missing environment picture."""
+        azimuth, elevation = self.sun
+        if not (np.isfinite(azimuth) and -90 <= elevation <= 90):
+            raise ValueError(f"sun must be an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
+        for name, low, high in [
+            ("sun_strength", 0, 1e6),
+            ("sun_size", 0, 180),
+            ("sky", 0, 1e6),
+            ("hdri_strength", 0, 1e6),
+            ("hdri_rotation", -1e6, 1e6),
+            ("roughness", 0, 1),
+            ("specular", 0, 1),
+            ("bounces", 0, 64),
+        ]:
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {value}")
+        if self.ground not in get_args(Ground):
+            raise ValueError(f"ground must be one of {', '.join(get_args(Ground))}, got {self.ground!r}")
+        if self.hdri is not None:
+            check_environment(self.hdri)
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How Blender draws the mesh."""
+
+    light: LightOptions | None = None
+    """None: colours as they are, the picture that ``meshsplats.render`` draws. Else lit by these."""
+    engine: Engine = "cycles"
+    """cycles: exact order and ray-traced light. eevee: quick; triangles are sorted for each camera."""
+    samples: int = 1
+    """Unlit: side of the grid of samples in each pixel, as in ``render``. Lit: samples a pixel."""
+    background: Annotated[tuple[float, float, float] | None, "RGB"] = (1.0, 1.0, 1.0)
+    """Display RGB behind everything; None: transparent. With an environment picture, that is seen instead."""
+    denoise: bool = False
+    """Cycles, lit: remove noise with OpenImageDenoise."""
+    threads: int | None = None
+    """At most this many; all processors by default."""
+
+    def check(self) -> None:
+        """Raises ValueError for values out of range and choices that contradict each other."""
+        if self.engine not in get_args(Engine):
+            raise ValueError(f"engine must be one of {', '.join(get_args(Engine))}, got {self.engine!r}")
+        top = 16 if self.light is None else 65536
+        if not 1 <= self.samples <= top:
+            what = "the side of the sample grid" if self.light is None else "the number of samples a pixel"
+            raise ValueError(f"samples is {what}, 1 to {top}, got {self.samples}")
+        if self.background is not None and not all(0 <= v <= 1 for v in self.background):
+            raise ValueError(f"background must be RGB in [0, 1], got {self.background}")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        if self.denoise and (self.light is None or self.engine != "cycles"):
+            raise ValueError("denoise is for lit pictures in Cycles: others have no noise, or another kind")
+        if self.light is not None:
+            self.light.check()
+            if self.engine == "eevee" and self.light.ground == "catcher":
+                raise ValueError("a shadow catcher works in Cycles only; choose ground 'plane' or 'none'")
+
+
+def check_environment(path: Path) -> None:
+    """Raises ValueError unless ``path`` begins as a Radiance (.hdr) or OpenEXR file does; OSError if unreadable."""
+    with open(path, "rb") as file:
+        start = file.read(10)
+    if not (start.startswith((b"#?RADIANCE", b"#?RGBE")) or start[:4] == b"\x76\x2f\x31\x01"):
+        raise ValueError(
+            f"{path}: an environment picture is a Radiance .hdr or an OpenEXR file; this is neither"
+        )

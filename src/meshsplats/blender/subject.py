@@ -1,0 +1,84 @@
+"""A mesh made ready for Blender: colours in the right space, shading normals, and what lies where."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.layers import bounce_limit, most_layers
+from meshsplats.blender.normals import shading_normals, typical_spacing
+from meshsplats.blender.options import MAX_LAYERS, SceneOptions
+from meshsplats.camera import Camera
+from meshsplats.colors import srgb_to_linear
+from meshsplats.framing import front_axes, scene_bounds, weighted_quantile
+from meshsplats.mesh import SplatMesh
+
+_FLOOR = 0.002
+"""Share of the opacity that may lie below the ground: strays must not lift the subject off it."""
+
+SELF_SHADOW = 3.0
+"""Distance within which layers do not shade each other, in spacings of the splats."""
+
+
+def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> tuple[int, int]:
+    """Most layers behind each other, and the limit on transparent bounces that follows."""
+    axes = front_axes(mesh.up.astype(np.float64))
+    directions = []
+    if options.light is not None:
+        directions.append(_world_direction(axes, *options.light.sun))
+    layers = most_layers(mesh, cameras, directions, threads=options.threads)
+    # An unlit picture is exact or it is not: a high limit costs nothing where there are no layers.
+    return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
+
+
+def prepare(
+    mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions, layers: int
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and facts: the fields of ``inside.scene.Subject``."""
+    bounds = scene_bounds(mesh)
+    up = mesh.up.astype(np.float64)
+    heights = bounds.points @ up
+    weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(heights))
+    low = np.minimum(heights.min(), 0) if len(heights) == 0 else weighted_quantile(heights, weights, _FLOOR)
+    facts = {
+        "radius": float(bounds.radius),
+        "floor": float(low),
+        "reach": float(np.linalg.norm(mesh.vertices - bounds.center, axis=1).max()),
+        "layers": layers,
+        "self_shadow": 0.0,
+    }
+    arrays = {
+        "vertices": mesh.vertices,
+        "faces": mesh.faces,
+        "colors": mesh.colors,
+        "up": up,
+        "center": bounds.center,
+    }
+    if mesh.face_splat is not None:
+        arrays["face_splat"] = mesh.face_splat
+    if options.light is not None:
+        if mesh.blending == "display":
+            colors = mesh.colors.copy()
+            colors[:, :3] = srgb_to_linear(mesh.colors[:, :3])
+            arrays["colors"] = colors
+        arrays["normals"] = normals = shading_normals(mesh, cameras, threads=options.threads)
+        arrays["faces"] = _facing_out(mesh, normals)
+        facts["self_shadow"] = SELF_SHADOW * typical_spacing(mesh)
+    return arrays, facts
+
+
+def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:
+    """(f, 3) the faces of ``mesh``, wound so that each has the shading normals on its front."""
+    a, b, c = mesh.faces.T
+    own = np.cross(mesh.vertices[b] - mesh.vertices[a], mesh.vertices[c] - mesh.vertices[a])
+    back = np.einsum("ij,ij->i", own, normals[a] + normals[b] + normals[c]) < 0
+    return np.where(back[:, None], mesh.faces[:, [0, 2, 1]], mesh.faces)
+
+
+def _world_direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
+    """(3,) unit vector in the splats' world; ``axes`` as from ``front_axes``."""
+    a, e = np.radians(azimuth), np.radians(elevation)
+    right, up, forward = axes
+    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up

@@ -1,0 +1,211 @@
+"""``meshsplats blender``: pictures and scenes by Blender."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from meshsplats.blender.options import LightOptions, SceneOptions
+from meshsplats.camera import Camera, save_cameras
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import (
+    Count,
+    File,
+    Output,
+    SplatOptions,
+    ViewOptions,
+    check_outputs,
+    configuration,
+    load_scene,
+    parse_color,
+    plural,
+    size_of,
+    view_names,
+    write_json,
+)
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+_FORMATS = (".png", ".exr", ".blend")
+
+
+@dataclass(frozen=True)
+class Blender:
+    """Draws a mesh in Blender: a picture (-o picture.png or .exr), a folder of them, or the scene (-o scene.blend).
+
+    Without --lit, the picture is that of `meshsplats render`. With it, sun and sky light the splats, which cast
+    shadows and are seen in mirrors and through glass. Splats are converted to a mesh first, with default settings.
+    Needs Blender's module bpy in an environment of its own, or an installed Blender (--executable).
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Splats, a model folder, or a mesh."""
+    output: Output
+    """A .png or .exr for one view, a folder for several, or a .blend with a camera for each view."""
+    lit: bool = False
+    """Light the splats; the options under "light" say how."""
+    engine: Literal["cycles", "eevee"] = "cycles"
+    """cycles: exact. eevee: quicker on a graphics card; triangles are sorted for each view, which is nearly exact."""
+    views: ViewOptions = field(default_factory=ViewOptions)
+    light: LightOptions = field(default_factory=LightOptions)
+    background: str = "white"
+    """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
+    transparent: bool = False
+    """No background: pictures with an alpha channel."""
+    samples: Count = None
+    """Unlit: side of the grid of samples in each pixel, as in render. Default: 2 (a .blend: 1). With --lit: samples a
+    pixel. Default: 64."""
+    denoise: bool = False
+    """With --lit, cycles: remove the noise of few samples."""
+    format: Literal["png", "exr"] = "png"
+    """Kind of the pictures in a folder."""
+    executable: File = None
+    """An installed Blender, 4.2 or newer, to use instead of the module bpy."""
+    threads: Count = None
+    """At most N threads. Default: all processors."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.blender import draw
+        from meshsplats.blender.launch import command
+
+        suffix = self.output.suffix.lower()
+        options = self._options(suffix)
+        command(self.executable)
+        start = time.perf_counter()
+        scene = load_scene(self.input, self.reading)
+        cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800)
+        if suffix in (".png", ".exr") and len(cameras) > 1:
+            raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
+        pictures = self._pictures(suffix, len(cameras))
+        blend = self.output if suffix == ".blend" else None
+        beside = self.output.with_suffix if suffix else lambda name: self.output / name.lstrip(".")
+        records = [beside(".cameras.json"), beside(".config.json")]
+        check_outputs(
+            [*pictures, *([blend] if blend else []), *records], self.force, None if suffix else self.output
+        )
+        mesh = _converted(scene)
+        if not suffix:
+            self.output.mkdir(exist_ok=True)
+        with _progress(len(pictures)) as advance:
+            result = draw(
+                mesh,
+                cameras,
+                pictures=pictures,
+                blend=blend,
+                options=options,
+                executable=self.executable,
+                progress=advance,
+            )
+        save_cameras(cameras, records[0])
+        write_json(records[1], configuration("blender", self))
+        self._report(result, cameras, pictures, len(mesh.faces), time.perf_counter() - start)
+
+    def _options(self, suffix: str) -> SceneOptions:
+        """What Blender is asked for, or UsageError for options that contradict each other or would do nothing."""
+        self.views.check()
+        if suffix and suffix not in _FORMATS:
+            raise UsageError(
+                f"-o must end in {', '.join(_FORMATS)}, or name a folder, got {self.output.name!r}"
+            )
+        if self.transparent and self.background != "white":
+            raise UsageError("--transparent and --background exclude each other")
+        if not self.lit and self.light != LightOptions():
+            raise UsageError("the options of light need --lit")
+        if self.denoise and not self.lit:
+            raise UsageError("--denoise needs --lit: an unlit picture has no noise")
+        if suffix and self.format != "png":
+            raise UsageError("--format is for a folder of pictures: the name given with -o decides")
+        if self.light.hdri is not None and self.background != "white":
+            raise UsageError("--background has no effect with --hdri, which is what is seen behind the scene")
+        samples = self.samples
+        if samples is None:
+            samples = 64 if self.lit else 1 if suffix == ".blend" else 2
+        elif suffix == ".blend" and not self.lit and samples > 1:
+            raise UsageError("--samples: an unlit .blend takes one sample a pixel; render it larger instead")
+        options = SceneOptions(
+            light=self.light if self.lit else None,
+            engine=self.engine,
+            samples=samples,
+            background=None if self.transparent else parse_color(self.background),  # type: ignore[arg-type]
+            denoise=self.denoise,
+            threads=self.threads,
+        )
+        options.check()
+        return options
+
+    def _views(self) -> ViewOptions:
+        """Mirror and ball need room beside the subject."""
+        wide = self.lit and (self.light.mirror or self.light.glass) and self.views.cameras is None
+        if wide and self.views.look_around is None and self.views.distance == 1.0:
+            return replace(self.views, distance=1.7)
+        return self.views
+
+    def _pictures(self, suffix: str, count: int) -> list[Path]:
+        if suffix:
+            return [] if suffix == ".blend" else [self.output]
+        return [self.output / name for name in view_names(count, suffix=f".{self.format}")]
+
+    def _report(
+        self,
+        result: dict,
+        cameras: Sequence[Camera],
+        pictures: Sequence[Path],
+        triangles: int,
+        seconds: float,
+    ) -> None:
+        if self.json:
+            output = (
+                {"blend": str(self.output)}
+                if not pictures
+                else {"pictures": [str(path) for path in pictures]}
+            )
+            print(
+                json.dumps(output | result | {"triangles": triangles, "seconds": round(seconds, 3)}, indent=1)
+            )
+            return
+        told = f"Blender {result['blender']}, {triangles:,} triangles, up to {result['layers']} layers"
+        if not pictures:
+            named = f"{self.output} ({size_of(self.output)}), {plural(len(cameras), 'camera')}"
+            print(f"{named}, in {seconds:.1f} s: {told}")
+            return
+        where = f"{self.output} ({size_of(self.output)})" if self.output.is_file() else f"{self.output}/"
+        size = f"{cameras[0].width} x {cameras[0].height}"
+        print(f"{plural(len(pictures), 'picture')} of {size} in {seconds:.1f} s: {where}")
+        print(told)
+
+
+def _converted(scene: GaussianCloud | SplatMesh) -> SplatMesh:
+    if isinstance(scene, SplatMesh):
+        return scene
+    from meshsplats.conversion import convert
+
+    return convert(scene)
+
+
+@contextmanager
+def _progress(total: int):
+    """A function to call after each picture: it moves a bar on stderr, where that is a terminal."""
+    import sys
+
+    if total < 2 or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("Blender renders", total=total)
+        advance: Callable[[], object] = lambda: bar.advance(task)  # noqa: E731
+        yield advance
