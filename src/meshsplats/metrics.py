@@ -26,7 +26,7 @@ def psnr(a: np.ndarray, b: np.ndarray, *, mask: np.ndarray | None = None) -> flo
     Raises TypeError for pictures or masks of another type, ValueError for shapes that differ, values that are
     not finite, and pictures or masks without a pixel.
     """
-    a, b = _checked_pictures(a, b)
+    a, b = checked_pictures(a, b)
     if mask is not None:
         mask = np.asarray(mask)
         if mask.dtype != bool:
@@ -59,7 +59,7 @@ def ssim(a: np.ndarray, b: np.ndarray, *, convention: SsimConvention = "3dgs") -
     Raises TypeError for pictures of another type, ValueError for shapes that differ, values that are not
     finite, an unknown convention, and pictures smaller than the window where the convention is 'valid'.
     """
-    a, b = _checked_pictures(a, b)
+    a, b = checked_pictures(a, b)
     if convention not in get_args(SsimConvention):
         known = ", ".join(get_args(SsimConvention))
         raise ValueError(f"convention must be one of {known}, got {convention!r}")
@@ -79,7 +79,8 @@ def ssim(a: np.ndarray, b: np.ndarray, *, convention: SsimConvention = "3dgs") -
     return total / (a.shape[0] * height * (a.shape[2] - WINDOW + 1))
 
 
-def _checked_pictures(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def checked_pictures(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two pictures of one shape as arrays; errors as :func:`psnr` says."""
     a, b = np.asarray(a), np.asarray(b)
     for picture in (a, b):
         if picture.dtype.kind != "f":
