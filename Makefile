@@ -32,8 +32,8 @@ $(VENV)/installed: $(BUILD_INPUTS) | $(BIN)/python
 	@touch $@
 
 $(VENV)/installed-dev: $(BUILD_INPUTS) | $(BIN)/python
-	@echo 'Compiling the core and installing MeshSplats with what its tests need: about half a minute'
-	@$(PIP) install --editable '.[dev]' --constraint ci-constraints.txt
+	@echo 'Compiling the core and installing MeshSplats with what its tests need, torch too: some minutes'
+	@$(PIP) install --editable '.[dev,finetune]' --constraint ci-constraints.txt
 	@touch $(VENV)/installed $@
 
 demo: $(VENV)/installed

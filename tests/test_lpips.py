@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 import types
 
@@ -138,6 +139,8 @@ def test_it_is_the_package_lpips(folder, network, monkeypatch, tmp_path):
     vision.models = models
     monkeypatch.setitem(sys.modules, "torchvision", vision)
     monkeypatch.setitem(sys.modules, "torchvision.models", models)
+    if importlib.util.find_spec("tqdm") is None:  # shows the progress of training
+        monkeypatch.setitem(sys.modules, "tqdm", types.SimpleNamespace(tqdm=None))
     for name in [name for name in sys.modules if name.split(".")[0] == "lpips"]:
         monkeypatch.delitem(sys.modules, name)
     package = pytest.importorskip("lpips", reason="compared with the package lpips: pip install lpips")
