@@ -5,10 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import sys
 import warnings
-import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -20,6 +18,7 @@ import tyro
 from meshsplats.camera import MAX_SIDE, Camera, dome, load_cameras, look_around, orbit
 from meshsplats.cli import UsageError
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.recognition import identify
 from meshsplats.framing import guess_up
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -147,52 +146,6 @@ class DrawOptions:
     all."""
     threads: Count = None
     """At most N threads. Default: all processors."""
-
-
-def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
-    """What kind of thing ``path`` is, by its content. Raises FileFormatError if it is none of them.
-
-    Four kinds of file may hold either splats or a mesh: .ply, .glb and .gltf, and zip archives (.sog, .npz).
-    """
-    from meshsplats.formats.ply_header import read_header
-    from meshsplats.formats.splat_gltf import has_splats
-    from meshsplats.formats.splat_ply import is_float_splat
-    from meshsplats.formats.splats import splat_format
-
-    if path.is_dir():
-        return "splats"
-    with open(path, "rb") as file:
-        start = file.read(4096)
-        file.seek(0)
-        found = splat_format(path)
-        if found == "ply":
-            return "splats" if is_float_splat(read_header(file, path)) else "mesh"
-    if found == "sog" and start.startswith(b"PK"):
-        return "mesh" if _holds_arrays(path) else "splats"
-    if found == "gltf":
-        return "splats" if has_splats(path) else "mesh"
-    text = b"\0" not in start
-    if text and (path.suffix.lower() == ".obj" or re.search(rb"(^|\n)v[ \t]+[-+.\d]", start)):
-        return "mesh"
-    if found is not None:
-        return "splats"
-    if text and re.match(rb"(\xef\xbb\xbf)?\s*[\[{]", start):
-        return "cameras"
-    if not start:
-        raise FileFormatError(f"{path}: the file is empty")
-    raise FileFormatError(
-        f"{path}: neither splats, a mesh nor cameras as known here; it begins with {start[:8]!r}"
-    )
-
-
-def _holds_arrays(path: Path) -> bool:
-    """Whether a zip archive is an .npz."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return any(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, ValueError, OSError):
-        # Broken: the name decides which reader says so.
-        return path.suffix.lower() == ".npz"
 
 
 def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:
