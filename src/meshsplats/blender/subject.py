@@ -59,14 +59,22 @@ def prepare(
     if mesh.face_splat is not None:
         arrays["face_splat"] = mesh.face_splat
     if options.light is not None:
-        if mesh.blending == "display":
-            colors = mesh.colors.copy()
-            colors[:, :3] = srgb_to_linear(mesh.colors[:, :3])
-            arrays["colors"] = colors
-        arrays["normals"] = normals = shading_normals(mesh, cameras, threads=options.threads)
-        arrays["faces"] = _facing_out(mesh, normals)
-        facts["self_shadow"] = SELF_SHADOW * typical_spacing(mesh)
+        lit, facts["self_shadow"] = lit_arrays(mesh, cameras, threads=options.threads)
+        arrays |= lit
     return arrays, facts
+
+
+def lit_arrays(
+    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
+) -> tuple[dict[str, np.ndarray], float]:
+    """What a lit material needs: ``colors`` (v, 4) in linear light, ``normals`` (v, 3), ``faces`` (f, 3) wound so that
+    they face out; and the distance, scene units, within which layers must not shade each other."""
+    colors = mesh.colors
+    if mesh.blending == "display":
+        colors = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
+    normals = shading_normals(mesh, cameras, threads=threads)
+    arrays = {"colors": colors, "normals": normals, "faces": _facing_out(mesh, normals)}
+    return arrays, SELF_SHADOW * typical_spacing(mesh)
 
 
 def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:

@@ -37,6 +37,14 @@ _FORMATS = (".png", ".exr", ".blend")
 
 
 @dataclass(frozen=True)
+class _Light(LightOptions):
+    """Light and surroundings of lit pictures. Lengths follow the subject's size."""
+
+    hdri: File = None
+    """Environment picture (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
+
+
+@dataclass(frozen=True)
 class Blender:
     """Draws a mesh in Blender: a picture (-o picture.png or .exr), a folder of them, or the scene (-o scene.blend).
 
@@ -54,7 +62,7 @@ class Blender:
     engine: Literal["cycles", "eevee"] = "cycles"
     """cycles: exact. eevee: quicker on a graphics card; triangles are sorted for each view, which is nearly exact."""
     views: ViewOptions = field(default_factory=ViewOptions)
-    light: LightOptions = field(default_factory=LightOptions)
+    light: _Light = field(default_factory=_Light)
     background: str = "white"
     """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
     transparent: bool = False
@@ -121,7 +129,7 @@ class Blender:
             )
         if self.transparent and self.background != "white":
             raise UsageError("--transparent and --background exclude each other")
-        if not self.lit and self.light != LightOptions():
+        if not self.lit and self.light != _Light():
             raise UsageError("the options of light need --lit")
         if self.denoise and not self.lit:
             raise UsageError("--denoise needs --lit: an unlit picture has no noise")

@@ -40,11 +40,11 @@ class _Tree:
         return node.outputs[0]
 
 
-def unlit(name: str = "Splats, unlit") -> Any:
-    """Shows the colours as they are, composited by opacity: from any side, in mirrors and through glass."""
+def unlit(name: str = "Splats, unlit", *, attribute: str = COLOR) -> Any:
+    """Shows the colours of ``attribute`` as they are, composited by opacity: from any side, in mirrors and through glass."""
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
-    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=COLOR)
+    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=attribute)
     emission = tree.node("ShaderNodeEmission", 2, 1)
     tree.link(color.outputs["Color"], emission.inputs["Color"])
     _translucent(tree, material, color.outputs["Alpha"], emission.outputs[0])
@@ -58,8 +58,9 @@ def lit(
     roughness: float = 1.0,
     specular: float = 0.0,
     smooth: bool = True,
+    attribute: str = COLOR,
 ) -> Any:
-    """A surface that lights and shadows act on.
+    """A surface that lights and shadows act on, its linear colours and opacity in ``attribute``.
 
     Many translucent layers make one surface, and each is shaded as if it lay in that surface: by the smoothed
     normal in the attribute ``splat_normal`` (``smooth`` False: by the triangle's own). A ray that starts on one
@@ -68,7 +69,7 @@ def lit(
     """
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
-    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=COLOR)
+    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=attribute)
     surface = tree.node("ShaderNodeBsdfDiffuse", 3, 1)
     tree.link(color.outputs["Color"], surface.inputs["Color"])
     shader = surface.outputs[0]

@@ -14,53 +14,50 @@ from meshsplats.blender.inside import versions
 
 def exact_settings(scene: Any, engine: str) -> None:
     """Colours come out as they went in: no view transform, no dither, one sample at each pixel's centre."""
-    _common(scene, engine)
-    scene.view_settings.view_transform = "Raw"
-    scene.view_settings.look = "None"
-    scene.view_settings.exposure = 0
-    scene.view_settings.gamma = 1
-    if engine == "cycles":
-        cycles = scene.cycles
-        cycles.samples = 1
-        cycles.pixel_filter_type = "GAUSSIAN"
-        # The first sample lies at the pixel's centre; so narrow a filter keeps it there.
-        cycles.filter_width = 0.01
-        cycles.max_bounces = 0
-        _layers(scene, 1024)
-        cycles.use_denoising = False
-    else:
-        scene.eevee.taa_render_samples = 1
-        scene.render.filter_size = 0.0
+    _common(scene, engine, "Raw")
+    cycles = scene.cycles
+    cycles.samples = 1
+    cycles.pixel_filter_type = "GAUSSIAN"
+    # The first sample lies at the pixel's centre; so narrow a filter keeps it there.
+    cycles.filter_width = 0.01
+    cycles.max_bounces = 0
+    cycles.use_denoising = False
+    _layers(scene, 1024)
+    scene.eevee.taa_render_samples = 1
+    scene.render.filter_size = 0.0
 
 
-def lit_settings(scene: Any, engine: str, samples: int, limit: int, bounces: int, denoise: bool) -> None:
-    """Linear light, shown with the view transform Standard (sRGB); ``limit`` layers may lie behind each other."""
-    _common(scene, engine)
-    scene.view_settings.view_transform = "Standard"
-    scene.view_settings.look = "None"
-    scene.view_settings.exposure = 0
-    scene.view_settings.gamma = 1
-    if engine == "cycles":
-        cycles = scene.cycles
-        cycles.samples = samples
-        cycles.use_adaptive_sampling = False
-        cycles.pixel_filter_type = "BLACKMAN_HARRIS"
-        cycles.filter_width = 1.5
-        cycles.max_bounces = bounces
-        cycles.diffuse_bounces = bounces
-        cycles.glossy_bounces = max(bounces, 4)
-        cycles.transmission_bounces = max(bounces, 8)
-        cycles.max_bounces = max(bounces, 8)
-        cycles.caustics_reflective = False
-        cycles.caustics_refractive = False
-        _layers(scene, limit)
-        cycles.use_denoising = denoise
-        # The light tree leaves out lights behind a triangle, though its smoothed normal may face them.
-        cycles.use_light_tree = False
-    else:
-        scene.eevee.taa_render_samples = samples
-        scene.render.filter_size = 1.5
-        versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=True, shadow_ray_count=2)
+def lit_settings(
+    scene: Any,
+    engine: str,
+    *,
+    samples: int = 64,
+    limit: int = 1024,
+    bounces: int = 4,
+    denoise: bool = False,
+    raytracing: bool = False,
+) -> None:
+    """Linear light, shown with the view transform Standard (sRGB); ``limit`` layers may lie behind each other.
+    ``raytracing``: EEVEE traces what mirrors and glass show."""
+    _common(scene, engine, "Standard")
+    cycles = scene.cycles
+    cycles.samples = samples
+    cycles.use_adaptive_sampling = False
+    cycles.pixel_filter_type = "BLACKMAN_HARRIS"
+    cycles.filter_width = 1.5
+    cycles.max_bounces = max(bounces, 8)
+    cycles.diffuse_bounces = bounces
+    cycles.glossy_bounces = max(bounces, 4)
+    cycles.transmission_bounces = max(bounces, 8)
+    cycles.caustics_reflective = False
+    cycles.caustics_refractive = False
+    cycles.use_denoising = denoise
+    # The light tree leaves out lights behind a triangle, though its smoothed normal may face them.
+    cycles.use_light_tree = False
+    _layers(scene, limit)
+    scene.eevee.taa_render_samples = samples
+    scene.render.filter_size = 1.5
+    versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=raytracing)
 
 
 def _layers(scene: Any, limit: int) -> None:
@@ -69,16 +66,19 @@ def _layers(scene: Any, limit: int) -> None:
     scene.cycles.min_transparent_bounces = limit
 
 
-def _common(scene: Any, engine: str) -> None:
+def _common(scene: Any, engine: str, view: str) -> None:
+    # Both engines are set up, so that one can be changed for the other.
     scene.render.engine = versions.engine_name(engine)
     scene.render.dither_intensity = 0
     scene.display_settings.display_device = "sRGB"
     scene.render.use_compositing = False
     scene.render.use_sequencer = False
     scene.render.use_border = False
-    if engine == "cycles":
-        scene.cycles.device = "CPU"
-        scene.cycles.seed = 0
+    scene.view_settings.view_transform = view
+    scene.view_settings.look = "None"
+    scene.view_settings.exposure = 0
+    scene.view_settings.gamma = 1
+    scene.cycles.seed = 0
 
 
 def render_to(scene: Any, path: Path, factor: int = 1) -> None:

@@ -102,7 +102,15 @@ def build(
         )
         mesh.materials.append(material)
         _light(subject, light, center, made[0].matrix_world.translation if made else None, options)
-        pictures.lit_settings(scene, options.engine, options.samples, limit, light.bounces, options.denoise)
+        pictures.lit_settings(
+            scene,
+            options.engine,
+            samples=options.samples,
+            limit=limit,
+            bounces=light.bounces,
+            denoise=options.denoise,
+            raytracing=light.mirror or light.glass,
+        )
     catcher = light is not None and light.ground == "catcher"
     scene.render.film_transparent = options.background is None or catcher
     if options.threads is not None:
@@ -141,11 +149,11 @@ def _light(
     right = np.array([-towards[1], towards[0], 0.0])
     if light.mirror:
         # A little to the left and turned to the viewer, so that the back of the subject shows in it.
-        place = floor - 1.9 * radius * towards - 0.9 * radius * right
+        place = floor - 1.5 * radius * towards - 0.7 * radius * right
         facing = towards + 0.45 * right
-        stage.add_mirror(place, facing / np.linalg.norm(facing), 3.2 * radius, 3.0 * radius, home)
+        stage.add_mirror(place, facing / np.linalg.norm(facing), 2.6 * radius, 2.2 * radius, home)
     if light.glass:
-        size = 0.45 * radius
+        size = 0.35 * radius
         place = floor + 0.9 * radius * towards + 0.95 * radius * right + [0, 0, 1.001 * size]
         stage.add_glass_ball(place, size, home)
 

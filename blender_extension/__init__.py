@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""MeshSplats for Blender: Gaussian splats, and meshes made of them, by File > Import or drag and drop."""
+
+from . import import_operator, object_operators, panel, settings
+
+
+def register():
+    settings.register()
+    import_operator.register()
+    object_operators.register()
+    panel.register()
+
+
+def unregister():
+    panel.unregister()
+    object_operators.unregister()
+    import_operator.unregister()
+    settings.unregister()

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""File > Import > Gaussian Splats, and files dropped on the 3D view."""
+
+import os
+
+import bpy
+from bpy.props import BoolProperty, CollectionProperty, StringProperty
+from bpy_extras.io_utils import ImportHelper
+
+from .settings import CHOICES, Choices
+from .work import Modal, Work
+
+SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".npz", ".glb", ".gltf")
+
+
+class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
+    """Import Gaussian splats as a mesh, or a mesh made by MeshSplats"""
+
+    bl_idname = "import_scene.meshsplats"
+    bl_label = "Import Gaussian Splats"
+    bl_options = {"UNDO", "PRESET"}  # noqa: RUF012 - Blender's own form
+
+    files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
+    directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
+    set_up_scene: BoolProperty(
+        name="Set up Render",
+        description="Bounce limits and colour management as these meshes need them",
+        default=True,
+    )
+
+    def invoke(self, context, event):
+        if self.files and self.directory:  # dropped
+            return context.window_manager.invoke_props_dialog(self)
+        return ImportHelper.invoke(self, context, event)
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        self.draw_choices(layout)
+        layout.prop(self, "set_up_scene")
+
+    def execute(self, context):
+        names = [file.name for file in self.files if file.name]
+        paths = [os.path.join(self.directory, name) for name in names] or [self.filepath]
+        return self.begin(context, Work(paths, {name: getattr(self, name) for name in CHOICES}))
+
+    def done(self, context, work):
+        from meshsplats.blender.inside import objects
+
+        things = []
+        for path, prepared in work.results:
+            name = os.path.splitext(os.path.basename(path))[0]
+            thing = objects.add(prepared, name, context.collection)
+            thing.meshsplats.path = path
+            thing.meshsplats.copy_choices(self)
+            things.append(thing)
+        for other in context.selected_objects:
+            other.select_set(False)
+        for thing in things:
+            thing.select_set(True)
+        if self.set_up_scene:
+            # All that the scene holds, as rays pass through several of them.
+            every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
+            objects.render_settings(context.scene, every, self.shading == "lit")
+        count = sum(len(thing.data.polygons) for thing in things)
+        self.report({"INFO"}, f"MeshSplats: {len(things)} imported, {count:,} triangles")
+
+
+class MeshSplatsFileHandler(bpy.types.FileHandler):
+    bl_idname = "IMPORT_FH_meshsplats"
+    bl_label = "Gaussian Splats"
+    bl_import_operator = ImportMeshSplats.bl_idname
+    bl_file_extensions = ";".join(SUFFIXES)
+
+    @classmethod
+    def poll_drop(cls, context):
+        return context.area is not None and context.area.type in {"VIEW_3D", "OUTLINER"}
+
+
+def menu(self, context):
+    self.layout.operator(ImportMeshSplats.bl_idname, text="Gaussian Splats (.ply, .splat, .spz, .sog, ...)")
+
+
+def register():
+    bpy.utils.register_class(ImportMeshSplats)
+    bpy.utils.register_class(MeshSplatsFileHandler)
+    bpy.types.TOPBAR_MT_file_import.append(menu)
+
+
+def unregister():
+    bpy.types.TOPBAR_MT_file_import.remove(menu)
+    bpy.utils.unregister_class(MeshSplatsFileHandler)
+    bpy.utils.unregister_class(ImportMeshSplats)

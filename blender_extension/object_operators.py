@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What can be done to objects: convert again, another shading, a material for other imports, render settings."""
+
+import bpy
+from bpy.props import EnumProperty
+
+from .settings import CHOICES
+from .work import Modal, Work
+
+SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
+
+
+class ConvertAgain(Modal, bpy.types.Operator):
+    """Convert the file of the active object again, with the settings shown"""
+
+    bl_idname = "object.meshsplats_convert_again"
+    bl_label = "Convert Again"
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
+
+    @classmethod
+    def poll(cls, context):
+        thing = context.object
+        return thing is not None and bool(thing.meshsplats.path) and not thing.meshsplats.busy
+
+    def execute(self, context):
+        source = context.object.meshsplats
+        self._name = context.object.name
+        source.busy = not bpy.app.background
+        path = bpy.path.abspath(source.path)
+        return self.begin(context, Work([path], {name: getattr(source, name) for name in CHOICES}))
+
+    def given_up(self):
+        thing = bpy.data.objects.get(self._name)
+        if thing is not None:
+            thing.meshsplats.busy = False
+
+    def done(self, context, work):
+        from meshsplats.blender.inside import objects
+
+        self.given_up()
+        thing = bpy.data.objects.get(self._name)
+        if thing is None:
+            self.report({"WARNING"}, "MeshSplats: the object is gone")
+            return
+        objects.replace_mesh(thing, work.results[0][1])
+        self.report({"INFO"}, f"MeshSplats: {len(thing.data.polygons):,} triangles")
+
+
+class SetShading(bpy.types.Operator):
+    """Change between unlit and lit, with what was edited since the import kept"""
+
+    bl_idname = "object.meshsplats_shading"
+    bl_label = "Change Shading"
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
+
+    shading: EnumProperty(items=SHADINGS)
+
+    @classmethod
+    def poll(cls, context):
+        return context.object is not None and context.object.type == "MESH"
+
+    def execute(self, context):
+        from meshsplats.blender.inside import objects
+
+        thing = context.object
+        lit = self.shading == "lit"
+        try:
+            if objects.LIT in thing.data:
+                objects.replace_mesh(thing, objects.prepare(objects.as_splat_mesh(thing), lit))
+                thing.meshsplats.shading = self.shading
+            else:
+                objects.dress(thing, lit)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class SetUpRender(bpy.types.Operator):
+    """Set bounce limits and colour management for the splat meshes of the scene"""
+
+    bl_idname = "scene.meshsplats_set_up"
+    bl_label = "Set up Render"
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
+
+    shading: EnumProperty(items=SHADINGS)
+
+    def execute(self, context):
+        from meshsplats.blender.inside import objects
+
+        every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
+        limit = objects.render_settings(context.scene, every, self.shading == "lit")
+        layers = sum(int(thing.data[objects.LAYERS]) for thing in every)
+        if layers > limit:
+            self.report({"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black")
+        return {"FINISHED"}
+
+
+CLASSES = (ConvertAgain, SetShading, SetUpRender)
+
+
+def register():
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister():
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The panel in the side bar of the 3D view."""
+
+import bpy
+
+from .import_operator import ImportMeshSplats
+from .object_operators import ConvertAgain, SetShading, SetUpRender
+
+
+class MeshSplatsPanel(bpy.types.Panel):
+    bl_idname = "VIEW3D_PT_meshsplats"
+    bl_label = "MeshSplats"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "MeshSplats"
+
+    def draw(self, context):
+        layout = self.layout
+        layout.operator(ImportMeshSplats.bl_idname, icon="IMPORT")
+        thing = context.object
+        if thing is not None and thing.type == "MESH":
+            self._object(layout, thing)
+        layout.separator()
+        layout.label(text="Render settings")
+        row = layout.row(align=True)
+        row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
+        row.operator(SetUpRender.bl_idname, text="Lit").shading = "lit"
+
+    def _object(self, layout, thing):
+        if thing.meshsplats.path:
+            box = layout.box()
+            box.use_property_split = True
+            box.prop(thing.meshsplats, "path")
+            thing.meshsplats.draw_choices(box)
+            box.label(text=f"{len(thing.data.polygons):,} triangles")
+            box.operator(ConvertAgain.bl_idname, icon="FILE_REFRESH")
+        layout.label(text="Material of this object")
+        row = layout.row(align=True)
+        row.operator(SetShading.bl_idname, text="Unlit").shading = "unlit"
+        row.operator(SetShading.bl_idname, text="Lit").shading = "lit"
+
+
+def register():
+    bpy.utils.register_class(MeshSplatsPanel)
+
+
+def unregister():
+    bpy.utils.unregister_class(MeshSplatsPanel)

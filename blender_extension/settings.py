@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The choices of a conversion, as properties: of the import, and kept with each imported object."""
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+
+
+class Choices:
+    """Properties shared by the import operator and by the objects it made."""
+
+    preset: EnumProperty(
+        name="Conversion",
+        description="How splats become triangles",
+        items=[
+            ("default", "Calibrated", "Looks like the splats: crossed ellipses, fitted falloff"),
+            ("paper", "Paper", "The conversion of the MeshSplats paper: flat ellipses of 8 triangles"),
+        ],
+        default="default",
+    )
+    max_triangles: IntProperty(
+        name="Max. Triangles",
+        description="Keep the most important splats, up to so many triangles; 0: all",
+        default=0,
+        min=0,
+        soft_max=10_000_000,
+    )
+    min_opacity: FloatProperty(
+        name="Min. Opacity",
+        description="Leave out splats fainter than this",
+        default=1 / 255,
+        min=0.0,
+        max=1.0,
+        precision=4,
+    )
+    axes: EnumProperty(
+        name="Up in File",
+        description="What points up in a splat file",
+        items=[
+            ("auto", "Automatic", "As the format prescribes"),
+            ("y-down", "-Y", "The y axis points down, as in trained .ply files"),
+            ("y-up", "Y", "The y axis points up"),
+        ],
+        default="auto",
+    )
+    shading: EnumProperty(
+        name="Shading",
+        description="How the mesh reacts to light",
+        items=[
+            ("unlit", "Unlit", "Colours as they are: the exact picture of the splats"),
+            ("lit", "Lit", "Light and shadow act on the splats, by smoothed normals"),
+        ],
+        default="unlit",
+    )
+
+    def draw_choices(self, layout):
+        layout.prop(self, "preset")
+        layout.prop(self, "max_triangles")
+        layout.prop(self, "min_opacity")
+        layout.prop(self, "axes")
+        layout.prop(self, "shading")
+
+    def copy_choices(self, other):
+        for name in CHOICES:
+            setattr(self, name, getattr(other, name))
+
+
+CHOICES = ("preset", "max_triangles", "min_opacity", "axes", "shading")
+
+
+class MeshSplatsSource(Choices, bpy.types.PropertyGroup):
+    """Where an object came from and how it was converted."""
+
+    path: StringProperty(name="File", description="The file this object was made from", subtype="FILE_PATH")
+    busy: BoolProperty(options={"SKIP_SAVE", "HIDDEN"})
+
+
+def register():
+    bpy.utils.register_class(MeshSplatsSource)
+    bpy.types.Object.meshsplats = PointerProperty(type=MeshSplatsSource)
+
+
+def unregister():
+    del bpy.types.Object.meshsplats
+    bpy.utils.unregister_class(MeshSplatsSource)

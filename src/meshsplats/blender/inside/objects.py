@@ -1,0 +1,135 @@
+"""Splat meshes as objects of an open Blender file: what the extension does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+import numpy as np
+
+from meshsplats.blender.inside import frame, materials, meshes, pictures, versions
+from meshsplats.blender.layers import bounce_limit, most_layers
+from meshsplats.blender.subject import lit_arrays
+from meshsplats.mesh import SplatMesh
+
+LIT = "meshsplats_lit"
+"""Property of the mesh data: whether its colours are linear light and its material lit."""
+LINEAR = "meshsplats_linear"
+"""Property of the mesh data: whether the mesh was made for blending in linear light."""
+UP = "meshsplats_up"
+"""Property of the mesh data: what points up in its own frame."""
+LAYERS = "meshsplats_layers"
+"""Property of the mesh data: most layers behind each other."""
+
+
+def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
+    """All that takes time and does not touch Blender: may run in another thread."""
+    arrays: dict[str, Any] = {"faces": mesh.faces, "colors": mesh.colors, "normals": None, "self_shadow": 0.0}
+    if lit:
+        made, arrays["self_shadow"] = lit_arrays(mesh)
+        arrays |= made
+    return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh)}
+
+
+def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
+    """A new object in ``collection``, upright in Blender's frame, with its material."""
+    thing = meshes.make_object(_data(prepared, name), name, frame.to_blender(prepared["mesh"].up), collection)
+    bpy.context.view_layer.objects.active = thing
+    return thing
+
+
+def replace_mesh(thing: Any, prepared: dict[str, Any]) -> None:
+    """Gives ``thing`` another mesh and material; its place, parent, modifiers and name stay."""
+    old = thing.data
+    thing.data = _data(prepared, old.name)
+    if old.users == 0:
+        bpy.data.meshes.remove(old)
+
+
+def _data(prepared: dict[str, Any], name: str) -> Any:
+    mesh: SplatMesh = prepared["mesh"]
+    data = meshes.make_mesh(
+        name,
+        mesh.vertices,
+        prepared["faces"],
+        prepared["colors"],
+        normals=prepared["normals"],
+        face_splat=mesh.face_splat,
+    )
+    if prepared["lit"]:
+        data.materials.append(materials.lit(self_shadow=prepared["self_shadow"]))
+    else:
+        data.materials.append(materials.unlit())
+    data[UP] = mesh.up.tolist()
+    data[LIT] = prepared["lit"]
+    data[LINEAR] = mesh.blending == "linear"
+    data[LAYERS] = prepared["layers"]
+    return data
+
+
+def as_splat_mesh(thing: Any) -> SplatMesh:
+    """The unlit mesh that ``thing`` was made from, frame and colours as in its file.
+
+    Raises ValueError for an object that is not a mesh of triangles with the colours of this project.
+    """
+    data = getattr(thing, "data", None)
+    if thing is None or thing.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
+        raise ValueError("the object was not made by MeshSplats")
+    vertices = np.empty(3 * len(data.vertices), np.float32)
+    data.vertices.foreach_get("co", vertices)
+    faces = np.empty(len(data.loops), np.int32)
+    data.loops.foreach_get("vertex_index", faces)
+    if len(faces) != 3 * len(data.polygons):
+        raise ValueError("the object has faces that are not triangles: triangulate it first")
+    colors = np.empty(4 * len(data.vertices), np.float32)
+    data.attributes[meshes.COLOR].data.foreach_get("color", colors)
+    colors = np.clip(colors.reshape(-1, 4), 0, 1)
+    if data[LIT] and not data[LINEAR]:
+        from meshsplats.colors import linear_to_srgb
+
+        colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
+    owner = None
+    if meshes.SPLAT in data.attributes:
+        owner = np.empty(len(data.polygons), np.int32)
+        data.attributes[meshes.SPLAT].data.foreach_get("value", owner)
+        if (np.diff(owner) < 0).any():
+            owner = None
+    up = np.array(data[UP])
+    blending = "linear" if data[LINEAR] else "display"
+    return SplatMesh(
+        vertices.reshape(-1, 3), faces.reshape(-1, 3), colors, face_splat=owner, up=up, blending=blending
+    )
+
+
+def render_settings(scene: Any, things: list[Any], lit: bool) -> int:
+    """Sets the scene up for ``things``: engine settings, colour management and the limit on transparent bounces, which
+    is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor EEVEE)."""
+    engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
+    versions.enable_cycles()
+    layers = sum(int(thing.data.get(LAYERS, 256)) for thing in things)
+    limit = bounce_limit(layers)
+    if lit:
+        pictures.lit_settings(scene, engine, limit=limit)
+    else:
+        pictures.exact_settings(scene, engine)
+        limit = 1024
+    return limit
+
+
+def dress(thing: Any, lit: bool) -> Any:
+    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) a material that shows its vertex colours.
+
+    They are taken for linear light, as these importers leave them. Returns the material. Raises ValueError if the
+    object has no colours.
+    """
+    data = thing.data if thing is not None and thing.type == "MESH" else None
+    if data is None or not len(data.color_attributes):
+        raise ValueError("the object has no vertex colours")
+    active = data.color_attributes.active_color or data.color_attributes[0]
+    if lit:
+        material = materials.lit(self_shadow=0.0, smooth=False, attribute=active.name)
+    else:
+        material = materials.unlit(attribute=active.name)
+    data.materials.clear()
+    data.materials.append(material)
+    return material
