@@ -1,0 +1,1 @@
+"""Readers of data sets, one module a folder layout. See :mod:`meshsplats.dataset`."""

@@ -1,0 +1,245 @@
+"""COLMAP's sparse models: ``cameras`` and ``images``, binary or text. Points are not read.
+
+Specification: colmap.github.io/format.html; the binary layout as in src/colmap/scene/reconstruction_io.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from meshsplats.camera import MAX_SIDE
+from meshsplats.datasets.lens import MODELS, Lens
+from meshsplats.datasets.photographs import MAX_NAME, Frame
+from meshsplats.errors import FileFormatError
+
+MAX_FRAMES = 200_000
+"""More cameras or pictures than this are refused."""
+_MODEL_NAMES = list(MODELS)
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I7dI")
+_POINT_BYTES = 24
+
+
+def find_model(folder: Path, places: tuple[str, ...]) -> Path | None:
+    """The first of ``places`` in ``folder`` that holds a sparse model, binary or text."""
+    for place in places:
+        for suffix in (".bin", ".txt"):
+            if all((folder / place / (name + suffix)).is_file() for name in ("cameras", "images")):
+                return folder / place
+    return None
+
+
+def read_model(model: Path, images: str) -> list[Frame]:
+    """The pictures of a sparse model, sorted by name; their files lie in the folder ``images``.
+
+    Raises FileFormatError, which names file and record, for what is broken.
+    """
+    if (model / "cameras.bin").is_file() and (model / "images.bin").is_file():
+        lenses = _binary_cameras(model / "cameras.bin")
+        frames = _binary_images(model / "images.bin", lenses, images)
+    else:
+        lenses = _text_cameras(model / "cameras.txt")
+        frames = _text_images(model / "images.txt", lenses, images)
+    frames.sort(key=lambda frame: frame.name)
+    for before, after in zip(frames, frames[1:], strict=False):
+        if before.name == after.name:
+            raise FileFormatError(f"{model}: two pictures have the name {after.name[:200]!r}")
+    return frames
+
+
+# ---- Binary
+
+
+@contextmanager
+def _mapped(path: Path) -> Iterator[_Bytes]:
+    with open(path, "rb") as file:
+        try:
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except ValueError:
+            raise FileFormatError(f"{path}: the file is empty") from None
+        with mapped:
+            yield _Bytes(mapped, path)
+
+
+class _Bytes:
+    """A file read in order; nothing of it is in memory but what was asked for."""
+
+    def __init__(self, data: mmap.mmap, path: Path) -> None:
+        self._data, self._path, self._at = data, path, 0
+
+    def unpack(self, layout: struct.Struct, what: str) -> tuple:
+        self._need(layout.size, what)
+        values = layout.unpack_from(self._data, self._at)
+        self._at += layout.size
+        return values
+
+    def count(self, least_bytes: int, what: str) -> int:
+        """A count of records of which each takes at least ``least_bytes``, checked against what is left."""
+        (count,) = self.unpack(struct.Struct("<Q"), f"the number of {what}")
+        left = len(self._data) - self._at
+        if count * least_bytes > left:
+            raise FileFormatError(
+                f"{self._path}: says it holds {count:,} {what}, but only {left:,} bytes follow (truncated, or"
+                " not a file of COLMAP?)"
+            )
+        if count > MAX_FRAMES:
+            raise FileFormatError(f"{self._path}: {count:,} {what}, more than the {MAX_FRAMES:,} accepted")
+        return count
+
+    def text(self, what: str) -> str:
+        """Text up to a zero byte."""
+        end = self._data.find(b"\0", self._at, self._at + MAX_NAME + 1)
+        if end < 0:
+            raise FileFormatError(f"{self._path}: {what} does not end within {MAX_NAME} bytes")
+        raw = self._data[self._at : end]
+        self._at = end + 1
+        return _decoded(raw, self._path, what)
+
+    def skip(self, count: int, what: str) -> None:
+        self._need(count, what)
+        self._at += count
+
+    def _need(self, count: int, what: str) -> None:
+        if self._at + count > len(self._data):
+            raise FileFormatError(f"{self._path}: ends within {what} (truncated?)")
+
+
+def _binary_cameras(path: Path) -> dict[int, Lens]:
+    lenses = {}
+    with _mapped(path) as data:
+        for i in range(data.count(_CAMERA.size + 16, "cameras")):
+            what = f"camera {i}"
+            number, model, width, height = data.unpack(_CAMERA, what)
+            if not 0 <= model < len(_MODEL_NAMES):
+                raise FileFormatError(
+                    f"{path}: {what} has model number {model}; known are 0 to {len(_MODEL_NAMES) - 1}"
+                )
+            layout = struct.Struct(f"<{MODELS[_MODEL_NAMES[model]].parameters}d")
+            values = data.unpack(layout, what)
+            lenses[number] = _lens(_MODEL_NAMES[model], width, height, values, f"{path}: {what}")
+    return lenses
+
+
+def _binary_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame]:
+    frames = []
+    with _mapped(path) as data:
+        for i in range(data.count(_IMAGE.size + 9, "pictures")):
+            what = f"picture {i}"
+            _, *pose, camera = data.unpack(_IMAGE, what)
+            name = data.text(f"the name of {what}")
+            (points,) = data.unpack(struct.Struct("<Q"), what)
+            data.skip(points * _POINT_BYTES, f"the points of {what}")
+            frames.append(_frame(name, pose, camera, lenses, images, f"{path}: {what} ({name[:60]!r})"))
+    return frames
+
+
+# ---- Text
+
+
+def _lines(file: IO[bytes]) -> Iterator[bytes]:
+    """Lines of up to 64 KiB; what a line has beyond that, thousands of points, is dropped."""
+    while line := file.readline(1 << 16):
+        rest = line
+        while not rest.endswith(b"\n") and (rest := file.readline(1 << 16)):
+            pass
+        yield line.strip()
+
+
+def _text_cameras(path: Path) -> dict[int, Lens]:
+    lenses: dict[int, Lens] = {}
+    with open(path, "rb") as file:
+        for row, line in enumerate(_lines(file), 1):
+            if not line or line.startswith(b"#"):
+                continue
+            where = f"{path}: line {row}"
+            words = line.split()
+            if len(words) < 4:
+                raise FileFormatError(f"{where}: a camera is 'ID MODEL WIDTH HEIGHT PARAMETERS'")
+            number, width, height = (_whole(words[k], where) for k in (0, 2, 3))
+            model = _decoded(words[1], path, f"line {row}")
+            lenses[number] = _lens(model, width, height, _floats(words[4:], where), where)
+            if len(lenses) > MAX_FRAMES:
+                raise FileFormatError(f"{path}: more than {MAX_FRAMES:,} cameras")
+    return lenses
+
+
+def _text_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame]:
+    frames: list[Frame] = []
+    with open(path, "rb") as file:
+        lines = enumerate(_lines(file), 1)
+        for row, line in lines:
+            if not line or line.startswith(b"#"):
+                continue
+            where = f"{path}: line {row}"
+            words = line.split(None, 9)
+            if len(words) < 10:
+                raise FileFormatError(
+                    f"{where}: a picture is 'ID QW QX QY QZ TX TY TZ CAMERA NAME' and a line of points after it"
+                )
+            name = _decoded(words[9], path, f"line {row}")
+            pose = list(_floats(words[1:8], where))
+            frames.append(_frame(name, pose, _whole(words[8], where), lenses, images, where))
+            if len(frames) > MAX_FRAMES:
+                raise FileFormatError(f"{path}: more than {MAX_FRAMES:,} pictures")
+            next(lines, None)  # the picture's points, on a line that may be empty
+    return frames
+
+
+def _decoded(raw: bytes, path: Path, what: str) -> str:
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path}: {what} is not UTF-8 text") from None
+
+
+def _whole(word: bytes, where: str) -> int:
+    if not (word.isdigit() and len(word) < 19):
+        raise FileFormatError(f"{where}: expected a whole number, got {word[:40]!r}")
+    return int(word)
+
+
+def _floats(words: list[bytes], where: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(word) for word in words)
+    except ValueError:
+        shown = b" ".join(words)[:60]
+        raise FileFormatError(f"{where}: expected numbers, got {shown!r}") from None
+
+
+# ---- Both
+
+
+def _lens(model: str, width: int, height: int, parameters: tuple[float, ...], where: str) -> Lens:
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise FileFormatError(f"{where}: a picture of {width} x {height} pixels; sides go from 1 to {MAX_SIDE}")
+    try:
+        return Lens.from_colmap(model, width, height, parameters)
+    except ValueError as error:
+        raise FileFormatError(f"{where}: {error}") from None
+
+
+def _frame(
+    name: str, pose: list[float], camera: int, lenses: dict[int, Lens], images: str, where: str
+) -> Frame:
+    if camera not in lenses:
+        raise FileFormatError(f"{where}: refers to camera {camera}, which the model does not have")
+    length = math.hypot(*pose[:4])
+    if not (all(map(math.isfinite, pose)) and 1e-6 < length < 1e6):
+        raise FileFormatError(f"{where}: its pose is no rotation and translation: {pose}")
+    w, x, y, z = (q / length for q in pose[:4])
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = pose[4:7]
+    return Frame(name, f"{images}/{name}", lenses[camera], matrix)

@@ -1,0 +1,163 @@
+"""What kind of data set a folder holds, and which of its views are for testing."""
+
+from __future__ import annotations
+
+import errno
+import os
+import warnings
+from pathlib import Path
+
+from meshsplats.dataset import PictureStore, View
+from meshsplats.datasets.colmap import find_model, read_model
+from meshsplats.datasets.photographs import Album, Frame, Taken, split
+from meshsplats.datasets.transforms import read_transforms
+from meshsplats.errors import DataWarning, FileFormatError
+
+Views = tuple[list[View], list[View]]
+MAX_LIST_BYTES = 16 << 20
+
+
+def read_folder(path: Path, downscale: int, test_every: int, store: PictureStore) -> Views:
+    """Training and test views of the data set at ``path``; see ``dataset.load_dataset``."""
+    if not path.exists():
+        raise FileNotFoundError(errno.ENOENT, "no such data set", str(path))
+    if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise FileFormatError(f"{path}: a data set is a folder, or its transforms.json")
+        if path.name == "transforms_train.json":
+            return _nerf_synthetic(path.parent, Album(path.parent, downscale, store))
+        return _nerfstudio(path, Album(path.parent, downscale, store), test_every)
+    album = Album(path, downscale, store)
+    if (path / "transforms_train.json").is_file():
+        return _nerf_synthetic(path, album)
+    model = find_model(path, ("sparse/0", "sparse"))
+    if model is None and (path / "transforms.json").is_file():
+        return _nerfstudio(path / "transforms.json", album, test_every)
+    model = model or find_model(path, ("colmap/sparse/0", "colmap/sparse"))
+    if model is None:
+        raise FileFormatError(f"{path}: {_what_is_there(path)}")
+    return _colmap(model, album, test_every)
+
+
+def _colmap(model: Path, album: Album, test_every: int) -> Views:
+    # Sizes of the model's cameras are those of images/; without it, pictures may lie beside sparse/.
+    frames = read_model(model, "images")
+    _warn_of_larger_model(model)
+    taken = album.views(frames, str(model))
+    album.report(str(model), len(taken))
+    chosen = _listed_test(model / "test.txt")
+    if chosen is None:
+        return _views(*split(taken, test_every))
+    stems = {name.rsplit(".", 1)[0] for name in chosen}
+    test = [views for views in taken if _stem(views) in stems]
+    return _views([views for views in taken if _stem(views) not in stems], test)
+
+
+def _stem(views: Taken) -> str:
+    return views[0][0].name.rsplit(".", 1)[0]
+
+
+def _listed_test(path: Path) -> set[str] | None:
+    """Names in INRIA's ``sparse/0/test.txt``, one a line; None if there is no such file."""
+    if not path.is_file():
+        return None
+    with open(path, "rb") as file:
+        text = file.read(MAX_LIST_BYTES)
+    try:
+        return {line.strip() for line in text.decode("utf-8").splitlines() if line.strip()}
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path}: not UTF-8 text") from None
+
+
+def _warn_of_larger_model(model: Path) -> None:
+    """COLMAP cuts what it cannot connect into several models, and the first need not be the largest."""
+    if model.name != "0":
+        return
+    sizes = {
+        other.name: file.stat().st_size
+        for other in sorted(model.parent.iterdir())
+        for file in (other / "images.bin", other / "images.txt")
+        if file.is_file()
+    }
+    largest = max(sizes, key=lambda name: sizes[name])
+    if sizes[largest] > 2 * sizes["0"]:
+        warnings.warn(
+            f"{model.parent}: model {largest} is larger than model 0, which is used; move {largest} to 0 to use it",
+            DataWarning,
+            stacklevel=2,
+        )
+
+
+def _nerf_synthetic(folder: Path, album: Album) -> Views:
+    train = _taken(folder / "transforms_train.json", album)
+    for name in ("transforms_test.json", "transforms_val.json"):
+        if (folder / name).is_file():
+            return _views(train, _taken(folder / name, album))
+    warnings.warn(
+        f"{folder}: neither transforms_test.json nor transforms_val.json: there are no test views",
+        DataWarning,
+        stacklevel=2,
+    )
+    return _views(train, [])
+
+
+def _taken(path: Path, album: Album) -> list[Taken]:
+    frames = sorted(read_transforms(path).frames, key=_by_number)
+    album.missing.clear()
+    album.no_mask.clear()
+    taken = album.views(frames, str(path))
+    album.report(str(path), len(taken))
+    return taken
+
+
+def _by_number(frame: Frame) -> tuple:
+    """r_2 before r_10: these names are numbered without leading zeros."""
+    stem = frame.name.rsplit(".", 1)[0]
+    digits = len(stem) - len(stem.rstrip("0123456789"))
+    cut = len(stem) - digits
+    return stem[:cut], int(stem[cut:] or 0) if digits < 19 else 0, frame.name
+
+
+def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
+    content = read_transforms(path)
+    frames = sorted(content.frames, key=lambda frame: frame.name)
+    taken = album.views(frames, str(path))
+    album.report(str(path), len(taken))
+    held = {key: {name.removeprefix("./") for name in names} for key, names in content.splits.items()}
+    out = held.get("test") or held.get("val")
+    if not held.get("train") or not out:
+        return _views(*split(taken, test_every))
+
+    def members(names: set[str]) -> list[Taken]:
+        return [views for views in taken if views[0][1].name in names]
+
+    train, test = members(held["train"]), members(out)
+    if not train:
+        raise FileFormatError(f"{path}: none of its pictures is in 'train_filenames'")
+    return _views(train, test)
+
+
+def _views(train: list[Taken], test: list[Taken]) -> Views:
+    flat = ([View(c, source) for views in part for c, source in views] for part in (train, test))
+    return next(flat), next(flat)
+
+
+def _what_is_there(path: Path) -> str:
+    """Why this is no data set, for people: what is close to one."""
+    names = sorted(os.listdir(path))[:10_000]
+    wanted = (
+        "no data set of a known layout: expected transforms_train.json, transforms.json, or images/ beside"
+        " sparse/0/ with cameras and images, .bin or .txt"
+    )
+    inner = [name for name in names if find_model(path / name, ("", "sparse/0", "sparse"))]
+    if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
+        return "a sparse model by itself; give the folder above it that holds images/ too"
+    if "sparse" in names:
+        return "sparse/ holds no cameras and images, .bin or .txt: was the reconstruction finished?"
+    if "database.db" in names:
+        return "COLMAP's data base without a sparse model: run its mapper first"
+    if inner:
+        return f"{wanted}. {inner[0]}/ in it looks like one"
+    if any(name.startswith("point_cloud") for name in names):
+        return "a trained model, not the photographs it was trained on"
+    return f"{wanted}; it holds {', '.join(names[:6]) or 'nothing'}"

@@ -1,0 +1,196 @@
+"""``transforms.json`` and its kin: NeRF-synthetic, instant-ngp, nerfstudio.
+
+Poses are camera-to-world with OpenGL axes (+x right, +y up, looking along -z). Specification:
+docs.nerf.studio/quickstart/data_conventions.html and the files of the NeRF-synthetic scenes.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.camera import MAX_FILE_BYTES, MAX_SIDE
+from meshsplats.datasets.lens import Lens
+from meshsplats.datasets.photographs import Frame, find, read_header
+from meshsplats.errors import FileFormatError
+
+MAX_FRAMES = 200_000
+MAX_SKEW = 1e-2
+"""How far a rotation may be from orthonormal; less than that is taken for rounding."""
+_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+_RADIAL = ("k1", "k2", "k3", "k4")
+_TANGENTIAL = ("p1", "p2")
+_PERSPECTIVE = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """What such a file holds."""
+
+    frames: list[Frame]
+    """In file order."""
+    splits: dict[str, set[str]]
+    """Files of each split the file names: 'train', 'val', 'test'; empty if it names none."""
+
+
+def read_transforms(path: Path) -> Transforms:
+    """The frames of ``path``. Where sizes are not in the file they are read from the pictures beside it, and
+    where those are missing the frame stays, with a size of one, to be counted by the caller.
+
+    Raises FileFormatError, which names the frame and the field, for what is broken.
+    """
+    content = _read_json(path)
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise FileFormatError(f"{path}: needs a list 'frames' with at least one frame")
+    if len(frames) > MAX_FRAMES:
+        raise FileFormatError(f"{path}: {len(frames):,} frames, more than the {MAX_FRAMES:,} accepted")
+    splits = {}
+    for key in _SPLITS:
+        if key in content:
+            names = content[key]
+            if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+                raise FileFormatError(f"{path}: {key!r} must be a list of file names")
+            splits[key.removesuffix("_filenames")] = set(names)
+    common = {key: value for key, value in content.items() if key != "frames"}
+    return Transforms([_frame(path, common, f, i) for i, f in enumerate(frames)], splits)
+
+
+def _read_json(path: Path) -> dict:
+    with open(path, "rb") as file:
+        text = file.read(MAX_FILE_BYTES + 1)
+    if len(text) > MAX_FILE_BYTES:
+        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no such file is")
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not a JSON file ({str(error)[:120]})") from None
+    if not isinstance(content, dict):
+        raise FileFormatError(f"{path}: must be a JSON object with 'frames'")
+    return content
+
+
+def _frame(path: Path, common: dict, frame: object, i: int) -> Frame:
+    where = f"{path}: frame {i}"
+    if not isinstance(frame, dict):
+        raise FileFormatError(f"{where}: must be a JSON object")
+    file, mask = frame.get("file_path"), frame.get("mask_path")
+    if not isinstance(file, str) or not file:
+        raise FileFormatError(f"{where}: needs a 'file_path'")
+    if mask is not None and not isinstance(mask, str):
+        raise FileFormatError(f"{where}: 'mask_path' must be a file name")
+    where = f"{where} ({file[:60]!r})"
+    values = common | frame
+    lens = _lens(path.parent, values, file, where)
+    return Frame(file.removeprefix("./"), file, lens, _world_to_camera(frame, where), mask)
+
+
+def _lens(folder: Path, values: dict, file: str, where: str) -> Lens:
+    size = _size(folder, values, file, where)
+    if size is None:
+        return Lens("PINHOLE", 1, 1, 0.5, 0.5, 1, 1)
+    width, height = size
+    model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if model == "EQUIRECTANGULAR":
+        return Lens(model, 1, 1, width / 2, height / 2, width, height)
+    if model not in (*_PERSPECTIVE, *_FISHEYE):
+        raise FileFormatError(
+            f"{where}: camera_model {str(model)[:40]!r} is not known here; known: "
+            + ", ".join((*_PERSPECTIVE, *_FISHEYE, "EQUIRECTANGULAR"))
+        )
+    fx, fy = _focals(values, width, height, where)
+    cx, cy = _number(values, "cx", where, width / 2), _number(values, "cy", where, height / 2)
+    k1, k2, k3, k4 = (_number(values, key, where, 0.0) for key in _RADIAL)
+    p1, p2 = (_number(values, key, where, 0.0) for key in _TANGENTIAL)
+    coefficients: tuple[float, ...]
+    if model in _FISHEYE:
+        if p1 or p2:
+            raise FileFormatError(f"{where}: a fisheye has no tangential terms p1, p2")
+        name, coefficients = "OPENCV_FISHEYE", (k1, k2, k3, k4)
+    elif k3 or k4:
+        if k4:
+            raise FileFormatError(
+                f"{where}: k4 is {k4:g}; programs differ in what it means for {model}: leave it out"
+            )
+        name, coefficients = "FULL_OPENCV", (k1, k2, p1, p2, k3, 0, 0, 0)
+    elif k1 or k2 or p1 or p2:
+        name, coefficients = "OPENCV", (k1, k2, p1, p2)
+    else:
+        name, coefficients = "PINHOLE", ()
+    try:
+        return Lens(name, fx, fy, cx, cy, width, height, coefficients)
+    except ValueError as error:
+        raise FileFormatError(f"{where}: {error}") from None
+
+
+def _size(folder: Path, values: dict, file: str, where: str) -> tuple[int, int] | None:
+    """(width, height) that the intrinsics are meant for."""
+    if "w" in values and "h" in values:
+        sides = (_number(values, "w", where), _number(values, "h", where))
+        if not all(side == int(side) and 1 <= side <= MAX_SIDE for side in sides):
+            raise FileFormatError(
+                f"{where}: 'w' and 'h' must be whole numbers from 1 to {MAX_SIDE}, got {sides[0]:g}, {sides[1]:g}"
+            )
+        return int(sides[0]), int(sides[1])
+    found = find(folder, file, where)
+    if found is None:
+        return None
+    header = read_header(found)
+    return header.width, header.height
+
+
+def _focals(values: dict, width: int, height: int, where: str) -> tuple[float, float]:
+    focals = []
+    for axis, side in (("x", width), ("y", height)):
+        length, angle = f"fl_{axis}", f"camera_angle_{axis}"
+        if length in values:
+            focals.append(_number(values, length, where))
+        elif angle in values:
+            view = _number(values, angle, where)
+            if not 0 < view < np.pi:
+                raise FileFormatError(f"{where}: {angle!r} must be an angle in radians from 0 to pi, got {view:g}")
+            focals.append(side / 2 / np.tan(view / 2))
+    if not focals:
+        raise FileFormatError(f"{where}: needs a focal length 'fl_x' or a viewing angle 'camera_angle_x'")
+    if min(focals) <= 0:
+        raise FileFormatError(f"{where}: focal lengths must be positive, got {min(focals):g}")
+    # One of them stands for both: pixels are square unless two are given.
+    return focals[0], focals[-1]
+
+
+def _world_to_camera(frame: dict, where: str) -> np.ndarray:
+    key = "transform_matrix"
+    matrix = None
+    try:
+        given = np.array(frame.get(key), dtype=object)
+        if given.shape in ((4, 4), (3, 4)) and all(type(v) in (int, float) for v in given.ravel()):
+            matrix = given.astype(np.float64)
+    except (ValueError, OverflowError):
+        pass
+    if matrix is None or not np.isfinite(matrix).all() or np.abs(matrix[:, :4]).max() > 1e9:
+        raise FileFormatError(f"{where}: {key!r} must be a 4 x 4 matrix of finite numbers, from camera to world")
+    if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise FileFormatError(f"{where}: the last row of {key!r} must be 0 0 0 1")
+    axes = matrix[:3, :3]
+    if np.abs(axes.T @ axes - np.eye(3)).max() > MAX_SKEW or np.linalg.det(axes) < 0:
+        raise FileFormatError(
+            f"{where}: {key!r} is no rotation and translation (it scales, shears or mirrors)"
+        )
+    left, _, right = np.linalg.svd(axes)
+    rotation = (left @ right * [1, -1, -1]).T  # OpenGL's y and z axes turned to OpenCV's, then inverted
+    result = np.eye(4)
+    result[:3, :3] = rotation
+    result[:3, 3] = -rotation @ matrix[:3, 3]
+    return result
+
+
+def _number(values: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
+    value = values.get(key, default)
+    if type(value) not in (int, float) or not -1e12 < value < 1e12:  # false for NaN too
+        raise FileFormatError(f"{where}: {key!r} must be a finite number, got {str(value)[:40]!r}")
+    return float(value)
