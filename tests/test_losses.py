@@ -13,6 +13,8 @@ from meshsplats import metrics
 
 torch = pytest.importorskip("torch", reason="the losses need torch: pip install 'meshsplats[finetune]'")
 
+from meshsplats.finetuning import losses  # noqa: E402
+from meshsplats.finetuning.kernels import compare_pictures  # noqa: E402
 from meshsplats.finetuning.losses import l1, photometric_loss, ssim  # noqa: E402
 
 
@@ -273,6 +275,24 @@ def test_gradients_as_torch_needs_them():
     x = picture.clone().requires_grad_()
     with pytest.raises(RuntimeError, match="no second derivative"):
         torch.autograd.grad(ssim(x, truth), x, create_graph=True)
+
+
+def test_gradients_are_made_only_where_they_are_wanted(monkeypatch):
+    made = []
+
+    def spy(*arrays, gradient, **options):
+        made.append(gradient)
+        return compare_pictures(*arrays, gradient=gradient, **options)
+
+    monkeypatch.setattr(losses, "compare_pictures", spy)
+    picture, truth = pair(9, 20, 20, 3)
+    x = picture.clone().requires_grad_()
+    with torch.no_grad():
+        ssim(x, truth)
+    ssim(picture, truth)
+    assert made == [False, False]
+    ssim(x, truth)
+    assert made == [False, False, True]
 
 
 def test_not_a_number_is_not_hidden():

@@ -169,6 +169,22 @@ def test_files_can_be_named_and_be_safetensors(folder, tmp_path):
     assert load_lpips(tmp_path, network="alex")(a, b) == expected
 
 
+def test_names_of_a_whole_module_stored_once(folder, tmp_path):
+    first, second = (torch.load(folder / name, weights_only=True) for name in FILES["alex"])
+    slices = {0: 1, 3: 2, 6: 3, 8: 4, 10: 5}
+    whole = {
+        f"net.slice{slices[int(name.split('.')[1])]}.{name.removeprefix('features.')}": tensor
+        for name, tensor in first.items()
+        if name.startswith("features")
+    }
+    whole |= {name.replace("lin", "lins."): tensor for name, tensor in second.items()}
+    torch.save(whole, tmp_path / "whole.pth")
+    a, b = pictures(40, 40)
+    assert load_lpips(tmp_path / "whole.pth", network="alex")(a, b) == load_lpips(folder, network="alex")(
+        a, b
+    )
+
+
 def test_without_weights_there_is_no_distance():
     assert load_lpips(None) is None
     with pytest.raises(ValueError, match="network must be one of vgg, alex, got 'squeeze'"):

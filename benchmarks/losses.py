@@ -1,0 +1,157 @@
+"""What the loss and the optimiser's step cost, beside what torch offers.
+
+    python benchmarks/losses.py                     both tables
+    python benchmarks/losses.py --size 800 --rows 1000000 --repeat 9
+
+The loss is 0.6 L1 + 0.4 (1 - SSIM) of pictures (size, size, 3), with its gradient. The step is Adam on
+positions (v, 3) and colours (v, 4), where a view reached a share of the splats of nine vertices each. Rows are
+timed in turns, and medians are printed: other work on the machine then disturbs all of them alike. Needs torch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+from meshsplats.finetuning.adam import RowAdam
+from meshsplats.finetuning.losses import photometric_loss
+from meshsplats.rendering.core import load_core
+
+VERTICES = 9  # of a splat
+SHARES = (1, 0.3, 0.03)
+
+
+def medians(rows: dict[str, Callable[[], object]], repeat: int) -> dict[str, float]:
+    """Milliseconds, the rows taking turns."""
+    times: dict[str, list[float]] = {name: [] for name in rows}
+    for turn in range(repeat + 1):
+        for name, work in rows.items():
+            start = time.perf_counter()
+            work()
+            if turn:  # the first is a warm-up
+                times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def gaussian() -> torch.Tensor:
+    line = torch.exp(-0.5 * (torch.arange(-5, 6, dtype=torch.float32) / 1.5) ** 2)
+    return line / line.sum()
+
+
+def torch_loss(picture: torch.Tensor, truth: torch.Tensor, separable: bool) -> torch.Tensor:
+    """The same loss in torch alone: five means under the window, each with one or with two convolutions."""
+    line = gaussian()
+    x, y = (p.permute(2, 0, 1)[None] for p in (picture, truth))
+
+    def mean(z: torch.Tensor) -> torch.Tensor:
+        if separable:
+            z = functional.conv2d(z, line.view(1, 1, 11, 1).expand(3, 1, 11, 1), padding=(5, 0), groups=3)
+            return functional.conv2d(z, line.view(1, 1, 1, 11).expand(3, 1, 1, 11), padding=(0, 5), groups=3)
+        return functional.conv2d(z, torch.outer(line, line).expand(3, 1, 11, 11), padding=5, groups=3)
+
+    mx, my = mean(x), mean(y)
+    vx, vy, cov = mean(x * x) - mx * mx, mean(y * y) - my * my, mean(x * y) - mx * my
+    values = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx * mx + my * my + 1e-4) * (vx + vy + 9e-4))
+    return 0.6 * (x - y).abs().mean() + 0.4 * (1 - values.mean())
+
+
+def losses(size: int, repeat: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(size, size, 3, generator=generator)
+    picture = (truth + 0.05 * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
+
+    def step(loss: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[], torch.Tensor]:
+        def work() -> torch.Tensor:
+            x = picture.clone().requires_grad_()
+            loss(x).backward()
+            assert x.grad is not None
+            return x.grad
+
+        return work
+
+    rows = {
+        "meshsplats, 1 thread": step(lambda x: photometric_loss(x, truth, threads=1)),
+        "meshsplats": step(lambda x: photometric_loss(x, truth)),
+        "torch, separable": step(lambda x: torch_loss(x, truth, separable=True)),
+        "torch, 11 x 11 windows": step(lambda x: torch_loss(x, truth, separable=False)),
+    }
+    expected = rows["torch, separable"]()
+    found = rows["meshsplats"]()
+    assert float((found - expected).norm() / expected.norm()) < 1e-3
+    times = medians(rows, repeat)
+    print(f"| loss and gradient, {size} x {size} x 3 | ms | of ours |\n|---|---|---|")
+    for name, value in times.items():
+        print(f"| {name} | {value:.1f} | {value / times['meshsplats']:.1f} |")
+
+
+def steps(rows: int, repeat: int) -> None:
+    splats = rows // VERTICES
+    rows = splats * VERTICES
+    print("| Adam, ms | " + " | ".join(f"{share:.0%} reached" for share in SHARES) + " |\n|---|---|---|---|")
+    table: dict[str, list[float]] = {}
+    for share in SHARES:
+        generator = np.random.default_rng(0)
+        mask = np.repeat(generator.random(splats) < share, VERTICES) if share < 1 else np.ones(rows, bool)
+        chosen = np.flatnonzero(mask).astype(np.int32)
+        index = torch.from_numpy(chosen).long()
+        work: dict[str, list[Callable[[], object]]] = {}
+        for columns in (3, 4):
+            start = torch.from_numpy(generator.random((rows, columns), np.float32))
+            gradient = torch.from_numpy(generator.normal(size=(rows, columns)).astype(np.float32))
+            gradient *= torch.from_numpy(mask)[:, None]
+            ours = RowAdam(start.clone(), lr=1e-3)
+            for name, reached in {"by mask": mask, "by number": chosen}.items():
+                step = partial(ours.step, gradient, reached)
+                work.setdefault(f"meshsplats, rows {name}", []).append(step)
+            for name, make in {
+                "torch Adam": lambda p: torch.optim.Adam([p], lr=1e-3),
+                "torch Adam, fused": lambda p: torch.optim.Adam([p], lr=1e-3, fused=True),
+            }.items():
+                leaf = start.clone().requires_grad_()
+                leaf.grad = gradient
+                work.setdefault(name, []).append(make(leaf).step)
+            leaf = start.clone().requires_grad_()
+            model = torch.optim.SparseAdam([leaf], lr=1e-3)
+
+            def sparse(leaf=leaf, model=model, gradient=gradient, index=index) -> None:
+                leaf.grad = torch.sparse_coo_tensor(
+                    index[None], gradient[index], gradient.shape, is_coalesced=True
+                )
+                model.step()
+
+            work.setdefault("torch SparseAdam", []).append(sparse)
+        together = {name: lambda both=both: [step() for step in both] for name, both in work.items()}
+        for name, value in medians(together, repeat).items():
+            table.setdefault(name, []).append(value)
+    for name, values in table.items():
+        print(f"| {name} | " + " | ".join(f"{value:.1f}" for value in values) + " |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--size", type=int, default=800)
+    parser.add_argument("--rows", type=int, default=1_000_000)
+    parser.add_argument("--repeat", type=int, default=9)
+    args = parser.parse_args()
+    warnings.filterwarnings("ignore", message="Sparse invariant checks")
+    machine = f"{platform.machine()}, {len(os.sched_getaffinity(0))} processors"
+    core = f"core {load_core().ms_variant().decode()}"
+    print(f"{machine}, {core}, torch {torch.__version__} with {torch.get_num_threads()} threads\n")
+    losses(args.size, args.repeat)
+    print()
+    steps(args.rows, args.repeat)
+
+
+if __name__ == "__main__":
+    main()
