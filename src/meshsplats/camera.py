@@ -181,7 +181,7 @@ def orbit(
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
-    return _round_subject(scene, angles, up, width, height, fov, distance)
+    return round_subject(scene, angles, up, width, height, fov, distance)
 
 
 def dome(
@@ -206,7 +206,7 @@ def dome(
     lowest = -1.0 if whole else 0.0
     heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     angles = [(i * golden % 360, float(np.degrees(np.arcsin(h)))) for i, h in enumerate(heights)]
-    return _round_subject(scene, angles, up, width, height, fov, distance)
+    return round_subject(scene, angles, up, width, height, fov, distance)
 
 
 def look_around(
@@ -246,7 +246,7 @@ def _direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray
     return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
 
 
-def _round_subject(
+def round_subject(
     scene: Scene,
     angles: Sequence[tuple[float, float]],
     up: Sequence[float] | np.ndarray | None,

@@ -1,0 +1,254 @@
+"""Data sets without photographs: cameras placed round a scene, or inside it, that see its splats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from meshsplats.camera import MAX_SIDE, NEAR_SHARE, Camera, look_at, round_subject
+from meshsplats.dataset import CACHE_BYTES, WHITE, Dataset, View, splat_views
+from meshsplats.framing import (
+    SAMPLE,
+    SURROUNDINGS,
+    front_axes,
+    guess_up,
+    scene_bounds,
+    unit_up,
+    weighted_quantile,
+)
+from meshsplats.gaussians import GaussianCloud
+
+Placement = Literal["auto", "object", "surrounded", "inside"]
+
+GOLDEN = (5**0.5 - 1) / 2
+"""Multiples of this, modulo 1, are spread evenly however many are taken."""
+OBJECT_ELEVATIONS = (-20.0, 70.0)
+SURROUNDED_ELEVATIONS = (3.0, 60.0)
+"""Degrees above the horizon; of a scene with ground there is nothing to be seen from below."""
+INSIDE_ELEVATIONS = (-35.0, 35.0)
+DISTANCES = (0.7, 1.2)
+"""Multiples of the distance from which the subject just fits: details, and the whole of it."""
+SURROUNDINGS_SHARE = 0.01
+"""More of the opacity than this beyond the subject, and it stands in surroundings."""
+STANDS = 12
+"""Most places from which a scene is seen from inside."""
+CANDIDATES = 512
+"""Points tried as such a place."""
+ROOMY = 0.4
+"""Least clearance of a place, as a share of the best one's."""
+
+
+def splat_dataset(
+    cloud: GaussianCloud,
+    *,
+    placement: Placement = "auto",
+    cameras: Sequence[Camera] | None = None,
+    train: int = 64,
+    test: int = 8,
+    width: int = 400,
+    height: int | None = None,
+    fov: float | None = None,
+    distance: tuple[float, float] = DISTANCES,
+    up: Sequence[float] | np.ndarray | None = None,
+    sh_degree: int | None = None,
+    background: Sequence[float] = WHITE,
+    samples: int = 1,
+    threads: int | None = None,
+    cache_bytes: int = CACHE_BYTES,
+) -> Dataset:
+    """A data set made of splats alone: pictures drawn the 3DGS way from cameras placed round them.
+
+    Parameters
+    ----------
+    placement: 'object': cameras on all sides, a little below the horizon too. 'surrounded': an object in its
+        surroundings, as of a walk round it; cameras above the ground only. 'inside': cameras that stand where
+        it is free between the splats and look outwards, for rooms and other scenes taken from inside. 'auto':
+        'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object'. 'inside' must
+        be asked for: splats do not tell a room from a hollow thing.
+    cameras: where the scene was trained from, as in a model folder's cameras.json. They are used in place of
+        a placement: test views spread among them, then as many for training as ``train`` says, scaled to
+        ``width`` (``height``, ``fov``, ``distance`` and ``up`` have no part).
+    train, test: numbers of views. The views held out lie between the others.
+    width, height: size in pixels; height: as width.
+    fov: degrees that the shorter side spans; 50, or 75 inside.
+    distance: nearest and farthest camera of 'object' and 'surrounded', as multiples of the distance from
+        which the subject just fits the picture.
+    up: (3,) direction; None: ``framing.guess_up``.
+    sh_degree, background, samples, threads, cache_bytes: as in ``dataset.splat_views``.
+
+    Raises ValueError for an empty cloud or an option out of its range.
+    """
+    if placement not in ("auto", "object", "surrounded", "inside"):
+        raise ValueError(f"placement must be auto, object, surrounded or inside, got {placement!r}")
+    if train < 1 or test < 0:
+        raise ValueError(f"there must be at least 1 training view and 0 test views, got {train} and {test}")
+    if not 1 <= width <= MAX_SIDE or not (height is None or 1 <= height <= MAX_SIDE):
+        raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
+    if not (len(distance) == 2 and 0 < distance[0] <= distance[1] < np.inf):
+        raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
+    if cameras is not None:
+        placed = _given(cameras, train + test, width)
+    elif placement == "inside":
+        placed = inside_cameras(
+            cloud, train + test, up=up, width=width, height=height or width, fov=75.0 if fov is None else fov
+        )
+    else:
+        if placement == "auto":
+            placement = "surrounded" if has_surroundings(cloud) else "object"
+        placed = outside_cameras(
+            cloud,
+            train + test,
+            elevations=SURROUNDED_ELEVATIONS if placement == "surrounded" else OBJECT_ELEVATIONS,
+            distance=distance,
+            up=up,
+            width=width,
+            height=height or width,
+            fov=50.0 if fov is None else fov,
+        )
+    views = splat_views(
+        cloud,
+        placed,
+        sh_degree=sh_degree,
+        background=background,
+        samples=samples,
+        threads=threads,
+        cache_bytes=cache_bytes,
+    )
+    held = set(_spread(len(views), min(test, len(views) - 1)))
+    part: tuple[list[View], list[View]] = ([], [])
+    for i, view in enumerate(views):
+        part[i in held].append(view)
+    return Dataset(tuple(part[0]), tuple(part[1]), "splats")
+
+
+def has_surroundings(cloud: GaussianCloud) -> bool:
+    """Whether more than ``SURROUNDINGS_SHARE`` of the opacity lies far outside the subject, as
+    ``framing.scene_bounds`` has it."""
+    center = scene_bounds(cloud).center
+    distance = np.linalg.norm(cloud.means - center, axis=1)
+    weights = cloud.opacities.astype(np.float64)
+    if weights.sum() == 0:
+        return False
+    far = distance > SURROUNDINGS * weighted_quantile(distance, weights, 0.5)
+    return bool(weights[far].sum() > SURROUNDINGS_SHARE * weights.sum())
+
+
+def outside_cameras(
+    cloud: GaussianCloud,
+    count: int,
+    *,
+    elevations: tuple[float, float] = OBJECT_ELEVATIONS,
+    distance: tuple[float, float] = DISTANCES,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 400,
+    height: int = 400,
+    fov: float = 50.0,
+) -> list[Camera]:
+    """``count`` cameras round the subject, spread evenly over directions and distances.
+
+    Directions are those of a Fibonacci spiral on the sphere between two ``elevations`` (degrees); distances
+    follow another such sequence, evenly on a logarithmic scale. The rest is as in ``splat_dataset``.
+    """
+    low, high = np.sin(np.radians(elevations))
+    # Steps of the two sequences must not keep pace: near cameras would all stand on one side.
+    i = np.arange(count)
+    heights = low + (high - low) * (i + 0.5) / count
+    angles = [(float(a), float(np.degrees(np.arcsin(h)))) for a, h in zip(i * GOLDEN * 360, heights, strict=True)]
+    cameras = round_subject(cloud, angles, up, width, height, fov, 1.0)
+    share = (0.5 + i * 2**0.5) % 1
+    factors = distance[0] * (distance[1] / distance[0]) ** share
+    return [_away(camera, float(f)) for camera, f in zip(cameras, factors, strict=True)]
+
+
+def _away(camera: Camera, factor: float) -> Camera:
+    """A camera of ``round_subject`` drawn back to ``factor`` times its distance from what it looks at."""
+    matrix = camera.world_to_camera.copy()
+    matrix[2, 3] += (factor - 1) * camera.near / NEAR_SHARE
+    return replace(camera, world_to_camera=matrix, near=camera.near * factor)
+
+
+def inside_cameras(
+    cloud: GaussianCloud,
+    count: int,
+    *,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 400,
+    height: int = 400,
+    fov: float = 75.0,
+) -> list[Camera]:
+    """``count`` cameras inside the scene that look outwards, in all directions near the horizon.
+
+    They stand in up to ``STANDS`` places, far from each other, in the middle parts of the scene where the
+    nearest splat is farthest away; each place looks all round.
+    """
+    axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
+    places, clearances = _free_places(cloud, axes, max(1, min(STANDS, count // 6)))
+    low, high = np.sin(np.radians(INSIDE_ELEVATIONS))
+    cameras = []
+    for i in range(count):
+        stand = i % len(places)
+        turn = 2 * np.pi * GOLDEN * i
+        h = low + (high - low) * ((0.5 + i * 2**0.5) % 1)
+        right, upward, forward = axes
+        direction = (1 - h * h) ** 0.5 * (np.sin(turn) * right + np.cos(turn) * forward) + h * upward
+        cameras.append(
+            look_at(
+                places[stand],
+                places[stand] + clearances[stand] * direction,
+                up=upward,
+                width=width,
+                height=height,
+                fov=fov,
+                near=clearances[stand] * 0.05,
+                name=f"view_{i:04d}",
+            )
+        )
+    return cameras
+
+
+def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Up to ``count`` points (k, 3) between the splats, and (k,) how far the nearest splat is from each."""
+    bounds = scene_bounds(cloud)  # refuses an empty cloud
+    solid = np.flatnonzero(cloud.opacities > 0.1)
+    rows = (solid if len(solid) else np.arange(len(cloud)))[:: -(-max(len(solid), 1) // SAMPLE)]
+    points = cloud.means[rows].astype(np.float64)
+    reach = 2 * np.median(cloud.scales[rows].astype(np.float64), axis=1)
+    along = bounds.points @ axes.T
+    low, high = (np.array([weighted_quantile(along[:, k], bounds.weights, q) for k in range(3)]) for q in (0.02, 0.98))
+    # The middle three quarters across and the middle half in height: people do not crawl.
+    middle, half = (low + high) / 2, (high - low) / 2 * [0.75, 0.5, 0.75]
+    # Kronecker's sequence of the plastic number's powers fills a cube evenly.
+    steps = 1.2207440846057596 ** -np.arange(1, 4)
+    inner = 2 * ((0.5 + np.arange(CANDIDATES)[:, None] * steps) % 1) - 1
+    tried = (middle + half * inner) @ axes
+    clearance = np.empty(CANDIDATES)
+    square = (points**2).sum(axis=1)
+    for start in range(0, CANDIDATES, 64):
+        some = tried[start : start + 64]
+        apart = np.maximum((some**2).sum(axis=1)[:, None] - 2 * some @ points.T + square, 0)
+        clearance[start : start + 64] = (np.sqrt(apart) - reach).min(axis=1)
+    best = clearance.max()
+    if best <= 0:
+        raise ValueError("no free place was found inside the scene; is it an object (placement 'object')?")
+    roomy = np.flatnonzero(clearance >= ROOMY * best)
+    chosen = [int(roomy[clearance[roomy].argmax()])]
+    while len(chosen) < min(count, len(roomy)):
+        away = np.linalg.norm(tried[roomy][:, None] - tried[chosen], axis=2).min(axis=1)
+        chosen.append(int(roomy[away.argmax()]))
+    return tried[chosen], clearance[chosen]
+
+
+def _given(cameras: Sequence[Camera], most: int, width: int) -> list[Camera]:
+    """Up to ``most`` of the cameras, spread over them, with pictures ``width`` pixels wide."""
+    if len(cameras) < 1:
+        raise ValueError("cameras is empty; leave it out to have cameras placed")
+    chosen = _spread(len(cameras), min(most, len(cameras)))
+    return [cameras[i].scaled(width / cameras[i].width) for i in chosen]
+
+
+def _spread(count: int, some: int) -> list[int]:
+    """``some`` of the numbers below ``count``, evenly spread."""
+    return [int((i + 0.5) * count / some) for i in range(some)]
