@@ -88,7 +88,9 @@ class View:
         picture = self.source if isinstance(self.source, Picture) else self.source.load()
         size = (self.camera.height, self.camera.width)
         if picture.color.shape[:2] != size:
-            raise ValueError(f"view {self.name!r}: the picture has shape {picture.color.shape[:2]}, not {size}")
+            raise ValueError(
+                f"view {self.name!r}: the picture has shape {picture.color.shape[:2]}, not {size}"
+            )
         return picture
 
     @property

@@ -29,6 +29,7 @@ Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 NAMED_COLORS = {
@@ -56,7 +57,8 @@ class SplatOptions:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """From where, and how large. Give one of --orbit, --dome, --look-around, --cameras."""
+    """From where, and how large. Give one of --orbit, --dome, --look-around, --cameras,
+    --data."""
 
     orbit: Count = None
     """N views on a circle round the subject."""
@@ -67,6 +69,8 @@ class ViewOptions:
     cameras: File = None
     """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder that has
     one."""
+    data: Folder = None
+    """Data set of photographs: COLMAP, NeRF-synthetic or nerfstudio. The cameras of its test views, undistorted."""
     elevation: Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0
@@ -79,14 +83,14 @@ class ViewOptions:
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
     folder, of the mesh, else -y, as COLMAP's scenes have it."""
     width: Count = None
-    """Picture width in pixels. With --cameras, pictures are scaled to this width."""
+    """Picture width in pixels. With --cameras or --data, pictures are scaled to this width."""
     height: Count = None
-    """Picture height in pixels. Default: the width. Not with --cameras, where it follows."""
+    """Picture height in pixels. Default: the width. Not with --cameras or --data, where it follows."""
 
     @property
     def moving(self) -> bool:
         """Whether the views make a turntable."""
-        return self.cameras is None and self.dome is None
+        return self.cameras is None and self.data is None and self.dome is None
 
     def make(self, scene: GaussianCloud | SplatMesh, source: Path, *, count: int, side: int) -> list[Camera]:
         """The cameras; ``count`` views of an orbit, ``side`` pixels wide, where nothing else is asked for."""
@@ -95,8 +99,8 @@ class ViewOptions:
             value = getattr(self, name)
             if value is not None and not 1 <= value <= MAX_SIDE:
                 raise ValueError(f"--{name} must be a number of pixels from 1 to {MAX_SIDE}, got {value}")
-        if self.cameras is not None:
-            cameras = load_cameras(self.cameras)
+        if self.cameras is not None or self.data is not None:
+            cameras = load_cameras(self.cameras) if self.cameras is not None else data_cameras(self.data, "test")
             return cameras if self.width is None else [c.scaled(self.width / c.width) for c in cameras]
         width = next(v for v in (self.width, self.height, side) if v is not None)
         lens: dict[str, Any] = {"width": width, "height": width if self.height is None else self.height}
@@ -115,7 +119,9 @@ class ViewOptions:
     def check(self) -> None:
         """UsageError for options that exclude each other or would do nothing."""
         modes = [
-            name for name in ("orbit", "dome", "look_around", "cameras") if getattr(self, name) is not None
+            name
+            for name in ("orbit", "dome", "look_around", "cameras", "data")
+            if getattr(self, name) is not None
         ]
         if len(modes) > 1:
             raise UsageError(f"give one of {', '.join(map(_flag, modes))}, not several")
@@ -123,6 +129,7 @@ class ViewOptions:
             "dome": ("elevation", "azimuth"),
             "look_around": ("distance",),
             "cameras": ("elevation", "azimuth", "distance", "fov", "up", "height"),
+            "data": ("elevation", "azimuth", "distance", "fov", "up", "height"),
         }
         for mode in modes:
             for name in without_effect.get(mode, ()):
@@ -171,6 +178,15 @@ def cameras_beside(source: Path) -> list[Camera] | None:
     except FileFormatError as error:
         warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
         return None
+
+
+def data_cameras(path: Path | None, part: Literal["train", "test"]) -> list[Camera]:
+    """Cameras of the training or test views of a data set; of all where it holds none out."""
+    from meshsplats.dataset import load_dataset
+
+    assert path is not None
+    dataset = load_dataset(path)
+    return [view.camera for view in getattr(dataset, part) or dataset.views]
 
 
 def parse_up(text: str) -> np.ndarray:

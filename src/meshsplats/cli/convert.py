@@ -16,12 +16,14 @@ from meshsplats.camera import load_cameras, orbit
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     File,
+    Folder,
     Output,
     SplatOptions,
     Text,
     cameras_beside,
     check_outputs,
     configuration,
+    data_cameras,
     identify,
     parse_up,
     size_of,
@@ -49,6 +51,8 @@ class Convert:
     cameras: File = None
     """Where the mesh will be seen from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the
     model folder that has one. Default: the cameras of the input where it is a model folder, else none."""
+    data: Folder = None
+    """Data set of the photographs: the cameras of its training views are where the mesh will be seen from."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else -y."""
     lit: bool = False
@@ -82,7 +86,12 @@ class Convert:
         check_outputs([path for path in (self.output, preview, config) if path], self.force)
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; convert needs a splat file or a model folder")
-        cameras = cameras_beside(self.input) if self.cameras is None else load_cameras(self.cameras)
+        if self.data is not None:
+            if self.cameras is not None:
+                raise UsageError("give --cameras or --data, not both")
+            cameras = data_cameras(self.data, "train")
+        else:
+            cameras = cameras_beside(self.input) if self.cameras is None else load_cameras(self.cameras)
         self.conversion.resolved(self.preset, has_cameras=bool(cameras))  # mistakes are told before the work
 
         times = [time.perf_counter()]

@@ -156,7 +156,9 @@ def outside_cameras(
     # Steps of the two sequences must not keep pace: near cameras would all stand on one side.
     i = np.arange(count)
     heights = low + (high - low) * (i + 0.5) / count
-    angles = [(float(a), float(np.degrees(np.arcsin(h)))) for a, h in zip(i * GOLDEN * 360, heights, strict=True)]
+    angles = [
+        (float(a), float(np.degrees(np.arcsin(h)))) for a, h in zip(i * GOLDEN * 360, heights, strict=True)
+    ]
     cameras = round_subject(cloud, angles, up, width, height, fov, 1.0)
     share = (0.5 + i * 2**0.5) % 1
     factors = distance[0] * (distance[1] / distance[0]) ** share
@@ -217,7 +219,9 @@ def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np
     points = cloud.means[rows].astype(np.float64)
     reach = 2 * np.median(cloud.scales[rows].astype(np.float64), axis=1)
     along = bounds.points @ axes.T
-    low, high = (np.array([weighted_quantile(along[:, k], bounds.weights, q) for k in range(3)]) for q in (0.02, 0.98))
+    low, high = (
+        np.array([weighted_quantile(along[:, k], bounds.weights, q) for k in range(3)]) for q in (0.02, 0.98)
+    )
     # The middle three quarters across and the middle half in height: people do not crawl.
     middle, half = (low + high) / 2, (high - low) / 2 * [0.75, 0.5, 0.75]
     # Kronecker's sequence of the plastic number's powers fills a cube evenly.

@@ -219,7 +219,9 @@ def _floats(words: list[bytes], where: str) -> tuple[float, ...]:
 
 def _lens(model: str, width: int, height: int, parameters: tuple[float, ...], where: str) -> Lens:
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise FileFormatError(f"{where}: a picture of {width} x {height} pixels; sides go from 1 to {MAX_SIDE}")
+        raise FileFormatError(
+            f"{where}: a picture of {width} x {height} pixels; sides go from 1 to {MAX_SIDE}"
+        )
     try:
         return Lens.from_colmap(model, width, height, parameters)
     except ValueError as error:

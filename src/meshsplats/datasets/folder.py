@@ -149,7 +149,7 @@ def _what_is_there(path: Path) -> str:
         "no data set of a known layout: expected transforms_train.json, transforms.json, or images/ beside"
         " sparse/0/ with cameras and images, .bin or .txt"
     )
-    inner = [name for name in names if find_model(path / name, ("", "sparse/0", "sparse"))]
+    inner = [name for name in names if _looks_like_one(path / name)]
     if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
         return "a sparse model by itself; give the folder above it that holds images/ too"
     if "sparse" in names:
@@ -161,3 +161,10 @@ def _what_is_there(path: Path) -> str:
     if any(name.startswith("point_cloud") for name in names):
         return "a trained model, not the photographs it was trained on"
     return f"{wanted}; it holds {', '.join(names[:6]) or 'nothing'}"
+
+
+def _looks_like_one(path: Path) -> bool:
+    named = ("transforms_train.json", "transforms.json")
+    return (
+        any((path / name).is_file() for name in named) or find_model(path, ("sparse/0", "sparse")) is not None
+    )

@@ -79,9 +79,7 @@ class Lens:
         """The same lens before a picture of another size; each axis is scaled by itself."""
         x, y = width / self.width, height / self.height
         fx, fy = (self.fx, self.fy) if self.model == "EQUIRECTANGULAR" else (self.fx * x, self.fy * y)
-        return Lens(
-            self.model, fx, fy, self.cx * x, self.cy * y, width, height, self.coefficients
-        )
+        return Lens(self.model, fx, fy, self.cx * x, self.cy * y, width, height, self.coefficients)
 
     def distort(self, u: np.ndarray, v: np.ndarray) -> Point:
         """(u', v') of rays (u, v, 1), any shape, float64; NaN or infinite where no picture point belongs to a

@@ -251,7 +251,10 @@ class Album:
             if mask is not None:
                 _check_shape(frame.lens, read_header(mask), mask)
             lens = frame.lens.scaled(width, height)
-            sources = [(p, PhotoFile(frame.name, path, lens, p, mask, header.has_alpha, self.store)) for p in pinholes(lens)]
+            sources = [
+                (p, PhotoFile(frame.name, path, lens, p, mask, header.has_alpha, self.store))
+                for p in pinholes(lens)
+            ]
             result.append([(_camera(frame, pinhole, told), source) for pinhole, source in sources])
         return result
 

@@ -153,7 +153,9 @@ def _focals(values: dict, width: int, height: int, where: str) -> tuple[float, f
         elif angle in values:
             view = _number(values, angle, where)
             if not 0 < view < np.pi:
-                raise FileFormatError(f"{where}: {angle!r} must be an angle in radians from 0 to pi, got {view:g}")
+                raise FileFormatError(
+                    f"{where}: {angle!r} must be an angle in radians from 0 to pi, got {view:g}"
+                )
             focals.append(side / 2 / np.tan(view / 2))
     if not focals:
         raise FileFormatError(f"{where}: needs a focal length 'fl_x' or a viewing angle 'camera_angle_x'")
@@ -173,7 +175,9 @@ def _world_to_camera(frame: dict, where: str) -> np.ndarray:
     except (ValueError, OverflowError):
         pass
     if matrix is None or not np.isfinite(matrix).all() or np.abs(matrix[:, :4]).max() > 1e9:
-        raise FileFormatError(f"{where}: {key!r} must be a 4 x 4 matrix of finite numbers, from camera to world")
+        raise FileFormatError(
+            f"{where}: {key!r} must be a 4 x 4 matrix of finite numbers, from camera to world"
+        )
     if len(matrix) == 4 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise FileFormatError(f"{where}: the last row of {key!r} must be 0 0 0 1")
     axes = matrix[:3, :3]
