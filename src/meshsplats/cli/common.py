@@ -70,7 +70,7 @@ class ViewOptions:
     """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder that has
     one."""
     data: Folder = None
-    """Data set of photographs: COLMAP, NeRF-synthetic or nerfstudio. The cameras of its test views, undistorted."""
+    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio): the cameras of its test views."""
     elevation: Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0
@@ -100,7 +100,11 @@ class ViewOptions:
             if value is not None and not 1 <= value <= MAX_SIDE:
                 raise ValueError(f"--{name} must be a number of pixels from 1 to {MAX_SIDE}, got {value}")
         if self.cameras is not None or self.data is not None:
-            cameras = load_cameras(self.cameras) if self.cameras is not None else data_cameras(self.data, "test")
+            if self.data is not None:
+                cameras = data_cameras(self.data, "test")
+            else:
+                assert self.cameras is not None
+                cameras = load_cameras(self.cameras)
             return cameras if self.width is None else [c.scaled(self.width / c.width) for c in cameras]
         width = next(v for v in (self.width, self.height, side) if v is not None)
         lens: dict[str, Any] = {"width": width, "height": width if self.height is None else self.height}
@@ -180,11 +184,10 @@ def cameras_beside(source: Path) -> list[Camera] | None:
         return None
 
 
-def data_cameras(path: Path | None, part: Literal["train", "test"]) -> list[Camera]:
+def data_cameras(path: Path, part: Literal["train", "test"]) -> list[Camera]:
     """Cameras of the training or test views of a data set; of all where it holds none out."""
     from meshsplats.dataset import load_dataset
 
-    assert path is not None
     dataset = load_dataset(path)
     return [view.camera for view in getattr(dataset, part) or dataset.views]
 

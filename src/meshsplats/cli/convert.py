@@ -90,8 +90,10 @@ class Convert:
             if self.cameras is not None:
                 raise UsageError("give --cameras or --data, not both")
             cameras = data_cameras(self.data, "train")
+        elif self.cameras is not None:
+            cameras = load_cameras(self.cameras)
         else:
-            cameras = cameras_beside(self.input) if self.cameras is None else load_cameras(self.cameras)
+            cameras = cameras_beside(self.input) or []
         self.conversion.resolved(self.preset, has_cameras=bool(cameras))  # mistakes are told before the work
 
         times = [time.perf_counter()]
