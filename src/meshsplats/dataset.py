@@ -1,5 +1,5 @@
-"""Dataset: cameras with the pictures they took, for training and for testing. Read from folders, or drawn from
-splats."""
+"""Dataset: cameras with the pictures they took, for training and for testing; read from folders, or drawn
+from splats."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Picture:
     """What a camera saw. Values are display-referred (sRGB-encoded), rows run from top to bottom."""
 
     color: np.ndarray
-    """(h, w, 3) RGB as it is on black, so times alpha where there is one: uint8 (255 is 1), or float16 or float32
-    in units of 1."""
+    """(h, w, 3) RGB as it is on black, so times alpha where there is one: uint8 (255 is 1), or float16 or
+    float32 in units of 1."""
     alpha: np.ndarray | None = None
     """(h, w) opacity, of the same type; None: opaque, as photographs are."""
     mask: np.ndarray | None = None
@@ -45,7 +45,7 @@ class Picture:
             raise ValueError(f"mask must have shape {shape[:2]} and type bool")
 
     def over(self, background: Sequence[float] | np.ndarray = WHITE) -> np.ndarray:
-        """(h, w, 3) float32 ``color + (1 - alpha) * background``; ``background`` is RGB, (3,) or (h, w, 3)."""
+        """(h, w, 3) float32 ``color + (1 - alpha) * background``; ``background``: RGB, (3,) or (h, w, 3)."""
         color = _unit(self.color)
         if self.alpha is None:
             return color
@@ -106,8 +106,8 @@ class View:
 
     @property
     def mask(self) -> np.ndarray | None:
-        """(h, w) bool, True where the picture counts; None: everywhere. Photographs do not count outside their
-        masks, and beyond the borders that undistortion leaves black."""
+        """(h, w) bool, True where the picture counts; None: everywhere. Photographs do not count outside
+        their masks, and beyond the borders that undistortion leaves black."""
         return self.picture.mask
 
 
@@ -162,9 +162,9 @@ def load_dataset(
     - nerfstudio: ``transforms.json``, also named itself as ``path``;
     - COLMAP with ``colmap/sparse/0/`` or ``colmap/sparse/``.
 
-    ``masks/``, or the masks a file names, say which pixels count. Photographs of lenses that are no pinhole are
-    undistorted when they are read; what the lens did not see is black and masked. Only the headers of pictures
-    are read here: cameras are scaled to the size the pictures really have.
+    ``masks/``, or the masks a file names, say which pixels count. Photographs of lenses that are no pinhole
+    are undistorted when they are read; what the lens did not see is black and masked. Only the headers of
+    pictures are read here: cameras are scaled to the size the pictures really have.
 
     Parameters
     ----------

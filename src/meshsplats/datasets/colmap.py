@@ -10,6 +10,7 @@ import mmap
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import IO
 
@@ -49,7 +50,7 @@ def read_model(model: Path, images: str) -> list[Frame]:
         lenses = _text_cameras(model / "cameras.txt")
         frames = _text_images(model / "images.txt", lenses, images)
     frames.sort(key=lambda frame: frame.name)
-    for before, after in zip(frames, frames[1:], strict=False):
+    for before, after in pairwise(frames):
         if before.name == after.name:
             raise FileFormatError(f"{model}: two pictures have the name {after.name[:200]!r}")
     return frames
@@ -182,7 +183,7 @@ def _text_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame
             words = line.split(None, 9)
             if len(words) < 10:
                 raise FileFormatError(
-                    f"{where}: a picture is 'ID QW QX QY QZ TX TY TZ CAMERA NAME' and a line of points after it"
+                    f"{where}: a picture is 'ID QW QX QY QZ TX TY TZ CAMERA NAME', then a line of points"
                 )
             name = _decoded(words[9], path, f"line {row}")
             pose = list(_floats(words[1:8], where))

@@ -82,7 +82,8 @@ def _warn_of_larger_model(model: Path) -> None:
     largest = max(sizes, key=lambda name: sizes[name])
     if sizes[largest] > 2 * sizes["0"]:
         warnings.warn(
-            f"{model.parent}: model {largest} is larger than model 0, which is used; move {largest} to 0 to use it",
+            f"{model.parent}: model {largest} is larger than model 0, which is used; rename {largest} to 0"
+            " to use it instead",
             DataWarning,
             stacklevel=2,
         )

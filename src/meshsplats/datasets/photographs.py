@@ -1,4 +1,5 @@
-"""Photographs in a data set's folder: found without leaving it, measured by their headers, read when needed."""
+"""Photographs in a data set's folder: found without leaving it, measured by their headers, read when
+needed."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ class Frame:
     """Name of the view."""
     file: str
     """Path of the picture in the folder, as written there."""
-    lens: Lens
+    lens: Lens | None
+    """None if neither the file nor the picture, which is missing, tells its size."""
     world_to_camera: np.ndarray
     mask: str | None = None
     """Path of its mask in the folder; None: looked for in ``masks/``."""
@@ -57,7 +59,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
     real, root = os.path.realpath(path), os.path.realpath(folder)
     if os.path.commonpath([real, root]) != root:
         raise FileFormatError(
-            f"{where}: {name[:200]!r} is a link that leads out of the data set's folder; copy what it links to"
+            f"{where}: {name[:200]!r} is a link that leads out of the data set's folder; copy what is there"
         )
     return path
 
@@ -91,7 +93,7 @@ class Header:
 def read_header(path: Path) -> Header:
     """Size and kind of a picture. FileFormatError for what is none, or too large."""
     with _opened(path) as image:
-        return Header(*image.size, _has_alpha(image))
+        return Header(image.width, image.height, _has_alpha(image))
 
 
 def load_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -177,9 +179,12 @@ class PhotoFile:
             color = _resized(color, size)
         else:
             # Colours of clear pixels mean nothing: mixing must see each as much as it is opaque.
-            share = alpha.astype(np.float32)[..., None] / 255
-            both = np.concatenate([color.astype(np.float32) / 255 * share, share], axis=2)
-            color = np.stack([_resized(both[..., i], size) for i in range(4)], axis=2)
+            share = alpha.astype(np.float32) / 255
+            mixed = np.empty((size[1], size[0], 4), np.float16)
+            for i in range(3):
+                mixed[..., i] = _resized(color[..., i].astype(np.float32) / 255 * share, size)
+            mixed[..., 3] = _resized(share, size)
+            color = mixed
         mask = None if self.mask is None else self._read_mask(size)
         if not self.lens.is_pinhole:
             color, seen = undistort(color, self.lens, self.pinhole)
@@ -190,7 +195,6 @@ class PhotoFile:
                 mask = seen
         if alpha is None:
             return Picture(color, None, mask)
-        color = color.astype(np.float16)
         return Picture(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
 
     def _read_mask(self, size: tuple[int, int]) -> np.ndarray:
@@ -237,7 +241,7 @@ class Album:
             told = f"{where}: picture {frame.name[:60]!r}"
             full = find(self.folder, frame.file, told)
             small = self._smaller(frame.file, told)
-            if full is None and small is None:
+            if frame.lens is None or (full is None and small is None):
                 self.missing.append(frame.file)
                 continue
             path = small or full
@@ -251,11 +255,11 @@ class Album:
             if mask is not None:
                 _check_shape(frame.lens, read_header(mask), mask)
             lens = frame.lens.scaled(width, height)
-            sources = [
-                (p, PhotoFile(frame.name, path, lens, p, mask, header.has_alpha, self.store))
-                for p in pinholes(lens)
-            ]
-            result.append([(_camera(frame, pinhole, told), source) for pinhole, source in sources])
+            taken = []
+            for pinhole in pinholes(lens):
+                source = PhotoFile(frame.name, path, lens, pinhole, mask, header.has_alpha, self.store)
+                taken.append((_camera(frame, pinhole, told), source))
+            result.append(taken)
         return result
 
     def _smaller(self, name: str, where: str) -> Path | None:

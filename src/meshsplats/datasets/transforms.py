@@ -39,8 +39,8 @@ class Transforms:
 
 
 def read_transforms(path: Path) -> Transforms:
-    """The frames of ``path``. Where sizes are not in the file they are read from the pictures beside it, and
-    where those are missing the frame stays, with a size of one, to be counted by the caller.
+    """The frames of ``path``. Where sizes are not in the file they are read from the pictures beside it; a
+    frame whose picture is missing then has no lens.
 
     Raises FileFormatError, which names the frame and the field, for what is broken.
     """
@@ -90,10 +90,10 @@ def _frame(path: Path, common: dict, frame: object, i: int) -> Frame:
     return Frame(file.removeprefix("./"), file, lens, _world_to_camera(frame, where), mask)
 
 
-def _lens(folder: Path, values: dict, file: str, where: str) -> Lens:
+def _lens(folder: Path, values: dict, file: str, where: str) -> Lens | None:
     size = _size(folder, values, file, where)
     if size is None:
-        return Lens("PINHOLE", 1, 1, 0.5, 0.5, 1, 1)
+        return None
     width, height = size
     model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if model == "EQUIRECTANGULAR":
@@ -134,7 +134,8 @@ def _size(folder: Path, values: dict, file: str, where: str) -> tuple[int, int] 
         sides = (_number(values, "w", where), _number(values, "h", where))
         if not all(side == int(side) and 1 <= side <= MAX_SIDE for side in sides):
             raise FileFormatError(
-                f"{where}: 'w' and 'h' must be whole numbers from 1 to {MAX_SIDE}, got {sides[0]:g}, {sides[1]:g}"
+                f"{where}: 'w' and 'h' must be whole numbers from 1 to {MAX_SIDE},"
+                f" got {sides[0]:g}, {sides[1]:g}"
             )
         return int(sides[0]), int(sides[1])
     found = find(folder, file, where)
@@ -194,7 +195,7 @@ def _world_to_camera(frame: dict, where: str) -> np.ndarray:
 
 
 def _number(values: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    value = values.get(key, default)
+    value: Any = values.get(key, default)
     if type(value) not in (int, float) or not -1e12 < value < 1e12:  # false for NaN too
         raise FileFormatError(f"{where}: {key!r} must be a finite number, got {str(value)[:40]!r}")
     return float(value)
