@@ -89,7 +89,7 @@ class View:
         size = (self.camera.height, self.camera.width)
         if picture.color.shape[:2] != size:
             raise ValueError(
-                f"view {self.name!r}: the picture has shape {picture.color.shape[:2]}, not {size}"
+                f"view {self.name!r}: its picture has shape {picture.color.shape[:2]}, not {size}"
             )
         return picture
 

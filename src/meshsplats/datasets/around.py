@@ -23,8 +23,10 @@ from meshsplats.gaussians import GaussianCloud
 
 Placement = Literal["auto", "object", "surrounded", "inside"]
 
-GOLDEN = (5**0.5 - 1) / 2
-"""Multiples of this, modulo 1, are spread evenly however many are taken."""
+STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
+"""Steps of Kronecker's sequence for azimuth, height and distance: its points modulo 1 fill the unit cube evenly
+wherever one begins and however many are taken. The first two are powers of the plastic number's inverse, the
+best known pair; directions matter most."""
 OBJECT_ELEVATIONS = (-20.0, 70.0)
 SURROUNDED_ELEVATIONS = (3.0, 60.0)
 """Degrees above the horizon; of a scene with ground there is nothing to be seen from below."""
@@ -69,9 +71,10 @@ def splat_dataset(
         'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object'. 'inside' must
         be asked for: splats do not tell a room from a hollow thing.
     cameras: where the scene was trained from, as in a model folder's cameras.json. They are used in place of
-        a placement: test views spread among them, then as many for training as ``train`` says, scaled to
-        ``width`` (``height``, ``fov``, ``distance`` and ``up`` have no part).
-    train, test: numbers of views. The views held out lie between the others.
+        a placement: as many as are asked for, spread over all, those held out between the others, scaled to
+        ``width``. ``height``, ``fov``, ``distance`` and ``up`` then have no part.
+    train, test: numbers of views. The views held out go on with the sequence of the others, so both are
+        spread evenly and none lies on another.
     width, height: size in pixels; height: as width.
     fov: degrees that the shorter side spans; 50, or 75 inside.
     distance: nearest and farthest camera of 'object' and 'surrounded', as multiples of the distance from
@@ -117,6 +120,8 @@ def splat_dataset(
         threads=threads,
         cache_bytes=cache_bytes,
     )
+    if cameras is None:
+        return Dataset(views[:train], views[train:], "splats")
     held = set(_spread(len(views), min(test, len(views) - 1)))
     part: tuple[list[View], list[View]] = ([], [])
     for i, view in enumerate(views):
@@ -149,20 +154,21 @@ def outside_cameras(
 ) -> list[Camera]:
     """``count`` cameras round the subject, spread evenly over directions and distances.
 
-    Directions are those of a Fibonacci spiral on the sphere between two ``elevations`` (degrees); distances
-    follow another such sequence, evenly on a logarithmic scale. The rest is as in ``splat_dataset``.
+    Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
+    Each run of these cameras is even by itself. The rest is as in ``splat_dataset``.
     """
+    turns, heights, share = _sequence(count)
     low, high = np.sin(np.radians(elevations))
-    # Steps of the two sequences must not keep pace: near cameras would all stand on one side.
-    i = np.arange(count)
-    heights = low + (high - low) * (i + 0.5) / count
-    angles = [
-        (float(a), float(np.degrees(np.arcsin(h)))) for a, h in zip(i * GOLDEN * 360, heights, strict=True)
-    ]
+    elevation = np.degrees(np.arcsin(low + (high - low) * heights))
+    angles = list(zip((360 * turns).tolist(), elevation.tolist(), strict=True))
     cameras = round_subject(cloud, angles, up, width, height, fov, 1.0)
-    share = (0.5 + i * 2**0.5) % 1
     factors = distance[0] * (distance[1] / distance[0]) ** share
     return [_away(camera, float(f)) for camera, f in zip(cameras, factors, strict=True)]
+
+
+def _sequence(count: int) -> np.ndarray:
+    """(3, count) numbers in [0, 1)."""
+    return (0.5 + np.outer(STEPS, np.arange(count))) % 1
 
 
 def _away(camera: Camera, factor: float) -> Camera:
@@ -189,11 +195,11 @@ def inside_cameras(
     axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
     places, clearances = _free_places(cloud, axes, max(1, min(STANDS, count // 6)))
     low, high = np.sin(np.radians(INSIDE_ELEVATIONS))
+    turns, heights, _ = _sequence(count)
     cameras = []
     for i in range(count):
         stand = i % len(places)
-        turn = 2 * np.pi * GOLDEN * i
-        h = low + (high - low) * ((0.5 + i * 2**0.5) % 1)
+        turn, h = 2 * np.pi * turns[i], low + (high - low) * heights[i]
         right, upward, forward = axes
         direction = (1 - h * h) ** 0.5 * (np.sin(turn) * right + np.cos(turn) * forward) + h * upward
         cameras.append(

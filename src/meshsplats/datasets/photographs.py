@@ -19,7 +19,7 @@ from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyErr
 
 MAX_PIXELS = 1 << 26
 """Pictures of more pixels than this (67 million) are refused: a small file can claim any size."""
-FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM", "MPO")
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 """What Pillow may read here. Other formats of its start programs, or hold no photographs."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", ".JPG", ".JPEG")
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""

@@ -155,7 +155,7 @@ def _focals(values: dict, width: int, height: int, where: str) -> tuple[float, f
             view = _number(values, angle, where)
             if not 0 < view < np.pi:
                 raise FileFormatError(
-                    f"{where}: {angle!r} must be an angle in radians from 0 to pi, got {view:g}"
+                    f"{where}: {angle!r} must lie between 0 and pi radians, got {view:g}"
                 )
             focals.append(side / 2 / np.tan(view / 2))
     if not focals:
