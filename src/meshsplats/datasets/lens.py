@@ -329,13 +329,19 @@ def undistort(picture: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.nda
                 valid = (x >= -slack) & (x <= w - 1 + slack) & (y >= -slack) & (y <= h - 1 + slack)
             x = np.clip(np.where(valid, x, 0), 0, w - 1)
             y = np.clip(np.where(valid, y, 0), 0, h - 1)
-        left, top = x.astype(np.int64), y.astype(np.int64)
+        left, top = x.astype(np.int32), y.astype(np.int32)
         right = (left + 1) % w if wraps else np.minimum(left + 1, w - 1)
         below = np.minimum(top + 1, h - 1)
-        a, b = (x - left).astype(np.float32)[..., None], (y - top).astype(np.float32)[..., None]
-        upper = flat[top * w + left] * (1 - a) + flat[top * w + right] * a
-        lower = flat[below * w + left] * (1 - a) + flat[below * w + right] * a
-        mixed = upper * (1 - b) + lower * b
+        a, b = (x - left).astype(np.float32), (y - top).astype(np.float32)
+        corners = (
+            (top * w + left, (1 - a) * (1 - b)),
+            (top * w + right, a * (1 - b)),
+            (below * w + left, (1 - a) * b),
+            (below * w + right, a * b),
+        )
+        mixed = np.zeros((*x.shape, channels), np.float32)
+        for places, weights in corners:
+            mixed += np.take(flat, places, axis=0) * weights[..., None]
         if picture.dtype == np.uint8:
             mixed = np.rint(mixed)
         mixed[~valid] = 0
