@@ -10,12 +10,19 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(wildcard src/meshsplats/csrc/*)
 
-.PHONY: help demo test lint format clean
+# Blender's Python module exists for one version of Python only, and each version of it lives in a place of its own.
+BLENDER_VENV ?= .venv-blender
+BPY ?= 4.2.23 5.0.1
+BLENDER_PYTHON ?= $(shell for name in python3.11 python3 python; do \
+	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && echo $$name && break; done)
+
+.PHONY: help demo test test-blender lint format clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo    splats to mesh, GLB, pictures and a comparison, in $(DEMO)/'
 	@echo 'make test    the tests'
+	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make lint    ruff and mypy (make format tidies the source)'
 	@echo 'make clean   removes everything that these made'
 
@@ -48,6 +55,31 @@ demo: $(VENV)/installed
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest
 
+$(BLENDER_VENV)/wheel/made: $(BUILD_INPUTS) $(shell find src -name '*.py')
+	@if [ -z "$(BLENDER_PYTHON)" ]; then echo 'Blender needs Python 3.11 with venv, and it was not found.' \
+	  'Name it: make test-blender BLENDER_PYTHON=...' >&2; exit 1; fi
+	@echo 'Compiling the core: about half a minute'
+	@$(BLENDER_PYTHON) -m venv $(BLENDER_VENV)/build
+	@rm -f $(@D)/*.whl
+	@$(BLENDER_VENV)/build/bin/python -m pip --disable-pip-version-check --quiet wheel --no-deps \
+	  -C build-dir=build/blender --wheel-dir $(@D) .
+	@touch $@
+
+$(BLENDER_VENV)/%/installed: $(BLENDER_VENV)/wheel/made
+	@echo 'Installing Blender $* into $(@D)'
+	@test -x $(@D)/bin/python || $(BLENDER_PYTHON) -m venv $(@D)
+	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install 'bpy==$*' 'numpy<2' pytest hypothesis \
+	  $(<D)/*.whl
+	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --force-reinstall --no-deps $(<D)/*.whl
+	@touch $@
+
+test-blender: $(BPY:%=$(BLENDER_VENV)/%/installed)
+	@for version in $(BPY); do \
+	  echo "Blender $$version"; \
+	  MESHSPLATS_WHEEL=$$(echo $(BLENDER_VENV)/wheel/*.whl) $(BLENDER_VENV)/$$version/bin/python -m pytest tests/blender \
+	    || exit 1; \
+	done
+
 lint: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
@@ -57,5 +89,5 @@ format: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check --fix .
 
 clean:
-	rm -rf $(VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(BLENDER_VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests examples benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

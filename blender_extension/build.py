@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Packs the extension with a wheel of MeshSplats for one platform, ready for Blender's Get Extensions > Install from
-Disk:
+"""Packs the extension with a wheel of MeshSplats for one platform, ready for Blender's Get Extensions >
+Install from Disk:
 
     python blender_extension/build.py -o dist
 
@@ -29,7 +29,8 @@ PLATFORMS = [
 
 
 def platform_of(wheel: str) -> str:
-    """Blender's name of the platform that ``wheel``, a file name, was built for. Raises ValueError if none fits."""
+    """Blender's name of the platform that ``wheel``, a file name, was built for. Raises ValueError if none
+    fits."""
     tag = wheel.removesuffix(".whl").rsplit("-", 1)[-1]
     for pattern, name in PLATFORMS:
         if re.fullmatch(pattern, tag):
@@ -77,7 +78,9 @@ def build_wheel(folder: Path) -> Path:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Packs the Blender extension.")
     parser.add_argument("-o", "--output", type=Path, default=Path("dist"), help="folder for the .zip")
-    parser.add_argument("--wheel", type=Path, help="a wheel of MeshSplats; built from the source tree if left out")
+    parser.add_argument(
+        "--wheel", type=Path, help="a wheel of MeshSplats; built from the source tree if left out"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         wheel = options.wheel or build_wheel(Path(folder))

@@ -7,7 +7,7 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
-from .settings import CHOICES, Choices
+from .settings import CHOICES, Choices, copy_choices, draw_choices
 from .work import Modal, Work
 
 SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".npz", ".glb", ".gltf")
@@ -37,7 +37,7 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
     def draw(self, context):
         layout = self.layout
         layout.use_property_split = True
-        self.draw_choices(layout)
+        draw_choices(self, layout)
         layout.prop(self, "set_up_scene")
 
     def execute(self, context):
@@ -53,7 +53,7 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
             name = os.path.splitext(os.path.basename(path))[0]
             thing = objects.add(prepared, name, context.collection)
             thing.meshsplats.path = path
-            thing.meshsplats.copy_choices(self)
+            copy_choices(thing.meshsplats, self)
             things.append(thing)
         for other in context.selected_objects:
             other.select_set(False)

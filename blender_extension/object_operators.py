@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What can be done to objects: convert again, another shading, a material for other imports, render settings."""
+"""What can be done to objects: convert again, another shading, a material for other imports, render
+settings."""
 
 import bpy
 from bpy.props import EnumProperty
@@ -92,7 +93,9 @@ class SetUpRender(bpy.types.Operator):
         limit = objects.render_settings(context.scene, every, self.shading == "lit")
         layers = sum(int(thing.data[objects.LAYERS]) for thing in every)
         if layers > limit:
-            self.report({"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black")
+            self.report(
+                {"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black"
+            )
         return {"FINISHED"}
 
 

@@ -5,6 +5,7 @@ import bpy
 
 from .import_operator import ImportMeshSplats
 from .object_operators import ConvertAgain, SetShading, SetUpRender
+from .settings import draw_choices
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -31,7 +32,7 @@ class MeshSplatsPanel(bpy.types.Panel):
             box = layout.box()
             box.use_property_split = True
             box.prop(thing.meshsplats, "path")
-            thing.meshsplats.draw_choices(box)
+            draw_choices(thing.meshsplats, box)
             box.label(text=f"{len(thing.data.polygons):,} triangles")
             box.operator(ConvertAgain.bl_idname, icon="FILE_REFRESH")
         layout.label(text="Material of this object")

@@ -52,19 +52,20 @@ class Choices:
         default="unlit",
     )
 
-    def draw_choices(self, layout):
-        layout.prop(self, "preset")
-        layout.prop(self, "max_triangles")
-        layout.prop(self, "min_opacity")
-        layout.prop(self, "axes")
-        layout.prop(self, "shading")
-
-    def copy_choices(self, other):
-        for name in CHOICES:
-            setattr(self, name, getattr(other, name))
-
 
 CHOICES = ("preset", "max_triangles", "min_opacity", "axes", "shading")
+
+
+def draw_choices(owner, layout):
+    """Shows the properties of ``owner``, an operator or an object's."""
+    for name in CHOICES:
+        layout.prop(owner, name)
+
+
+def copy_choices(owner, other):
+    """Gives ``owner`` the values of ``other``."""
+    for name in CHOICES:
+        setattr(owner, name, getattr(other, name))
 
 
 class MeshSplatsSource(Choices, bpy.types.PropertyGroup):

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reading and converting in a thread of its own, so that Blender's window stays alive and the work can be given up."""
+"""Reading and converting in a thread of its own, so that Blender's window stays alive and the work can be
+given up."""
 
 import threading
 import traceback
@@ -11,7 +12,8 @@ class Stopped(Exception):
 
 
 class Work:
-    """Reads files and prepares their meshes. ``progress`` runs from 0 to 1, ``stage`` says what is being done."""
+    """Reads files and prepares their meshes. ``progress`` runs from 0 to 1, ``stage`` says what is being
+    done."""
 
     def __init__(self, paths, choices):
         self.paths = list(paths)
@@ -84,6 +86,10 @@ class Work:
             options = {"max_triangles": self.choices["max_triangles"] or None}
             if self.choices["min_opacity"] > 0:
                 options["min_opacity"] = self.choices["min_opacity"]
+            if self.choices["shading"] == "lit":
+                options["mode"] = (
+                    "flat"  # crossed ellipses stand upright on the surface and catch too little light
+                )
             mesh = convert(cloud, preset=self.choices["preset"], **options)
         self._at(number, 0.6, "shading normals" if self.choices["shading"] == "lit" else "counting layers")
         prepared = objects.prepare(mesh, self.choices["shading"] == "lit")

@@ -41,9 +41,9 @@ def draw(
 ) -> dict[str, Any]:
     """Has Blender render ``mesh`` from ``cameras``, or save the scene, or both; existing files are replaced.
 
-    Unlit (``options.light`` None), Cycles draws what ``meshsplats.render`` draws, and the values of an .exr are
-    those of ``Rendering.color``, in the space of the mesh's colours. Lit, colours are turned to linear light; an
-    .exr holds that, a .png is shown through Blender's view transform Standard (sRGB).
+    Unlit (``options.light`` None), Cycles draws what ``meshsplats.render`` draws, and the values of an .exr
+    are those of ``Rendering.color``, in the space of the mesh's colours. Lit, colours are turned to linear
+    light; an .exr holds that, a .png is shown through Blender's view transform Standard (sRGB).
 
     Args:
         mesh: what to draw.
@@ -55,11 +55,12 @@ def draw(
         progress: called after each picture.
 
     Returns:
-        ``{"blender": its version, "build_seconds": float, "picture_seconds": [float, ...], "layers": most layers
-        behind each other, "bounce_limit": int}``.
+        ``{"blender": its version, "build_seconds": float, "picture_seconds": [float, ...], "layers": most
+        layers behind each other, "bounce_limit": int}``.
 
     Raises:
-        ValueError: options out of range, another suffix, pictures that do not match the cameras, an empty mesh.
+        ValueError: options out of range, another suffix, pictures that do not match the cameras, an empty
+        mesh.
         MissingDependencyError: neither bpy nor an executable, or no OpenGL libraries for EEVEE.
         BlenderError: Blender failed; the message holds what it said.
 
@@ -106,9 +107,9 @@ def _warn(mesh: SplatMesh, cameras: Sequence[Camera], layers: int, options: Scen
     shares = [hidden_by_limit(mesh, camera, threads=options.threads) for camera in cameras[:8]]
     share = float(np.max(shares)) if shares else 0.0
     warnings.warn(
-        f"up to {layers} triangles lie behind each other, and Cycles follows a ray through {MAX_LAYERS}: beyond, it is"
-        f" black ({share:.2%} of the pixels of a view are touched); draw fewer with --max-triangles on conversion or"
-        " a smaller part",
+        f"up to {layers} triangles lie behind each other, and Cycles follows a ray through {MAX_LAYERS}:"
+        f" beyond, it is black ({share:.2%} of the pixels of a view are touched); draw fewer, with"
+        " --max-triangles on conversion, or a smaller part",
         DataWarning,
         stacklevel=3,
     )

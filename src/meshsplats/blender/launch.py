@@ -40,10 +40,11 @@ def command(executable: Path | None) -> list[str]:
     if executable is None:
         if importlib.util.find_spec("bpy") is None:
             raise MissingDependencyError(
-                "Blender's Python module bpy is not installed in this environment. Make one for it, as it needs"
-                f" Python 3.11 and a NumPy of its own (this is Python {sys.version_info[0]}.{sys.version_info[1]}):"
-                " python3.11 -m venv blender-env && blender-env/bin/pip install 'meshsplats[blender]'; or name an"
-                " installed Blender: --executable /path/to/blender"
+                "Blender's Python module bpy is not installed in this environment. Make one for it, as it"
+                " needs Python 3.11 and a NumPy of its own (this is Python"
+                f" {sys.version_info[0]}.{sys.version_info[1]}): python3.11 -m venv blender-env &&"
+                " blender-env/bin/pip install 'meshsplats[blender]'; or name an installed Blender:"
+                " --executable /path/to/blender"
             )
         return [sys.executable, "-m", worker.__name__]
     found = shutil.which(executable)
@@ -76,10 +77,11 @@ def run_job(
 ) -> dict[str, Any]:
     """Has Blender build the scene, save ``blend`` and render ``pictures``, one a camera.
 
-    ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called after each picture.
-    Returns ``{"blender": version, "build_seconds": s, "picture_seconds": [s, ...]}``.
+    ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called after each
+    picture. Returns ``{"blender": version, "build_seconds": s, "picture_seconds": [s, ...]}``.
 
-    Raises BlenderError with Blender's own words if it fails, besides what ``command`` raises. Ctrl-C ends Blender too.
+    Raises BlenderError with Blender's own words if it fails, besides what ``command`` raises. Ctrl-C ends
+    Blender too.
     """
     start = command(executable)
     if options.engine == "eevee":
@@ -147,6 +149,9 @@ def _watch(
             process.kill()
             process.wait()
         raise
+    finally:
+        if process.stdout is not None:
+            process.stdout.close()
     if failure is not None:
         raise BlenderError(f"Blender stopped: {failure}")
     if not finished:

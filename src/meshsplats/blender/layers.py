@@ -14,7 +14,8 @@ from meshsplats.rendering import render
 
 _PROBE = 2.0**-12
 _PROBE_SIDE = 192
-"""Longer side in pixels of the pictures in which layers are counted: the count changes slowly over a picture."""
+"""Longer side in pixels of the pictures in which layers are counted: the count changes slowly over a
+picture."""
 
 
 def count_layers(mesh: SplatMesh, camera: Camera, *, threads: int | None = None) -> np.ndarray:
@@ -39,8 +40,8 @@ def most_layers(
 ) -> int:
     """The largest number of layers met from up to eight of the ``cameras`` and along ``directions``.
 
-    ``directions`` are (3,) unit vectors in the world frame from the subject to a far light; the scene's own six
-    axis directions stand for all the other ways that light takes.
+    ``directions`` are (3,) unit vectors in the world frame from the subject to a far light; the scene's own
+    six axis directions stand for all the other ways that light takes.
     """
     if len(mesh.faces) == 0:
         return 0
@@ -54,22 +55,31 @@ def most_layers(
         away = 20 * reach
         angle = 2 * np.degrees(np.arctan(reach / away))
         center = bounds.center + away * np.asarray(direction, np.float64)
-        side = {"width": _PROBE_SIDE, "height": _PROBE_SIDE}
         probes.append(
-            look_at(center, bounds.center, up=axes[1], fov=max(angle, 1.0), near=away / 100, **side)
+            look_at(
+                center,
+                bounds.center,
+                up=axes[1],
+                width=_PROBE_SIDE,
+                height=_PROBE_SIDE,
+                fov=max(angle, 1.0),
+                near=away / 100,
+            )
         )
     return max(int(count_layers(mesh, camera, threads=threads).max()) for camera in probes)
 
 
 def bounce_limit(layers: int, largest: int = 1024) -> int:
-    """A limit on transparent bounces for a scene of so many layers: a quarter more, as not every ray was tried."""
+    """A limit on transparent bounces for a scene of so many layers: a quarter more, as not every ray was
+    tried."""
     return int(min(largest, max(64, -(-layers * 5 // 4))))
 
 
 def hidden_by_limit(
     mesh: SplatMesh, camera: Camera, limit: int = 1024, *, threads: int | None = None
 ) -> float:
-    """Share of the pixels (0 to 1) that change by more than half a step of 8 bits if only ``limit`` layers count."""
+    """Share of the pixels (0 to 1) that change by more than half a step of 8 bits if only ``limit`` layers
+    count."""
     probe = camera.scaled(min(1.0, 2 * _PROBE_SIDE / max(camera.width, camera.height)))
     whole = render(mesh, probe, threads=threads).alpha
     cut = render(mesh, probe, max_layers=limit, threads=threads).alpha

@@ -1,8 +1,9 @@
 """Shading normals of splat meshes: smooth, and pointing outwards.
 
-The layers of a splat mesh are tilted by chance, and crossed ones stand upright on the surface; lit by their own
-normals they look mottled. Here each splat takes the normal of the surface that it and its neighbours form: their
-centres lie in it, and the largest of their discs lie along it. Which side is out is decided by looking: the side
+The layers of a splat mesh are tilted by chance, and crossed ones stand upright on the surface; lit by their
+own normals they look mottled. Here each splat takes the normal of the surface that it and its neighbours
+form: their centres lie in it, and the largest of their discs lie along it. Which side is out is decided by
+looking: the side
 from which cameras round the scene see the splat.
 """
 
@@ -19,8 +20,8 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 
 CELL = 2.5
-"""Side of the cells in which neighbours are sought, in spacings: measured on splats of a known surface, clean and
-noisy, where 2 to 3 give the least error (see docs/blender.md)."""
+"""Side of the cells in which neighbours are sought, in spacings: measured on splats of a known surface,
+clean and noisy, where 2 to 3 give the least error (see docs/blender.md)."""
 VIEWS = 24
 _SIDE = 160
 """Pixels of the square pictures that decide what is seen."""
@@ -32,10 +33,12 @@ _CHUNK = 1 << 16
 def shading_normals(
     mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
 ) -> np.ndarray:
-    """(v, 3) float32 unit normals for lighting the surface that the splats of ``mesh`` form, pointing outwards.
+    """(v, 3) float32 unit normals for lighting the surface that the splats of ``mesh`` form, pointing
+    outwards.
 
     All vertices of a splat share one. A mesh with normals of its own keeps them; without ``face_splat``, each
-    triangle counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` are places from which the
+    triangle counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` are places from
+    which the
     scene is seen, besides 24 round it: a room is seen from inside only.
     """
     if mesh.normals is not None:
@@ -102,8 +105,8 @@ def _unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
 
 
 def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Number of the splat that each face belongs to (f,), and of the n splats: centres (n, 3), weights (n,), area
-    times opacity, and (n, 3, 3) sums of weight times normal times normal over their triangles."""
+    """Number of the splat that each face belongs to (f,), and of the n splats: centres (n, 3), weights
+    (n,), area times opacity, and (n, 3, 3) sums of weight times normal times normal over their triangles."""
     if mesh.face_splat is None:
         starts = np.arange(len(mesh.faces))
     else:
@@ -143,8 +146,8 @@ class _Neighbours:
         self.cell_of = self.cell_of.reshape(-1)
 
     def sums(self, values: np.ndarray, width: float):
-        """Yields slices of points and (c, k) sums of ``values`` (n, k), weighted by a Gaussian of the distance to
-        each cell's middle with standard deviation ``width`` cells."""
+        """Yields slices of points and (c, k) sums of ``values`` (n, k), weighted by a Gaussian of the
+        distance to each cell's middle with standard deviation ``width`` cells."""
         count = len(self.cells)
         held = [np.bincount(self.cell_of, values[:, k], count) for k in range(values.shape[1])]
         cell_values = np.stack(held, axis=1)

@@ -20,8 +20,8 @@ class LightOptions:
     """Light and surroundings of lit pictures. Lengths follow the subject's size."""
 
     sun: tuple[float, float] = (-50.0, 45.0)
-    """Where the sun stands: azimuth (0 behind the viewer of the front, 90 on that viewer's right) and elevation,
-    degrees."""
+    """Where the sun stands: azimuth (0 behind the viewer of the front, 90 on that viewer's right) and
+    elevation, degrees."""
     sun_strength: float = 2.5
     """Irradiance of a surface that faces the sun, W/m^2; at pi, a white one has radiance 1. 0: no sun."""
     sun_size: float = 2.0
@@ -35,7 +35,8 @@ class LightOptions:
     hdri_rotation: float = 0.0
     """Degrees that the environment is turned round the up direction."""
     ground: Ground = "plane"
-    """What the subject stands on: a grey plane; a catcher, seen only where shadows fall (Cycles); or nothing."""
+    """What the subject stands on: a grey plane; a catcher, seen only where shadows fall (Cycles); or
+    nothing."""
     mirror: bool = False
     """A mirror behind the subject."""
     glass: bool = False
@@ -43,7 +44,8 @@ class LightOptions:
     roughness: float = 1.0
     """Roughness of the splats' surface, 0 to 1; it shows with --specular."""
     specular: float = 0.0
-    """Highlights of the splats' surface, 0 to 1; 0.5 is plastic. Splats have their own highlights painted on."""
+    """Highlights of the splats' surface, 0 to 1; 0.5 is plastic. Splats have their own highlights painted
+    on."""
     bounces: int = 4
     """How often light is scattered on its way, 0 to 64; layers that it passes through are not counted."""
 
@@ -109,7 +111,8 @@ class SceneOptions:
 
 
 def check_environment(path: Path) -> None:
-    """Raises ValueError unless ``path`` begins as a Radiance (.hdr) or OpenEXR file does; OSError if unreadable."""
+    """Raises ValueError unless ``path`` begins as a Radiance (.hdr) or OpenEXR file does; OSError if
+    unreadable."""
     with open(path, "rb") as file:
         start = file.read(10)
     if not (start.startswith((b"#?RADIANCE", b"#?RGBE")) or start[:4] == b"\x76\x2f\x31\x01"):

@@ -21,6 +21,12 @@ _FLOOR = 0.002
 SELF_SHADOW = 3.0
 """Distance within which layers do not shade each other, in spacings of the splats."""
 
+_CASTS = 0.25
+"""Opacity from which a splat casts a shadow in EEVEE."""
+_SUNK = 1.0
+"""How far below the surface the stand-in that casts it lies, in spacings: deeper, thin parts lose their
+shadow; less deep, it falls on the surface itself."""
+
 
 def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> tuple[int, int]:
     """Most layers behind each other, and the limit on transparent bounces that follows."""
@@ -61,20 +67,31 @@ def prepare(
     if options.light is not None:
         lit, facts["self_shadow"] = lit_arrays(mesh, cameras, threads=options.threads)
         arrays |= lit
+        if options.engine == "eevee":
+            arrays |= _caster(mesh, lit["normals"], facts["self_shadow"] * _SUNK / SELF_SHADOW)
     return arrays, facts
 
 
 def lit_arrays(
     mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
 ) -> tuple[dict[str, np.ndarray], float]:
-    """What a lit material needs: ``colors`` (v, 4) in linear light, ``normals`` (v, 3), ``faces`` (f, 3) wound so that
-    they face out; and the distance, scene units, within which layers must not shade each other."""
+    """What a lit material needs: ``colors`` (v, 4) in linear light, ``normals`` (v, 3), ``faces`` (f, 3)
+    wound so that they face out; and the distance, scene units, within which layers must not shade each
+    other."""
     colors = mesh.colors
     if mesh.blending == "display":
         colors = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
     normals = shading_normals(mesh, cameras, threads=threads)
     arrays = {"colors": colors, "normals": normals, "faces": _facing_out(mesh, normals)}
     return arrays, SELF_SHADOW * typical_spacing(mesh)
+
+
+def _caster(mesh: SplatMesh, normals: np.ndarray, depth: float) -> dict[str, np.ndarray]:
+    """``caster_vertices``, ``caster_faces``: a solid stand-in that casts the shadow in EEVEE, whose shadow
+    maps know no distance within which layers must not shade each other. It lies a little below the surface,
+    without what is faint."""
+    faces = mesh.faces[mesh.colors[mesh.faces, 3].max(axis=1) > _CASTS]
+    return {"caster_vertices": mesh.vertices - np.float32(depth) * normals, "caster_faces": faces}
 
 
 def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:

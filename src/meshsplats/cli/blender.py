@@ -46,10 +46,12 @@ class _Light(LightOptions):
 
 @dataclass(frozen=True)
 class Blender:
-    """Draws a mesh in Blender: a picture (-o picture.png or .exr), a folder of them, or the scene (-o scene.blend).
+    """Draws a mesh in Blender: a picture (-o picture.png or .exr), a folder of them, or the scene (-o
+    scene.blend).
 
-    Without --lit, the picture is that of `meshsplats render`. With it, sun and sky light the splats, which cast
-    shadows and are seen in mirrors and through glass. Splats are converted to a mesh first, with default settings.
+    Without --lit, the picture is that of `meshsplats render`. With it, sun and sky light the splats, which
+    cast shadows and are seen in mirrors and through glass. Splats are converted to a mesh first, with
+    default settings; with --lit, to one flat ellipse a splat (convert --mode flat), which takes light best.
     Needs Blender's module bpy in an environment of its own, or an installed Blender (--executable).
     """
 
@@ -60,7 +62,8 @@ class Blender:
     lit: bool = False
     """Light the splats; the options under "light" say how."""
     engine: Literal["cycles", "eevee"] = "cycles"
-    """cycles: exact. eevee: quicker on a graphics card; triangles are sorted for each view, which is nearly exact."""
+    """cycles: exact. eevee: quicker on a graphics card; triangles are sorted for each view, which is nearly
+    exact."""
     views: ViewOptions = field(default_factory=ViewOptions)
     light: _Light = field(default_factory=_Light)
     background: str = "white"
@@ -68,8 +71,8 @@ class Blender:
     transparent: bool = False
     """No background: pictures with an alpha channel."""
     samples: Count = None
-    """Unlit: side of the grid of samples in each pixel, as in render. Default: 2 (a .blend: 1). With --lit: samples a
-    pixel. Default: 64."""
+    """Unlit: side of the grid of samples in each pixel, as in render. Default: 2 (a .blend: 1). With --lit:
+    samples a pixel. Default: 64."""
     denoise: bool = False
     """With --lit, cycles: remove the noise of few samples."""
     format: Literal["png", "exr"] = "png"
@@ -103,7 +106,7 @@ class Blender:
         check_outputs(
             [*pictures, *([blend] if blend else []), *records], self.force, None if suffix else self.output
         )
-        mesh = _converted(scene)
+        mesh = _converted(scene, self.lit)
         if not suffix:
             self.output.mkdir(exist_ok=True)
         with _progress(len(pictures)) as advance:
@@ -121,7 +124,8 @@ class Blender:
         self._report(result, cameras, pictures, len(mesh.faces), time.perf_counter() - start)
 
     def _options(self, suffix: str) -> SceneOptions:
-        """What Blender is asked for, or UsageError for options that contradict each other or would do nothing."""
+        """What Blender is asked for, or UsageError for options that contradict each other or would do
+        nothing."""
         self.views.check()
         if suffix and suffix not in _FORMATS:
             raise UsageError(
@@ -194,12 +198,13 @@ class Blender:
         print(told)
 
 
-def _converted(scene: GaussianCloud | SplatMesh) -> SplatMesh:
+def _converted(scene: GaussianCloud | SplatMesh, lit: bool) -> SplatMesh:
     if isinstance(scene, SplatMesh):
         return scene
     from meshsplats.conversion import convert
 
-    return convert(scene)
+    # Crossed ellipses stand upright on the surface, where they catch too little light.
+    return convert(scene, mode="flat") if lit else convert(scene)
 
 
 @contextmanager

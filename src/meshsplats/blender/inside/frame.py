@@ -11,8 +11,8 @@ from meshsplats.framing import front_axes
 
 
 def to_blender(up: np.ndarray) -> np.ndarray:
-    """(3, 3) float64 rotation from the world frame to Blender's for a unit ``up``: the scene stands upright, its
-    front towards -y, where Blender's front view looks from."""
+    """(3, 3) float64 rotation from the world frame to Blender's for a unit ``up``: the scene stands
+    upright, its front towards -y, where Blender's front view looks from."""
     right, upward, forward = front_axes(np.asarray(up, np.float64))
     return np.stack([right, forward, upward])
 
@@ -27,8 +27,8 @@ def camera_pose(camera: Camera, rotation: np.ndarray) -> np.ndarray:
 
 
 def lens(camera: Camera, sensor_width: float = 36.0) -> dict[str, Any]:
-    """Blender's settings for the camera's lens, sensor fit HORIZONTAL: ``lens`` in mm, ``shift_x``, ``shift_y``,
-    ``pixel_aspect_x``, ``pixel_aspect_y`` (these two belong to the scene)."""
+    """Blender's settings for the camera's lens, sensor fit HORIZONTAL: ``lens`` in mm, ``shift_x``,
+    ``shift_y``, ``pixel_aspect_x``, ``pixel_aspect_y`` (these two belong to the scene)."""
     aspect = (camera.fy / camera.fx, 1.0) if camera.fy >= camera.fx else (1.0, camera.fx / camera.fy)
     ratio = aspect[1] / aspect[0]
     return {

@@ -41,7 +41,8 @@ class _Tree:
 
 
 def unlit(name: str = "Splats, unlit", *, attribute: str = COLOR) -> Any:
-    """Shows the colours of ``attribute`` as they are, composited by opacity: from any side, in mirrors and through glass."""
+    """Shows the colours of ``attribute`` as they are, composited by opacity: from any side, in mirrors and
+    through glass."""
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
     color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=attribute)
@@ -63,9 +64,9 @@ def lit(
     """A surface that lights and shadows act on, its linear colours and opacity in ``attribute``.
 
     Many translucent layers make one surface, and each is shaded as if it lay in that surface: by the smoothed
-    normal in the attribute ``splat_normal`` (``smooth`` False: by the triangle's own). A ray that starts on one
-    layer does not see the others within ``self_shadow`` (scene units): they would shade it by chance, half of it
-    on average. Shadows of things farther off than that are not touched.
+    normal in the attribute ``splat_normal`` (``smooth`` False: by the triangle's own). A ray that starts on
+    one layer does not see the others within ``self_shadow`` (scene units): they would shade it by chance,
+    half of it on average. Shadows of things farther off than that are not touched.
     """
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
@@ -151,7 +152,8 @@ def glass(name: str = "Glass") -> Any:
     surface = tree.node("ShaderNodeBsdfGlass", 0)
     surface.inputs["Roughness"].default_value = 0
     surface.inputs["IOR"].default_value = 1.45
-    # Light that reaches a place through glass is a caustic, which path tracing finds late: let shadows rays pass.
+    # Light that reaches a place through glass is a caustic, which path tracing finds late: let shadows rays
+    # pass.
     path = tree.node("ShaderNodeLightPath", 0, 2)
     clear = tree.node("ShaderNodeBsdfTransparent", 0, 1)
     clear.inputs[0].default_value = (0.9, 0.9, 0.9, 1)

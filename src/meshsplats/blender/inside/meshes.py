@@ -27,17 +27,12 @@ def make_mesh(
     face_splat: np.ndarray | None = None,
     edges: bool = True,
 ) -> Any:
-    """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored as they are.
+    """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored as they
+    are.
 
     ``edges`` False leaves out the edges, which renderers do not need but editing does.
     """
-    mesh = bpy.data.meshes.new(name)
-    mesh.vertices.add(len(vertices))
-    mesh.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
-    mesh.loops.add(3 * len(faces))
-    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
-    mesh.polygons.add(len(faces))
-    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
+    mesh = make_plain(name, vertices, faces)
     color = mesh.attributes.new(COLOR, "FLOAT_COLOR", "POINT")
     color.data.foreach_set("color", np.ascontiguousarray(colors, np.float32).ravel())
     if normals is not None:
@@ -52,6 +47,18 @@ def make_mesh(
     if normals is not None:
         # Cycles lights no side of a surface that its own normal, as smooth as the mesh says, does not face.
         versions.set_normals(mesh, normals)
+    return mesh
+
+
+def make_plain(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """A bpy mesh of (v, 3) float32 vertices and (f, 3) int32 faces."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(vertices))
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(vertices, np.float32).ravel())
+    mesh.loops.add(3 * len(faces))
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, 3 * len(faces), 3, dtype=np.int32))
     return mesh
 
 
@@ -72,6 +79,7 @@ def set_faces(mesh: Any, faces: np.ndarray) -> None:
 
 
 def far_to_near(vertices: np.ndarray, faces: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
-    """(f,) order of the faces for a painter: descending depth of their middles. Frame: that of the vertices."""
+    """(f,) order of the faces for a painter: descending depth of their middles. Frame: that of the
+    vertices."""
     depth = vertices @ world_to_camera[2, :3].astype(np.float32)
     return np.argsort(-depth[faces].sum(axis=1), kind="stable")

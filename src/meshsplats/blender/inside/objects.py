@@ -10,7 +10,7 @@ import numpy as np
 from meshsplats.blender.inside import frame, materials, meshes, pictures, versions
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.subject import lit_arrays
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import Blending, SplatMesh
 
 LIT = "meshsplats_lit"
 """Property of the mesh data: whether its colours are linear light and its material lit."""
@@ -72,7 +72,7 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
 
     Raises ValueError for an object that is not a mesh of triangles with the colours of this project.
     """
-    data = getattr(thing, "data", None)
+    data: Any = getattr(thing, "data", None)
     if thing is None or thing.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
         raise ValueError("the object was not made by MeshSplats")
     vertices = np.empty(3 * len(data.vertices), np.float32)
@@ -95,15 +95,16 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
         if (np.diff(owner) < 0).any():
             owner = None
     up = np.array(data[UP])
-    blending = "linear" if data[LINEAR] else "display"
+    blending: Blending = "linear" if data[LINEAR] else "display"
     return SplatMesh(
         vertices.reshape(-1, 3), faces.reshape(-1, 3), colors, face_splat=owner, up=up, blending=blending
     )
 
 
 def render_settings(scene: Any, things: list[Any], lit: bool) -> int:
-    """Sets the scene up for ``things``: engine settings, colour management and the limit on transparent bounces, which
-    is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor EEVEE)."""
+    """Sets the scene up for ``things``: engine settings, colour management and the limit on transparent
+    bounces, which is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor
+    EEVEE)."""
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
     layers = sum(int(thing.data.get(LAYERS, 256)) for thing in things)
@@ -117,10 +118,11 @@ def render_settings(scene: Any, things: list[Any], lit: bool) -> int:
 
 
 def dress(thing: Any, lit: bool) -> Any:
-    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) a material that shows its vertex colours.
+    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) a material that shows its vertex
+    colours.
 
-    They are taken for linear light, as these importers leave them. Returns the material. Raises ValueError if the
-    object has no colours.
+    They are taken for linear light, as these importers leave them. Returns the material. Raises ValueError
+    if the object has no colours.
     """
     data = thing.data if thing is not None and thing.type == "MESH" else None
     if data is None or not len(data.color_attributes):

@@ -37,8 +37,8 @@ def lit_settings(
     denoise: bool = False,
     raytracing: bool = False,
 ) -> None:
-    """Linear light, shown with the view transform Standard (sRGB); ``limit`` layers may lie behind each other.
-    ``raytracing``: EEVEE traces what mirrors and glass show."""
+    """Linear light, shown with the view transform Standard (sRGB); ``limit`` layers may lie behind each
+    other. ``raytracing``: EEVEE traces what mirrors and glass show."""
     _common(scene, engine, "Standard")
     cycles = scene.cycles
     cycles.samples = samples
@@ -82,8 +82,8 @@ def _common(scene: Any, engine: str, view: str) -> None:
 
 
 def render_to(scene: Any, path: Path, factor: int = 1) -> None:
-    """Renders to ``path``, .png (8 bits) or .exr (32 bits). ``factor`` > 1: the mean of that many squared pixels
-    becomes one."""
+    """Renders to ``path``, .png (8 bits) or .exr (32 bits). ``factor`` > 1: the mean of that many squared
+    pixels becomes one."""
     transparent = scene.render.film_transparent
     picture = scene.render.image_settings
     picture.color_mode = "RGBA" if transparent else "RGB"

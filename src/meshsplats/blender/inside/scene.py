@@ -43,6 +43,10 @@ class Subject:
     """(v, 3) float32 unit shading normals, where lit."""
     face_splat: np.ndarray | None = None
     """(f,) int32."""
+    caster_vertices: np.ndarray | None = None
+    """(w, 3) float32 stand-in that casts the shadow in EEVEE."""
+    caster_faces: np.ndarray | None = None
+    """(g, 3) int32."""
     name: str = "Splats"
 
 
@@ -101,6 +105,17 @@ def build(
             smooth=subject.normals is not None,
         )
         mesh.materials.append(material)
+        if subject.caster_vertices is not None and subject.caster_faces is not None:
+            caster = meshes.make_plain(
+                f"{subject.name} shadow", subject.caster_vertices, subject.caster_faces
+            )
+            caster.update(calc_edges=edges)
+            caster.materials.append(materials.plain("Shadow", stage.GREY))
+            stand_in = meshes.make_object(caster, caster.name, rotation, splats)
+            stand_in.visible_camera = False
+            stand_in.parent = thing
+            stand_in.matrix_parent_inverse = thing.matrix_world.inverted()
+            thing.visible_shadow = False
         _light(subject, light, center, made[0].matrix_world.translation if made else None, options)
         pictures.lit_settings(
             scene,
@@ -129,9 +144,9 @@ def _light(
     """Sun, world, ground, mirror and glass round the subject, placed for someone at ``viewer``."""
     radius = subject.radius
     if light.sun_strength > 0:
-        stage.add_sun(
-            frame.sun_direction(*light.sun), light.sun_strength, light.sun_size, stage.collection("Lights")
-        )
+        direction = frame.sun_direction(*light.sun)
+        home = stage.collection("Lights")
+        stage.add_sun(direction, light.sun_strength, light.sun_size, 0.004 * radius, home)
     if light.hdri is not None:
         stage.environment_world(str(light.hdri), light.hdri_strength, light.hdri_rotation)
     else:

@@ -1,4 +1,5 @@
-"""What surrounds the mesh in Blender: cameras, sun, sky, ground, mirror, glass ball, each in a named collection."""
+"""What surrounds the mesh in Blender: cameras, sun, sky, ground, mirror, glass ball, each in a named
+collection."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ def collection(name: str) -> Any:
 
 
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
-    """A Blender camera like ``camera``; what is farther than ``reach`` is cut off. Its pixel aspect is the scene's:
-    see ``aim``."""
+    """A Blender camera like ``camera``; what is farther than ``reach`` is cut off. Its pixel aspect is the
+    scene's: see ``aim``."""
     data = bpy.data.cameras.new(name)
     settings = frame.lens(camera)
     data.sensor_fit = "HORIZONTAL"
@@ -51,13 +52,13 @@ def aim(scene: Any, camera: Camera, thing: Any, factor: int = 1) -> None:
     scene.render.pixel_aspect_y = settings["pixel_aspect_y"]
 
 
-def add_sun(direction: np.ndarray, strength: float, size: float, home: Any) -> Any:
-    """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees."""
+def add_sun(direction: np.ndarray, strength: float, size: float, detail: float, home: Any) -> Any:
+    """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees. ``detail``:
+    smallest thing that EEVEE's shadow maps resolve, scene units."""
     data = bpy.data.lights.new("Sun", "SUN")
     data.energy = strength
     data.angle = float(np.radians(size))
-    # Shadows of EEVEE: as fine as they go, soft as the sun's size says.
-    versions.set_if_there(data, use_shadow=True, use_shadow_jitter=True, shadow_maximum_resolution=0.0005)
+    versions.set_if_there(data, use_shadow=True, shadow_maximum_resolution=detail)
     thing = bpy.data.objects.new("Sun", data)
     thing.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
     thing.location = (direction * 5).tolist()
@@ -91,7 +92,8 @@ def _background(tree: Any, color: Sequence[float]) -> Any:
 
 
 def environment_world(path: str, strength: float, rotation: float) -> Any:
-    """A world lit by the environment picture at ``path``, packed into the file, turned by ``rotation`` degrees."""
+    """A world lit by the environment picture at ``path``, packed into the file, turned by ``rotation``
+    degrees."""
     image = bpy.data.images.load(path)
     if 0 in image.size:
         raise ValueError(f"{path}: Blender cannot read this environment picture")
@@ -125,7 +127,8 @@ def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> A
 
 
 def add_mirror(center: np.ndarray, facing: np.ndarray, width: float, height: float, home: Any) -> Any:
-    """An upright mirror, its lower edge's middle at ``center`` (3,), that faces the level direction ``facing``."""
+    """An upright mirror, its lower edge's middle at ``center`` (3,), that faces the level direction
+    ``facing``."""
     corners = [(-width / 2, 0, 0), (width / 2, 0, 0), (width / 2, 0, height), (-width / 2, 0, height)]
     thing = _faces("Mirror", corners, [(0, 1, 2, 3)], home)
     thing.location = center.tolist()

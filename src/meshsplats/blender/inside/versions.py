@@ -34,7 +34,8 @@ def socket(sockets: Any, *names: str) -> Any:
 
 
 def set_normals(mesh: Any, normals: np.ndarray) -> None:
-    """Gives each vertex of a bpy mesh its (v, 3) normal; the faces must wind so that their own agree with it."""
+    """Gives each vertex of a bpy mesh its (v, 3) normal; the faces must wind so that their own agree with
+    it."""
     normals = np.ascontiguousarray(normals, np.float32)
     if bpy.app.version < (4, 5, 0):
         mesh.normals_split_custom_set_from_vertices(normals)

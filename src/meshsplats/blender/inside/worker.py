@@ -1,5 +1,6 @@
-"""Carries out a job inside Blender: ``python -m meshsplats.blender.inside.worker job.json``, or Blender itself with
-``--python worker.py -- job.json``. ``meshsplats.blender.launch`` writes the job and reads the result."""
+"""Carries out a job inside Blender: ``python -m meshsplats.blender.inside.worker job.json``, or Blender
+itself with ``--python worker.py -- job.json``. ``meshsplats.blender.launch`` writes the job and reads the
+result."""
 
 from __future__ import annotations
 

@@ -1,0 +1,97 @@
+# ruff: noqa: E402
+"""The extension as Blender sees it: its manifest, its installation from the .zip, import, another
+conversion, the picture, and its removal."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
+
+from _blender_scenes import ball_splats, random_mesh
+
+from meshsplats import save_gaussians, save_mesh
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = Path(__file__).with_name("_extension_session.py")
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("extension")
+    command = [sys.executable, str(ROOT / "blender_extension" / "build.py"), "-o", str(folder)]
+    if "MESHSPLATS_WHEEL" in os.environ:  # built already
+        command += ["--wheel", os.environ["MESHSPLATS_WHEEL"]]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return next(folder.glob("*.zip"))
+
+
+def test_blenders_own_tool_accepts_the_package(packed):
+    tool = Path(bpy.utils.system_resource("SCRIPTS")) / "addons_core" / "bl_pkg" / "cli" / "blender_ext.py"
+    done = subprocess.run(
+        [sys.executable, str(tool), "validate", str(packed)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Error" not in done.stdout + done.stderr
+
+
+def test_package_holds_one_wheel_for_one_platform(packed):
+    with zipfile.ZipFile(packed) as archive:
+        names = archive.namelist()
+        manifest = archive.read("blender_manifest.toml").decode()
+    wheels = [name for name in names if name.startswith("wheels/")]
+    assert len(wheels) == 1
+    assert f'wheels = ["./{wheels[0]}"]' in manifest
+    assert 'license = ["SPDX:GPL-3.0-or-later"]' in manifest
+    assert {"__init__.py", "LICENSE", "blender_manifest.toml"} <= set(names)
+    assert "build.py" not in names
+
+
+def test_platform_names():
+    spec = importlib.util.spec_from_file_location("build", ROOT / "blender_extension" / "build.py")
+    build = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(build)
+    assert build.platform_of("meshsplats-0.1.0-py3-none-manylinux_2_28_x86_64.whl") == "linux-x64"
+    assert build.platform_of("meshsplats-0.1.0-py3-none-macosx_11_0_arm64.whl") == "macos-arm64"
+    with pytest.raises(ValueError, match="not a wheel of a platform"):
+        build.platform_of("meshsplats-0.1.0-py3-none-any.whl")
+
+
+def test_a_whole_session(packed, tmp_path):
+    """In a process of its own, where meshsplats comes from the extension's wheel alone."""
+    save_gaussians(ball_splats(400)[0], tmp_path / "ball.ply")
+    save_mesh(random_mesh(30), tmp_path / "mesh.npz")
+    (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense")
+    environment = {
+        **os.environ,
+        "BLENDER_USER_RESOURCES": str(tmp_path / "blender"),
+        "BLENDER_USER_EXTENSIONS": str(tmp_path / "blender" / "extensions"),
+        "PYTHONNOUSERSITE": "1",
+    }
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), str(packed), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    told = json.loads((tmp_path / "told.json").read_text())
+    assert str(tmp_path / "blender") in told["package"], "meshsplats comes from the wheel"
+    assert told["imported"] == ["FINISHED"]
+    assert told["triangles"]["default"] > told["triangles"]["fewer"] > 0
+    assert told["materials"] == ["Splats, lit", "Splats, unlit"]
+    assert told["moved"] == [1.0, 2.0, 3.0], "converting again leaves the object where it was"
+    assert 64 <= told["bounces"] <= 1024
+    assert told["broken"].startswith("Error: ")
+    assert "broken.ply" in told["broken"]
+    assert told["left"] == []
+    assert told["mean"] < 0.99, "something was drawn"

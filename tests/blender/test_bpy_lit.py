@@ -1,0 +1,147 @@
+# ruff: noqa: E402
+"""Lit pictures against a known surface lit the same way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
+
+from _blender_scenes import ball_splats
+
+from meshsplats import convert, orbit, render
+from meshsplats.blender import LightOptions, SceneOptions, subject
+from meshsplats.blender.inside import materials, meshes, pictures, scene, stage, versions
+from meshsplats.camera import look_at
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.metrics import psnr
+
+
+def built(mesh, view, options):
+    layers, limit = subject.count(mesh, [view], options)
+    arrays, facts = subject.prepare(mesh, [view], options, layers)
+    return scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
+
+
+def shot(made, view, path):
+    stage.aim(made.scene, view, made.cameras[0])
+    pictures.render_to(made.scene, path)
+    return pictures.read_pixels(path)[..., :3]
+
+
+def display(values):
+    return linear_to_srgb(np.clip(values, 0, 1))
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    """Linear pictures of splats on a ball, of the ball itself, and of the ground alone."""
+    folder = tmp_path_factory.mktemp("ball")
+    cloud, _ = ball_splats(3000)
+    mesh = convert(cloud, mode="flat")
+    view = orbit(mesh, 1, elevation=35, azimuth=20, width=128, height=96, distance=2.2)[0]
+    options = SceneOptions(light=LightOptions(sun=(100, 40), bounces=1), samples=24)
+    made = built(mesh, view, options)
+    splats = shot(made, view, folder / "splats.exr")
+    made.thing.hide_render = True
+    ground = shot(made, view, folder / "ground.exr")
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=128, ring_count=64, radius=1)
+    true = bpy.context.object
+    true.data.shade_smooth()
+    grey, red = (srgb_to_linear(np.array(c)).tolist() for c in ([0.7, 0.7, 0.7], [0.8, 0.2, 0.1]))
+    true.data.materials.append(materials.plain("Grey", grey))
+    true.data.materials.append(materials.plain("Red", red))
+    for polygon in true.data.polygons:
+        polygon.material_index = int(polygon.center.z > 0.5)  # y down in the file is up here
+    solid = shot(made, view, folder / "solid.exr")
+    covered = render(mesh, view).alpha
+    return splats, solid, ground, covered
+
+
+def test_splats_look_like_the_surface_they_were_taken_from(ball):
+    splats, solid, _, covered = ball
+    assert psnr(display(splats), display(solid)) > 29
+    inside = covered > 0.99
+    assert 0.95 < splats[inside].mean() / solid[inside].mean() < 1.03
+
+
+def test_layers_do_not_speckle_or_mottle(ball):
+    """Away from edges, neighbouring pixels differ as little as on the smooth surface, but for the noise."""
+    splats, solid, _, covered = ball
+    inside = (
+        np.minimum.reduce([covered[1:-1, 1:-1], covered[:-2, 1:-1], covered[2:, 1:-1], covered[1:-1, 2:]])
+        > 0.995
+    )
+
+    def roughness(picture):
+        grey = display(picture).mean(axis=2)
+        middle = grey[1:-1, 1:-1]
+        around = (grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]) / 4
+        return np.median(np.abs(middle - around)[inside])
+
+    assert roughness(splats) < roughness(solid) + 0.025
+
+
+def test_shadow_falls_where_the_surface_throws_it(ball):
+    splats, solid, ground, covered = ball
+    floor = (covered < 0.02) & (ground.mean(axis=2) > 0.05)
+    dark = [picture.mean(axis=2)[floor] < 0.75 * ground.mean(axis=2)[floor] for picture in (splats, solid)]
+    assert dark[1].sum() > 200
+    assert (dark[0] & dark[1]).sum() / (dark[0] | dark[1]).sum() > 0.9
+
+
+@pytest.mark.parametrize("tilt", [10, 60, 85])
+@pytest.mark.parametrize("side", [-60, 60])
+def test_light_follows_the_smoothed_normal_only(tmp_path, tilt, side):
+    """A triangle askew in a surface is as bright as the surface, from both sides and for every light."""
+    t, a = np.radians(tilt), np.radians(side)
+    square = 3 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    corners = np.stack([square[:, 0] * np.cos(t), square[:, 1], square[:, 0] * np.sin(t)], axis=1)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    versions.enable_cycles()
+    home = stage.collection("all")
+    normals = np.tile([0.0, 0, 1], (4, 1))
+    faces, grey = np.array([[0, 1, 2], [0, 2, 3]]), np.tile([0.5, 0.5, 0.5, 1], (4, 1))
+    data = meshes.make_mesh("m", corners, faces, grey, normals=normals)
+    data.materials.append(materials.lit(self_shadow=0.1))
+    meshes.make_object(data, "m", np.eye(3), home)
+    stage.even_world((0, 0, 0))
+    view = look_at((5 * np.sin(a), 0, 5 * np.cos(a)), (0, 0, 0), up=(0, 1, 0), width=8, height=8, fov=2)
+    camera = stage.add_camera(view, "c", np.eye(3), 100, home)
+    for height in (20, 70):
+        for way in (-1, 1):
+            direction = np.array([way * np.cos(np.radians(height)), 0, np.sin(np.radians(height))])
+            sun = stage.add_sun(direction, np.pi, 0, 0.01, home)
+            pictures.lit_settings(bpy.context.scene, "cycles", samples=1, limit=64, bounces=0)
+            stage.aim(bpy.context.scene, view, camera)
+            pictures.render_to(bpy.context.scene, tmp_path / "a.exr")
+            found = pictures.read_pixels(tmp_path / "a.exr")[4, 4, 0]
+            assert np.isclose(found, 0.5 * direction[2], atol=2e-3)
+            bpy.data.objects.remove(sun)
+
+
+def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
+    """Slow without a graphics card: one small scene for both."""
+    pytest.importorskip("ctypes").CDLL("libEGL.so.1")
+    cloud, _ = ball_splats(400)
+    mesh = convert(cloud, mode="flat")
+    view = orbit(mesh, 1, elevation=35, azimuth=20, width=64, height=48, distance=2.2)[0]
+    from meshsplats.blender import draw
+
+    draw(mesh, [view], pictures=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
+    plain = pictures.read_pixels(tmp_path / "plain.exr")[..., :3]
+    assert psnr(np.clip(plain, 0, 1), render(mesh, view).color) > 30
+    light = LightOptions(sun=(100, 40), sky=0.2)
+    options = SceneOptions(light=light, engine="eevee", samples=2)
+    draw(mesh, [view], pictures=[tmp_path / "lit.exr"], options=options)
+    bare = replace(options, light=replace(light, sun_strength=0.0))
+    lit = pictures.read_pixels(tmp_path / "lit.exr").mean(axis=2)
+    draw(mesh, [view], pictures=[tmp_path / "bare.exr"], options=bare)
+    dark = pictures.read_pixels(tmp_path / "bare.exr").mean(axis=2)
+    floor = (render(mesh, view).alpha < 0.01) & (np.arange(48) > 30)[:, None]
+    sun = (lit - dark)[floor]
+    assert sun.max() > 0.2, "the sun shines on the ground"
+    assert (sun < 0.1 * sun.max()).sum() > 20, "but not in the shadow"

@@ -1,0 +1,197 @@
+# ruff: noqa: E402
+"""Saved .blend files open ready to use, and the command line makes them."""
+
+from __future__ import annotations
+
+import json
+import stat
+import sys
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
+
+from _blender_scenes import ball_splats, cameras, random_mesh
+
+from meshsplats import convert, load_mesh, save_cameras, save_gaussians, save_mesh
+from meshsplats.blender import LightOptions, SceneOptions, draw
+from meshsplats.blender.inside import meshes, pictures, versions
+from meshsplats.cli import main
+from meshsplats.pictures import load_png
+
+
+def environment(path):
+    """A small environment picture, brighter above."""
+    image = bpy.data.images.new("sky", 8, 4, float_buffer=True)
+    values = np.ones((4, 8, 4), np.float32)
+    values[2:] = 3
+    image.pixels.foreach_set(values.ravel())
+    image.file_format = "HDR"
+    image.filepath_raw = str(path)
+    image.save()
+    return path
+
+
+def test_unlit_file_renders_the_picture_again(tmp_path):
+    mesh = random_mesh()
+    views = cameras()[1:3]
+    targets = [tmp_path / "a.png", tmp_path / "b.png"]
+    draw(mesh, views, pictures=targets, blend=tmp_path / "s.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
+    scene = bpy.context.scene
+    assert [c.name for c in scene.collection.children] == ["Splats", "Cameras"]
+    assert scene.camera.name == "wide"
+    assert [marker.camera.name for marker in scene.timeline_markers] == ["wide", "tall"]
+    assert (scene.frame_start, scene.frame_end) == (0, 1)
+    pictures.render_to(scene, tmp_path / "again.png")
+    assert (load_png(tmp_path / "again.png") == load_png(targets[0])).all()
+
+
+def test_lit_file_has_everything_in_named_collections(tmp_path):
+    cloud, _ = ball_splats(300)
+    light = LightOptions(mirror=True, glass=True, hdri=environment(tmp_path / "sky.hdr"), hdri_rotation=90)
+    draw(
+        convert(cloud),
+        cameras()[:1],
+        blend=tmp_path / "s.blend",
+        options=SceneOptions(light=light, samples=5),
+    )
+    (tmp_path / "sky.hdr").unlink()  # it is in the file
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
+    scene = bpy.context.scene
+    named = {c.name: sorted(o.name for o in c.objects) for c in scene.collection.children}
+    assert named == {
+        "Splats": ["Splats"],
+        "Cameras": ["view_0000"],
+        "Lights": ["Sun"],
+        "Surroundings": ["Glass ball", "Ground", "Mirror"],
+    }
+    image = next(node.image for node in scene.world.node_tree.nodes if node.type == "TEX_ENVIRONMENT")
+    assert image.packed_file is not None
+    assert tuple(image.size) == (8, 4)
+    assert scene.cycles.samples == 5
+    assert 64 <= scene.cycles.transparent_max_bounces < 1024
+    data = bpy.data.objects["Splats"].data
+    assert data.materials[0].name == "Splats, lit"
+    assert {meshes.COLOR, meshes.NORMAL, meshes.SPLAT} <= set(data.attributes.keys())
+    assert data.validate(verbose=True) is False, "Blender finds nothing to mend"
+
+
+def test_mesh_arrays_arrive_as_they_are():
+    mesh = random_mesh(50)
+    normals = np.tile(np.float32([0, 0.6, 0.8]), (len(mesh.vertices), 1))
+    data = meshes.make_mesh(
+        "m", mesh.vertices, mesh.faces, mesh.colors, normals=normals, face_splat=mesh.face_splat
+    )
+    assert data.validate(verbose=True) is False
+    assert len(data.edges) == 150
+    found = np.empty(4 * len(mesh.vertices), np.float32)
+    data.attributes[meshes.COLOR].data.foreach_get("color", found)
+    assert (found.reshape(-1, 4) == mesh.colors).all()
+    assert [tuple(p.vertices) for p in data.polygons] == [tuple(face) for face in mesh.faces]
+    owners = [value.value for value in data.attributes[meshes.SPLAT].data]
+    assert owners == mesh.face_splat.tolist()
+
+
+def test_scene_stands_upright():
+    from meshsplats.blender.inside import frame
+
+    for up in ([0, -1, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, -0.8]):
+        rotation = frame.to_blender(np.array(up, float))
+        assert np.allclose(rotation @ up, [0, 0, 1])
+        assert np.isclose(np.linalg.det(rotation), 1)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".glb", ".ply"])
+def test_command_line_draws_meshes_and_splats(tmp_path, suffix, capsys):
+    source = tmp_path / f"in{suffix}"
+    if suffix == ".ply":
+        save_gaussians(ball_splats(200)[0], source)
+    else:
+        save_mesh(random_mesh(40), source)
+    save_cameras(cameras()[:2], tmp_path / "c.json")
+    arguments = [
+        "blender",
+        str(source),
+        "-o",
+        str(tmp_path / "out"),
+        "--cameras",
+        str(tmp_path / "c.json"),
+        "--json",
+    ]
+    assert main(arguments) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["pictures"]) == len(told["picture_seconds"]) == 2
+    assert told["blender"] == bpy.app.version_string
+    assert load_png(told["pictures"][1]).shape == (40, 72, 3)
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "cameras.json",
+        "config.json",
+        "view_0000.png",
+        "view_0001.png",
+    ]
+    assert main(arguments) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_executable_runs_the_worker_by_itself(tmp_path):
+    """A stand-in for Blender's program: bpy run as Blender runs scripts, without this package installed."""
+    program = tmp_path / "blender"
+    program.write_text(
+        f"#!{sys.executable} -I\n"
+        "import sys\n"
+        "if sys.argv[1] == '--version':\n"
+        "    print('Blender 4.2.0')\n"
+        "    sys.exit()\n"
+        "sys.meta_path = [f for f in sys.meta_path if 'meshsplats' not in repr(f).lower()]\n"
+        "sys.path = [p for p in sys.path if 'meshsplats' not in p]\n"
+        "script = sys.argv[sys.argv.index('--python') + 1]\n"
+        "exec(compile(open(script).read(), script, 'exec'), {'__name__': '__main__', '__file__': script,"
+        " '__package__': ''})\n"
+    )
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    result = draw(
+        random_mesh(20),
+        cameras()[:1],
+        pictures=[tmp_path / "a.png"],
+        blend=tmp_path / "a.blend",
+        executable=program,
+    )
+    assert result["blender"] == bpy.app.version_string
+    assert load_png(tmp_path / "a.png").shape == (48, 64, 3)
+    assert (tmp_path / "a.blend").stat().st_size > 10_000
+
+
+def test_errors_inside_blender_come_out_in_words(tmp_path):
+    from meshsplats.blender import BlenderError
+
+    broken = tmp_path / "sky.hdr"
+    broken.write_bytes(b"#?RADIANCE\nbroken")
+    options = SceneOptions(light=LightOptions(hdri=broken), samples=1)
+    with pytest.raises(BlenderError, match=r"sky\.hdr: Blender cannot read this environment picture"):
+        draw(random_mesh(5), cameras()[:1], pictures=[tmp_path / "a.png"], options=options)
+    assert [path.name for path in tmp_path.iterdir()] == ["sky.hdr"]
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".ply"])
+def test_files_opened_by_blenders_own_importers_get_a_material(tmp_path, suffix):
+    from meshsplats.blender.inside import objects
+
+    mesh = random_mesh(30)
+    save_mesh(mesh, tmp_path / f"m{suffix}")
+    assert len(load_mesh(tmp_path / f"m{suffix}").faces) == 30
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    versions.enable_cycles()
+    if suffix == ".glb":
+        bpy.ops.import_scene.gltf(filepath=str(tmp_path / "m.glb"))
+    else:
+        bpy.ops.wm.ply_import(filepath=str(tmp_path / "m.ply"), import_colors="LINEAR")
+    thing = next(o for o in bpy.data.objects if o.type == "MESH")
+    for lit in (True, False):
+        material = objects.dress(thing, lit)
+        assert list(thing.data.materials) == [material]
+    attribute = next(n for n in material.node_tree.nodes if n.type == "ATTRIBUTE")
+    assert attribute.attribute_name in thing.data.color_attributes
+    with pytest.raises(ValueError, match="no vertex colours"):
+        objects.dress(bpy.data.objects.new("empty", None), True)

@@ -1,0 +1,74 @@
+"""Shading normals: those of a known surface, outwards, whatever the layers' own tilt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _blender_scenes import ball_splats, sheets
+
+from meshsplats import convert
+from meshsplats.blender.normals import shading_normals, typical_spacing
+from meshsplats.blender.subject import lit_arrays
+from meshsplats.colors import srgb_to_linear
+
+
+def angles(mesh, normals, true):
+    """Degrees between the normal of each splat and the truth."""
+    first = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) != 0]))
+    found = normals[mesh.faces[first, 0]]
+    return np.degrees(np.arccos(np.clip((found * true[mesh.face_splat[first]]).sum(axis=1), -1, 1)))
+
+
+@pytest.mark.parametrize(("noise", "mean", "worst"), [(0.0, 2.0, 8.0), (0.35, 6.0, 30.0)])
+def test_normals_of_a_ball_point_outwards_and_are_smooth(noise, mean, worst):
+    cloud, true = ball_splats(noise=noise)
+    mesh = convert(cloud)
+    found = angles(mesh, shading_normals(mesh), true)
+    assert found.mean() < mean
+    assert found.max() < worst
+
+
+def test_normals_turn_with_the_scene():
+    cloud, _ = ball_splats(800)
+    mesh = convert(cloud)
+    turn = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], np.float32)
+    moved = replace(mesh, vertices=5 * mesh.vertices @ turn.T + 3, up=turn @ mesh.up)
+    difference = shading_normals(moved) - shading_normals(mesh) @ turn.T
+    # Cells lie elsewhere and views see other pixels: nearly the same, not the same.
+    assert np.abs(difference).mean() < 0.02
+
+
+def test_unit_length_and_own_normals_are_kept():
+    cloud, _ = ball_splats(500)
+    mesh = convert(cloud)
+    normals = shading_normals(mesh)
+    assert normals.dtype == np.float32
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    own = np.tile(np.float32([0, 0, 1]), (len(mesh.vertices), 1))
+    assert (shading_normals(replace(mesh, normals=own)) == own).all()
+
+
+def test_a_mesh_without_splats_and_degenerate_ones_work():
+    plain = sheets(1, 1.0)
+    assert (np.abs(shading_normals(plain)[:, 2]) > 0.99).all()
+    point = replace(plain, vertices=np.zeros_like(plain.vertices))
+    assert np.isfinite(shading_normals(point)).all()
+    assert typical_spacing(point) > 0
+    nothing = plain.keep_faces(np.zeros(2, bool))
+    assert shading_normals(nothing).shape == (0, 3)
+
+
+def test_lit_faces_wind_towards_their_normals_and_colours_are_linear():
+    cloud, _ = ball_splats(500)
+    mesh = convert(cloud)
+    arrays, distance = lit_arrays(mesh)
+    a, b, c = (mesh.vertices[arrays["faces"][:, k]] for k in range(3))
+    facing = (np.cross(b - a, c - a) * arrays["normals"][arrays["faces"]].sum(axis=1)).sum(axis=1)
+    assert (facing >= 0).all()
+    assert (np.sort(arrays["faces"], axis=1) == np.sort(mesh.faces, axis=1)).all()
+    assert np.allclose(arrays["colors"][:, :3], srgb_to_linear(mesh.colors[:, :3]))
+    assert (arrays["colors"][:, 3] == mesh.colors[:, 3]).all()
+    assert 0 < distance < 1
+    assert (lit_arrays(replace(mesh, blending="linear"))[0]["colors"] == mesh.colors).all()

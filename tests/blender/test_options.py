@@ -1,0 +1,53 @@
+"""Options that contradict each other or lie out of range are told before any work."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+
+from meshsplats.blender import LightOptions, SceneOptions
+from meshsplats.blender.options import check_environment
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (SceneOptions(engine="povray"), "engine must be one of cycles, eevee"),
+        (SceneOptions(samples=0), "samples is the side of the sample grid, 1 to 16, got 0"),
+        (SceneOptions(samples=17), "1 to 16"),
+        (SceneOptions(light=LightOptions(), samples=70000), "samples a pixel, 1 to 65536"),
+        (SceneOptions(background=(0, 0, 2)), "background must be RGB in"),
+        (SceneOptions(threads=0), "threads"),
+        (SceneOptions(denoise=True), "denoise is for lit"),
+        (SceneOptions(light=LightOptions(), denoise=True, engine="eevee"), "denoise is for lit"),
+        (SceneOptions(light=LightOptions(sun=(0, 91))), "elevation of -90 to 90"),
+        (SceneOptions(light=LightOptions(sun=(float("nan"), 1))), "azimuth"),
+        (SceneOptions(light=LightOptions(sun_strength=-1)), "sun_strength must lie between 0 and"),
+        (SceneOptions(light=LightOptions(sky=float("nan"))), "sky must lie"),
+        (SceneOptions(light=LightOptions(roughness=1.1)), "roughness must lie between 0 and 1"),
+        (SceneOptions(light=LightOptions(bounces=65)), "bounces"),
+        (SceneOptions(light=LightOptions(ground="grass")), "ground must be one of plane, catcher, none"),
+        (SceneOptions(light=LightOptions(ground="catcher"), engine="eevee"), "Cycles only"),
+    ],
+)
+def test_what_cannot_be_is_told(options, words):
+    with pytest.raises(ValueError, match=words):
+        options.check()
+
+
+def test_defaults_are_good():
+    SceneOptions().check()
+    SceneOptions(light=LightOptions(), samples=64).check()
+    assert {f.name for f in fields(LightOptions)} >= {"sun", "hdri", "ground", "mirror", "glass"}
+
+
+def test_environment_pictures_are_known_by_content(tmp_path):
+    good, bad = tmp_path / "sky.hdr", tmp_path / "sky.exr"
+    good.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n")
+    bad.write_bytes(b"\x89PNG\r\n")
+    check_environment(good)
+    with pytest.raises(ValueError, match=r"\.hdr or an OpenEXR file; this is neither"):
+        check_environment(bad)
+    with pytest.raises(FileNotFoundError):
+        SceneOptions(light=replace(LightOptions(), hdri=tmp_path / "none.hdr")).check()
