@@ -47,7 +47,7 @@ def rotation(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def colmap_bytes(cameras: list[tuple], images: list[tuple]) -> tuple[bytes, bytes]:
-    """cameras.bin and images.bin of (id, model, width, height, parameters) and (name, quaternion, t, camera)."""
+    """cameras.bin and images.bin: (id, model, width, height, parameters), (name, quaternion, t, camera)."""
     head = struct.pack("<Q", len(cameras))
     for number, model, width, height, parameters in cameras:
         head += struct.pack("<iiQQ", number, COLMAP_MODELS[model][0], width, height)

@@ -1,4 +1,4 @@
-"""COLMAP folders: poses and lenses of binary and text models, splits, sizes, and everything that can be broken."""
+"""COLMAP folders: poses and lenses of binary and text models, splits, sizes; what can be broken in them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
-
 from _datasets import colmap_bytes, pinhole_rays, rotation, save, simple_colmap, sky, write_colmap
+
 from meshsplats import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
 
@@ -128,6 +128,9 @@ def test_a_panorama_gives_six_views_that_stay_together(tmp_path):
     assert {view.camera.width for view in dataset.views} == {16}
     np.testing.assert_allclose(dataset.train[2].camera.center, -rotation(1)[1].T @ (0, 1, 0), atol=1e-12)
     np.testing.assert_allclose(dataset.train[4].image, 101 / 255, atol=1e-6)
+    forward = [view.camera.world_to_camera[2, :3] @ rotation(1)[1].T for view in dataset.train]
+    along = [(0, 0, 1), (1, 0, 0), (0, 0, -1), (-1, 0, 0), (0, -1, 0), (0, 1, 0)]
+    np.testing.assert_allclose(forward, along, atol=1e-12)
 
 
 # ---- Against COLMAP itself
@@ -322,7 +325,9 @@ def test_pictures_of_another_shape_are_refused(tmp_path):
 
 def test_a_larger_second_model_is_told(tmp_path):
     folder = simple_colmap(tmp_path, 2)
-    write_colmap(folder, *GOOD[:1], [(f"{i}.png", (1, 0, 0, 0), (0, 0, 0), 1) for i in range(9)], place="sparse/1")
+    write_colmap(
+        folder, *GOOD[:1], [(f"{i}.png", (1, 0, 0, 0), (0, 0, 0), 1) for i in range(9)], place="sparse/1"
+    )
     with pytest.warns(DataWarning, match="model 1 is larger than model 0"):
         assert len(load_dataset(folder).views) == 2
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-
 from _datasets import pinhole_rays, sky
+
 from meshsplats.datasets.lens import MODELS, Lens, pinholes, undistort
 
 # Where pycolmap 4.2.1 puts the point (0.6, -0.4, 1.6) on a picture of 640 x 480.
@@ -33,7 +33,8 @@ TRUTH = [
     ),
     (
         "RAD_TAN_THIN_PRISM_FISHEYE",
-        (500, 510, 321, 238, -0.05, 0.02, -0.01, 0.004, 0.003, -0.002, 0.002, -0.003, 0.001, -0.002, 0.003, -0.001),
+        (500, 510, 321, 238, -0.05, 0.02, -0.01, 0.004, 0.003, -0.002)
+        + (0.002, -0.003, 0.001, -0.002, 0.003, -0.001),
         (496.404188, 118.867993),
     ),
     ("SIMPLE_DIVISION", (500, 321, 238, -0.2), (501.445229, 117.703181)),
@@ -46,7 +47,9 @@ TRUTH = [
 BY_MODEL = {model: parameters for model, parameters, _ in TRUTH}
 
 
-@pytest.mark.parametrize(("model", "parameters", "pixel"), TRUTH, ids=lambda v: v if isinstance(v, str) else "")
+@pytest.mark.parametrize(
+    ("model", "parameters", "pixel"), TRUTH, ids=lambda v: v if isinstance(v, str) else ""
+)
 def test_point_lies_where_colmap_puts_it(model, parameters, pixel):
     lens = Lens.from_colmap(model, 640, 480, parameters)
     np.testing.assert_allclose(lens.pixels(np.array([0.6, -0.4, 1.6])), pixel, atol=2e-6)
@@ -191,7 +194,8 @@ def test_six_sides_of_a_panorama():
     x, y = np.meshgrid((np.arange(width) + 0.5) / width - 0.5, (np.arange(height) + 0.5) / height - 0.5)
     longitude, latitude = 2 * np.pi * x, np.pi * y
     directions = np.stack(
-        [np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)], axis=-1
+        [np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)],
+        axis=-1,
     )
     panorama = sky(directions).astype(np.float32)
     ahead = {}

@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 import pytest
-
 from _datasets import pinhole_rays, rotation, save, sky, write_json
+
 from meshsplats import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
 
@@ -143,13 +143,20 @@ def test_frames_have_intrinsics_of_their_own(tmp_path):
 
 def test_the_files_own_split(tmp_path):
     names = [f"images/f{i}.png" for i in range(5)]
-    split = {"train_filenames": [*names[:2], "./" + names[2]], "val_filenames": names[3:4], "test_filenames": names[4:]}
+    split = {
+        "train_filenames": [*names[:2], "./" + names[2]],
+        "val_filenames": names[3:4],
+        "test_filenames": names[4:],
+    }
     dataset = load_dataset(studio(tmp_path, 5, **split))
     assert [view.name for view in dataset.train] == names[:3]
     assert [view.name for view in dataset.test] == names[4:]
     dataset = load_dataset(studio(tmp_path, 5, **split | {"test_filenames": []}))
     assert [view.name for view in dataset.test] == names[3:4]
-    refused(studio(tmp_path, 5, **split | {"train_filenames": ["other.png"]}), "none of its pictures is in 'train_")
+    refused(
+        studio(tmp_path, 5, **split | {"train_filenames": ["other.png"]}),
+        "none of its pictures is in 'train_",
+    )
     refused(studio(tmp_path, 5, test_filenames="all"), "'test_filenames' must be a list")
 
 
@@ -226,7 +233,10 @@ def test_missing_pictures_are_counted(tmp_path):
         assert len(load_dataset(folder).views) == 3
     # The same where their size would have been asked of them.
     with pytest.warns(DataWarning, match="1 pictures are missing"):
-        assert len(load_dataset(studio(tmp_path, 3, [*map(frame, ("images/f0.png", "no.png"))], w=None)).views) == 1
+        assert (
+            len(load_dataset(studio(tmp_path, 3, [*map(frame, ("images/f0.png", "no.png"))], w=None)).views)
+            == 1
+        )
 
 
 @pytest.mark.parametrize(

@@ -190,7 +190,7 @@ class PhotoFile:
             color, seen = undistort(color, self.lens, self.pinhole)
             if mask is not None:
                 counts = undistort(mask.astype(np.float32)[..., None], self.lens, self.pinhole)[0]
-                mask = seen & (counts[..., 0] >= WHOLE)
+                mask = counts[..., 0] >= WHOLE  # 0 where nothing was seen
             else:
                 mask = seen
         if alpha is None:

@@ -154,9 +154,7 @@ def _focals(values: dict, width: int, height: int, where: str) -> tuple[float, f
         elif angle in values:
             view = _number(values, angle, where)
             if not 0 < view < np.pi:
-                raise FileFormatError(
-                    f"{where}: {angle!r} must lie between 0 and pi radians, got {view:g}"
-                )
+                raise FileFormatError(f"{where}: {angle!r} must lie between 0 and pi radians, got {view:g}")
             focals.append(side / 2 / np.tan(view / 2))
     if not focals:
         raise FileFormatError(f"{where}: needs a focal length 'fl_x' or a viewing angle 'camera_angle_x'")
