@@ -25,8 +25,8 @@ Placement = Literal["auto", "object", "surrounded", "inside"]
 
 STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
 """Steps of Kronecker's sequence for azimuth, height and distance: its points modulo 1 fill the unit cube
-evenly wherever one begins and however many are taken. The first two are powers of the plastic number's inverse,
-which are the most even pair known: directions matter most."""
+evenly wherever one begins and however many are taken. The first two are powers of the plastic number's
+inverse, which are the most even pair known: directions matter most."""
 OBJECT_ELEVATIONS = (-20.0, 70.0)
 SURROUNDED_ELEVATIONS = (3.0, 60.0)
 """Degrees above the horizon; of a scene with ground there is nothing to be seen from below."""
