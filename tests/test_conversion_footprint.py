@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats.camera import Camera, look_at
+from meshsplats.camera import Camera, look_at, orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion import footprint as module
 from meshsplats.conversion.footprint import Views, spacing
@@ -33,6 +33,17 @@ def ahead(focal=100.0, z=0.0, size=64) -> Camera:
 
 def reach(mesh: SplatMesh) -> np.ndarray:
     return (mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)) / 2
+
+
+def grid(side: int, size: float = 1.0) -> GaussianCloud:
+    """``side`` x ``side`` small splats, ``size`` apart on a plane."""
+    x, y = np.meshgrid(np.arange(side), np.arange(side))
+    return cloud_at(size * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1), 1e-4 * size)
+
+
+def reaches(mesh: SplatMesh, cloud: GaussianCloud) -> np.ndarray:
+    """(n, 8) how far the rim of each flat fan is from its centre."""
+    return np.linalg.norm(mesh.vertices.reshape(-1, 9, 3)[:, 1:] - cloud.means[:, None], axis=2)
 
 
 FLAT = dict(mode="flat", scale_mul=1.0, center_mul=1.0, compensation=0.0, shrink_faint=False)
@@ -184,14 +195,44 @@ class TestSpacing:
         np.testing.assert_array_equal(spacing(points)[order], spacing(points[order]))
 
     def test_density_footprint(self):
-        """Without cameras splats grow by the order of their spacing; one splat alone does not."""
-        x, y = np.meshgrid(np.arange(64.0), np.arange(64.0))
-        cloud = cloud_at(np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1), 1e-4)
-        mesh = convert(cloud, footprint_px2=1, **FLAT)
-        sizes = np.linalg.norm(mesh.vertices.reshape(-1, 9, 3)[:, 1:] - cloud.means[:, None], axis=2)
-        np.testing.assert_allclose(np.median(sizes), module.SPACING_SHARE, rtol=0.15)
-        alone = convert(cloud.select([0]), **FLAT)
+        """Splats grow by the order of their spacing; one splat alone does not."""
+        cloud = grid(64)
+        mesh = convert(cloud, footprint="density", footprint_px2=1, **FLAT)
+        np.testing.assert_allclose(np.median(reaches(mesh, cloud)), module.SPACING_SHARE, rtol=0.15)
+        alone = convert(cloud.select([0]), footprint="density", **FLAT)
         np.testing.assert_allclose(np.sort(reach(alone)), [0, 1e-4, 1e-4], rtol=1e-5)
+
+
+class TestFraming:
+    def test_pixel_of_a_picture_that_holds_the_subject(self):
+        """Sparse splats: as if given the cameras of such pictures."""
+        cloud = grid(16)
+        cameras = orbit(cloud, module.FRAMING_VIEWS, width=module.FRAMING_PIXELS, height=module.FRAMING_PIXELS)
+        framed = reaches(convert(cloud, footprint_px2=1, **FLAT), cloud)
+        told = reaches(convert(cloud, footprint_px2=1, cameras=cameras, **FLAT), cloud)
+        np.testing.assert_allclose(framed, told, rtol=1e-5)
+        # 16 units on 1000 pixels, and some room round them.
+        assert 0.016 < np.median(framed) < 0.04
+
+    @pytest.mark.parametrize("sample", [10**6, 5000])
+    def test_dense_splats_need_finer_pixels(self, sample, monkeypatch):
+        monkeypatch.setattr(module, "SAMPLE", sample)
+        monkeypatch.setattr(module, "FRAMING_PIXELS", 50)
+        cloud = grid(128)
+        found = reaches(convert(cloud, footprint_px2=1, **FLAT), cloud)
+        np.testing.assert_allclose(found, module.FRAMING_SPACING, rtol=0.3)
+
+    def test_size_of_the_scene_does_not_matter(self):
+        for size in (1e-6, 1.0, 1e6):
+            cloud = grid(16, size)
+            found = reaches(convert(cloud, footprint_px2=1, **FLAT), cloud) / size
+            assert 0.016 < np.median(found) < 0.04, size
+
+    def test_splats_in_one_spot(self):
+        cloud = cloud_at([[1, 2, 3]] * 20, 0.1)
+        assert np.isfinite(convert(cloud).vertices).all()
+        with_nothing = replace(cloud, scales=np.zeros((20, 3)), opacities=np.full(20, 1.0))
+        assert np.isfinite(convert(with_nothing).vertices).all()
 
 
 class TestCompensation:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import shlex
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
 
 import numpy as np
 import tyro
@@ -32,6 +32,29 @@ from meshsplats.cli.common import (
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.errors import FileFormatError
 from meshsplats.mesh import SplatMesh
+
+
+def _with_placeholders(options: type[ConversionOptions]) -> type[ConversionOptions]:
+    """The same options, described to tyro: ``--rings N`` where it would say ``--rings {None}|INT (default:
+    None)``. Their docstrings are the help and say what happens without them."""
+    typed, named = {}, {}
+    for name, hint in get_type_hints(options).items():
+        kind = next(part for part in get_args(hint) if part is not type(None))
+        choices = "{" + ",".join(map(str, get_args(kind))) + "}"
+        placeholders = {int: "N", float: "X", bool: "{True,False}"}
+        metavar = "X0 Y0 Z0 X1 Y1 Z1" if name == "crop" else placeholders.get(kind, choices)
+        typed[name] = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint="")]  # type: ignore[valid-type]
+    for option in fields(options):
+        named[option.name] = option.default
+    about = "What is not given is left to the preset."
+    described = type(options.__name__, (options,), {"__annotations__": typed, "__doc__": about, **named})
+    return dataclass(frozen=True)(described)
+
+
+if TYPE_CHECKING:
+    _Options = ConversionOptions
+else:
+    _Options = _with_placeholders(ConversionOptions)
 
 
 @dataclass(frozen=True)
@@ -63,7 +86,7 @@ class Convert:
     """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
     no_preview: bool = False
     """Draw no preview."""
-    conversion: ConversionOptions = field(default_factory=ConversionOptions)
+    conversion: _Options = field(default_factory=_Options)
     reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
     """Print the result as JSON."""

@@ -11,15 +11,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, orbit
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.products import thin_product
+from meshsplats.framing import SAMPLE
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
 
-FILTER_PX2 = 0.5
-"""Variance of the filter in square pixels. 3DGS adds 0.3 and 2DGS has 0.5; for both 0.5 serves best over the
-distances of the given cameras and up to eight times as far."""
+FILTER_PX2 = {"3dgs": 0.5, "antialiased": 0.4, "2dgs": 0.3}
+"""Variance of the filter in square pixels. 3DGS and its antialiased kernel add 0.3 and 2DGS has 0.5; these
+serve best over the distances of the given cameras and up to eight times as far."""
 
 MAX_CAMERAS = 32
 """Of more cameras, so many are used, evenly spaced in their order."""
@@ -31,6 +32,13 @@ pictures that they were made from, or shown at, have 0.31 to 0.91."""
 SPACING_POWER = 0.3
 """How far the pixel size follows the local spacing (1) rather than the scene's median (0). Splats lie closer
 where there is more detail, not only where cameras come closer."""
+
+FRAMING_PIXELS = 1000
+FRAMING_VIEWS = 6
+"""Side and number of the square pictures for 'framing'."""
+FRAMING_SPACING = 0.7
+"""The most that a pixel of 'framing' may be, as a share of the median spacing of the splats: twice that of
+'density'. Only clouds that hold far more detail than such pictures show come to it."""
 
 _CHUNK = 1 << 14
 
@@ -128,7 +136,7 @@ def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
     code = np.zeros(n, np.uint64)
     for axis in range(3):
         code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
-    order = np.argsort(code, kind="stable")
+    order = np.argsort(code)  # points of one cell get one spacing: their order does not matter
     code = code[order]
     found = np.full(n, extent / np.sqrt(n), np.float32)
     settled = np.zeros(n, bool)
@@ -162,10 +170,13 @@ def _every_third_bit(values: np.ndarray) -> np.ndarray:
     return v
 
 
-def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views | None) -> np.ndarray | None:
+def pixel_sizes(
+    cloud: GaussianCloud, options: ConversionOptions, views: Views | None, up: np.ndarray
+) -> np.ndarray | None:
     """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none'.
 
-    Splats that no camera sees take the median of the others.
+    Splats that no camera sees take the median of the others. ``up`` (3,) is the axis of the cameras of
+    'framing'.
     """
     if options.footprint == "none":
         return None
@@ -177,6 +188,9 @@ def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views |
         typical = np.median(local)
         relative = np.divide(local, typical, out=np.ones_like(local), where=typical > 0)
         return np.float32(SPACING_SHARE) * typical * np.power(relative, np.float32(SPACING_POWER))
+    if options.footprint == "framing":
+        side = FRAMING_PIXELS
+        views = Views(cloud.means, orbit(cloud, FRAMING_VIEWS, width=side, height=side, up=up))
     if views is None:
         raise ValueError("footprint='cameras' needs cameras")
     sizes = views.pixel_sizes()
@@ -186,7 +200,14 @@ def pixel_sizes(cloud: GaussianCloud, options: ConversionOptions, views: Views |
             f"none of the {len(views.cameras)} cameras sees any of the {len(cloud)} splats: are they of one"
             " scene? Choose footprint='density' or 'none' to go without them"
         )
-    return np.where(seen, sizes, np.median(sizes[seen]))
+    sizes = np.where(seen, sizes, np.median(sizes[seen]))
+    if options.footprint == "framing":
+        # One point in ``step`` lies sqrt(step) times as far from the next, on a surface.
+        step = -(-len(cloud) // SAMPLE)
+        typical = np.median(spacing(cloud.means[::step])) / np.sqrt(step)
+        if typical > 0:  # splats all in one spot have no spacing
+            np.minimum(sizes, np.float32(FRAMING_SPACING * typical), out=sizes)
+    return sizes
 
 
 def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 Mode = Literal["crossed", "flat", "3d"]
-Footprint = Literal["cameras", "distance", "density", "none"]
+Footprint = Literal["cameras", "framing", "distance", "density", "none"]
 Colors = Literal["degree0", "cameras"]
 
 
@@ -44,9 +44,10 @@ class ConversionOptions:
     0."""
     footprint: Footprint | None = None
     """Where the size of a pixel at each splat comes from, for the low-pass filter that splats were trained
-    with: the cameras, one stated distance, the spacing of the splats (scenes seen from where such detail was
-    recorded), or none (a model trained without the filter). Default: cameras if there are any, else distance
-    if stated, else density."""
+    with. cameras: the cameras given. framing: pictures of 1000 pixels from all round that just hold the
+    subject, or finer where splats lie too densely for these. distance: one stated distance. density: the
+    spacing of the splats alone. none: no filter, for a model trained without it. Default: cameras if there
+    are any, else distance if stated, else framing; paper: none."""
     footprint_px2: float | None = None
     """Variance of that filter in square pixels, 0 to 100; every standard deviation s becomes
     sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats trained as 2DGS."""
@@ -88,7 +89,7 @@ class ConversionOptions:
         if full.no_triag is None:
             full = replace(full, no_triag=8 if full.mode == "flat" else 4)
         if full.footprint is None:
-            source: Footprint = "cameras" if has_cameras else "density"
+            source: Footprint = "cameras" if has_cameras else "framing"
             full = replace(full, footprint=source if self.viewing_distance is None else "distance")
         full._check(given, has_cameras)
         return full
@@ -117,7 +118,7 @@ class ConversionOptions:
             raise ValueError(f"flat_below is for mode 'crossed', got mode {self.mode!r}")
         if self.footprint == "cameras" and not has_cameras:
             raise ValueError(
-                "footprint='cameras' needs cameras: give some, or choose distance, density or none"
+                "footprint='cameras' needs cameras: give some, or choose framing, distance, density or none"
             )
         if self.footprint == "distance" and self.viewing_distance is None:
             raise ValueError("footprint='distance' needs viewing_distance, in scene units")
