@@ -153,7 +153,8 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
     """One after the other in one folder, on a small scene and with small pictures."""
     lines = "".join(code_blocks(ROOT / "README.md", "sh")).replace("\\\n", " ").splitlines()
     commands = [shlex.split(line, comments=True) for line in lines if line.startswith("meshsplats ")]
-    assert {command[1] for command in commands} >= set(cli.COMMANDS)
+    # blender needs an environment of its own; tests/blender runs it.
+    assert {command[1] for command in commands} >= set(cli.COMMANDS) - {"blender"}
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.ply").write_bytes(scene_file.read_bytes())
     for command in commands:

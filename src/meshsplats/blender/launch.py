@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import worker
+from meshsplats.blender.inside import MISSING, worker
 from meshsplats.blender.options import SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
@@ -39,13 +39,7 @@ def command(executable: Path | None) -> list[str]:
     """
     if executable is None:
         if importlib.util.find_spec("bpy") is None:
-            raise MissingDependencyError(
-                "Blender's Python module bpy is not installed in this environment. Make one for it, as it"
-                " needs Python 3.11 and a NumPy of its own (this is Python"
-                f" {sys.version_info[0]}.{sys.version_info[1]}): python3.11 -m venv blender-env &&"
-                " blender-env/bin/pip install 'meshsplats[blender]'; or name an installed Blender:"
-                " --executable /path/to/blender"
-            )
+            raise MissingDependencyError(MISSING)
         return [sys.executable, "-m", worker.__name__]
     found = shutil.which(executable)
     if found is None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import bpy
-
 from meshsplats.blender.inside import versions
+from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.meshes import COLOR, NORMAL
 
 SELF_SHADOW = "Self-shadow distance"

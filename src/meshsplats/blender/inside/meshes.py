@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import bpy
 import numpy as np
 
 from meshsplats.blender.inside import versions
+from meshsplats.blender.inside.host import bpy
 
 COLOR = "Color"
 """Attribute with RGBA: display values where the picture is unlit, linear light where it is lit."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import bpy
 import numpy as np
 
 from meshsplats.blender.inside import frame, materials, meshes, pictures, versions
+from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.subject import lit_arrays
 from meshsplats.mesh import Blending, SplatMesh

@@ -6,10 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-import bpy
 import numpy as np
 
 from meshsplats.blender.inside import versions
+from meshsplats.blender.inside.host import bpy
 
 
 def exact_settings(scene: Any, engine: str) -> None:

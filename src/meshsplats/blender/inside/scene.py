@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import bpy
 import numpy as np
 
 from meshsplats.blender.inside import frame, materials, meshes, pictures, stage, versions
+from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear

@@ -6,11 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import bpy
 import numpy as np
-from mathutils import Matrix, Vector
 
 from meshsplats.blender.inside import frame, materials, versions
+from meshsplats.blender.inside.host import bpy
 from meshsplats.camera import Camera
 
 GREY = (0.6, 0.6, 0.6)
@@ -27,6 +26,8 @@ def collection(name: str) -> Any:
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
     """A Blender camera like ``camera``; what is farther than ``reach`` is cut off. Its pixel aspect is the
     scene's: see ``aim``."""
+    from mathutils import Matrix
+
     data = bpy.data.cameras.new(name)
     settings = frame.lens(camera)
     data.sensor_fit = "HORIZONTAL"
@@ -55,6 +56,8 @@ def aim(scene: Any, camera: Camera, thing: Any, factor: int = 1) -> None:
 def add_sun(direction: np.ndarray, strength: float, size: float, detail: float, home: Any) -> Any:
     """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees. ``detail``:
     smallest thing that EEVEE's shadow maps resolve, scene units."""
+    from mathutils import Vector
+
     data = bpy.data.lights.new("Sun", "SUN")
     data.energy = strength
     data.angle = float(np.radians(size))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import bpy
 import numpy as np
+
+from meshsplats.blender.inside.host import bpy
 
 OLDEST = (4, 2, 0)
 
