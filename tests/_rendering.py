@@ -68,7 +68,8 @@ def layers(depths, alpha, colors=None) -> SplatMesh:
 def fan(seed: int, triangles: int, alpha: float) -> SplatMesh:
     """A closed convex fan that is tilted, of one opacity."""
     rng = np.random.default_rng(seed)
-    angles = np.sort(rng.random(triangles)) + np.arange(triangles)
+    # Less than half a turn apart, also of three: else the centre is outside.
+    angles = np.sort(0.49 * rng.random(triangles)) + np.arange(triangles)
     angles *= 2 * np.pi / triangles
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     rim = np.cos(angles)[:, None] * axes[0] + np.sin(angles)[:, None] * 0.8 * axes[1]
