@@ -13,3 +13,8 @@ class MissingDependencyError(ImportError):
 
 class DataWarning(UserWarning):
     """Something in the data was left out or altered; the message counts it."""
+
+
+class DivergenceError(ValueError):
+    """Values that are not finite turned up in an optimisation; the message names the view that brought
+    them."""
