@@ -8,27 +8,36 @@ import numpy as np
 def checked_array(name: str, value, dtype, shape: tuple[int | None, ...]) -> np.ndarray:
     """``value`` as a C-contiguous array of ``dtype``; ``None`` in ``shape`` admits any length.
 
-    Raises TypeError if the values are not numbers and ValueError if the shape differs or a value is not finite.
+    An array that already is one is returned itself, after one pass over its values where they are floats.
+    Raises TypeError if the values are not numbers, ValueError if the shape differs or a value is not finite.
     """
     given = np.asarray(value)
     if given.dtype.kind not in "fiub":
         raise TypeError(f"{name} must hold numbers, got dtype {given.dtype}")
-    wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
-    if given.ndim != len(shape) or any(s is not None and s != g for s, g in zip(shape, given.shape, strict=True)):
+    if given.ndim != len(shape) or any(
+        s is not None and s != g for s, g in zip(shape, given.shape, strict=True)
+    ):
+        sides = ", ".join("n" if s is None else str(s) for s in shape)
+        wanted = f"({sides},)" if len(shape) == 1 else f"({sides})"
         raise ValueError(f"{name} must have shape {wanted}, got {given.shape}")
     if np.dtype(dtype).kind == "i":
         if given.dtype.kind == "f":
             raise TypeError(f"{name} must hold integers, got dtype {given.dtype}")
         limits = np.iinfo(dtype)
-        if given.size and (given.min() < limits.min or given.max() > limits.max):
-            raise ValueError(f"{name} must fit {np.dtype(dtype).name}, got values up to {given.max()}")
+        fits = np.can_cast(given.dtype, dtype)
+        if not fits and given.size and (given.min() < limits.min or given.max() > limits.max):
+            raise ValueError(
+                f"{name} must fit {np.dtype(dtype).name}, got values from {given.min()} to {given.max()}"
+            )
     array = np.ascontiguousarray(given, dtype=dtype)
-    # A sum is not finite if any term is not; only then look value by value.
+    # A sum is not finite if any term is not. Only then, or if large values overflow it, look at each.
     if array.dtype.kind == "f" and array.size:
         with np.errstate(over="ignore", invalid="ignore"):
-            suspicious = not np.isfinite(array.sum(dtype=np.float64))
+            suspicious = not np.isfinite(array.sum())
         if suspicious:
             bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1)
             if bad.any():
-                raise ValueError(f"{name} must be finite, row {int(bad.argmax())} is not ({int(bad.sum())} such rows)")
+                raise ValueError(
+                    f"{name} must be finite, row {int(bad.argmax())} is not ({int(bad.sum())} such rows)"
+                )
     return array

@@ -35,7 +35,8 @@ class GaussianCloud:
     """(n, k, 3) spherical harmonic coefficients of the display colour, k = 1, 4, 9 or 16 (degree 0 to 3)."""
     kernel: Kernel = "3dgs"
     """How the splats were trained to be drawn: '3dgs' (0.3 px^2 added to the projected covariance),
-    'antialiased' (the same with the opacity lowered to keep its integral) or '2dgs' (flat splats met by the ray)."""
+    'antialiased' (the same with the opacity lowered to keep its integral) or '2dgs' (flat splats met by the
+    ray)."""
 
     def __post_init__(self) -> None:
         means = checked_array("means", self.means, np.float32, (None, 3))
@@ -50,7 +51,8 @@ class GaussianCloud:
             norm = np.einsum("ij,ij->i", quaternions, quaternions)
             if np.abs(norm - 1).max() > 1e-3:
                 row = int(np.abs(norm - 1).argmax())
-                raise ValueError(f"quaternions must be normalised, row {row} has length {float(norm[row]) ** 0.5:.4g}")
+                length = float(norm[row]) ** 0.5
+                raise ValueError(f"quaternions must be normalised, row {row} has length {length:.4g}")
             if scales.min() < 0:
                 raise ValueError(f"scales are standard deviations and must be >= 0, got {scales.min():.4g}")
             if opacities.min() < 0 or opacities.max() > 1:

@@ -29,16 +29,19 @@ class SplatMesh:
     colors: np.ndarray
     """(v, 4) float32 straight RGBA in [0, 1]."""
     face_splat: np.ndarray | None = None
-    """(f,) int32 number of the splat each triangle was made from, ascending; None if the mesh has no such origin."""
+    """(f,) int32 number of the splat each triangle was made from, ascending; None for a mesh of other
+    origin."""
     normals: np.ndarray | None = None
     """(v, 3) float32 unit shading normals, or None."""
     depth_group: np.ndarray | None = None
-    """(f,) int32: triangles with the same number >= 0 are coplanar layers that share one depth, that of their common
-    plane, and are ordered by face number; -1 keeps a triangle's own depth."""
+    """(f,) int32: triangles with the same number >= 0 are coplanar layers that share one depth, that of their
+    common plane, and are ordered by face number; -1 keeps a triangle's own depth."""
     up: np.ndarray = field(default_factory=lambda: np.array([0, -1, 0], np.float32))
-    """(3,) float32 unit direction that points up in the world frame; splats trained from COLMAP cameras have y down."""
+    """(3,) float32 unit direction that points up in the world frame; splats trained from COLMAP cameras have
+    y down. Another length than 1 is corrected."""
     blending: Blending = "display"
-    """Space in which the colours were made to be blended: 'display' (sRGB-encoded, as splats are) or 'linear'."""
+    """Space in which the colours were made to be blended: 'display' (sRGB-encoded, as splats are) or
+    'linear'."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Further float32 arrays (v,) or (v, c) by name, one row a vertex."""
 
@@ -47,7 +50,7 @@ class SplatMesh:
         v = len(vertices)
         faces = checked_array("faces", self.faces, np.int32, (None, 3))
         f = len(faces)
-        if f and (faces.min() < 0 or faces.max() >= v):
+        if f and faces.view(np.uint32).max() >= v:  # one pass: as unsigned numbers, negative ones are large
             raise ValueError(f"faces must number vertices 0 to {v - 1}, got {faces.min()} to {faces.max()}")
         colors = checked_array("colors", self.colors, np.float32, (v, 4))
         if v and (colors.min() < 0 or colors.max() > 1):
@@ -58,7 +61,7 @@ class SplatMesh:
         set_("colors", colors)
         if self.face_splat is not None:
             face_splat = checked_array("face_splat", self.face_splat, np.int32, (f,))
-            if f and (face_splat[0] < 0 or (np.diff(face_splat) < 0).any()):
+            if f and (face_splat[0] < 0 or (face_splat[1:] < face_splat[:-1]).any()):
                 raise ValueError("face_splat must be ascending numbers >= 0")
             set_("face_splat", face_splat)
         if self.depth_group is not None:
@@ -72,14 +75,18 @@ class SplatMesh:
         length = float(np.linalg.norm(up))
         if length == 0:
             raise ValueError("up must not be the zero vector")
-        set_("up", up / np.float32(length))
+        # Left as it is where rounding alone is to blame, so that a saved mesh comes back bit for bit.
+        set_("up", up if abs(length - 1) <= 1e-6 else up / np.float32(length))
         if self.blending not in get_args(Blending):
-            raise ValueError(f"blending must be one of {', '.join(get_args(Blending))}, got {self.blending!r}")
+            known = ", ".join(get_args(Blending))
+            raise ValueError(f"blending must be one of {known}, got {self.blending!r}")
         attributes = {}
         for name, value in self.attributes.items():
             ndim = np.ndim(value)
             if ndim not in (1, 2):
-                raise ValueError(f"attribute {name!r} must have one row a vertex, got shape {np.shape(value)}")
+                raise ValueError(
+                    f"attribute {name!r} must have one row a vertex, got shape {np.shape(value)}"
+                )
             attributes[name] = checked_array(f"attribute {name!r}", value, np.float32, (v, None)[:ndim])
         set_("attributes", MappingProxyType(attributes))
 
@@ -91,7 +98,8 @@ class SplatMesh:
         return int(len(self.face_splat) > 0) + int(np.count_nonzero(np.diff(self.face_splat)))
 
     def keep_faces(self, keep: np.ndarray) -> SplatMesh:
-        """The triangles marked in ``keep`` (f,) bool, in order, without the vertices that no kept triangle uses."""
+        """The triangles marked in ``keep`` (f,) bool, in order, without the vertices that no kept triangle
+        uses."""
         keep = np.asarray(keep, bool)
         faces = self.faces[keep]
         used = np.zeros(len(self.vertices), bool)
@@ -109,5 +117,6 @@ class SplatMesh:
         )
 
     def prune(self, min_opacity: float) -> SplatMesh:
-        """Without the triangles all of whose corners are below ``min_opacity``, and without orphaned vertices."""
+        """Without the triangles all of whose corners are below ``min_opacity``, and without orphaned
+        vertices."""
         return self.keep_faces((self.colors[self.faces, 3] >= min_opacity).any(axis=1))

@@ -1,0 +1,91 @@
+"""What the constructors of the data classes check, and what they leave alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from meshsplats import GaussianCloud, SplatMesh
+from meshsplats._arrays import checked_array
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+COLORS = np.full((3, 4), 0.5, np.float32)
+FACES = np.array([[0, 1, 2]], np.int32)
+
+
+def triangle(**changed) -> SplatMesh:
+    return SplatMesh(**{"vertices": CORNERS, "faces": FACES, "colors": COLORS, **changed})
+
+
+def test_good_arrays_are_not_copied():
+    mesh = triangle()
+    assert mesh.vertices is CORNERS
+    assert mesh.faces is FACES
+    assert mesh.colors is COLORS
+
+
+@pytest.mark.parametrize(
+    "value", [[1, 2], np.array([1, 2], np.int64), np.array([1, 2], np.uint8), np.array([[1, 2]]).T[:, 0]]
+)
+def test_whole_numbers_of_any_type_become_int32(value):
+    got = checked_array("numbers", value, np.int32, (None,))
+    assert got.dtype == np.int32
+    assert got.flags.c_contiguous
+    assert got.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("number", [1 << 31, -(1 << 31) - 1])
+def test_whole_numbers_that_do_not_fit(number):
+    with pytest.raises(ValueError, match=rf"must fit int32, got values from .*{number}"):
+        checked_array("numbers", [7, number], np.int32, (None,))
+
+
+def test_large_values_are_finite_though_their_sum_is_not():
+    values = np.full((2, 3), 3e38, np.float32)
+    assert checked_array("values", values, np.float32, (None, 3)) is values
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_the_row_that_is_not_finite_is_named(bad):
+    values = np.zeros((4, 3), np.float32)
+    values[2, 1] = bad
+    with pytest.raises(ValueError, match=r"values must be finite, row 2 is not \(1 such rows\)"):
+        checked_array("values", values, np.float32, (None, 3))
+
+
+def test_infinities_that_cancel_are_found():
+    with pytest.raises(ValueError, match="row 0"):
+        checked_array("values", np.array([np.inf, -np.inf], np.float32), np.float32, (None,))
+
+
+@pytest.mark.parametrize("number", [-1, 3, -(1 << 31), (1 << 31) - 1])
+def test_faces_number_vertices(number):
+    with pytest.raises(ValueError, match=r"faces must number vertices 0 to 2, got "):
+        triangle(faces=np.array([[0, 1, number]]))
+
+
+def test_face_splat_ascends():
+    faces = np.repeat(FACES, 3, axis=0)
+    assert triangle(faces=faces, face_splat=np.array([2, 2, 5])).splat_count == 2
+    for wrong in ([0, 2, 1], [-1, 0, 0]):
+        with pytest.raises(ValueError, match="ascending numbers >= 0"):
+            triangle(faces=faces, face_splat=np.array(wrong))
+
+
+def test_up_is_normalised_once():
+    assert triangle(up=(0, 0, 2)).up.tolist() == [0, 0, 1]
+    rng = np.random.default_rng(0)
+    for direction in rng.normal(size=(200, 3)):
+        up = triangle(up=direction).up
+        assert abs(np.linalg.norm(up.astype(np.float64)) - 1) < 2e-7
+        assert triangle(up=up).up.tolist() == up.tolist()  # not by another bit
+    with pytest.raises(ValueError, match="zero vector"):
+        triangle(up=(0, 0, 0))
+
+
+def test_quaternions_are_not_normalised_but_checked():
+    cloud = {"means": CORNERS, "scales": np.ones((3, 3)), "opacities": np.ones(3), "sh": np.zeros((3, 1, 3))}
+    unit = np.tile(np.array([1, 0, 0, 0], np.float32), (3, 1))
+    assert GaussianCloud(quaternions=unit, **cloud).quaternions is unit
+    with pytest.raises(ValueError, match="row 1 has length 2"):
+        GaussianCloud(quaternions=unit * np.array([[1], [2], [1]]), **cloud)
