@@ -15,7 +15,7 @@ SHARED = Path(os.environ.get("MESHSPLATS_SHARED_DATA", Path(__file__).parents[2]
 
 
 def shared_data(path: str) -> Path:
-    """A file of the local collection of real data, which is not part of the project; skips the test without it."""
+    """A file of the local collection of real data, which is no part of the project; skips without it."""
     found = SHARED / path
     if not found.exists():
         pytest.skip(f"real data not here: {found} (set MESHSPLATS_SHARED_DATA to its folder)")

@@ -207,7 +207,9 @@ class TestFraming:
     def test_pixel_of_a_picture_that_holds_the_subject(self):
         """Sparse splats: as if given the cameras of such pictures."""
         cloud = grid(16)
-        cameras = orbit(cloud, module.FRAMING_VIEWS, width=module.FRAMING_PIXELS, height=module.FRAMING_PIXELS)
+        cameras = orbit(
+            cloud, module.FRAMING_VIEWS, width=module.FRAMING_PIXELS, height=module.FRAMING_PIXELS
+        )
         framed = reaches(convert(cloud, footprint_px2=1, **FLAT), cloud)
         told = reaches(convert(cloud, footprint_px2=1, cameras=cameras, **FLAT), cloud)
         np.testing.assert_allclose(framed, told, rtol=1e-5)

@@ -62,7 +62,7 @@ def test_each_ingredient_helps(scene):
 
 @pytest.mark.parametrize("count", [300, 8000])
 def test_without_cameras(count):
-    """Better than paper on coarse clouds and fine ones, at the distance of pictures of the whole and nearer."""
+    """Better than paper on coarse and fine clouds, at the distance of pictures of the whole and nearer."""
     cloud = one_color_each(make_scene(count))
     paper, default = convert(cloud, preset="paper"), convert(cloud)
     assert len(default.faces) <= 8 * len(cloud)

@@ -72,8 +72,8 @@ def compare_views(
 ) -> Iterator[ComparedView]:
     """The views one by one, so that only one pair of pictures is in memory.
 
-    The splats are drawn as their trainer draws them, at the centres of the pixels with a filter of a pixel's size;
-    a mesh has no such filter and needs several samples a pixel instead.
+    The splats are drawn as their trainer draws them, at the centres of the pixels with a filter of a pixel's
+    size; a mesh has no such filter and needs several samples a pixel instead.
 
     Parameters
     ----------
