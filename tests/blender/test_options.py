@@ -25,6 +25,7 @@ from meshsplats.blender.options import check_environment
         (SceneOptions(light=LightOptions(sun=(float("nan"), 1))), "azimuth"),
         (SceneOptions(light=LightOptions(sun_strength=-1)), "sun_strength must lie between 0 and"),
         (SceneOptions(light=LightOptions(sky=float("nan"))), "sky must lie"),
+        (SceneOptions(light=LightOptions(sun_color=(1, 2, 0))), "sun_color must be linear RGB"),
         (SceneOptions(light=LightOptions(roughness=1.1)), "roughness must lie between 0 and 1"),
         (SceneOptions(light=LightOptions(bounces=65)), "bounces"),
         (SceneOptions(light=LightOptions(ground="grass")), "ground must be one of plane, catcher, none"),

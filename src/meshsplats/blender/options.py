@@ -26,6 +26,8 @@ class LightOptions:
     """Irradiance of a surface that faces the sun, W/m^2; at pi, a white one has radiance 1. 0: no sun."""
     sun_size: float = 2.0
     """Degrees that the sun's disc spans: the larger, the softer shadows are."""
+    sun_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
+    """Colour of sunlight: linear R G B, 0 to 1; --sun-strength is multiplied by it."""
     sky: float = 0.35
     """Radiance of the even white sky; not used with --hdri."""
     hdri: Path | None = None
@@ -67,6 +69,8 @@ class LightOptions:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {value}")
+        if not all(0 <= value <= 1 for value in self.sun_color):
+            raise ValueError(f"sun_color must be linear RGB in [0, 1], got {self.sun_color}")
         if self.ground not in get_args(Ground):
             raise ValueError(f"ground must be one of {', '.join(get_args(Ground))}, got {self.ground!r}")
         if self.hdri is not None:

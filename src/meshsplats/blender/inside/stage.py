@@ -53,13 +53,21 @@ def aim(scene: Any, camera: Camera, thing: Any, factor: int = 1) -> None:
     scene.render.pixel_aspect_y = settings["pixel_aspect_y"]
 
 
-def add_sun(direction: np.ndarray, strength: float, size: float, detail: float, home: Any) -> Any:
-    """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees. ``detail``:
-    smallest thing that EEVEE's shadow maps resolve, scene units."""
+def add_sun(
+    direction: np.ndarray,
+    strength: float,
+    size: float,
+    detail: float,
+    home: Any,
+    color: Sequence[float] = (1.0, 1.0, 1.0),
+) -> Any:
+    """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees, linear ``color``.
+    ``detail``: smallest thing that EEVEE's shadow maps resolve, scene units."""
     from mathutils import Vector
 
     data = bpy.data.lights.new("Sun", "SUN")
     data.energy = strength
+    data.color = tuple(color)
     data.angle = float(np.radians(size))
     versions.set_if_there(data, use_shadow=True, shadow_maximum_resolution=detail)
     thing = bpy.data.objects.new("Sun", data)
