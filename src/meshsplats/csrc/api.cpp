@@ -1,8 +1,10 @@
 // The plain C interface of the core: checks, memory and Python stay outside (rendering/core.py).
 #include <cstdio>
+#include <memory>
 #include <new>
 
 #include "adam.h"
+#include "gradient.h"
 #include "mesh_tile.h"
 #include "splats.h"
 #include "ssim.h"
@@ -15,25 +17,102 @@
 
 namespace {
 
-// Draws every tile with one `Tile` a thread; returns the number of fragments blended.
-template <class MakeTile>
-int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int threads, MakeTile make_tile) {
+// Calls draw(worker, tile, list, length) for every tile, with one worker a thread; returns the number of fragments blended.
+template <class MakeWorker, class Draw>
+int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int threads, MakeWorker make_worker, Draw draw) {
     threads = (int)std::min<int64_t>(threads, grid.tiles());
-    std::vector<decltype(make_tile())> workers(threads);
+    std::vector<decltype(make_worker())> workers(threads);
     ms::TileLists lists(grid, items, threads);
     while (lists.next()) {
         std::atomic<int64_t> next{lists.begin()};
         ms::on_threads(threads, [&](int thread) {
-            if (!workers[thread]) workers[thread] = make_tile();
+            if (!workers[thread]) workers[thread] = make_worker();
             for (int64_t tile; (tile = next.fetch_add(1)) < lists.end();)
-                workers[thread]->draw((int)(tile % grid.tiles_x), (int)(tile / grid.tiles_x), lists.list(tile),
-                                      lists.length(tile));
+                draw(*workers[thread], tile, lists.list(tile), lists.length(tile));
         });
     }
     int64_t fragments = 0;
     for (auto &worker : workers)
         if (worker) fragments += worker->fragments();
     return fragments;
+}
+
+template <class Worker>
+void draw_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::Entry *list, int64_t length) {
+    worker.draw((int)(tile % grid.tiles_x), (int)(tile / grid.tiles_x), list, length);
+}
+
+using PictureWorker = ms::MeshTile<ms::PictureTile>;
+
+int64_t draw_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera, const MsOptions &options,
+                  const MsPicture &picture, ms::PictureLog *log) {
+    std::vector<ms::TileLog> logs(options.threads);
+    std::atomic<int> started{0};
+    return draw_tiles(
+        grid, scene.items, options.threads,
+        [&] {
+            auto worker = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, picture, camera));
+            if (log) worker->blend().record(&logs[started++]);
+            return worker;
+        },
+        [&](PictureWorker &worker, int64_t tile, const ms::Entry *list, int64_t length) {
+            draw_tile(grid, worker, tile, list, length);
+            if (log) log->keep(tile, *worker.blend().log());
+        });
+}
+
+// Goes back through all tiles: those with a log follow it, others are drawn once more.
+void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &options, const ms::PictureLog &log,
+             const MsPictureGradient &given, const MsVertexGradients &out) {
+    const ms::Grid grid(camera, options.samples);
+    const bool redraws = !log.complete();
+    const ms::Scene scene(mesh, camera, grid, options.threads, redraws);
+    const int threads = (int)std::min<int64_t>(options.threads, grid.tiles());
+    const int channels = given.attributes ? mesh.attribute_count : 0;
+    const MsPicture nothing{};  // what is drawn once more is only logged
+    ms::VertexGradients sum(mesh, out, channels, threads);
+
+    // Gradients of a few tiles at a time wait to be added in order.
+    constexpr int WAVE = 256;
+    std::vector<std::vector<ms::CornerGradients>> waiting(WAVE);
+    std::vector<std::vector<float>> waiting_attributes(WAVE);
+    struct Worker {
+        ms::GradientTile back;
+        std::unique_ptr<PictureWorker> again;
+        ms::TileLog log;
+    };
+    std::vector<std::unique_ptr<Worker>> workers(threads);
+    auto run = [&](int64_t begin, int64_t end, ms::TileLists *lists) {
+        for (int64_t wave = begin; wave < end; wave += WAVE) {
+            const int count = (int)std::min<int64_t>(WAVE, end - wave);
+            std::atomic<int> next{0};
+            ms::on_threads(threads, [&](int thread) {
+                auto &worker = workers[thread];
+                if (!worker)
+                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}});
+                for (int i; (i = next.fetch_add(1)) < count;) {
+                    const int64_t tile = wave + i;
+                    const ms::TileLog *entries = log.find(tile);
+                    if (!entries) {
+                        if (!worker->again) {
+                            worker->again = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, nothing, camera));
+                            worker->again->blend().record(&worker->log);
+                        }
+                        draw_tile(grid, *worker->again, tile, lists->list(tile), lists->length(tile));
+                        entries = &worker->log;
+                    }
+                    waiting[i].clear();
+                    waiting_attributes[i].clear();
+                    worker->back.run((int)(tile % grid.tiles_x), (int)(tile / grid.tiles_x), *entries, waiting[i],
+                                     waiting_attributes[i]);
+                }
+            });
+            sum.add(waiting.data(), waiting_attributes.data(), count);
+        }
+    };
+    if (!redraws) return run(0, grid.tiles(), nullptr);
+    ms::TileLists lists(grid, scene.items, threads);
+    while (lists.next()) run(lists.begin(), lists.end(), &lists);
 }
 
 template <class Body>
@@ -54,7 +133,7 @@ int guarded(char *message, int size, Body body) {
 
 extern "C" {
 
-MS_EXPORT int ms_interface_version() { return 1; }
+MS_EXPORT int ms_interface_version() { return 2; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 
@@ -72,26 +151,48 @@ MS_EXPORT const char *ms_best_variant() {
     return "baseline";
 }
 
-// Returns 0, or 1 (memory) or 2 (other) with a message.
+// All functions from here on return 0, or 1 (memory) or 2 (other) with a message.
 MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, MsPicture *picture,
                              char *message, int message_size) {
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
-        picture->fragments = draw_tiles(grid, scene.items, options->threads, [&] {
-            return std::make_unique<ms::MeshTile>(scene, *options, *picture, *camera);
-        });
+        picture->fragments = draw_mesh(scene, grid, *camera, *options, *picture, nullptr);
     });
 }
+
+// The same, with a log of at most `budget` bytes to go back by, which ms_forget frees.
+MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, MsPicture *picture,
+                           int64_t budget, void **log, char *message, int message_size) {
+    return guarded(message, message_size, [&] {
+        ms::Grid grid(*camera, options->samples);
+        ms::Scene scene(*mesh, *camera, grid, options->threads);
+        auto kept = std::make_unique<ms::PictureLog>(grid.tiles(), budget);
+        picture->fragments = draw_mesh(scene, grid, *camera, *options, *picture, kept.get());
+        *log = kept.release();
+    });
+}
+
+MS_EXPORT int ms_rasterize_back(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, const void *log,
+                                const MsPictureGradient *given, const MsVertexGradients *out, char *message,
+                                int message_size) {
+    return guarded(message, message_size,
+                   [&] { go_back(*mesh, *camera, *options, *(const ms::PictureLog *)log, *given, *out); });
+}
+
+MS_EXPORT void ms_forget(void *log) { delete (ms::PictureLog *)log; }
 
 MS_EXPORT int ms_render_splats(const MsSplats *splats, const MsCamera *camera, const MsOptions *options,
                                MsPicture *picture, char *message, int message_size) {
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::SplatScene scene(*splats, *camera, grid, options->threads);
-        picture->fragments = draw_tiles(grid, scene.items, options->threads, [&] {
-            return std::make_unique<ms::SplatTile>(scene, grid, *options, *picture, *camera, *splats);
-        });
+        picture->fragments = draw_tiles(
+            grid, scene.items, options->threads,
+            [&] { return std::make_unique<ms::SplatTile>(scene, grid, *options, *picture, *camera, *splats); },
+            [&](ms::SplatTile &worker, int64_t tile, const ms::Entry *list, int64_t length) {
+                draw_tile(grid, worker, tile, list, length);
+            });
     });
 }
 

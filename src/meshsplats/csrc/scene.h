@@ -23,11 +23,13 @@ struct Scene {
     std::vector<DepthPlane> planes;    // by depth group
     std::vector<Item> items;           // groups that may cover samples, nearest first
 
-    Scene(const MsMesh &mesh, const MsCamera &camera, const Grid &grid, int threads)
+    // Items are needed to draw; without, just to follow a log.
+    Scene(const MsMesh &mesh, const MsCamera &camera, const Grid &grid, int threads, bool with_items = true)
         : mesh(mesh), grid(grid), projection(camera, grid.samples), vertices(mesh.vertex_count) {
         parallel_blocks(threads, mesh.vertex_count, 1 << 16, [&](int64_t a, int64_t b, int) {
             for (int64_t i = a; i < b; ++i) vertices[i] = projection.project(projection.to_camera(mesh.vertices + 3 * i));
         });
+        if (!with_items) return;
         find_groups();
         if (mesh.depth_group) find_planes();
         find_items(threads);

@@ -50,6 +50,7 @@ inline vm greater(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }
 inline vm equal(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_EQ_OQ); }
 inline vm not_less(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
 inline vm both(vm a, vm b) { return a & b; }
+inline vm not_mask(vm a) { return ~a; }
 inline unsigned bits(vm m) { return m; }
 inline vf pick(vm m, vf yes, vf no) { return _mm512_mask_blend_ps(m, no, yes); }
 inline vf add_where(vf a, vm m, vf b) { return _mm512_mask_add_ps(a, m, a, b); }
@@ -59,6 +60,7 @@ inline vm greater(vf a, vf b) { return a > b; }
 inline vm equal(vf a, vf b) { return a == b; }
 inline vm not_less(vf a, vf b) { return a >= b; }
 inline vm both(vm a, vm b) { return a & b; }
+inline vm not_mask(vm a) { return ~a; }
 #if defined(__AVX2__)
 inline unsigned bits(vm m) { return _mm256_movemask_ps((__m256)m); }
 inline vf pick(vm m, vf yes, vf no) { return _mm256_blendv_ps(no, yes, (__m256)m); }
@@ -97,45 +99,20 @@ inline unsigned at_least(vf a, vf b) {
 }
 #endif
 
-// Writes the lanes of `v` whose bit is set next to each other from `out` on, which has room for W.
+// A mask of the lanes whose bit is set.
 #if defined(__AVX512F__)
-inline void compress(float *out, vf v, unsigned bits) { store(out, _mm512_maskz_compress_ps((__mmask16)bits, v)); }
-#elif defined(__AVX2__)
-struct CompressTable {
-    alignas(32) unsigned char lane[256][8];
-    constexpr CompressTable() : lane() {
-        for (int bits = 0; bits < 256; ++bits) {
-            int n = 0;
-            for (int i = 0; i < 8; ++i)
-                if (bits >> i & 1) lane[bits][n++] = (unsigned char)i;
-        }
-    }
-};
-constexpr CompressTable compress_table;
-inline void compress(float *out, vf v, unsigned bits) {
-    __m256i lane = _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)compress_table.lane[bits]));
-    _mm256_storeu_ps(out, _mm256_permutevar8x32_ps(v, lane));
-}
+inline vm where(unsigned bits) { return (__mmask16)bits; }
+inline vf only(vm m, vf v) { return _mm512_maskz_mov_ps(m, v); }
 #else
-inline void compress(float *out, vf v, unsigned bits) {
-    for (int i = 0; i < W; ++i)
-        if (bits >> i & 1) *out++ = v[i];
-}
-#endif
-
-
-// Writes first + lane for the lanes whose bit is set, next to each other; `out` has room for W.
-inline void compress_numbers(int *out, int first, unsigned bits) {
-    typedef int vi __attribute__((vector_size(4 * W)));
-    static const vi lane = {0, 1, 2, 3,
+inline vm where(unsigned bits) {
 #if defined(__AVX2__)
-                            4, 5, 6, 7,
+    const vm flag = {1, 2, 4, 8, 16, 32, 64, 128};
+#else
+    const vm flag = {1, 2, 4, 8};
 #endif
-#if defined(__AVX512F__)
-                            8, 9, 10, 11, 12, 13, 14, 15,
-#endif
-    };
-    compress((float *)out, (vf)(lane + first), bits);
+    return (((int)bits - vm{}) & flag) == flag;
 }
+inline vf only(vm m, vf v) { return (vf)(m & (vm)v); }
+#endif
 
 }  // namespace ms

@@ -68,7 +68,6 @@ struct Triangles {
     alignas(64) float qa[N], qb[N], qc[N];     // 1 / depth
     alignas(64) float q_min[N], q_max[N];      // its range over the corners
     alignas(64) float sa[3][N], sb[3][N], sc[3][N];  // b_i / depth
-    alignas(64) float low_x[N], high_x[N], low_y[N], high_y[N];
     alignas(64) float area[N];           // 0: no area on the picture, nothing to draw
 
     // For triangles wholly in front of the near plane; all N slots are computed, whatever they hold.
@@ -112,8 +111,6 @@ struct Triangles {
             float least = w0 < w1 ? w0 : w1, most = w0 > w1 ? w0 : w1;
             q_min[t] = least < w2 ? least : w2;
             q_max[t] = most > w2 ? most : w2;
-            bounds(x, low_x, high_x, t);
-            bounds(y, low_y, high_y, t);
         }
     }
 
@@ -158,19 +155,11 @@ struct Triangles {
         // What is in front reaches from the near plane to the farthest corner.
         q_min[t] = (float)(1 / std::max({v[0].z, v[1].z, v[2].z}));
         q_max[t] = (float)(1 / near);
-        low_x[t] = low_y[t] = -std::numeric_limits<float>::infinity();
-        high_x[t] = high_y[t] = std::numeric_limits<float>::infinity();
     }
 
   private:
     static float edge_threshold(float a, float b) {
         return (a > 0) | ((a == 0) & (b > 0)) ? 0.0f : std::numeric_limits<float>::min();
-    }
-    static void bounds(const double p[3][N], float *low, float *high, int t) {
-        float a = (float)p[0][t], b = (float)p[1][t], c = (float)p[2][t];
-        float least = a < b ? a : b, most = a > b ? a : b;
-        low[t] = least < c ? least : c;
-        high[t] = most > c ? most : c;
     }
 };
 

@@ -55,4 +55,18 @@ struct MsPicture {
     int64_t fragments;  // blended
 };
 
+// Gradients of a number with respect to a picture ...
+struct MsPictureGradient {
+    const float *color;
+    const float *alpha;       // or null
+    const float *attributes;  // or null
+};
+
+// ... and to the vertices: added to what is there.
+struct MsVertexGradients {
+    float *vertices;    // xyz
+    float *colors;      // RGBA
+    float *attributes;  // or null
+};
+
 }  // extern "C"

@@ -72,8 +72,8 @@ def render(
         ValueError: an option out of its range, or an attribute that the mesh does not have.
         MemoryError: the scene does not fit.
     """
-    keep = _Alive()
-    options = _options(keep, camera, background, samples, threads)
+    keep = Alive()
+    options = checked_options(keep, camera, background, samples, threads)
     if max_layers is not None and not (
         isinstance(max_layers, (int, np.integer)) and 1 <= max_layers <= np.iinfo(np.int32).max
     ):
@@ -87,7 +87,9 @@ def render(
     if attributes:
         for name in attributes:
             if name not in mesh.attributes:
-                raise ValueError(f"the mesh has no attribute {name!r}; it has: {', '.join(mesh.attributes) or 'none'}")
+                raise ValueError(
+                    f"the mesh has no attribute {name!r}; it has: {', '.join(mesh.attributes) or 'none'}"
+                )
         chosen = {name: mesh.attributes[name] for name in attributes}
         columns = {name: value if value.ndim == 2 else value[:, None] for name, value in chosen.items()}
         widths = {name: column.shape[1] for name, column in columns.items()}
@@ -99,7 +101,7 @@ def render(
         colors=keep(mesh.colors),
         faces=keep(mesh.faces),
         face_splat=keep(mesh.face_splat),
-        depth_group=keep(_compact(mesh.depth_group)),
+        depth_group=keep(compact_groups(mesh.depth_group)),
         normals=keep(mesh.normals),
         attributes=keep(values),
         attribute_count=sum(widths.values()),
@@ -110,7 +112,7 @@ def render(
     directions = np.empty((h, w, 3), np.float32) if normals else None
     sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
     picture = core.PictureStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
-    core.call("ms_render_mesh", subject, _camera(camera), options, picture)
+    core.call("ms_render_mesh", subject, camera_struct(camera), options, picture)
 
     named = {}
     start = 0
@@ -154,8 +156,8 @@ def render_splats(
         ValueError: an option out of its range.
         MemoryError: the scene does not fit.
     """
-    keep = _Alive()
-    options = _options(keep, camera, background, samples, threads)
+    keep = Alive()
+    options = checked_options(keep, camera, background, samples, threads)
     if sh_degree is not None and sh_degree not in (0, 1, 2, 3):
         raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
     if not (np.isfinite(dilation) and dilation >= 0):
@@ -176,11 +178,11 @@ def render_splats(
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
     picture = core.PictureStruct(keep(color), keep(alpha), None, None, None, 0)
-    core.call("ms_render_splats", subject, _camera(camera), options, picture)
+    core.call("ms_render_splats", subject, camera_struct(camera), options, picture)
     return Rendering(color, alpha, fragments=int(picture.fragments))
 
 
-class _Alive:
+class Alive:
     """Addresses of arrays for the core; holds the arrays until the call is over."""
 
     def __init__(self) -> None:
@@ -192,14 +194,16 @@ class _Alive:
         return core.pointer(array)
 
 
-def _camera(camera: Camera) -> core.CameraStruct:
+def camera_struct(camera: Camera) -> core.CameraStruct:
     rows = (core.c_double * 12)(*camera.world_to_camera[:3].ravel())
     return core.CameraStruct(
         rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height
     )
 
 
-def _options(keep: _Alive, camera: Camera, background, samples: int, threads: int | None) -> core.OptionsStruct:
+def checked_options(
+    keep: Alive, camera: Camera, background, samples: int, threads: int | None
+) -> core.OptionsStruct:
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
     if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
@@ -222,7 +226,7 @@ def _options(keep: _Alive, camera: Camera, background, samples: int, threads: in
     )
 
 
-def _compact(depth_group: np.ndarray | None) -> np.ndarray | None:
+def compact_groups(depth_group: np.ndarray | None) -> np.ndarray | None:
     """The same groups under small numbers, so that tables over them stay as small as the mesh."""
     if depth_group is None or not len(depth_group) or depth_group.max() < len(depth_group):
         return depth_group

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_int32, c_int64, c_void_p
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets a core may be built for, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
 
-INTERFACE_VERSION = 1
+INTERFACE_VERSION = 2
 
 
 class CameraStruct(ctypes.Structure):
@@ -81,6 +81,14 @@ class PictureStruct(ctypes.Structure):
     ]
 
 
+class PictureGradientStruct(ctypes.Structure):
+    _fields_ = [("color", c_void_p), ("alpha", c_void_p), ("attributes", c_void_p)]
+
+
+class VertexGradientsStruct(ctypes.Structure):
+    _fields_ = [("vertices", c_void_p), ("colors", c_void_p), ("attributes", c_void_p)]
+
+
 def pointer(array: np.ndarray | None) -> int | None:
     """Address of a C-contiguous array, for a structure that is used while the array is alive."""
     if array is None:
@@ -114,7 +122,7 @@ def available_variants() -> list[str]:
     return [variant for variant in runs if library_path(variant)]
 
 
-@lru_cache(maxsize=None)
+@cache
 def load_core(variant: str | None = None) -> ctypes.CDLL:
     """The core's library; the best variant, or the one named by MESHSPLATS_VARIANT, unless another is asked for.
 
@@ -128,30 +136,43 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
         )
     wanted = variant or os.environ.get("MESHSPLATS_VARIANT") or available[0]
     if wanted not in available:
-        raise ValueError(f"the core has no variant {wanted!r} that runs here; available: {', '.join(available)}")
+        raise ValueError(
+            f"the core has no variant {wanted!r} that runs here; available: {', '.join(available)}"
+        )
     library = ctypes.CDLL(str(library_path(wanted)))
     library.ms_variant.restype = c_char_p
     if library.ms_interface_version() != INTERFACE_VERSION:
-        raise ImportError("the compiled core is of another version than the Python code: install the package again")
-    for name, struct in [("ms_render_mesh", MeshStruct), ("ms_render_splats", SplatsStruct)]:
+        raise ImportError(
+            "the compiled core is of another version than the Python code: install the package again"
+        )
+    message = [c_char_p, c_int]
+    mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
+    for name, arguments in {
+        "ms_render_mesh": [*mesh_and_camera, POINTER(PictureStruct)],
+        "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(PictureStruct)],
+        "ms_rasterize": [*mesh_and_camera, POINTER(PictureStruct), c_int64, POINTER(c_void_p)],
+        "ms_rasterize_back": [
+            *mesh_and_camera,
+            c_void_p,
+            POINTER(PictureGradientStruct),
+            POINTER(VertexGradientsStruct),
+        ],
+    }.items():
         function = getattr(library, name)
         function.restype = c_int
-        function.argtypes = [
-            POINTER(struct),
-            POINTER(CameraStruct),
-            POINTER(OptionsStruct),
-            POINTER(PictureStruct),
-            c_char_p,
-            c_int,
-        ]
+        function.argtypes = arguments + message
+    library.ms_forget.restype = None
+    library.ms_forget.argtypes = [c_void_p]
     return library
 
 
-def call(name: str, subject, camera: CameraStruct, options: OptionsStruct, picture: PictureStruct) -> None:
+def call(name: str, *arguments) -> None:
     """Runs a function of the core. Raises MemoryError or RuntimeError with the core's message."""
     message = ctypes.create_string_buffer(256)
-    status = getattr(load_core(), name)(subject, camera, options, picture, message, len(message))
+    status = getattr(load_core(), name)(*arguments, message, len(message))
     if status == 1:
-        raise MemoryError(f"{name}: {message.value.decode()}; render fewer triangles, pixels or samples at a time")
+        raise MemoryError(
+            f"{name}: {message.value.decode()}; render fewer triangles, pixels or samples at a time"
+        )
     if status:
         raise RuntimeError(f"{name}: {message.value.decode()}")

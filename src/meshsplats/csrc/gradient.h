@@ -1,0 +1,416 @@
+// The way back: from the gradient of a picture to those of the vertices.
+//
+// With what stands behind fragment k, B_k = a_{k+1} c_{k+1} + (1 - a_{k+1}) B_{k+1} and B = background at the end,
+//     dC/dc_k = T_k a_k,  dC/da_k = T_k (c_k - B_k),
+// found from back to front, so that nothing is divided by 1 - a and a = 1 needs no exception.
+//
+// Values are v = (sum_k s_k v_k) / (sum_k s_k) with s = A p, p = (x, y, 1), A the inverse of the matrix V of the corners in
+// homogeneous sample coordinates. As ds = -A dV s, a gradient g of v gives, summed over samples p at depth z = 1 / sum s,
+//     dL/dv_k = A_k . sum z g p,  dL/dV = -A^T G A^T,  G_k = sum z g (v_k - v) p^T.
+// So of every triangle only sums of z g and z g v times 1, x and y are needed. Which triangles a sample sees, and in which
+// order, is constant.
+#pragma once
+
+#include "mesh_tile.h"
+
+namespace ms {
+
+// Gradients with respect to the corners of one triangle, from one tile.
+struct CornerGradients {
+    int32_t vertex[3];
+    float position[3][3];
+    float rgba[3][4];
+};
+
+class GradientTile {
+  public:
+    GradientTile(const Scene &scene, const MsOptions &options, const MsCamera &camera, const MsPictureGradient &given)
+        : scene_(scene), mesh_(scene.mesh), grid_(scene.grid), options_(options), camera_(camera), given_(given),
+          extra_(given.attributes ? mesh_.attribute_count : 0), towards_extra_((size_t)extra_ * SAMPLES) {}
+
+    // Adds a tile's gradients to the lists; of attributes, (3, attribute_count) numbers a triangle.
+    void run(int tile_x, int tile_y, const TileLog &log, std::vector<CornerGradients> &out, std::vector<float> &out_attributes) {
+        area_ = TileArea(grid_, tile_x, tile_y);
+        if (log.entries.empty() || !load_given()) return;
+        set_up(log);
+        const int64_t n = (int64_t)log.entries.size(), chunks = (n + CHUNK - 1) / CHUNK;
+        // The light that comes through to each fragment is found from the front and kept for a chunk of them.
+        before_.resize((size_t)std::min<int64_t>(n, CHUNK));
+        starts_.resize((size_t)chunks * SAMPLES);
+        for (int i = 0; i < SAMPLES; ++i) through_[i] = 1;
+        for (int64_t chunk = 0; chunk < chunks; ++chunk) {
+            std::copy(through_, through_ + SAMPLES, starts_.begin() + chunk * SAMPLES);
+            forth(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+        }
+        for (int64_t chunk = chunks - 1; chunk >= 0; --chunk) {
+            if (chunk < chunks - 1) {
+                std::copy(starts_.begin() + chunk * SAMPLES, starts_.begin() + (chunk + 1) * SAMPLES, through_);
+                forth(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+            }
+            if (extra_)
+                back<true>(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+            else
+                back<false>(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+        }
+        for (size_t first = 0; first < triangles_.size(); first += Triangles::N)
+            finish(first, (int)std::min<size_t>(Triangles::N, triangles_.size() - first), out, out_attributes);
+    }
+
+  private:
+    static constexpr int64_t CHUNK = 1 << 14;
+    enum { SUMS = 5, MOMENTS = 16 };  // z g of r, g, b, a and z g v; times 1, x, y and one unused
+
+    // Positions count from a place of the triangle's own, close to it and to the tile: else small triangles would lose digits.
+    struct Prepared {
+        alignas(64) float moments[MOMENTS];
+        alignas(16) float a[4], b[4], c[4];
+        alignas(16) float low[4], high[4], first[4];
+        float qa, qb, qc, q_min, q_max;
+        float x0, y0;
+        float s[3][3];  // 1 / depth times the corners' weights: the matrix A
+        int32_t face;
+    };
+    struct Plane {
+        float a, b, c, low, high, first;
+    };
+
+    bool load_given() {
+        const int s = grid_.samples;
+        const float share = 1.0f / (s * s);
+        bool any = false;
+        for (int c = 0; c < 3; ++c) std::fill(towards_[c], towards_[c] + SAMPLES, 0.0f);
+        std::fill(behind_, behind_ + SAMPLES, 0.0f);
+        std::fill(towards_extra_.begin(), towards_extra_.end(), 0.0f);
+        for (int y = 0; y < area_.rows; ++y) {
+            for (int x = 0; x < area_.columns; ++x) {
+                const int sample = TileArea::number(x, y);
+                const int64_t pixel = (int64_t)((area_.y0 + y) / s) * camera_.width + (area_.x0 + x) / s;
+                const float *background = options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
+                float end = given_.alpha ? -given_.alpha[pixel] * share : 0;
+                any |= end != 0;
+                for (int c = 0; c < 3; ++c) {
+                    const float g = given_.color[3 * pixel + c] * share;
+                    towards_[c][sample] = g;
+                    end += g * background[c];
+                    any |= g != 0;
+                }
+                for (int c = 0; c < extra_; ++c) {
+                    const float g = given_.attributes[pixel * extra_ + c] * share;
+                    towards_extra_[(size_t)c * SAMPLES + sample] = g;
+                    any |= g != 0;
+                }
+                behind_[sample] = end;
+            }
+        }
+        return any;
+    }
+
+    // Makes the triangles ready that the log names.
+    void set_up(const TileLog &log) {
+        place_.assign(log.faces.size(), -1);
+        for (const TileLog::Entry &entry : log.entries) place_[entry.triangle] = 0;
+        triangles_.clear();
+        planes_.clear();
+        int held = 0;
+        int32_t numbers[Triangles::N];
+        for (size_t i = 0; i < place_.size(); ++i) {
+            if (place_[i] < 0) continue;
+            numbers[held++] = (int32_t)i;
+            if (held == Triangles::N) {
+                set_up_held(log, numbers, held);
+                held = 0;
+            }
+        }
+        if (held) set_up_held(log, numbers, held);
+        extra_sums_.assign(triangles_.size() * extra_ * 3, 0.0f);
+    }
+
+    void set_up_held(const TileLog &log, const int32_t *numbers, int held) {
+        fill(held, [&](int k) { return log.faces[numbers[k]]; });
+        for (int k = 0; k < held; ++k) {
+            place_[numbers[k]] = (int32_t)triangles_.size();
+            triangles_.emplace_back();
+            Prepared &p = triangles_.back();
+            const Triangles &t = batch_;
+            const f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
+            auto mix = [&](float *out, const float s[3][Triangles::N]) {
+                store4(out, set4(s[0][k]) * c[0] + set4(s[1][k]) * c[1] + set4(s[2][k]) * c[2]);
+            };
+            mix(p.a, t.sa);
+            mix(p.b, t.sb);
+            mix(p.c, t.sc);
+            store4(p.low, min4(min4(c[0], c[1]), c[2]));
+            store4(p.high, max4(max4(c[0], c[1]), c[2]));
+            store4(p.first, c[0]);
+            p.qa = t.qa[k];
+            p.qb = t.qb[k];
+            p.qc = t.qc[k];
+            p.q_min = t.q_min[k];
+            p.q_max = t.q_max[k];
+            p.x0 = (float)origin_x_[k];
+            p.y0 = (float)origin_y_[k];
+            p.face = t.face[k];
+            for (int i = 0; i < 3; ++i) {
+                p.s[i][0] = t.sa[i][k];
+                p.s[i][1] = t.sb[i][k];
+                p.s[i][2] = t.sc[i][k];
+            }
+            std::fill(p.moments, p.moments + MOMENTS, 0.0f);
+            for (int c = 0; c < extra_; ++c) {
+                const int32_t *corner = mesh_.faces + 3 * (int64_t)p.face;
+                Plane plane{0, 0, 0, 0, 0, 0};
+                for (int i = 0; i < 3; ++i) {
+                    const float v = mesh_.attributes[(int64_t)corner[i] * extra_ + c];
+                    plane.a += t.sa[i][k] * v;
+                    plane.b += t.sb[i][k] * v;
+                    plane.c += t.sc[i][k] * v;
+                    plane.low = i ? std::min(plane.low, v) : v;
+                    plane.high = i ? std::max(plane.high, v) : v;
+                    if (i == 0) plane.first = v;
+                }
+                planes_.push_back(plane);
+            }
+        }
+    }
+
+    // Sets up the first few of the triangles side by side, each with positions that count from a place of its own.
+    template <class Face>
+    void fill(int held, Face face_of) {
+        Triangles &t = batch_;
+        unsigned crossing = 0;
+        for (int k = 0; k < held; ++k) {
+            t.face[k] = face_of(k);
+            const int32_t *corner = mesh_.faces + 3 * (int64_t)t.face[k];
+            double sum_x = 0, sum_y = 0;
+            int in_front = 0;
+            for (int i = 0; i < 3; ++i) {
+                const Projected &p = scene_.vertices[corner[i]];
+                if (p.w > 0) {
+                    sum_x += p.x - area_.x0;
+                    sum_y += p.y - area_.y0;
+                    ++in_front;
+                }
+                t.rgba[i][k] = mesh_.colors + 4 * (int64_t)corner[i];
+            }
+            // Whole numbers: the distances of samples from it are exact.
+            origin_x_[k] = std::floor(std::min(std::max(sum_x / in_front, 0.0), (double)TILE));
+            origin_y_[k] = std::floor(std::min(std::max(sum_y / in_front, 0.0), (double)TILE));
+            for (int i = 0; i < 3; ++i) {
+                const Projected &p = scene_.vertices[corner[i]];
+                t.x[i][k] = p.x - (area_.x0 + origin_x_[k]);
+                t.y[i][k] = p.y - (area_.y0 + origin_y_[k]);
+                t.w[i][k] = p.w;
+            }
+            if (in_front < 3) crossing |= 1u << k;
+        }
+        t.set_up_in_front();
+        for (; crossing; crossing &= crossing - 1) {
+            const int k = __builtin_ctz(crossing);
+            Vec3 v[3];
+            scene_.homogeneous(mesh_.faces + 3 * (int64_t)t.face[k], area_.x0 + origin_x_[k], area_.y0 + origin_y_[k], v);
+            t.set_up_crossing(k, v, scene_.projection.near);
+        }
+    }
+
+    // A triangle at the samples of a block: where they are, the depth, a value.
+    static void positions(const Prepared &t, int block, Lanes &x, Lanes &y) {
+        x = TileArea::lane_x() + lanes(TileArea::block_x(block) - t.x0);
+        y = TileArea::lane_y() + lanes(TileArea::block_y(block) - t.y0);
+    }
+    static Lanes depth(const Prepared &t, const Lanes &x, const Lanes &y) {
+        const Lanes q = (lanes(t.qa) * x + lanes(t.qb) * y) + lanes(t.qc);
+        return lanes(1) / clamp(q, lanes(t.q_min), lanes(t.q_max));
+    }
+    static Lanes value(const Prepared &t, int channel, const Lanes &x, const Lanes &y, const Lanes &z) {
+        const Lanes linear = (lanes(t.a[channel]) * x + lanes(t.b[channel]) * y) + lanes(t.c[channel]);
+        return clamp(linear * z, lanes(t.low[channel]), lanes(t.high[channel]));
+    }
+
+    // Notes the light before each entry, as the picture was drawn.
+    void forth(const TileLog &log, int64_t begin, int64_t end) {
+        const Lanes enough = lanes(options_.min_transmittance);
+        for (int64_t i = begin; i < end; ++i) {
+            const TileLog::Entry &entry = log.entries[i];
+            const Prepared &t = triangles_[place_[entry.triangle]];
+            Lanes x, y;
+            positions(t, entry.block, x, y);
+            const Lanes alpha = value(t, 3, x, y, depth(t, x, y));
+            float *at = through_ + entry.block * LANES;
+            const Lanes before = load_lanes(at);
+            before_[i - begin] = before;
+            const Lanes after = before - before * alpha;
+            store_lanes(at, pick(entry.lanes, only(at_least(after, enough), after), before));
+        }
+    }
+
+    template <bool EXTRA>
+    void back(const TileLog &log, int64_t begin, int64_t end) {
+        for (int64_t i = end - 1; i >= begin; --i) {
+            const TileLog::Entry &entry = log.entries[i];
+            const int32_t place = place_[entry.triangle];
+            Prepared &t = triangles_[place];
+            const uint32_t covered = entry.lanes;
+            Lanes x, y;
+            positions(t, entry.block, x, y);
+            const Lanes z = depth(t, x, y);
+            Lanes rgba[4];
+            for (int c = 0; c < 4; ++c) rgba[c] = value(t, c, x, y, z);
+            Lanes g[3];
+            for (int c = 0; c < 3; ++c) g[c] = load_lanes(towards_[c] + entry.block * LANES);
+            Lanes own = (rgba[0] * g[0] + rgba[1] * g[1]) + rgba[2] * g[2];
+            if (EXTRA)
+                for (int c = 0; c < extra_; ++c) own = own + extra_value(place, c, x, y, z) * load_lanes(towards_extra(c, entry.block));
+            float *at = behind_ + entry.block * LANES;
+            const Lanes behind = load_lanes(at), contrast = own - behind;
+            store_lanes(at, pick(covered, behind + rgba[3] * contrast, behind));
+
+            const Lanes light = only(covered, before_[i - begin] * z), opaque = light * rgba[3];
+            Lanes sums[16];
+            for (int c = 0; c < 3; ++c) sums[c] = opaque * g[c];
+            sums[3] = light * contrast;
+            sums[4] = sums[3] * (rgba[3] - lanes(t.first[3]));
+            for (int c = 0; c < 3; ++c) sums[4] = sums[4] + sums[c] * (rgba[c] - lanes(t.first[c]));
+            if (EXTRA) {
+                for (int c = 0; c < extra_; ++c) {
+                    const Lanes sum = opaque * load_lanes(towards_extra(c, entry.block));
+                    sums[4] = sums[4] + sum * (extra_value(place, c, x, y, z) - lanes(planes_[(size_t)place * extra_ + c].first));
+                    float *to = &extra_sums_[((size_t)place * extra_ + c) * 3];
+                    to[0] += ::ms::sum(sum * x);
+                    to[1] += ::ms::sum(sum * y);
+                    to[2] += ::ms::sum(sum);
+                }
+            }
+            for (int j = 0; j < SUMS; ++j) {
+                sums[SUMS + j] = sums[j] * x;
+                sums[2 * SUMS + j] = sums[j] * y;
+            }
+            sums[15] = lanes(0);
+            add_totals(sums, t.moments);
+        }
+    }
+
+    const float *towards_extra(int c, int block) const { return &towards_extra_[(size_t)c * SAMPLES + block * LANES]; }
+    Lanes extra_value(int32_t place, int c, const Lanes &x, const Lanes &y, const Lanes &z) const {
+        const Plane &p = planes_[(size_t)place * extra_ + c];
+        return clamp(((lanes(p.a) * x + lanes(p.b) * y) + lanes(p.c)) * z, lanes(p.low), lanes(p.high));
+    }
+
+    // From sums over samples to the corners, for some triangles side by side.
+    void finish(size_t first, int held, std::vector<CornerGradients> &out, std::vector<float> &out_attributes) {
+        constexpr int N = Triangles::N;
+        alignas(64) double s[3][3][N], sum[3][SUMS][N], apart[3][4][N], g[3][3][N], h[3][3][N], move[3][3][N];
+        for (int t = 0; t < N; ++t) {
+            const Prepared &p = triangles_[first + std::min(t, held - 1)];
+            const int32_t *corner = mesh_.faces + 3 * (int64_t)p.face;
+            for (int k = 0; k < 3; ++k)
+                for (int j = 0; j < 3; ++j) s[k][j][t] = p.s[k][j];
+            // Times x, y and 1, in this order.
+            for (int j = 0; j < 3; ++j)
+                for (int c = 0; c < SUMS; ++c) sum[j][c][t] = p.moments[(j + 1) % 3 * SUMS + c];
+            for (int k = 0; k < 3; ++k)
+                for (int c = 0; c < 4; ++c) apart[k][c][t] = (double)mesh_.colors[4 * (int64_t)corner[k] + c] - p.first[c];
+        }
+        for (int k = 0; k < 3; ++k)
+            for (int j = 0; j < 3; ++j)
+                for (int t = 0; t < N; ++t) {
+                    double v = -sum[j][4][t];
+                    for (int c = 0; c < 4; ++c) v += apart[k][c][t] * sum[j][c][t];
+                    g[k][j][t] = v;
+                }
+        for (int c = 0; c < extra_; ++c) {
+            for (int t = 0; t < held; ++t) {
+                const size_t place = (first + t) * extra_ + c;
+                const int32_t *corner = mesh_.faces + 3 * (int64_t)triangles_[first + t].face;
+                for (int k = 0; k < 3; ++k) {
+                    const double d = (double)mesh_.attributes[(int64_t)corner[k] * extra_ + c] - planes_[place].first;
+                    for (int j = 0; j < 3; ++j) g[k][j][t] += d * extra_sums_[place * 3 + j];
+                }
+            }
+        }
+        for (int i = 0; i < 3; ++i)
+            for (int k = 0; k < 3; ++k)
+                for (int t = 0; t < N; ++t)
+                    h[i][k][t] = g[i][0][t] * s[k][0][t] + g[i][1][t] * s[k][1][t] + g[i][2][t] * s[k][2][t];
+        const Projection &pr = scene_.projection;
+        for (int k = 0; k < 3; ++k) {
+            for (int t = 0; t < N; ++t) {
+                double d[3];
+                for (int i = 0; i < 3; ++i) d[i] = -(s[0][i][t] * h[0][k][t] + s[1][i][t] * h[1][k][t] + s[2][i][t] * h[2][k][t]);
+                const Prepared &p = triangles_[first + std::min(t, held - 1)];
+                d[2] += (pr.cx - area_.x0 - p.x0) * d[0] + (pr.cy - area_.y0 - p.y0) * d[1];
+                d[0] *= pr.fx;
+                d[1] *= pr.fy;
+                for (int j = 0; j < 3; ++j) move[k][j][t] = pr.m[j] * d[0] + pr.m[4 + j] * d[1] + pr.m[8 + j] * d[2];
+            }
+        }
+        for (int t = 0; t < held; ++t) {
+            const Prepared &p = triangles_[first + t];
+            out.emplace_back();
+            CornerGradients &o = out.back();
+            for (int k = 0; k < 3; ++k) {
+                o.vertex[k] = mesh_.faces[3 * (int64_t)p.face + k];
+                for (int j = 0; j < 3; ++j) o.position[k][j] = (float)move[k][j][t];
+                for (int c = 0; c < 4; ++c)
+                    o.rgba[k][c] = (float)(s[k][0][t] * sum[0][c][t] + s[k][1][t] * sum[1][c][t] + s[k][2][t] * sum[2][c][t]);
+                for (int c = 0; c < extra_; ++c) {
+                    const float *m = &extra_sums_[((first + t) * extra_ + c) * 3];
+                    out_attributes.push_back((float)(s[k][0][t] * m[0] + s[k][1][t] * m[1] + s[k][2][t] * m[2]));
+                }
+            }
+        }
+    }
+
+    const Scene &scene_;
+    const MsMesh &mesh_;
+    const Grid &grid_;
+    const MsOptions &options_;
+    const MsCamera &camera_;
+    const MsPictureGradient &given_;
+    const int extra_;  // channels of attributes
+    TileArea area_;
+    alignas(64) float towards_[3][SAMPLES];  // gradient of each sample's colour
+    alignas(64) float through_[SAMPLES];
+    alignas(64) float behind_[SAMPLES];      // what is seen behind, times that gradient
+    std::vector<float> towards_extra_;
+    Triangles batch_;
+    double origin_x_[Triangles::N], origin_y_[Triangles::N];
+    std::vector<int32_t> place_;  // of the log's triangles
+    std::vector<Prepared> triangles_;
+    std::vector<Plane> planes_;
+    std::vector<float> extra_sums_;
+    std::vector<Lanes> before_;
+    std::vector<float> starts_;
+};
+
+// Adds the gradients of all tiles to those of the vertices, always in the order of the tiles: the result does not depend on
+// the number of threads.
+class VertexGradients {
+  public:
+    VertexGradients(const MsMesh &mesh, const MsVertexGradients &out, int attributes, int threads)
+        : mesh_(mesh), out_(out), attributes_(attributes), threads_(threads) {}
+
+    void add(const std::vector<CornerGradients> *tiles, const std::vector<float> *attributes, int count) {
+        on_threads(threads_, [&](int thread) {
+            const int64_t begin = mesh_.vertex_count * thread / threads_, end = mesh_.vertex_count * (thread + 1) / threads_;
+            for (int i = 0; i < count; ++i) {
+                const float *extra = attributes[i].data();
+                for (const CornerGradients &g : tiles[i]) {
+                    for (int k = 0; k < 3; ++k, extra += attributes_) {
+                        const int64_t v = g.vertex[k];
+                        if (v < begin || v >= end) continue;
+                        for (int j = 0; j < 3; ++j) out_.vertices[3 * v + j] += g.position[k][j];
+                        store4(out_.colors + 4 * v, load4(out_.colors + 4 * v) + load4(g.rgba[k]));
+                        for (int c = 0; c < attributes_; ++c) out_.attributes[v * attributes_ + c] += extra[c];
+                    }
+                }
+            }
+        });
+    }
+
+  private:
+    const MsMesh &mesh_;
+    const MsVertexGradients &out_;
+    int attributes_, threads_;
+};
+
+}  // namespace ms

@@ -1,0 +1,240 @@
+// Blends fragments into a picture, front to back.
+#pragma once
+
+#include "scene.h"
+#include "tile_area.h"
+#include "tile_log.h"
+
+namespace ms {
+
+// What a picture needs besides colour.
+struct Extras {
+    bool any = false;
+    int channels = 0;  // depth, normals, attributes, in this order
+    int depth = -1, normals = -1, attributes = -1;
+
+    Extras(const MsPicture &picture, const MsMesh &mesh) {
+        if (picture.depth) depth = channels, channels += 1;
+        if (picture.normals) normals = channels, channels += 3;
+        if (picture.attributes) attributes = channels, channels += mesh.attribute_count;
+        any = channels > 0;
+    }
+};
+
+class PictureTile {
+  public:
+    PictureTile(const Scene &scene, const MsOptions &options, const MsPicture &picture, const MsCamera &camera)
+        : scene_(scene), grid_(scene.grid), options_(options), picture_(picture), camera_(camera),
+          extras_(picture, scene.mesh), sums_((size_t)SAMPLES * extras_.channels) {}
+
+    // Writes what is blended to a log, or not (null). Then triangles without opacity count too, and what lies behind an
+    // opaque one is followed as if it let some light through: for gradients, that is what making it translucent shows.
+    void record(TileLog *log) { log_ = log; }
+    const TileLog *log() const { return log_; }
+    uint32_t number(int32_t face) {
+        if (!log_) return 0;
+        log_->faces.push_back(face);
+        return (uint32_t)log_->faces.size() - 1;
+    }
+    bool keeps_invisible() const { return log_; }
+    bool needs_weights() const { return extras_.any; }
+    int64_t fragments() const { return fragments_; }
+    unsigned open(int block) const { return open_[block]; }
+
+    void begin(const TileArea &area) {
+        area_ = area;
+        if (log_) log_->clear();
+        for (int i = 0; i < SAMPLES; ++i) {
+            layers_[i] = 0;
+            color_[0][i] = color_[1][i] = color_[2][i] = 0;
+            through_[i] = reach_[i] = 1;
+        }
+        for (int block = 0; block < BLOCKS; ++block) open_[block] = area.lanes(block);
+        std::fill(sums_.begin(), sums_.end(), 0.0f);
+    }
+
+    // Blends what is nearer than anything with 1 / depth <= nearest_to_come.
+    void blend(int block, Waiting &waiting, TilePool &pool, float nearest_to_come) {
+        if (extras_.any || options_.max_layers || log_)
+            blend_entries<true>(block, waiting, pool, nearest_to_come);
+        else
+            blend_entries<false>(block, waiting, pool, nearest_to_come);
+    }
+
+    // Takes from the list what surely stays hidden behind other entries of it.
+    void drop_hidden(int block, Waiting &waiting, TilePool &pool) {
+        // Half: more in front can only lower the light, but for the rounding of the last bit.
+        const Lanes enough = lanes(std::max(0.5f * options_.min_transmittance, 1e-30f));
+        Lanes through = load_lanes((log_ ? reach_ : through_) + block * LANES);
+        const Lanes most_opaque = lanes(log_ ? MOST_OPAQUE : 1);
+        uint32_t open = open_[block];
+        int left[LANES];
+        for (int i = 0; i < LANES; ++i)
+            left[i] = options_.max_layers ? options_.max_layers - layers_[block * LANES + i] : waiting.count();
+        waiting.keep(pool, open, [&](int32_t place, uint32_t ready, const float *keys) {
+            const TileTriangle &t = pool[place];
+            Lanes rgba[4];
+            area_.values(t, block, area_.depth(t, block, load_lanes(keys)), rgba);
+            const uint32_t seen = ready & open & (log_ ? ~0u : greater(rgba[3], lanes(0)));
+            through = through - only(seen, through * least(rgba[3], most_opaque));
+            open &= at_least(through, enough);
+            for (uint32_t rest = seen; rest; rest &= rest - 1)
+                if (--left[__builtin_ctz(rest)] == 0) open &= ~(rest & -rest);
+            return seen;
+        });
+    }
+
+    // Averages the samples of each pixel into the picture.
+    void finish() {
+        if (!picture_.color) return;
+        int s = grid_.samples;
+        float share = 1.0f / (s * s);
+        for (int y = 0; y < area_.rows; y += s) {
+            for (int x = 0; x < area_.columns; x += s) {
+                int64_t pixel = (int64_t)((area_.y0 + y) / s) * camera_.width + (area_.x0 + x) / s;
+                float color[3] = {0, 0, 0}, through = 0;
+                for (int j = 0; j < s; ++j)
+                    for (int i = 0; i < s; ++i) {
+                        int sample = TileArea::number(x + i, y + j);
+                        for (int c = 0; c < 3; ++c) color[c] += color_[c][sample];
+                        through += through_[sample];
+                    }
+                through *= share;
+                const float *background = options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
+                for (int c = 0; c < 3; ++c) picture_.color[3 * pixel + c] = color[c] * share + through * background[c];
+                picture_.alpha[pixel] = 1 - through;
+                if (!extras_.any) continue;
+                auto average = [&](float *out, int channel, int channels) {
+                    for (int c = 0; c < channels; ++c) {
+                        float sum = 0;
+                        for (int j = 0; j < s; ++j)
+                            for (int i = 0; i < s; ++i)
+                                sum += sums_[(size_t)TileArea::number(x + i, y + j) * extras_.channels + channel + c];
+                        out[pixel * channels + c] = sum * share;
+                    }
+                };
+                if (extras_.depth >= 0) average(picture_.depth, extras_.depth, 1);
+                if (extras_.normals >= 0) average(picture_.normals, extras_.normals, 3);
+                if (extras_.attributes >= 0) average(picture_.attributes, extras_.attributes, scene_.mesh.attribute_count);
+            }
+        }
+    }
+
+  private:
+    static constexpr float MOST_OPAQUE = 0.9f;
+
+    template <bool GENERAL>
+    void blend_entries(int block, Waiting &waiting, TilePool &pool, float nearest_to_come) {
+        float *at = through_ + block * LANES;
+        Lanes through = load_lanes(at), reach = load_lanes(reach_ + block * LANES), color[3];
+        for (int c = 0; c < 3; ++c) color[c] = load_lanes(color_[c] + block * LANES);
+        const Lanes enough = lanes(options_.min_transmittance);
+        uint32_t open = open_[block], lit = at_least(through, enough);
+        waiting.take(pool, nearest_to_come, open, [&](int32_t place, uint32_t ready, const float *keys) {
+            const TileTriangle &t = pool[place];
+            const Lanes z = area_.depth(t, block, load_lanes(keys));
+            Lanes rgba[4];
+            area_.values(t, block, z, rgba);
+            const Lanes weight = only(ready & (GENERAL ? lit & open : open), through * rgba[3]);
+            for (int c = 0; c < 3; ++c) color[c] = color[c] + weight * rgba[c];
+            through = through - weight;
+            const uint32_t seen = greater(weight, lanes(0));
+            fragments_ += __builtin_popcount(seen);
+            if (!GENERAL) {
+                open &= at_least(through, enough);
+                return;
+            }
+            lit = at_least(through, enough);
+            if (log_) {
+                if (ready & open)
+                    log_->entries.push_back({t.number, (uint16_t)(ready & open), (uint16_t)block});
+                reach = reach - only(ready & open, reach * least(rgba[3], lanes(MOST_OPAQUE)));
+                open &= lit | at_least(reach, enough);
+            } else {
+                open &= lit;
+            }
+            if (!extras_.any && !options_.max_layers) return;
+            alignas(64) float weights[LANES], depths[LANES];
+            store_lanes(weights, weight);
+            store_lanes(depths, z);
+            for (uint32_t rest = seen; rest; rest &= rest - 1) {
+                int lane = __builtin_ctz(rest), sample = block * LANES + lane;
+                if (extras_.any) add_extras(sample, t, depths[lane], weights[lane]);
+                if (options_.max_layers && ++layers_[sample] >= options_.max_layers) open &= ~(1u << lane);
+            }
+        });
+        open_[block] = open;
+        store_lanes(at, through);
+        if (GENERAL) store_lanes(reach_ + block * LANES, reach);
+        for (int c = 0; c < 3; ++c) store_lanes(color_[c] + block * LANES, color[c]);
+    }
+
+    void add_extras(int sample, const TileTriangle &t, float z, float weight) {
+        const MsMesh &mesh = scene_.mesh;
+        float *sum = sums_.data() + (size_t)sample * extras_.channels;
+        const int32_t *corner = mesh.faces + 3 * (int64_t)t.face;
+        const float x = TileArea::column(sample) + 0.5f, y = TileArea::row(sample) + 0.5f;
+        float b[3], total = 0;
+        for (int k = 0; k < 3; ++k) {
+            b[k] = std::min(std::max((t.sc[k] + t.sb[k] * y + t.sa[k] * x) * z, 0.0f), 1.0f);
+            total += b[k];
+        }
+        for (int k = 0; k < 3; ++k) b[k] = total > 0 ? b[k] / total : k == 0;
+        if (extras_.depth >= 0) sum[extras_.depth] += weight * z;
+        if (extras_.normals >= 0) {
+            double n[3] = {0, 0, 0};
+            if (mesh.normals) {
+                for (int k = 0; k < 3; ++k)
+                    for (int c = 0; c < 3; ++c) n[c] += (double)b[k] * mesh.normals[3 * (int64_t)corner[k] + c];
+            } else {
+                const float *p = mesh.vertices + 3 * (int64_t)corner[0], *q = mesh.vertices + 3 * (int64_t)corner[1],
+                            *r = mesh.vertices + 3 * (int64_t)corner[2];
+                double u[3], v[3];
+                for (int k = 0; k < 3; ++k) {
+                    u[k] = (double)q[k] - p[k];
+                    v[k] = (double)r[k] - p[k];
+                }
+                for (int k = 0; k < 3; ++k)
+                    n[k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
+            }
+            // The ray through the sample, in the world.
+            const Projection &pr = scene_.projection;
+            double ray[3] = {((double)area_.x0 + x - pr.cx) / pr.fx, ((double)area_.y0 + y - pr.cy) / pr.fy, 1};
+            double along = 0, length = 0;
+            for (int k = 0; k < 3; ++k) {
+                along += n[k] * (pr.m[k] * ray[0] + pr.m[4 + k] * ray[1] + pr.m[8 + k] * ray[2]);
+                length += n[k] * n[k];
+            }
+            if (length > 0) {
+                double scale = (along > 0 ? -1 : 1) / std::sqrt(length) * weight;
+                for (int k = 0; k < 3; ++k) sum[extras_.normals + k] += (float)(n[k] * scale);
+            }
+        }
+        if (extras_.attributes >= 0) {
+            int channels = mesh.attribute_count;
+            for (int c = 0; c < channels; ++c) {
+                float value = 0;
+                for (int k = 0; k < 3; ++k) value += b[k] * mesh.attributes[(int64_t)corner[k] * channels + c];
+                sum[extras_.attributes + c] += weight * value;
+            }
+        }
+    }
+
+    const Scene &scene_;
+    const Grid &grid_;
+    const MsOptions &options_;
+    const MsPicture &picture_;
+    const MsCamera &camera_;
+    Extras extras_;
+    TileArea area_;
+    alignas(64) float color_[3][SAMPLES];
+    alignas(64) float through_[SAMPLES];
+    alignas(64) float reach_[SAMPLES];  // the same if nothing were more opaque than MOST_OPAQUE
+    TileLog *log_ = nullptr;
+    int32_t layers_[SAMPLES];
+    uint32_t open_[BLOCKS];  // per block, the samples that still take light
+    std::vector<float> sums_;
+    int64_t fragments_ = 0;
+};
+
+}  // namespace ms

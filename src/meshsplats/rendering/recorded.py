@@ -1,0 +1,115 @@
+"""Pictures that can be gone back through: from gradients of a picture to those of the mesh, on NumPy arrays."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.rendering import core
+from meshsplats.rendering.api import MIN_TRANSMITTANCE, Alive, camera_struct, checked_options, compact_groups
+
+LOG_BYTES = 128 << 20
+"""Most memory that the log of one picture takes: about a byte for each fragment. Going back, tiles whose log did
+not fit are drawn once more."""
+
+
+class RecordedPicture:
+    """A picture of a mesh, drawn as ``render`` draws it, with a log of what was blended."""
+
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        colors: np.ndarray,
+        attributes: np.ndarray | None,
+        camera: Camera,
+        *,
+        background: Sequence[float] | np.ndarray = (1, 1, 1),
+        world_to_camera: np.ndarray | None = None,
+        face_splat: np.ndarray | None = None,
+        depth_group: np.ndarray | None = None,
+        samples: int = 1,
+        min_transmittance: float = MIN_TRANSMITTANCE,
+        threads: int | None = None,
+        log_bytes: int | None = LOG_BYTES,
+    ) -> None:
+        """Arrays are those of a ``SplatMesh``, C-contiguous, float32 and int32, and are kept, not copied: they
+        must not change until ``back`` is called. ``attributes`` are (v, k); ``world_to_camera`` (4, 4) takes the
+        place of the camera's; without ``log_bytes`` the picture is drawn faster and there is no way back."""
+        keep = self._keep = Alive()
+        self._options = checked_options(keep, camera, background, samples, threads)
+        self._options.min_transmittance = min_transmittance
+        self._camera = camera_struct(camera)
+        if world_to_camera is not None:
+            self._camera.world_to_camera = (core.c_double * 12)(*world_to_camera[:3].ravel())
+        width = 0 if attributes is None else attributes.shape[1]
+        self._mesh = core.MeshStruct(
+            vertex_count=len(vertices),
+            face_count=len(faces),
+            vertices=keep(vertices),
+            colors=keep(colors),
+            faces=keep(faces),
+            face_splat=keep(face_splat),
+            depth_group=keep(compact_groups(depth_group)),
+            normals=None,
+            attributes=keep(attributes if width else None),
+            attribute_count=width,
+        )
+        h, w = camera.height, camera.width
+        self.color = np.empty((h, w, 3), np.float32)
+        self.alpha = np.empty((h, w), np.float32)
+        self.attributes = np.empty((h, w, width), np.float32)
+        picture = core.PictureStruct(
+            keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
+        )
+        self._log = ctypes.c_void_p()
+        if log_bytes is None:
+            core.call("ms_render_mesh", self._mesh, self._camera, self._options, picture)
+        else:
+            core.call(
+                "ms_rasterize",
+                self._mesh,
+                self._camera,
+                self._options,
+                picture,
+                log_bytes,
+                ctypes.byref(self._log),
+            )
+        self.fragments = int(picture.fragments)
+
+    def __del__(self) -> None:
+        if getattr(self, "_log", None):
+            core.load_core().ms_forget(self._log)
+            self._log = ctypes.c_void_p()
+
+    def back(
+        self,
+        color: np.ndarray,
+        alpha: np.ndarray | None,
+        attributes: np.ndarray | None,
+        *,
+        vertices: np.ndarray,
+        colors: np.ndarray,
+        vertex_attributes: np.ndarray | None = None,
+    ) -> None:
+        """Adds to ``vertices`` (v, 3), ``colors`` (v, 4) and ``vertex_attributes`` (v, k) the gradients that
+        follow from those of the picture's ``color`` (h, w, 3), ``alpha`` (h, w) and ``attributes`` (h, w, k).
+        All float32, C-contiguous.
+
+        Which triangles a sample sees and in which order is constant. The gradient of an opacity a of 1 is that
+        of what is behind it. The result has the same bits with any number of threads.
+        """
+        if not self._log:
+            raise ValueError("the picture was drawn without a log: there is no way back")
+        if attributes is not None and not self._mesh.attribute_count:
+            attributes = None
+        given = core.PictureGradientStruct(core.pointer(color), core.pointer(alpha), core.pointer(attributes))
+        out = core.VertexGradientsStruct(
+            core.pointer(vertices),
+            core.pointer(colors),
+            None if attributes is None else core.pointer(vertex_attributes),
+        )
+        core.call("ms_rasterize_back", self._mesh, self._camera, self._options, self._log, given, out)
