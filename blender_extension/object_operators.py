@@ -71,6 +71,9 @@ class SetShading(bpy.types.Operator):
                 thing.meshsplats.shading = self.shading
             else:
                 objects.dress(thing, lit)
+                # One click: the colours of imports are shown right with these settings only.
+                every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
+                objects.render_settings(context.scene, every, lit)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

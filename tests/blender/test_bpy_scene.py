@@ -14,9 +14,9 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 
 from _blender_scenes import ball_splats, cameras, random_mesh
 
-from meshsplats import convert, load_mesh, save_cameras, save_gaussians, save_mesh
+from meshsplats import convert, save_cameras, save_gaussians, save_mesh
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import meshes, pictures, versions
+from meshsplats.blender.inside import meshes, pictures
 from meshsplats.cli import main
 from meshsplats.pictures import load_png
 
@@ -172,26 +172,3 @@ def test_errors_inside_blender_come_out_in_words(tmp_path):
     with pytest.raises(BlenderError, match=r"sky\.hdr: Blender cannot read this environment picture"):
         draw(random_mesh(5), cameras()[:1], pictures=[tmp_path / "a.png"], options=options)
     assert [path.name for path in tmp_path.iterdir()] == ["sky.hdr"]
-
-
-@pytest.mark.parametrize("suffix", [".glb", ".ply"])
-def test_files_opened_by_blenders_own_importers_get_a_material(tmp_path, suffix):
-    from meshsplats.blender.inside import objects
-
-    mesh = random_mesh(30)
-    save_mesh(mesh, tmp_path / f"m{suffix}")
-    assert len(load_mesh(tmp_path / f"m{suffix}").faces) == 30
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    versions.enable_cycles()
-    if suffix == ".glb":
-        bpy.ops.import_scene.gltf(filepath=str(tmp_path / "m.glb"))
-    else:
-        bpy.ops.wm.ply_import(filepath=str(tmp_path / "m.ply"), import_colors="LINEAR")
-    thing = next(o for o in bpy.data.objects if o.type == "MESH")
-    for lit in (True, False):
-        material = objects.dress(thing, lit)
-        assert list(thing.data.materials) == [material]
-    attribute = next(n for n in material.node_tree.nodes if n.type == "ATTRIBUTE")
-    assert attribute.attribute_name in thing.data.color_attributes
-    with pytest.raises(ValueError, match="no vertex colours"):
-        objects.dress(bpy.data.objects.new("empty", None), True)

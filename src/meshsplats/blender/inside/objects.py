@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import frame, materials, meshes, pictures, versions
+from meshsplats.blender.inside import foreign, frame, materials, meshes, pictures, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.subject import lit_arrays
@@ -117,21 +117,10 @@ def render_settings(scene: Any, things: list[Any], lit: bool) -> int:
     return limit
 
 
-def dress(thing: Any, lit: bool) -> Any:
-    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) a material that shows its vertex
-    colours.
+def dress(thing: Any, lit: bool) -> None:
+    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) what a mesh of our own has: display
+    colours for the exact picture, or linear ones, smoothed normals and a lit material.
 
-    They are taken for linear light, as these importers leave them. Returns the material. Raises ValueError
-    if the object has no colours.
+    Raises ValueError if the object has no colours or other faces than triangles.
     """
-    data = thing.data if thing is not None and thing.type == "MESH" else None
-    if data is None or not len(data.color_attributes):
-        raise ValueError("the object has no vertex colours")
-    active = data.color_attributes.active_color or data.color_attributes[0]
-    if lit:
-        material = materials.lit(self_shadow=0.0, smooth=False, attribute=active.name)
-    else:
-        material = materials.unlit(attribute=active.name)
-    data.materials.clear()
-    data.materials.append(material)
-    return material
+    replace_mesh(thing, prepare(foreign.splat_mesh(thing), lit))
