@@ -53,9 +53,9 @@ def splat_mesh(thing: Any) -> SplatMesh:
 
 def _at_vertices(data: Any, attribute: Any, name: str, width: int, corners: np.ndarray) -> np.ndarray:
     """(v, width) float32 values of a point or corner attribute."""
-    values = np.empty(width * len(attribute.data), np.float32)
-    attribute.data.foreach_get(name, values)
-    values = values.reshape(-1, width)
+    flat = np.empty(width * len(attribute.data), np.float32)
+    attribute.data.foreach_get(name, flat)
+    values = flat.reshape(-1, width)
     if attribute.domain == "POINT":
         return values
     if attribute.domain != "CORNER":
