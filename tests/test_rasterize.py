@@ -68,7 +68,7 @@ SCENES = [
 
 
 def gradients(function, dtype, mesh: SplatMesh, cameras, seed: int = 0, extra: int = 2, **options):
-    """What ``function`` gives back for random gradients of a picture: vertices, attributes, background, poses."""
+    """For random gradients of a picture those of vertices, attributes, background and poses."""
     generator = torch.Generator().manual_seed(seed)
     more = torch.randn(len(mesh.vertices), extra, generator=generator)
     view = cameras[0]
@@ -136,7 +136,7 @@ def test_reference_by_finite_differences():
 
 
 def test_picture_moves_as_its_gradient_says():
-    """Where no edge is in the picture, the reference renderer's picture itself shows what a small move does."""
+    """Where no edge is in the picture, the reference renderer itself shows what a small move does."""
     mesh, view = layers([1.2, 1.5, 2.0, 2.2], [0.3, 0.6, 0.2, 0.9]), camera(20, 16)
     rng = np.random.default_rng(0)
     mesh = replace(mesh, colors=rng.random(mesh.colors.shape))
@@ -153,7 +153,7 @@ def test_picture_moves_as_its_gradient_says():
 
 
 def one_pixel(colors, **options):
-    """Colour (3,) of a pixel wholly covered by layers of these RGBA, nearest first; a gradient of ones came back."""
+    """Colour (3,) of a pixel under layers of these RGBA, nearest first, and the gradients of its sum."""
     mesh = layers(np.arange(1, len(colors) + 1), 1)
     rgba = torch.tensor(np.repeat(np.array(colors, np.float32), 3, axis=0), requires_grad=True)
     color = rasterize(torch.from_numpy(mesh.vertices), mesh.faces, rgba, camera(1, 1), **options).color[0, 0]
@@ -196,7 +196,8 @@ def test_opaque_layer_can_become_translucent():
             opacity -= opacity.grad
             opacity.clamp_(0, 1)
         opacity.grad = None
-    assert loss < 1e-3 and opacity.max() < 0.05
+    assert loss < 1e-3
+    assert opacity.max() < 0.05
 
 
 def test_face_without_opacity_can_appear():
@@ -268,7 +269,8 @@ def test_more_entries_than_are_kept_at_once():
     mesh, view = stack(np.linspace(1, 2, 1100), 0.002), camera(16, 16)
     found = gradients(rasterize, torch.float32, mesh, [view], extra=0)
     truth = gradients(reference_autograd.rasterize, torch.float64, mesh, [view], extra=0)
-    assert error(found[0], truth[0]) < TOLERANCE and error(found[1], truth[1]) < TOLERANCE
+    assert error(found[0], truth[0]) < TOLERANCE
+    assert error(found[1], truth[1]) < TOLERANCE
 
 
 def test_without_gradients_it_is_render():
@@ -280,7 +282,8 @@ def test_without_gradients_it_is_render():
             points.requires_grad_(), mesh.faces, colors, view, background=(0.1, 0.2, 0.3), samples=2
         )
     slow = rasterize(points, mesh.faces, colors, view, background=(0.1, 0.2, 0.3), samples=2)
-    assert slow.color.requires_grad and not fast.color.requires_grad
+    assert slow.color.requires_grad
+    assert not fast.color.requires_grad
     for picture in (fast, slow):
         np.testing.assert_array_equal(picture.color.detach().numpy(), expected.color)
         np.testing.assert_array_equal(picture.alpha.detach().numpy(), expected.alpha)
@@ -291,7 +294,9 @@ def test_only_what_is_asked_for():
     mesh, view = soup(12), camera()
     points, colors = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.colors)
     rasterize(points, mesh.faces, colors.requires_grad_(), view).alpha.sum().backward()
-    assert points.grad is None and (colors.grad[:, 3] > 0).any() and (colors.grad[:, :3] == 0).all()
+    assert points.grad is None
+    assert (colors.grad[:, 3] > 0).any()
+    assert (colors.grad[:, :3] == 0).all()
 
 
 def test_backward_twice_and_second_derivatives():
@@ -302,7 +307,7 @@ def test_backward_twice_and_second_derivatives():
     (once,) = torch.autograd.grad(total, points, retain_graph=True)
     (again,) = torch.autograd.grad(total, points, create_graph=True)
     assert torch.equal(once, again)
-    with pytest.raises(RuntimeError, match="once_differentiable|twice|second"):
+    with pytest.raises(RuntimeError, match=r"once_differentiable|twice|second"):
         again.sum().backward()
 
 
@@ -322,7 +327,8 @@ def test_empty_mesh():
     points, colors = torch.zeros(0, 3, requires_grad=True), torch.zeros(0, 4, requires_grad=True)
     picture = rasterize(points, np.zeros((0, 3), np.int32), colors, camera(), background=(0.5, 0.25, 0))
     picture.color.sum().backward()
-    assert (picture.color == torch.tensor([0.5, 0.25, 0])).all() and points.grad.shape == (0, 3)
+    assert (picture.color == torch.tensor([0.5, 0.25, 0])).all()
+    assert points.grad.shape == (0, 3)
 
 
 @pytest.mark.parametrize(

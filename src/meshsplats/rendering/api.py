@@ -25,11 +25,11 @@ class Rendering:
     """A picture. Rows run from top to bottom."""
 
     color: np.ndarray
-    """(h, w, 3) float32 RGB composited over the background, in the space of the colours given (display RGB)."""
+    """(h, w, 3) float32 RGB over the background, in the space of the colours given (display RGB)."""
     alpha: np.ndarray
     """(h, w) float32 opacity in [0, 1]: 1 minus the light that still comes from the background."""
     depth: np.ndarray | None = None
-    """(h, w) float32 camera depth z summed with the same weights as colour; divide by ``alpha`` for the mean depth."""
+    """(h, w) float32 camera depth z, summed with the weights of colour: the mean is this / ``alpha``."""
     normals: np.ndarray | None = None
     """(h, w, 3) float32 world-frame unit normals turned to the camera, summed with the same weights."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -53,17 +53,19 @@ def render(
 ) -> Rendering:
     """The picture of a mesh of translucent triangles, exact at every sample.
 
-    All triangles that cover a sample are sorted by their depth there (equal depths by face number) and blended
-    front to back, ``C = sum_k T_k a_k c_k + T_end * background`` with ``T_k = prod_{j<k} (1 - a_j)``; colour and
-    opacity are interpolated with perspective-correct weights. A sample on an edge shared by two triangles belongs
-    to exactly one (top-left rule). Triangles are seen from both sides and are cut at the near plane.
+    All triangles that cover a sample are sorted by their depth there (equal depths by face number) and
+    blended front to back, ``C = sum_k T_k a_k c_k + T_end * background`` with ``T_k = prod_{j<k} (1 -
+    a_j)``; colour and opacity are interpolated with perspective-correct weights. A sample on an edge shared
+    by two triangles belongs to exactly one (top-left rule). Triangles are seen from both sides and are cut
+    at the near plane.
 
     Args:
         mesh: what to draw.
         camera: from where.
         background: RGB, (3,) or (h, w, 3), in the space of the mesh's colours.
         samples: side of the grid of samples in each pixel, 1 to 16; 2 means 2 x 2 samples, averaged.
-        max_layers: blend only the nearest so many triangles at each sample, as depth peeling with that many passes.
+        max_layers: blend only the nearest so many triangles at each sample, as depth peeling with that many
+            passes.
         min_transmittance: a sample stops once less than this fraction of light comes through; 0 never stops.
         depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
         threads: at most this many; all processors by default. The picture does not depend on it.
@@ -117,6 +119,7 @@ def render(
     named = {}
     start = 0
     for name, width in widths.items():
+        assert sums is not None
         part = sums[:, :, start : start + width]
         named[name] = part[:, :, 0] if mesh.attributes[name].ndim == 1 else part
         start += width
@@ -135,21 +138,23 @@ def render_splats(
 ) -> Rendering:
     """The picture of the splats themselves, as 3D Gaussian Splatting draws them.
 
-    Splats are projected by their local affine approximation (EWA), widened by ``dilation``, and blended whole in the
-    order of their centres' depth: opacity below 1/255 is skipped, at most 0.99 is taken, and a sample ends before
-    the splat that would leave less than 1e-4 of the light. Every sample where a splat's opacity reaches 1/255 is
-    drawn, however far from its centre. The cloud's kernel decides what is drawn: '3dgs' as above, 'antialiased' with
-    the opacity lowered by as much as the widening adds, '2dgs' flat splats met by the ray (no widening; a low pass of
-    variance 1/2 px^2).
+    Splats are projected by their local affine approximation (EWA), widened by ``dilation``, and blended
+    whole in the order of their centres' depth: opacity below 1/255 is skipped, at most 0.99 is taken, and a
+    sample ends before the splat that would leave less than 1e-4 of the light. Every sample where a splat's
+    opacity reaches 1/255 is drawn, however far from its centre. The cloud's kernel decides what is drawn:
+    '3dgs' as above, 'antialiased' with the opacity lowered by as much as the widening adds, '2dgs' flat
+    splats met by the ray (no widening; a low pass of variance 1/2 px^2).
 
     Args:
         cloud: the splats.
         camera: from where; splats whose centres are nearer than ``camera.near`` are left out.
         background: RGB, (3,) or (h, w, 3).
         samples: side of the grid of samples in each pixel, 1 to 16; the widening stays that of whole pixels.
-        sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default. Colour is kept
-            from falling below 0, as in 3DGS; that of degree 0 alone is ``cloud.colors``, kept in [0, 1].
-        dilation: variance added to the projected covariance, square pixels; models trained otherwise need theirs.
+        sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default. Colour
+            is kept from falling below 0, as in 3DGS; that of degree 0 alone is ``cloud.colors``, kept in [0,
+            1].
+        dilation: variance added to the projected covariance, square pixels; models trained otherwise need
+            theirs.
         threads: at most this many; all processors by default. The picture does not depend on it.
 
     Raises:

@@ -1,4 +1,4 @@
-"""rasterize: the renderer as a torch operator, with gradients to everything that a picture depends on smoothly."""
+"""rasterize: the renderer as a torch operator."""
 
 from __future__ import annotations
 
@@ -50,12 +50,13 @@ def rasterize(
 ) -> Raster:
     """The pictures that ``render`` draws, differentiable once.
 
-    Gradients go to ``vertices``, ``attributes``, ``background`` and ``world_to_camera``. They are those of the
-    pictures as drawn: values move with the interpolation (perspective included) and the blending; which triangles
-    a sample sees and in which order is constant, so an edge that passes over a sample gives no gradient. An
-    opacity of 1 is no exception: its gradient tells what is behind (at least six layers of it). Memory for the
-    way back is a log of at most ``log_bytes`` a picture, about a byte for each fragment; tiles beyond are drawn
-    once more. Every result has the same bits in every run, with any number of threads.
+    Gradients go to ``vertices``, ``attributes``, ``background`` and ``world_to_camera``. They are those of
+    the pictures as drawn: values move with the interpolation (perspective included) and the blending; which
+    triangles a sample sees and in which order is constant, so an edge that passes over a sample gives no
+    gradient. An opacity of 1 is no exception: its gradient tells what is behind (at least six layers
+    of it). Memory for the way back is a log of at most ``log_bytes`` a picture, about a byte for each
+    fragment; tiles beyond are drawn once more. Every result has the same bits in every run, with any number
+    of threads.
 
     Args:
         vertices: (v, 3) float32 world positions.
@@ -72,8 +73,8 @@ def rasterize(
         threads: at most this many; all processors by default.
 
     Raises:
-        ValueError: tensors of other types, shapes or devices; faces that name missing vertices; options out of
-            range.
+        ValueError: tensors of other types, shapes or devices; faces that name missing vertices; options out
+            of range.
         RuntimeError: from torch, where a second derivative is asked for.
     """
     single = isinstance(cameras, Camera)
@@ -84,7 +85,8 @@ def rasterize(
     for view in views:
         if (view.height, view.width) != size:
             raise ValueError(
-                f"cameras of one call must have one size, got {size[1]} x {size[0]} and {view.width} x {view.height}"
+                f"cameras of one call must have one size, got {size[1]} x {size[0]} and"
+                f" {view.width} x {view.height}"
             )
     if not 0 <= min_transmittance < 1:
         raise ValueError(f"min_transmittance must lie in [0, 1), got {min_transmittance}")
@@ -172,7 +174,7 @@ def _draw(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, vertices, attributes, background, poses, constant):  # type: ignore[no-untyped-def, override]
+    def forward(ctx, vertices, attributes, background, poses, constant):  # type: ignore[override]
         ctx.records = []
         pictures = _draw(vertices, attributes, background, poses, constant, ctx.records)
         # What the core reads again must not have been changed in place: torch checks it.
@@ -182,7 +184,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, to_color, to_alpha, to_extra):  # type: ignore[no-untyped-def, override]
+    def backward(ctx, to_color, to_alpha, to_extra):  # type: ignore[override]
         vertices, attributes, background, poses, alpha = ctx.saved_tensors
         needs = ctx.needs_input_grad
         if to_color is None:
@@ -194,17 +196,16 @@ class _Rasterize(torch.autograd.Function):
             points = np.zeros(vertices.shape, np.float32)
             colors = np.zeros((len(vertices), 4), np.float32)
             more = np.zeros((len(vertices), width), np.float32)
-            if needs[3]:
-                to_poses = torch.zeros_like(poses)
+            by_pose = []
             for number, record in enumerate(ctx.records):
                 given = [None if part is None else part[number] for part in towards]
                 moved = np.zeros_like(points) if needs[3] else points
                 record.back(*given, vertices=moved, colors=colors, vertex_attributes=more)
                 if needs[3]:
-                    to_poses[number] = torch.from_numpy(_pose_gradient(vertices, poses[number], moved)).to(
-                        poses
-                    )
+                    by_pose.append(_pose_gradient(vertices, poses[number], moved))
                     points += moved
+            if needs[3]:
+                to_poses = torch.from_numpy(np.stack(by_pose)).to(poses)
             to_points = torch.from_numpy(points)
             to_values = torch.from_numpy(np.concatenate([colors, more], axis=1) if width else colors)
         if needs[2]:
@@ -230,7 +231,8 @@ def _pose_gradient(vertices: torch.Tensor, pose: torch.Tensor, moved: np.ndarray
 def _check(name: str, tensor: torch.Tensor, shape: str, fits: bool) -> None:
     if tensor.device.type != "cpu" or tensor.dtype != torch.float32 or not fits:
         raise ValueError(
-            f"{name} must be {shape} float32 on the CPU, got {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}"
+            f"{name} must be {shape} float32 on the CPU, got {tuple(tensor.shape)} {tensor.dtype} on"
+            f" {tensor.device}"
         )
 
 

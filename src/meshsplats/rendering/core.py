@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 VARIANTS = ("v4", "v3", "baseline")
-"""Instruction sets a core may be built for, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
+"""Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
 
 INTERFACE_VERSION = 2
 
@@ -124,15 +124,16 @@ def available_variants() -> list[str]:
 
 @cache
 def load_core(variant: str | None = None) -> ctypes.CDLL:
-    """The core's library; the best variant, or the one named by MESHSPLATS_VARIANT, unless another is asked for.
+    """The core's library; the best variant, or the one named by MESHSPLATS_VARIANT, unless another is asked
+    for.
 
     Raises ImportError if the core was not built, ValueError if the processor cannot run the variant.
     """
     available = available_variants()
     if not available:
         raise ImportError(
-            "the compiled core of meshsplats is missing: install the package (pip install meshsplats, or pip install ."
-            " in a source tree) instead of running it from its sources"
+            "the compiled core of meshsplats is missing: install the package (pip install meshsplats, or"
+            " pip install . in a source tree) instead of running it from its sources"
         )
     wanted = variant or os.environ.get("MESHSPLATS_VARIANT") or available[0]
     if wanted not in available:
@@ -147,7 +148,7 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
         )
     message = [c_char_p, c_int]
     mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
-    for name, arguments in {
+    signatures: dict[str, list] = {
         "ms_render_mesh": [*mesh_and_camera, POINTER(PictureStruct)],
         "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(PictureStruct)],
         "ms_rasterize": [*mesh_and_camera, POINTER(PictureStruct), c_int64, POINTER(c_void_p)],
@@ -157,7 +158,8 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
             POINTER(PictureGradientStruct),
             POINTER(VertexGradientsStruct),
         ],
-    }.items():
+    }
+    for name, arguments in signatures.items():
         function = getattr(library, name)
         function.restype = c_int
         function.argtypes = arguments + message

@@ -1,4 +1,4 @@
-"""Pictures that can be gone back through: from gradients of a picture to those of the mesh, on NumPy arrays."""
+"""Pictures with a way back: from gradients of a picture to those of the mesh, on NumPy arrays."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from meshsplats.rendering import core
 from meshsplats.rendering.api import MIN_TRANSMITTANCE, Alive, camera_struct, checked_options, compact_groups
 
 LOG_BYTES = 128 << 20
-"""Most memory that the log of one picture takes: about a byte for each fragment. Going back, tiles whose log did
-not fit are drawn once more."""
+"""Most memory that the log of one picture takes: about a byte for each fragment. Going back, tiles whose log
+did not fit are drawn once more."""
 
 
 class RecordedPicture:
@@ -36,9 +36,10 @@ class RecordedPicture:
         threads: int | None = None,
         log_bytes: int | None = LOG_BYTES,
     ) -> None:
-        """Arrays are those of a ``SplatMesh``, C-contiguous, float32 and int32, and are kept, not copied: they
-        must not change until ``back`` is called. ``attributes`` are (v, k); ``world_to_camera`` (4, 4) takes the
-        place of the camera's; without ``log_bytes`` the picture is drawn faster and there is no way back."""
+        """Arrays are those of a ``SplatMesh``, C-contiguous, float32 and int32, and are kept, not copied:
+        they must not change until ``back`` is called. ``attributes`` are (v, k); ``world_to_camera`` (4, 4)
+        takes the place of the camera's; without ``log_bytes`` the picture is drawn faster and there is no
+        way back."""
         keep = self._keep = Alive()
         self._options = checked_options(keep, camera, background, samples, threads)
         self._options.min_transmittance = min_transmittance
@@ -99,8 +100,8 @@ class RecordedPicture:
         follow from those of the picture's ``color`` (h, w, 3), ``alpha`` (h, w) and ``attributes`` (h, w, k).
         All float32, C-contiguous.
 
-        Which triangles a sample sees and in which order is constant. The gradient of an opacity a of 1 is that
-        of what is behind it. The result has the same bits with any number of threads.
+        Which triangles a sample sees and in which order is constant. The gradient of an opacity a of 1 is
+        that of what is behind it. The result has the same bits with any number of threads.
         """
         if not self._log:
             raise ValueError("the picture was drawn without a log: there is no way back")

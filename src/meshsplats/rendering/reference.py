@@ -374,8 +374,8 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 def splat_colors(cloud: GaussianCloud, camera: Camera, degree: int) -> np.ndarray:
     """(n, 3) RGB of every splat seen from the camera: max(0, 0.5 + SH), direction camera centre to splat.
 
-    Degrees above the stored one are not there to be used. There is no upper limit, as in 3DGS, except that degree 0
-    alone gives ``cloud.colors``, the colour that a vertex can carry, at most 1.
+    Degrees above the stored one are not there to be used. There is no upper limit, as in 3DGS, except that
+    degree 0 alone gives ``cloud.colors``, the colour that a vertex can carry, at most 1.
     """
     degree = min(degree, cloud.sh_degree)
     directions = cloud.means.astype(np.float64) - camera.center

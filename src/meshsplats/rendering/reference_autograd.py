@@ -1,4 +1,4 @@
-"""The specification of :func:`meshsplats.rendering.autograd.rasterize`: plain torch in float64, slow, written to be read.
+"""The specification of :func:`meshsplats.rendering.autograd.rasterize`: torch in float64, slow, to be read.
 
 Which triangles a sample sees, and in which order, comes from :mod:`meshsplats.rendering.reference` and is
 constant; everything else is torch, differentiated by torch.
@@ -31,8 +31,8 @@ def rasterize(
 ) -> Raster:
     """What ``autograd.rasterize`` returns, in float64, with no limit to the layers that are blended.
 
-    Arguments are those of ``autograd.rasterize``; positions and colours may be float32 or float64, but order and
-    visibility are found from their float32 values.
+    Arguments are those of ``autograd.rasterize``; positions and colours may be float32 or float64, but order
+    and visibility are found from their float32 values.
     """
     if isinstance(cameras, Camera):
         pose = None if world_to_camera is None else world_to_camera[None]
