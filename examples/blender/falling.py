@@ -30,7 +30,8 @@ mesh = ms.convert(cloud, mode="flat")
 
 # The parts of the still life follow each other: which splats are whose?
 size = {name: int(share * len(cloud)) for name, share in SHARES.items()}
-order = [("vase", size["vase"]), ("ball", size["ball"]), ("orange", size["orange"]), ("orange.001", size["orange"])]
+order = [("vase", size["vase"]), ("ball", size["ball"])]
+order += [("orange", size["orange"]), ("orange.001", size["orange"])]
 order += [("flowers", size["leaves"] + size["flowers"])]
 ends = np.cumsum([count for _, count in order])
 part_of_splat = np.searchsorted(ends, np.arange(len(cloud)), side="right")
@@ -50,7 +51,7 @@ import mathutils  # noqa: E402
 
 from meshsplats.blender.inside import objects  # noqa: E402
 
-bpy.ops.wm.open_mainfile(filepath=str(out / "falling.blend"))
+bpy.ops.wm.open_mainfile(filepath=str((out / "falling.blend").resolve()))
 scene = bpy.context.scene
 bpy.ops.rigidbody.world_add()
 scene.rigidbody_world.substeps_per_frame = 20
@@ -122,4 +123,5 @@ for frame in range(1, moments[-1] + 1):  # rigid bodies go from frame to frame
 bpy.ops.wm.save_as_mainfile(filepath=str((out / "falling.blend").resolve()), compress=True)
 Image.fromarray(np.concatenate(strip, axis=1)).save(out / "falling.png", optimize=True)
 tilt = np.degrees(bodies["vase"].matrix_world.to_quaternion().angle)
-print(f"{out / 'falling.png'}, {out / 'falling.blend'}: {len(mesh.faces):,} triangles; the vase lies at {tilt:.0f} degrees")
+print(f"{out / 'falling.png'}, {out / 'falling.blend'}: {len(mesh.faces):,} triangles")
+print(f"the vase lies at {tilt:.0f} degrees")

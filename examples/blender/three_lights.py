@@ -47,7 +47,7 @@ LIGHTS = {
     ),
     "overcast sky": LightOptions(sun_strength=0, sky=0.9, mirror=True, glass=True),
     "studio": LightOptions(
-        sun_strength=0, hdri=studio(out / "studio.hdr"), hdri_strength=1.6, mirror=True, glass=True
+        sun_strength=0, hdri=studio(out / "studio.hdr"), hdri_strength=0.6, mirror=True, glass=True
     ),
 }
 

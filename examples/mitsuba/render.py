@@ -50,7 +50,7 @@ def make_shape(mesh: ms.SplatMesh) -> mi.Mesh:
 
 
 def make_sensor(camera: ms.Camera, samples: int) -> dict:
-    """``camera`` for Mitsuba, whose cameras have x to the left and y up; the principal point may be anywhere."""
+    """``camera`` for Mitsuba, whose cameras have x to the left and y up. Any principal point will do."""
     to_world = np.linalg.inv(camera.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
         "type": "perspective",
@@ -72,14 +72,16 @@ def make_sensor(camera: ms.Camera, samples: int) -> dict:
     }
 
 
-def make_scene_of(mesh: ms.SplatMesh, camera: ms.Camera, samples: int, floor: float | None = None) -> mi.Scene:
-    """``mesh`` under sun and sky on a ground ``floor`` scene units up (the lowest part of the mesh)."""
+def make_scene_of(
+    mesh: ms.SplatMesh, camera: ms.Camera, samples: int, floor: float | None = None
+) -> mi.Scene:
+    """``mesh`` under sun and sky on a ground ``floor`` scene units up (by default its own lowest part)."""
     if camera.fx != camera.fy:
         raise ValueError("Mitsuba's cameras have square pixels: fx and fy must be the same")
-    axes = front_axes(mesh.up.astype(np.float64))
-    right, up, forward = axes
+    right, up, forward = front_axes(mesh.up.astype(np.float64))
     azimuth, elevation = np.radians(SUN)
-    to_sun = np.cos(elevation) * (np.sin(azimuth) * right - np.cos(azimuth) * forward) + np.sin(elevation) * up
+    level = np.sin(azimuth) * right - np.cos(azimuth) * forward
+    to_sun = np.cos(elevation) * level + np.sin(elevation) * up
     bounds = scene_bounds(mesh)
     height = float((mesh.vertices @ up).min()) if floor is None else floor
     place = bounds.center + (height - bounds.center @ up) * up
@@ -100,7 +102,7 @@ def make_scene_of(mesh: ms.SplatMesh, camera: ms.Camera, samples: int, floor: fl
     return mi.load_dict(
         {
             "type": "scene",
-            # Each layer that a ray passes is one more step of its path; volpath follows light through them.
+            # On its way to a light, volpath goes on through layers, which path would take for opaque.
             "integrator": {"type": "volpath", "max_depth": 4, "rr_depth": 1000},
             "sensor": make_sensor(camera, samples),
             "splats": make_shape(mesh),
@@ -139,8 +141,9 @@ def main() -> None:
     camera = ms.orbit(mesh, 1, elevation=20, width=given.width, height=height, distance=1.3)[0]
     picture = mi.render(make_scene_of(mesh, camera, given.samples))
     mi.util.write_bitmap(str(given.output), picture)
-    mi.util.write_bitmap(str(given.output.with_suffix(".png")), picture)
-    print(f"{given.output}: {len(mesh.faces):,} triangles by Mitsuba {mi.__version__}; {given.output.with_suffix('.png')}")
+    shown = given.output.with_suffix(".png")
+    mi.util.write_bitmap(str(shown), picture)
+    print(f"{given.output}, {shown}: {len(mesh.faces):,} triangles by Mitsuba {mi.__version__}")
 
 
 if __name__ == "__main__":

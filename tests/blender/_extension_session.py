@@ -2,8 +2,10 @@
 
 import json
 import sys
+import time
 from importlib.machinery import PathFinder
 from pathlib import Path
+from types import SimpleNamespace
 
 package, folder = sys.argv[1], Path(sys.argv[2])
 
@@ -61,6 +63,13 @@ try:
 except RuntimeError as error:
     told["broken"] = str(error)
 
+# All splats again, for a picture of the ball: it stands at (1, 2, 3) and has radius 1.
+bpy.context.view_layer.objects.active = thing
+thing.meshsplats.max_triangles = 0
+bpy.ops.object.meshsplats_convert_again()
+told["triangles"]["again"] = len(thing.data.polygons)
+from meshsplats.blender.inside import stage  # noqa: E402
+
 scene = bpy.context.scene
 scene.render.engine = "CYCLES"
 camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
@@ -68,14 +77,95 @@ scene.collection.objects.link(camera)
 camera.location = (1, -4, 3)
 camera.rotation_euler = (1.5708, 0, 0)
 scene.camera = camera
-scene.world = bpy.data.worlds.new("w")
-scene.world.color = (1, 1, 1)
+stage.even_world((1, 1, 1))
 scene.render.resolution_x = scene.render.resolution_y = 32
 scene.render.filepath = str(folder / "picture.png")
 bpy.ops.render.render(write_still=True)
 picture = bpy.data.images.load(scene.render.filepath)
 values = picture.pixels[:]
-told["mean"] = sum(values[0::4]) / len(values[0::4])
+row = [values[4 * (16 * 32 + column)] for column in range(32)]
+told["edge"], told["middle"] = row[1], row[16]
+
+# As in a window, where Blender calls the operator again and again while a thread does the work.
+work = sys.modules[addon + ".work"]
+work.bpy_background = lambda: False
+
+
+class Window:
+    """What the operator asks of Blender's window."""
+
+    def __init__(self):
+        self.shown, self.handlers, self.timers, self.text = [], 0, 0, None
+        self.window_manager = self.window = self.workspace = self
+
+    def event_timer_add(self, seconds, window):
+        self.timers += 1
+        return self
+
+    def event_timer_remove(self, timer):
+        self.timers -= 1
+
+    def progress_begin(self, low, high):
+        self.shown.append(low)
+
+    def progress_update(self, value):
+        self.shown.append(value)
+
+    def progress_end(self):
+        self.shown.append("end")
+
+    def modal_handler_add(self, operator):
+        self.handlers += 1
+
+    def status_text_set(self, text):
+        self.text = text
+
+
+class Operator(work.Modal):
+    def __init__(self):
+        self.said, self.results, self.left_alone = [], None, False
+
+    def report(self, kind, text):
+        self.said.append(text)
+
+    def done(self, context, work):
+        self.results = len(work.results)
+
+    def given_up(self):
+        self.left_alone = True
+
+
+def event(kind):
+    return SimpleNamespace(type=kind, value="PRESS")
+
+
+choices = {name: getattr(thing.meshsplats, name) for name in sys.modules[addon + ".settings"].CHOICES}
+window, operator = Window(), Operator()
+answers = [operator.begin(window, work.Work([str(folder / "ball.ply")], choices))]
+answers.append(operator.modal(window, event("MOUSEMOVE")))
+while answers[-1] != {"FINISHED"} and len(answers) < 2000:
+    time.sleep(0.02)
+    answers.append(operator.modal(window, event("TIMER")))
+told["waited"] = {
+    "answers": [sorted(answers[0]), sorted(answers[1]), sorted(answers[-1])],
+    "progress": [value for value in window.shown if value != "end"],
+    "results": operator.results,
+    "timers": window.timers,
+    "text": window.text,
+}
+
+window, operator = Window(), Operator()
+job = work.Work([str(folder / "ball.ply")] * 50, choices)
+operator.begin(window, job)
+told["escape"] = {"answer": sorted(operator.modal(window, event("ESC"))), "said": operator.said}
+job._thread.join(60)
+told["escape"] |= {
+    "alive": job._thread.is_alive(),
+    "converted": len(job.results),
+    "results": operator.results,
+    "left_alone": operator.left_alone,
+    "timers": window.timers,
+}
 
 bpy.ops.preferences.addon_disable(module=addon)
 told["left"] = [

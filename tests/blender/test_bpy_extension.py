@@ -12,6 +12,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
@@ -94,4 +95,17 @@ def test_a_whole_session(packed, tmp_path):
     assert told["broken"].startswith("Error: ")
     assert "broken.ply" in told["broken"]
     assert told["left"] == []
-    assert told["mean"] < 0.99, "something was drawn"
+    assert told["triangles"]["again"] > told["triangles"]["fewer"]
+    assert told["edge"] == pytest.approx(1, abs=0.01)
+    assert told["middle"] == pytest.approx(0.7, abs=0.1), "the grey ball is drawn"
+    waited = told["waited"]
+    assert waited["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["FINISHED"]]
+    assert (np.diff(waited["progress"]) >= 0).all()
+    assert waited["results"] == 1
+    assert (waited["timers"], waited["text"]) == (0, None)
+    escape = told["escape"]
+    assert escape["answer"] == ["CANCELLED"]
+    assert escape["said"] == ["MeshSplats: given up"]
+    assert (escape["results"], escape["left_alone"], escape["timers"]) == (None, True, 0)
+    assert not escape["alive"], "the thread stops by itself"
+    assert escape["converted"] < 50

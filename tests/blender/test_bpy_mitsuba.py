@@ -20,7 +20,7 @@ from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import pictures, scene, stage
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "mitsuba" / "render.py"
-SAMPLES = 96
+SAMPLES = 48
 
 SESSION = """
 import runpy, sys
