@@ -16,6 +16,8 @@ COMMANDS = {
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
     "render": ("meshsplats.cli.render:Render", "pictures of splats or a mesh, and a turntable"),
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, pictures side by side"),
+    "finetune": ("meshsplats.cli.finetune:Finetune", "the mesh brought closer to splats or photographs"),
+    "evaluate": ("meshsplats.cli.evaluate:Evaluate", "scores against photographs: PSNR, SSIM, LPIPS"),
     "blender": ("meshsplats.cli.blender:Blender", "pictures and scenes by Blender: exact ones, and lit ones"),
     "info": ("meshsplats.cli.info:Info", "what is in a splat file, mesh, camera file or model folder"),
     "doctor": ("meshsplats.cli.doctor:Doctor", "what is installed here, and what is missing"),

@@ -1,0 +1,367 @@
+"""``meshsplats evaluate``: scores against held-out photographs, or against the splats' own pictures."""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from meshsplats.camera import load_cameras
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import (
+    Count,
+    File,
+    Folder,
+    Output,
+    SplatOptions,
+    cameras_beside,
+    check_outputs,
+    configuration,
+    load_scene,
+    parse_color,
+    plural,
+    track,
+    view_names,
+    write_json,
+)
+from meshsplats.dataset import Dataset, load_dataset, splat_views
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.evaluation import SSIM_CONVENTION, Report, ScoredView, evaluate
+from meshsplats.evaluation_pictures import markdown_table, picture_folder, view_crop, view_strip
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.protocols import PROTOCOLS, Protocol, find_input
+
+RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION = (
+    "results.json",
+    "per_view.json",
+    "report.json",
+    "table.md",
+    "config.json",
+)
+Weights = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Scores pictures of a mesh, and of splats beside it: PSNR, SSIM and LPIPS of each view, their means and
+    medians, and strips truth | mesh | splats | error.
+
+    results.json and per_view.json have the shape of those that the 3DGS code writes; report.json has
+    everything.
+    """
+
+    mesh: tyro.conf.Positional[File] = None
+    """The mesh. With --protocol: a folder with a mesh, splats or a model folder for each scene, by
+    its name."""
+    output: Output = tyro.MISSING
+    """Folder for the results."""
+    data: Folder = None
+    """Data set of photographs; with --protocol the folder of its scenes. Default: the splats' pictures."""
+    before: File = None
+    """Another mesh to score beside, for instance the one before it was fine-tuned."""
+    splats: File = None
+    """The splats, scored beside the mesh at degree 0 and with all their spherical harmonics."""
+    pictures: Folder = None
+    """Pictures made elsewhere, by Blender say: a file for each view, by its name or in the views' order."""
+    cameras: File = None
+    """Without --data: cameras to draw the splats from. Default: as finetune holds them out."""
+    sh_degree: Count = None
+    """Without --data: the splats' pictures are the truth up to this degree. Default: all that are stored."""
+    lpips: Weights = ()
+    """Weights of LPIPS, files or a folder; without them that column is empty."""
+    network: Literal["vgg", "alex"] = "vgg"
+    """Network of LPIPS; splatting papers use vgg."""
+    fit_exposure: bool = False
+    """Also score after a gain and an offset a channel are fitted to each picture."""
+    samples: int = 1
+    """Side of the grid of samples in each pixel, for meshes."""
+    background: str = "white"
+    """Behind everything: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
+    downscale: Count = None
+    """Pictures this many times smaller. Default: 1; that of the protocol."""
+    test_every: int = 8
+    """Every n-th view is held out where the data set has no split of its own."""
+    protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
+    """Score all scenes of a benchmark as the paper's Table 1 does."""
+    tune: Literal["default", "paper", "published"] | None = None
+    """With --protocol: fine-tune the scenes' splats on the training views first, with this preset."""
+    strips: int = 8
+    """For so many views, spread over all, write strips and enlarged crops."""
+    amplify: float = 4.0
+    """Factor that makes the error visible in the strips."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """At most N threads. Default: all processors."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        self._check()
+        start = time.perf_counter()
+        if self.protocol is not None:
+            reports = self._run_protocol(PROTOCOLS[self.protocol])
+        else:
+            self._check_outputs(self.output)
+            mesh = None if self.mesh is None else self._load_mesh(self.mesh)
+            before = None if self.before is None else self._load_mesh(self.before)
+            splats = None if self.splats is None else self._load_splats(self.splats)
+            dataset = self._dataset(splats)
+            own_truth = self.data is None
+            reports = [self._score(self.output, dataset, mesh, None if own_truth else splats, before)]
+        seconds = round(time.perf_counter() - start, 2)
+        write_json(self.output / CONFIGURATION, configuration("evaluate", self))
+        if self.json:
+            print(json.dumps({"scenes": [r.to_dict() for r in reports], "seconds": seconds}, indent=1))
+            return
+        _print_table(reports)
+        print(f"SSIM: convention {SSIM_CONVENTION!r}; {seconds:.1f} s; {self.output}/")
+
+    def _check(self) -> None:
+        parse_color(self.background)
+        if self.amplify <= 0 or self.strips < 0:
+            raise ValueError("--amplify must be positive and --strips >= 0")
+        if self.protocol is not None:
+            if self.data is None or self.mesh is None:
+                raise UsageError("--protocol needs a folder of meshes or models, and --data with the scenes")
+            for name in ("before", "splats", "pictures", "cameras", "sh_degree"):
+                if getattr(self, name) is not None:
+                    raise UsageError(f"--{name.replace('_', '-')} has no effect with --protocol")
+            return
+        if self.tune is not None:
+            raise UsageError("--tune is for --protocol; otherwise use meshsplats finetune, then evaluate")
+        if self.mesh is None and self.pictures is None and (self.splats is None or self.data is None):
+            raise UsageError("nothing to score: give a mesh, --pictures, or --splats with --data")
+        if self.data is None and self.splats is None:
+            raise UsageError("nothing to compare with: give --data, or --splats")
+        if self.data is not None and (self.cameras is not None or self.sh_degree is not None):
+            raise UsageError("--cameras and --sh-degree have no effect with --data")
+        if self.data is None and self.downscale is not None:
+            raise UsageError("--downscale has no effect without --data")
+
+    def _check_outputs(self, folder: Path) -> None:
+        names = (RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION)
+        check_outputs([folder / name for name in names], self.force, folder)
+
+    def _load_mesh(self, path: Path) -> SplatMesh:
+        found = load_scene(path, self.reading)
+        if not isinstance(found, SplatMesh):
+            raise FileFormatError(
+                f"{path}: splats, not a mesh; give them with --splats, or convert them first"
+            )
+        return found
+
+    def _load_splats(self, path: Path) -> GaussianCloud:
+        found = load_scene(path, self.reading)
+        if not isinstance(found, GaussianCloud):
+            raise FileFormatError(f"{path}: a mesh, not splats")
+        return found
+
+    def _dataset(self, splats: GaussianCloud | None) -> Dataset:
+        background = parse_color(self.background)
+        if self.data is not None:
+            options = {"downscale": self.downscale or 1, "test_every": self.test_every}
+            return load_dataset(self.data, background=background, **options)
+        assert splats is not None
+        assert self.splats is not None
+        drawing: dict[str, Any] = {
+            "sh_degree": self.sh_degree,
+            "background": background,
+            "threads": self.threads,
+        }
+        if self.cameras is not None:
+            return Dataset((), splat_views(splats, load_cameras(self.cameras), **drawing), "splats")
+        from meshsplats.datasets.around import splat_dataset
+
+        return splat_dataset(splats, cameras=cameras_beside(self.splats), **drawing)
+
+    def _score(
+        self,
+        folder: Path,
+        dataset: Dataset,
+        mesh: SplatMesh | None,
+        splats: GaussianCloud | None,
+        before: SplatMesh | None,
+    ) -> Report:
+        """Evaluates one scene and writes its files into ``folder``."""
+        from meshsplats.lpips import load_lpips
+
+        views = dataset.test or dataset.views
+        pictures = None if self.pictures is None else picture_folder(self.pictures, [v.camera for v in views])
+        lpips = load_lpips(list(self.lpips) or None, network=self.network)
+        shown = set(np.linspace(0, len(views) - 1, min(self.strips, len(views))).round().astype(int).tolist())
+        names = view_names(len(views))
+        folder.mkdir(exist_ok=True)
+        bar = iter(track(range(len(views)), "scoring", len(views)))
+        next(bar, None)
+        count = 0
+
+        def keep(scored: ScoredView) -> None:
+            nonlocal count
+            if count in shown:
+                _save_strips(folder, names[count], scored, self.amplify)
+            count += 1
+            next(bar, None)
+
+        report = evaluate(
+            mesh,
+            dataset,
+            before=before,
+            splats=splats,
+            pictures=pictures,
+            samples=self.samples,
+            lpips=lpips,
+            fit_exposure=self.fit_exposure,
+            threads=self.threads,
+            on_view=keep,
+        )
+        about = {
+            "background": list(parse_color(self.background)),
+            "lpips_network": self.network if lpips else None,
+        }
+        report = replace(report, about={**report.about, **about})
+        write_json(folder / RESULTS, report.results())
+        write_json(folder / PER_VIEW, report.per_view())
+        write_json(folder / REPORT, report.to_dict())
+        _write_text(folder / TABLE, markdown_table([report]))
+        return report
+
+    def _run_protocol(self, protocol: Protocol) -> list[Report]:
+        assert self.data is not None
+        assert self.mesh is not None
+        self._check_outputs(self.output)
+        found = []
+        for scene, factor in protocol.scenes.items():
+            source = find_input(self.mesh, scene)
+            if source is None or not (self.data / scene).is_dir():
+                missing = f"{self.data / scene}" if source else f"{self.mesh / scene}(.npz, .ply, ...)"
+                warnings.warn(
+                    f"{protocol.title}: scene {scene} is left out, no {missing}", DataWarning, stacklevel=2
+                )
+                continue
+            found.append((scene, source, self.downscale or factor))
+        if not found:
+            raise FileNotFoundError(
+                f"none of the scenes of {protocol.title} ({', '.join(protocol.scenes)}) is both in"
+                f" {self.mesh} and in {self.data}"
+            )
+        reports = []
+        for scene, source, factor in found:
+            dataset = load_dataset(
+                self.data / scene,
+                downscale=factor,
+                test_every=protocol.test_every,
+                background=protocol.background,
+            )
+            mesh, splats, before = self._prepared(load_scene(source, self.reading), dataset)
+            self.output.mkdir(exist_ok=True)
+            reports.append(self._score(self.output / scene, dataset, mesh, splats, before))
+        means = {
+            name: {
+                key: _mean([r.results().get(name, {}).get(key) for r in reports])
+                for key in ("SSIM", "PSNR", "LPIPS")
+            }
+            for name in reports[0].results()
+        }
+        write_json(self.output / RESULTS, means)
+        write_json(self.output / PER_VIEW, {r.scene: r.per_view() for r in reports})
+        write_json(
+            self.output / REPORT,
+            {
+                "protocol": self.protocol,
+                "scenes": [scene for scene, _, _ in found],
+                "missing": sorted(set(protocol.scenes) - {scene for scene, _, _ in found}),
+                "downscale": {scene: factor for scene, _, factor in found},
+                "test_every": protocol.test_every,
+                "background": list(protocol.background),
+                "ssim_convention": SSIM_CONVENTION,
+                "mean": means,
+                "reported": {name: list(values) for name, values in protocol.reported.items()},
+                "reports": [r.to_dict() for r in reports],
+            },
+        )
+        title = f"{protocol.title}: {plural(len(found), 'scene')} of {len(protocol.scenes)}"
+        _write_text(self.output / TABLE, markdown_table(reports, title=title, reported=protocol.reported))
+        return reports
+
+    def _prepared(
+        self, scene: GaussianCloud | SplatMesh, dataset: Dataset
+    ) -> tuple[SplatMesh, GaussianCloud | None, SplatMesh | None]:
+        """Mesh, splats and the mesh before tuning, of what was found for a scene."""
+        if isinstance(scene, SplatMesh):
+            if self.tune is None:
+                return scene, None, None
+            return _tuned(scene, dataset, self.tune, self.threads), None, scene
+        from meshsplats.conversion import convert
+
+        start = "default" if self.tune in (None, "default") else "paper"
+        mesh = convert(scene, preset=start, cameras=[view.camera for view in dataset.train])
+        if self.tune is None:
+            return mesh, scene, None
+        return _tuned(mesh, dataset, self.tune, self.threads), scene, mesh
+
+
+def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) -> SplatMesh:
+    from meshsplats.finetuning import RunOptions, finetune, make_config
+
+    return finetune(mesh, dataset, make_config(preset), run=RunOptions(threads=threads, report_every=0))
+
+
+def _save_strips(folder: Path, name: str, scored: ScoredView, amplify: float) -> None:
+    from meshsplats.pictures import save_png
+
+    makers: dict[str, Callable[[ScoredView, float], np.ndarray]] = {"strips": view_strip, "crops": view_crop}
+    for part, make in makers.items():
+        (folder / part).mkdir(exist_ok=True)
+        save_png(folder / part / name, make(scored, amplify))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known and len(known) == len(values) else None
+
+
+def _write_text(path: Path, text: str) -> None:
+    from meshsplats.formats.atomic import atomic_path
+
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _print_table(reports: Sequence[Report]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("scene", "method", box=None, pad_edge=False)
+    for column in ("PSNR dB", "median", "SSIM", "LPIPS", "PSNR fitted", "floater px"):
+        table.add_column(column, justify="right")
+    for report in reports:
+        for scores in report.methods:
+            mean = {
+                column: scores.mean(column)
+                for column in ("psnr", "ssim", "lpips", "psnr_exposure", "floaters")
+            }
+            table.add_row(
+                report.scene,
+                scores.method,
+                _shown(mean["psnr"], 2),
+                _shown(scores.median("psnr"), 2),
+                _shown(mean["ssim"], 4),
+                _shown(mean["lpips"], 4),
+                _shown(mean["psnr_exposure"], 2),
+                _shown(mean["floaters"], 1),
+            )
+    Console().print(table)
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "n/a" if value is None else f"{value:.{digits}f}"

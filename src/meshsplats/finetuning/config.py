@@ -1,0 +1,188 @@
+"""What a fine-tuning does: its configuration, the presets, and what can be told wrong before any work."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal, get_args
+
+Unit = Literal["splat", "scene"]
+Backdrop = Literal["random", "white", "black"]
+BACKDROPS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+LENGTHS = ("epochs", "steps", "minutes")
+
+
+@dataclass(frozen=True)
+class FinetuneConfig:
+    """Every choice that changes the result. The defaults are those of the preset 'default'.
+
+    The loss of a step, one picture, is ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM) + l2_weight * L2``
+    with L1 and L2 the means of the differences' sizes and squares, and SSIM in the convention of 3DGS.
+    """
+
+    preset: str = "default"
+    """The preset that these values began from; a name for the record."""
+    epochs: float | None = None
+    """Length: so many times all training views. Of the three lengths exactly one is given."""
+    steps: int | None = 1500
+    """Length: so many steps, one view each."""
+    minutes: float | None = None
+    """Length: so much time, with what came before (reading, converting, drawing the targets). The one length
+    whose result depends on the machine's speed."""
+    color_rate: float = 0.02
+    """Adam's rate of red, green, blue and opacity, which lie in [0, 1]: about how far one step moves them."""
+    position_rate: float = 0.02
+    """Adam's rate of the positions, in ``position_unit``; 0: they stay."""
+    position_unit: Unit = "splat"
+    """splat: the size of the splat that a vertex belongs to. scene: scene units, as the paper has it."""
+    final_share: float = 0.1
+    """Both rates fall exponentially over the whole length, to this share of what they were."""
+    color_step_decay: float = 1.0
+    """The colour rate is also multiplied by this after every step."""
+    beta1: float = 0.9
+    """Adam's memory of the gradient."""
+    beta2: float = 0.999
+    """Adam's memory of the gradient's square."""
+    epsilon: float = 1e-8
+    """Adam's smallest divisor."""
+    ssim_weight: float = 0.4
+    """Share of SSIM, 0 to 1."""
+    l2_weight: float = 0.0
+    """Weight of the mean square difference, added to the others."""
+    background: Backdrop = "random"
+    """Behind pictures that have alpha; random: another colour in every step, so that what should be empty
+    becomes so. Photographs without alpha are drawn on the data set's own background."""
+    exposure: bool = False
+    """Photographs: fit a gain and an offset a channel for each training picture, so that changes of light
+    between them are not painted into the mesh. Their means stay 1 and 0."""
+    exposure_rate: float = 0.002
+    """Adam's rate of gains and offsets."""
+    prune_epochs: float = 5.0
+    """Triangles are dropped each time so many epochs have passed; 0: never."""
+    prune_opacity: float = 1 / 255
+    """Of those, the ones all of whose corners have less opacity than this; their orphaned vertices with
+    them."""
+    prune_importance: float = 0.0
+    """Of those, also the splats that training views have before them, but that all together show less of
+    them than this, in pixels: hidden inside, or too faint."""
+    blending: Literal["mesh", "display", "linear"] = "mesh"
+    """Space in which the triangles are blended: as the mesh says; display values; or linear light, for
+    exports that will be lit or blended by engines that work in linear light."""
+    samples: int = 1
+    """Side of the grid of samples in each pixel."""
+    seed: int = 0
+    """Of the views' order and the random backgrounds. The same seed gives the same result to the last bit,
+    with any number of threads, unless the length is given in minutes."""
+
+    def __post_init__(self) -> None:
+        for name, low, high, whole in _RANGES:
+            value = getattr(self, name)
+            if value is None and name in LENGTHS:
+                continue
+            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+            if not number or not low <= value <= high or (whole and int(value) != value):
+                what = "a whole number" if whole else "a number"
+                raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
+        for name, kind in [
+            ("position_unit", get_args(Unit)),
+            ("background", get_args(Backdrop)),
+            ("blending", ("mesh", "display", "linear")),
+        ]:
+            if getattr(self, name) not in kind:
+                raise ValueError(f"{name} must be one of {', '.join(kind)}, got {getattr(self, name)!r}")
+        if not isinstance(self.exposure, bool):
+            raise ValueError(f"exposure must be True or False, got {self.exposure!r}")
+        given = [name for name in LENGTHS if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
+
+    def total_steps(self, views: int) -> int | None:
+        """Number of steps with so many training views; None where time is the limit."""
+        if self.minutes is not None:
+            return None
+        return int(self.steps) if self.steps is not None else max(1, round((self.epochs or 0) * views))
+
+    def prune_interval(self, views: int) -> int:
+        """Number of steps from one pruning to the next; 0: never."""
+        return max(1, round(self.prune_epochs * views)) if self.prune_epochs else 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+_RANGES: list[tuple[str, float, float, bool]] = [
+    ("epochs", 0, 1e6, False),
+    ("steps", 0, 10**9, True),
+    ("minutes", 0, 1e5, False),
+    ("color_rate", 1e-9, 1, False),
+    ("position_rate", 0, 10, False),
+    ("final_share", 1e-6, 1, False),
+    ("color_step_decay", 0.5, 1, False),
+    ("beta1", 0, 0.99999, False),
+    ("beta2", 0, 0.9999999, False),
+    ("epsilon", 1e-30, 1, False),
+    ("ssim_weight", 0, 1, False),
+    ("l2_weight", 0, 1000, False),
+    ("exposure_rate", 1e-9, 1, False),
+    ("prune_epochs", 0, 1e6, False),
+    ("prune_opacity", 0, 1, False),
+    ("prune_importance", 0, 1e6, False),
+    ("samples", 1, 16, True),
+    ("seed", 0, 2**63 - 1, True),
+]
+
+_PAPER = FinetuneConfig(
+    preset="paper",
+    epochs=15,
+    steps=None,
+    color_rate=5e-3,
+    position_rate=math.exp(-3) * 5e-3,
+    position_unit="scene",
+    final_share=1.0,
+    color_step_decay=0.999,
+    ssim_weight=0.4,
+    background="white",
+    prune_epochs=10,
+    prune_opacity=math.exp(-4),
+    prune_importance=0.0,
+)
+
+PRESETS: Mapping[str, FinetuneConfig] = {
+    "default": FinetuneConfig(),
+    "paper": _PAPER,
+    "published": replace(_PAPER, preset="published", color_rate=1e-2, position_rate=1e-6, prune_opacity=1e-4),
+}
+"""default: measured to be the best at equal time. paper: the values in the text of arXiv 2502.07754, whose
+colour rate is left open there and taken from its code. published: those of its code, with SSIM and background
+as they were meant. ``docs/finetuning.md`` has the table."""
+
+
+def make_config(preset: str = "default", **changes: Any) -> FinetuneConfig:
+    """The configuration of ``preset`` with ``changes``; a length that is given takes the place of the
+    preset's.
+
+    Raises ValueError for an unknown preset and for values out of range, TypeError for a name that does not
+    exist.
+    """
+    if preset not in PRESETS:
+        raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+    known = [f.name for f in fields(FinetuneConfig) if f.name != "preset"]
+    for name in changes:
+        if name not in known:
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
+            raise TypeError(f"fine-tuning has no option {name!r}{hint}")
+    if any(changes.get(name) is not None for name in LENGTHS):
+        changes = {name: None for name in LENGTHS} | changes
+    return replace(PRESETS[preset], **changes)
+
+
+def rates(config: FinetuneConfig, step: int, fraction: float) -> tuple[float, float]:
+    """Rates of colours and of positions for step number ``step`` (from 0), ``fraction`` (0 to 1) of the
+    way."""
+    decay = config.final_share ** min(max(fraction, 0.0), 1.0)
+    color = config.color_rate * decay * config.color_step_decay**step
+    return max(color, 1e-12), config.position_rate * decay

@@ -1,0 +1,32 @@
+"""The size of each vertex' splat: the unit in which positions are optimised."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from meshsplats.mesh import SplatMesh
+
+
+def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
+    """(v,) float32 sizes in scene units: the side of a square with twice the area of a vertex' typical
+    triangle.
+
+    Triangles count together where they come from one splat (``face_splat``), else each by itself; a vertex
+    that several share takes the mean of theirs. Vertices without area take the smallest size that there is,
+    so that they hardly move; all sizes are 0 if no triangle has an area.
+    """
+    v = len(mesh.vertices)
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.sqrt(np.linalg.norm(normals, axis=1))
+    if mesh.face_splat is not None and len(size):
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) > 0]))
+        counts = np.diff(np.append(starts, len(size)))
+        size = np.repeat(np.add.reduceat(size, starts) / counts, counts)
+    total = np.bincount(mesh.faces.ravel(), np.repeat(size, 3), v)
+    uses = np.bincount(mesh.faces.ravel(), minlength=v)
+    result = np.divide(total, uses, out=np.zeros(v), where=uses > 0)
+    positive = result > 0
+    if positive.any():
+        result[~positive] = result[positive].min()
+    return result.astype(np.float32)

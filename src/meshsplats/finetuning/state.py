@@ -1,0 +1,177 @@
+"""What a fine-tuning changes: positions, colours and exposures as torch tensors with their optimisers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from meshsplats.colors import srgb_to_linear
+from meshsplats.errors import FileFormatError, MissingDependencyError
+from meshsplats.finetuning.adam import RowAdam
+from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
+from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.sizes import vertex_sizes
+from meshsplats.mesh import SplatMesh
+
+try:
+    import torch
+except ImportError as error:
+    raise MissingDependencyError("fine-tuning needs torch: pip install 'meshsplats[finetune]'") from error
+
+GAIN, OFFSET = slice(0, 3), slice(3, 6)
+
+
+class State:
+    """The mesh in the making.
+
+    Attributes:
+        vertices: (v, 3) float32 leaf tensor, scene units.
+        colors: (v, 4) float32 leaf tensor, straight RGBA in [0, 1], in the space of ``blending``.
+        mesh: the mesh it began with, as far as it was not dropped: triangles, their splats, attributes.
+        sizes: (v,) float32, the unit of each vertex' position.
+        exposures: (views, 6) float32 leaf tensor: gain and offset of red, green and blue of each training
+            view; None if they are not fitted.
+    """
+
+    def __init__(
+        self,
+        mesh: SplatMesh,
+        sizes: np.ndarray,
+        exposures: np.ndarray | None,
+        config: FinetuneConfig,
+        threads: int | None,
+    ) -> None:
+        self.mesh, self.sizes, self.config, self.threads = mesh, sizes, config, threads
+        self.vertices = torch.from_numpy(mesh.vertices.copy()).requires_grad_(True)
+        self.colors = torch.from_numpy(mesh.colors.copy()).requires_grad_(True)
+        self.exposures = (
+            None if exposures is None else torch.from_numpy(exposures.copy()).requires_grad_(True)
+        )
+        adam = partial(RowAdam, betas=(config.beta1, config.beta2), eps=config.epsilon, threads=threads)
+        unit = sizes if config.position_unit == "splat" else None
+        self._positions = adam(self.vertices, lr=1.0, scale=unit)
+        self._colors = adam(self.colors, lr=1.0, bounds=(0, 1))
+        self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
+
+    @classmethod
+    def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
+        """That of a mesh before the first step."""
+        mesh = replace(mesh, normals=None)  # they would not follow the positions
+        if config.blending == "linear" and mesh.blending == "display":
+            colors = mesh.colors.copy()
+            colors[:, :3] = np.clip(srgb_to_linear(colors[:, :3]), 0, 1)
+            mesh = replace(mesh, colors=colors, blending="linear")
+        elif config.blending == "display" and mesh.blending == "linear":
+            raise ValueError(
+                "the mesh is made to be blended in linear light: choose blending 'mesh' or 'linear'"
+            )
+        exposures = None
+        if config.exposure:
+            exposures = np.tile(np.array([1, 1, 1, 0, 0, 0], np.float32), (views, 1))
+        return cls(mesh, vertex_sizes(mesh), exposures, config, threads)
+
+    @classmethod
+    def resume(
+        cls,
+        arrays: dict[str, np.ndarray],
+        blending: str,
+        views: int,
+        config: FinetuneConfig,
+        threads: int | None,
+    ) -> State:
+        """That of a checkpoint. FileFormatError if its arrays do not fit each other."""
+        mesh = stored_mesh(arrays, blending)
+        try:
+            sizes = _of_shape(arrays["sizes"], (len(mesh.vertices),))
+            exposures = _of_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
+            state = cls(mesh, sizes, exposures, config, threads)
+            for name, adam in state._optimisers().items():
+                part = {key: arrays[f"{name}.{key}"] for key in ("mean", "square", "steps")}
+                adam.load_state(part)
+        except KeyError as error:
+            raise FileFormatError(f"the checkpoint lacks {error}") from None
+        except (ValueError, TypeError) as error:
+            raise FileFormatError(f"the checkpoint is broken: {error}") from None
+        return state
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What ``resume`` needs."""
+        arrays = mesh_arrays(self.result()) | {"sizes": self.sizes}
+        if self.exposures is not None:
+            arrays["exposure.values"] = self.exposures.detach().numpy()
+        for name, adam in self._optimisers().items():
+            arrays |= {f"{name}.{key}": value for key, value in adam.state().items()}
+        return arrays
+
+    def result(self) -> SplatMesh:
+        """The mesh as it is now."""
+        return replace(
+            self.mesh,
+            vertices=self.vertices.detach().numpy().copy(),
+            colors=self.colors.detach().numpy().copy(),
+        )
+
+    def finite_gradients(self) -> bool:
+        """Whether all gradients of the last backward pass are finite."""
+        gradients = [
+            t.grad
+            for t in (self.vertices, self.colors, self.exposures)
+            if t is not None and t.grad is not None
+        ]
+        # A sum of finite numbers may overflow, but then training has failed, too.
+        return all(bool(torch.isfinite(gradient.sum(dtype=torch.float64))) for gradient in gradients)
+
+    def step(self, color_rate: float, position_rate: float, view: int) -> None:
+        """One step of Adam on what training view number ``view`` reached, with the gradients that are
+        there."""
+        assert self.colors.grad is not None
+        assert self.vertices.grad is not None
+        # Nothing in a picture moves without its opacity mattering; one column is quick to look through.
+        reached = self.colors.grad[:, 3].numpy() != 0
+        self._colors.lr = color_rate
+        self._colors.step(self.colors.grad, reached)
+        if position_rate > 0:
+            self._positions.lr = position_rate
+            self._positions.step(self.vertices.grad, reached)
+        if self._exposures is not None and self.exposures is not None and self.exposures.grad is not None:
+            self._exposures.step(self.exposures.grad, np.array([view], np.int32))
+            with torch.no_grad():
+                # A gain of all pictures and one of the mesh's colours would be the same: means stay.
+                self.exposures -= self.exposures.mean(0) - torch.tensor([1.0, 1, 1, 0, 0, 0])
+        self.forget_gradients()
+
+    def forget_gradients(self) -> None:
+        self.vertices.grad = self.colors.grad = None
+        if self.exposures is not None:
+            self.exposures.grad = None
+
+    def prune(self, keep: np.ndarray) -> State:
+        """Only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
+        if keep.all():
+            return self
+        used = np.zeros(len(self.mesh.vertices), bool)
+        used[self.mesh.faces[keep].ravel()] = True
+        mesh = self.result().keep_faces(keep)
+        exposures = None if self.exposures is None else self.exposures.detach().numpy()
+        smaller = State(mesh, self.sizes[used], exposures, self.config, self.threads)
+        rows = np.flatnonzero(used)
+        smaller._positions = self._positions.select(smaller.vertices, rows)
+        smaller._colors = self._colors.select(smaller.colors, rows)
+        if self._exposures is not None:
+            every = np.arange(len(self._exposures.mean))
+            smaller._exposures = self._exposures.select(smaller.exposures, every)
+        return smaller
+
+    def _optimisers(self) -> dict[str, RowAdam]:
+        found = {"positions": self._positions, "colors": self._colors}
+        return found if self._exposures is None else found | {"exposure": self._exposures}
+
+
+def _of_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
+        raise ValueError(
+            f"an array of shape {array.shape}, {array.dtype}; finite float32 of shape {shape} expected"
+        )
+    return array

@@ -1,0 +1,184 @@
+"""``meshsplats finetune``, run in this process, and in its own where it is stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from _photographs import write_photographs
+
+from meshsplats.camera import orbit, save_cameras
+from meshsplats.cli import main
+from meshsplats.cli.finetune import Finetune, TargetOptions
+from meshsplats.demo_scene import make_scene
+from meshsplats.finetuning import make_config
+from meshsplats.formats.meshes import load_mesh
+from meshsplats.formats.splats import save_gaussians
+from meshsplats.rendering import render_splats
+
+SMALL = ("--views", "4", "--held-out", "2", "--width", "32")
+
+
+@pytest.fixture(scope="module")
+def splats(tmp_path_factory):
+    path = tmp_path_factory.mktemp("finetune") / "scene.ply"
+    save_gaussians(make_scene(300), path)
+    return path
+
+
+def run(*arguments) -> int:
+    return main(["finetune", *map(str, arguments)])
+
+
+def test_from_the_splat_file_alone(splats, tmp_path, capsys):
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "-o", out, *SMALL, "--steps", "12", "--report-every", "6", "--json") == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out)
+    assert result["steps"] == 12
+    assert result["held_out_psnr"]["after"] > result["held_out_psnr"]["before"]
+    assert "memory: about" in told.err
+    assert "step 6/12, loss" in told.err
+    mesh = load_mesh(out)
+    assert result["triangles"] == len(mesh.faces)
+    names = ["tuned.config.json", "tuned.npz", "tuned.preview.png", "tuned.run"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    config = json.loads((tmp_path / "tuned.config.json").read_text())
+    assert config["tuning"] == make_config(steps=12).to_dict()
+    assert config["options"]["width"] == 32
+    # Nothing is overwritten, and an older run is not lost.
+    assert run(splats, "-o", out, *SMALL, "--steps", "12") == 1
+    assert "--resume goes on with it, --force begins anew" in capsys.readouterr().err
+    assert run(splats, "-o", out, *SMALL, "--steps", "12", "--force") == 0
+    assert np.array_equal(load_mesh(out).vertices, mesh.vertices)
+    assert "next: meshsplats evaluate" in capsys.readouterr().out
+
+
+def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):
+    cloud = make_scene(300)
+    cameras = orbit(cloud, 9, width=32, height=32)
+    data = write_photographs(tmp_path / "photos", cameras, [render_splats(cloud, c).color for c in cameras])
+    out = tmp_path / "tuned.ply"
+    options = ("--preset", "paper", "--epochs", "2", "--exposure", "True", "--seed", "3", "--no-triag", "4")
+    assert run(splats, "-o", out, "--data", data, *options) == 0
+    assert "7 training views, 2 held out" in capsys.readouterr().err
+    config = json.loads((tmp_path / "tuned.config.json").read_text())["tuning"]
+    assert config == make_config("paper", epochs=2, exposure=True, seed=3).to_dict()
+    mesh = load_mesh(out)
+    assert len(mesh.faces) == 300 * 4  # --no-triag went to the conversion
+    again = tmp_path / "again.npz"
+    assert run(out, "-o", again, "--data", data, "--steps", "2") == 0  # a mesh is tuned further
+    assert len(load_mesh(again).faces) == len(mesh.faces)
+
+
+def test_given_cameras_are_where_the_targets_are_drawn_from(splats, tmp_path, capsys):
+    cameras = orbit(make_scene(300), 5, width=64, height=48)
+    save_cameras(cameras, tmp_path / "five.json")
+    options = ("--cameras", tmp_path / "five.json", "--views", "3", "--held-out", "1", "--width", "32")
+    assert run(splats, "-o", tmp_path / "t.npz", *options, "--steps", "1") == 0
+    assert "3 training views, 1 held out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--steps", "3", "--minutes", "1"], 2, "give one of --epochs, --steps and --minutes"),
+        (["--data", "d", "--views", "9"], 2, "--views has no effect with --data"),
+        (["--downscale", "2"], 2, "--downscale has no effect with splats"),
+        (["--resume"], 1, "no checkpoint at"),
+        (["--color-rate", "7"], 1, "color_rate must be a number"),
+        (["--data", "nowhere"], 1, "no such data set"),
+        (["--held-out", "-1"], 1, "at least 1 training view"),
+    ],
+)
+def test_wrong_usage_writes_nothing(splats, tmp_path, capsys, arguments, code, message):
+    assert run(splats, "-o", tmp_path / "out.npz", *arguments) == code
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_needs_photographs(splats, tmp_path, capsys):
+    assert main(["convert", str(splats), "-o", str(tmp_path / "m.npz"), "--no-preview"]) == 0
+    assert run(tmp_path / "m.npz", "-o", tmp_path / "t.npz") == 2
+    assert "--data" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "t.stl") == 2
+    assert "-o must end in" in capsys.readouterr().err
+
+
+def test_too_little_memory_is_told_before_the_work(splats, tmp_path, capsys, monkeypatch):
+    from meshsplats.finetuning import memory
+
+    monkeypatch.setattr(memory, "available_memory", lambda: 1 << 20)
+    assert run(splats, "-o", tmp_path / "t.npz", *SMALL) == 1
+    assert "--max-splats" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_library_names_the_extra(splats, tmp_path):
+    program = (
+        "import sys\n"
+        "class NoTorch:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] == 'torch': raise ModuleNotFoundError('gone', name=name)\n"
+        "sys.meta_path.insert(0, NoTorch())\n"
+        "from meshsplats.cli import main\n"
+        f"sys.exit(main(['finetune', {str(splats)!r}, '-o', {str(tmp_path / 't.npz')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "meshsplats[finetune]" in done.stderr
+
+
+def test_help_needs_no_torch():
+    program = (
+        "import sys; from meshsplats.cli import main\n"
+        "try: main(['finetune', '--help'])\nexcept SystemExit: pass\n"
+        "print('torch' in sys.modules, 'safetensors' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False False"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
+    out = tmp_path / "tuned.npz"
+    arguments = [str(splats), "-o", str(out), *SMALL, "--steps", "40", "--report-every", "1"]
+    command = [sys.executable, "-m", "meshsplats", "finetune", *arguments]
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    for line in child.stderr:
+        if "step 3/" in line:
+            child.send_signal(number)
+            break
+    told = child.communicate(timeout=60)[1]
+    assert child.returncode == 128 + number
+    assert "--resume" in told
+    assert not out.exists()
+    assert (tmp_path / "tuned.run" / "checkpoint.safetensors").is_file()
+    assert run(*arguments, "--resume") == 0
+    whole = tmp_path / "whole.npz"
+    assert run(*[str(whole) if a == str(out) else a for a in arguments]) == 0
+    for name in ("vertices", "colors", "faces"):
+        assert np.array_equal(getattr(load_mesh(out), name), getattr(load_mesh(whole), name))
+
+
+def test_time_before_the_run_counts(splats, tmp_path):
+    start = time.perf_counter()
+    assert run(splats, "-o", tmp_path / "t.npz", *SMALL, "--minutes", "0.05") == 0
+    assert time.perf_counter() - start < 15
+
+
+def test_every_option_of_the_configuration_can_be_given():
+    command = Finetune(input=None, output=None, steps=5)  # type: ignore[arg-type]
+    assert command.configured() == make_config(steps=5)
+    assert TargetOptions().cache_bytes == 2_000_000_000

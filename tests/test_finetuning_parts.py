@@ -1,0 +1,290 @@
+"""The parts of a fine-tuning that need neither torch nor the renderer: configuration, sizes, checkpoints,
+memory."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshsplats.camera import Camera
+from meshsplats.conversion import convert
+from meshsplats.dataset import Dataset, Picture, View
+from meshsplats.demo_scene import make_scene
+from meshsplats.errors import FileFormatError
+from meshsplats.finetuning import memory
+from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, rates
+from meshsplats.finetuning.interruption import StopSignals
+from meshsplats.finetuning.journal import METRICS, Journal
+from meshsplats.finetuning.sizes import vertex_sizes
+from meshsplats.mesh import SplatMesh
+
+ROOT = Path(__file__).parents[1]
+
+
+# ---- Configuration
+
+
+def test_presets_are_pinned():
+    """What the paper's text and its code say; a change here is a change of meaning."""
+    paper, published = PRESETS["paper"], PRESETS["published"]
+    assert paper.position_rate == pytest.approx(math.exp(-3) * paper.color_rate)
+    assert paper.prune_opacity == pytest.approx(math.exp(-4))
+    assert (published.color_rate, published.position_rate, published.prune_opacity) == (1e-2, 1e-6, 1e-4)
+    for preset in (paper, published):
+        assert (preset.epochs, preset.steps, preset.minutes) == (15, None, None)
+        assert (preset.ssim_weight, preset.l2_weight, preset.prune_epochs) == (0.4, 0, 10)
+        assert (preset.color_step_decay, preset.final_share) == (0.999, 1)
+        assert (preset.background, preset.position_unit, preset.exposure) == ("white", "scene", False)
+        assert (preset.beta1, preset.beta2, preset.epsilon) == (0.9, 0.999, 1e-8)
+    assert PRESETS["default"] == FinetuneConfig()
+
+
+def test_the_documented_table_has_the_presets_values():
+    text = (ROOT / "docs" / "finetuning.md").read_text(encoding="utf-8")
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith("| `")
+    ]
+    table = {row[0].strip("`"): row[1:4] for row in rows}
+    names = [name for name in FinetuneConfig.__dataclass_fields__ if name != "preset"]
+    assert set(names) <= set(table)
+    for name in names:
+        for cell, preset in zip(table[name], ("paper", "published", "default"), strict=True):
+            value = getattr(PRESETS[preset], name)
+            shown = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+            assert cell == shown, f"{name} of {preset}"
+
+
+def test_a_length_takes_the_place_of_the_presets():
+    assert make_config("paper", steps=7).total_steps(100) == 7
+    assert make_config("paper").total_steps(100) == 1500
+    assert make_config("paper", epochs=0.5).total_steps(9) == 4
+    assert make_config("default", minutes=2).total_steps(9) is None
+    assert make_config("paper").prune_interval(30) == 300
+    assert make_config("default", prune_epochs=0).prune_interval(30) == 0
+
+
+def test_rates_fall_over_the_length_and_by_step():
+    config = make_config(color_rate=0.1, position_rate=0.2, final_share=0.01, color_step_decay=0.5)
+    assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
+    assert rates(config, 0, 0.5) == pytest.approx((0.01, 0.02))
+    assert rates(config, 3, 1) == pytest.approx((0.1 * 0.01 / 8, 0.002))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"color_rate": 0}, "color_rate must be a number"),
+        ({"color_rate": float("nan")}, "color_rate"),
+        ({"beta2": 1.0}, "beta2"),
+        ({"steps": 2.5}, "steps must be a whole number"),
+        ({"steps": 3, "minutes": 1}, "steps and minutes"),
+        ({"background": "grey"}, "background must be one of random, white, black"),
+        ({"blending": "srgb"}, "blending must be one of"),
+        ({"position_unit": "pixel"}, "position_unit must be one of"),
+        ({"exposure": 1}, "exposure must be True or False"),
+        ({"samples": True}, "samples"),
+    ],
+)
+def test_values_out_of_range(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(**changes)
+
+
+def test_names_that_do_not_exist():
+    with pytest.raises(ValueError, match="preset must be one of default, paper, published"):
+        make_config("best")
+    with pytest.raises(TypeError, match="did you mean 'color_rate'"):
+        make_config(colour_rate=1)
+    with pytest.raises(ValueError, match="none of them"):
+        FinetuneConfig(steps=None)
+
+
+# ---- Sizes
+
+
+def test_sizes_follow_the_scale_of_each_splat():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    mesh = SplatMesh(
+        np.concatenate([corners, corners * 4, corners * 2, corners[:1]]),
+        np.arange(9).reshape(3, 3),
+        np.ones((10, 4)),
+        face_splat=[0, 1, 1],
+    )
+    sizes = vertex_sizes(mesh)
+    assert np.allclose(sizes[:3], 1)
+    assert np.allclose(sizes[3:9], 3)  # one splat: the mean of 4 and 2
+    assert sizes[9] == 1  # no triangle: the smallest there is
+    alone = vertex_sizes(replace(mesh, face_splat=None))
+    assert np.allclose(alone, [1, 1, 1, 4, 4, 4, 2, 2, 2, 1])
+    assert np.allclose(vertex_sizes(replace(mesh, vertices=mesh.vertices * 7)), 7 * sizes)
+    flat = SplatMesh(np.zeros((3, 3)), [[0, 1, 2]], np.ones((3, 4)))
+    assert (vertex_sizes(flat) == 0).all()
+
+
+def test_sizes_of_a_real_mesh_are_those_of_its_splats():
+    cloud = make_scene(200)
+    mesh = convert(cloud)
+    sizes = vertex_sizes(mesh)
+    first = mesh.faces[np.searchsorted(mesh.face_splat, np.arange(200)), 0]
+    spread = np.log(sizes[first] / np.sort(cloud.scales, axis=1)[:, 1])
+    assert spread.std() < 0.5
+
+
+# ---- Memory
+
+
+def dataset(count: int, side: int = 8) -> Dataset:
+    camera = Camera(np.eye(4), side, side, side / 2, side / 2, side, side)
+    picture = Picture(np.zeros((side, side, 3), np.uint8))
+    return Dataset(tuple(View(replace(camera, name=f"v{i}"), picture) for i in range(count)))
+
+
+def test_memory_is_refused_with_advice(monkeypatch):
+    mesh = convert(make_scene(200))
+    data = dataset(2)
+    needed = memory.needed_memory(mesh, data)
+    monkeypatch.setattr(memory, "available_memory", lambda: needed)
+    assert memory.check_memory(mesh, data) == needed
+    monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
+    with pytest.raises(MemoryError, match=r"needs about .* are free: .*--max-splats.*--downscale"):
+        memory.check_memory(mesh, data)
+    monkeypatch.setattr(memory, "available_memory", lambda: None)
+    memory.check_memory(mesh, data)
+
+
+def test_memory_grows_with_what_there_is():
+    mesh, data = convert(make_scene(200)), dataset(2)
+    base = memory.needed_memory(mesh, data)
+    assert memory.needed_memory(convert(make_scene(400)), data) > base
+    assert memory.needed_memory(mesh, dataset(2, 64)) > base
+    assert memory.needed_memory(mesh, dataset(9)) - base == 7 * 8 * 8 * 3
+    assert memory.needed_memory(mesh, dataset(9), cache_bytes=0) == base - 2 * 8 * 8 * 3
+    assert memory.available_memory() is None or memory.available_memory() > 0
+
+
+# ---- Checkpoints and the journal
+
+
+def arrays() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {"mesh.vertices": rng.random((4, 3), np.float32), "mesh.faces": np.arange(3, dtype=np.int32)[None]}
+
+
+def checkpoint(step: int = 3):
+    pytest.importorskip("safetensors")
+    from meshsplats.finetuning.checkpoint import Checkpoint
+
+    return Checkpoint(step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays())
+
+
+def test_checkpoints_come_back_to_the_last_bit(tmp_path):
+    from meshsplats.finetuning.checkpoint import load_checkpoint, save_checkpoint
+
+    saved = checkpoint()
+    save_checkpoint(saved, tmp_path / "c.safetensors")
+    found = load_checkpoint(tmp_path / "c.safetensors")
+    assert (found.step, found.seconds, found.mesh, found.dataset) == (3, 1.5, "mesh", "views")
+    assert found.config == saved.config
+    assert all((found.arrays[name] == array).all() for name, array in saved.arrays.items())
+    assert [p.name for p in tmp_path.iterdir()] == ["c.safetensors"]
+
+
+def test_broken_checkpoints_are_refused(tmp_path):
+    from meshsplats.finetuning.checkpoint import load_checkpoint, save_checkpoint
+
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(checkpoint(), path)
+    whole = path.read_bytes()
+    for cut in (0, 5, 40, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(FileFormatError, match="not a checkpoint"):
+            load_checkpoint(path)
+    path.write_bytes(whole.replace(b'\\"version\\": 1', b'\\"version\\": 7'))
+    with pytest.raises(FileFormatError, match="version 7"):
+        load_checkpoint(path)
+    path.write_bytes(whole.replace(b'\\"step\\": 3', b'\\"step\\":-3'))
+    with pytest.raises(FileFormatError, match="step -3"):
+        load_checkpoint(path)
+    from safetensors.numpy import save_file
+
+    save_file(arrays(), path)
+    with pytest.raises(FileFormatError, match="not a checkpoint of meshsplats"):
+        load_checkpoint(path)
+    with pytest.raises(FileNotFoundError, match="leave out --resume"):
+        load_checkpoint(tmp_path / "none")
+
+
+def test_a_checkpoint_of_another_run_says_what_differs():
+    from meshsplats.finetuning.checkpoint import check_same_run
+
+    found = checkpoint()
+    check_same_run(found, FinetuneConfig(), "mesh", "views")
+    with pytest.raises(ValueError, match=r"seed was 0 and is 5"):
+        check_same_run(found, FinetuneConfig(seed=5), "mesh", "views")
+    with pytest.raises(ValueError, match="another mesh"):
+        check_same_run(found, FinetuneConfig(), "other", "views")
+    with pytest.raises(ValueError, match="other views"):
+        check_same_run(found, FinetuneConfig(), "mesh", "other")
+
+
+def test_fingerprints_change_with_what_they_are_of():
+    from meshsplats.finetuning.checkpoint import dataset_fingerprint, mesh_fingerprint
+
+    mesh = convert(make_scene(200))
+    moved = mesh.vertices.copy()
+    moved[0, 0] = np.nextafter(moved[0, 0], np.float32(9))
+    assert mesh_fingerprint(mesh) == mesh_fingerprint(replace(mesh))
+    assert mesh_fingerprint(mesh) != mesh_fingerprint(replace(mesh, vertices=moved))
+    data = dataset(3)
+    assert dataset_fingerprint(data) == dataset_fingerprint(dataset(3))
+    assert dataset_fingerprint(data) != dataset_fingerprint(dataset(2))
+    assert dataset_fingerprint(data) != dataset_fingerprint(data.over((0, 0, 0)))
+
+
+def test_resuming_drops_what_came_after_the_checkpoint(tmp_path):
+    journal = Journal(tmp_path / "run")
+    journal.begin({"seed": 1})
+    for step in (0, 3, 6):
+        journal.note(step, loss=0.5)
+    picture = np.zeros((6, 6, 3), np.float32)
+    journal.preview(2, picture, picture)
+    journal.preview(4, picture, picture)
+    journal.save(checkpoint(3))
+    with open(tmp_path / "run" / METRICS, "a") as file:
+        file.write('{"step": 7, "lo')  # a kill in the middle of a line
+    assert journal.resume().step == 3
+    assert [line["step"] for line in journal.metrics()] == [0, 3]
+    assert [p.name for p in (tmp_path / "run" / "previews").iterdir()] == ["step_0000002.png"]
+    assert json.loads((tmp_path / "run" / "config.json").read_text()) == {"seed": 1}
+    journal.begin({"seed": 2})
+    assert journal.metrics() == []
+    assert not journal.checkpoint_path.exists()
+    assert not list((tmp_path / "run" / "previews").iterdir())
+
+
+def test_the_folder_above_a_run_is_not_made(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Journal(tmp_path / "no" / "run").begin({})
+
+
+# ---- Signals
+
+
+def test_the_first_signal_is_kept_and_the_second_interrupts():
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with StopSignals() as stop:
+        assert stop.received is None
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.received == signal.SIGTERM
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
