@@ -6,6 +6,7 @@ import ctypes
 import importlib.util
 import os
 import stat
+from pathlib import Path
 
 import pytest
 from _blender_scenes import cameras, random_mesh
@@ -56,6 +57,17 @@ def test_what_blender_said_last_is_in_the_error(program, tmp_path):
     with pytest.raises(BlenderError, match=r"SIGKILL.*fewer triangles"):
         draw(random_mesh(3), cameras()[:1], pictures=[target], executable=killed)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blender"]
+
+
+def test_folders_that_cannot_be_written_in_are_told_first(program, tmp_path):
+    blender = program("Blender 5.0.1", f"touch {tmp_path}/started")
+    places = [tmp_path / "nowhere"] + [Path("/proc")] * Path("/proc/self").exists()
+    for folder in places:
+        for outputs in ({"pictures": [folder / "a.png"]}, {"blend": folder / "a.blend"}):
+            with pytest.raises(OSError, match="cannot write in the folder") as told:
+                draw(random_mesh(3), cameras()[:1], executable=blender, **outputs)
+            assert told.value.filename == str(folder)
+    assert not (tmp_path / "started").exists()
 
 
 @pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="libraries have other names")

@@ -6,8 +6,9 @@ Blender runs as a process of its own, as the module bpy of this environment or a
 from __future__ import annotations
 
 import os
+import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,7 @@ def draw(
         ValueError: options out of range, another suffix, pictures that do not match the cameras, an empty
         mesh.
         MissingDependencyError: neither bpy nor an executable, or no OpenGL libraries for EEVEE.
+        OSError: a folder that cannot be written in, told before the work.
         BlenderError: Blender failed; the message holds what it said.
 
     Warns with a DataWarning if more layers lie behind each other than Blender can follow (1024).
@@ -81,6 +83,7 @@ def draw(
     if len(mesh.faces) == 0:
         raise ValueError("the mesh has no triangles: there is nothing to draw")
     launch.command(None if executable is None else Path(executable))  # told before the work
+    _check_folders([*targets, *([] if blend is None else [Path(blend)])])
     layers, limit = subject.count(mesh, cameras, options)
     if layers > MAX_LAYERS:
         _warn(mesh, cameras, layers, options)
@@ -97,6 +100,18 @@ def draw(
         progress=progress,
     )
     return result | {"layers": layers, "bounce_limit": limit}
+
+
+def _check_folders(paths: Iterable[Path]) -> None:
+    """Raises OSError for a folder in which no file can be made: rights alone do not tell."""
+    for folder in {path.absolute().parent for path in paths}:
+        try:
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError as error:
+            raise type(error)(
+                error.errno, f"cannot write in the folder: {error.strerror}", str(folder)
+            ) from None
 
 
 def _warn(mesh: SplatMesh, cameras: Sequence[Camera], layers: int, options: SceneOptions) -> None:
