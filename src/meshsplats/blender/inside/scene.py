@@ -146,9 +146,7 @@ def _light(
     if light.sun_strength > 0:
         direction = frame.sun_direction(*light.sun)
         home = stage.collection("Lights")
-        stage.add_sun(
-            direction, light.sun_strength, light.sun_size, 0.004 * radius, home, light.sun_color
-        )
+        stage.add_sun(direction, light.sun_strength, light.sun_size, 0.004 * radius, home, light.sun_color)
     if light.hdri is not None:
         stage.environment_world(str(light.hdri), light.hdri_strength, light.hdri_rotation)
     else:
