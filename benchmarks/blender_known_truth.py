@@ -1,0 +1,179 @@
+"""Lit splats against the surface they were taken from, lit the same way, in Cycles.
+
+    blender-env/bin/python benchmarks/blender_known_truth.py --data ../shared/data
+
+Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the
+data folder), clean and noisy, and drawn on the ground under sun and sky: as ``meshsplats blender --lit``
+draws them and, for comparison, with a plain diffuse material. Prints a Markdown table, below what Blender
+says, and writes a strip of the pictures (-o). Shadow overlap is intersection over union of those pixels of
+the ground that are darker than 0.8 of the bare ground.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from meshsplats import GaussianCloud, convert, orbit, render
+from meshsplats.blender import LightOptions, SceneOptions, subject
+from meshsplats.blender.inside import meshes, pictures, scene, versions
+from meshsplats.blender.inside.host import bpy
+from meshsplats.colors import linear_to_srgb
+from meshsplats.gaussians import SH_C0
+from meshsplats.metrics import psnr
+from meshsplats.pictures import save_png, strip
+
+UP = np.array([0.0, 1.0, 0.0], np.float32)
+SPLATS = 20_000
+
+
+def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (v, 3), texture coordinates (t, 2), and the numbers of both at the corners (f, 3) of the
+    triangles."""
+    points, places, corners = [], [], []
+    for line in path.read_text().splitlines():
+        kind, *values = line.split() or [""]
+        if kind == "v":
+            points.append([float(x) for x in values])
+        elif kind == "vt":
+            places.append([float(x) for x in values])
+        elif kind == "f":
+            corners.append([[int(x) - 1 for x in corner.split("/")[:2]] for corner in values])
+    numbers = np.array(corners)
+    return np.array(points), np.array(places), numbers[:, :, 0], numbers[:, :, 1]
+
+
+def sample(obj, texture: np.ndarray, noisy: bool) -> GaussianCloud:
+    """Flat splats in the surface; ``noisy``: tilted by 20 degrees at random, moved by a third of their
+    spacing, and of all opacities from 0.3 on."""
+    points, places, faces, texture_faces = obj
+    rng = np.random.default_rng(0)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    area = 0.5 * np.linalg.norm(cross, axis=1)
+    # Even steps of area along the triangles, and a golden sequence across them.
+    step = (np.arange(SPLATS) + 0.5) / SPLATS * area.sum()
+    face = np.searchsorted(np.cumsum(area), step).clip(0, len(faces) - 1)
+    root, other = np.sqrt(rng.random(SPLATS)), (np.arange(SPLATS) * 0.6180339887) % 1
+    shares = np.stack([1 - root, root * (1 - other), root * other], axis=1)[:, :, None]
+    vertex_normals = np.zeros_like(points)
+    for k in range(3):
+        np.add.at(vertex_normals, faces[:, k], cross)
+    normals = (vertex_normals[faces[face]] * shares).sum(axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    means = (points[faces[face]] * shares).sum(axis=1)
+    u, v = (places[texture_faces[face]] * shares).sum(axis=1).T
+    height, width = texture.shape[:2]
+    colors = texture[((1 - v) * height).astype(int) % height, (u * width).astype(int) % width] / 255
+    spacing = np.sqrt(area.sum() / SPLATS)
+    opacities = np.full(SPLATS, 0.95)
+    if noisy:
+        means = means + normals * (spacing / 3 * rng.normal(size=(SPLATS, 1)))
+        normals = normals + np.tan(np.radians(20)) / np.sqrt(2) * rng.normal(size=(SPLATS, 3))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        opacities = rng.uniform(0.3, 1, SPLATS)
+    # The rotation from +z to the normal: (1 + z, z x normal), normalised.
+    quaternions = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(SPLATS)], axis=1)
+    quaternions[normals[:, 2] < -0.999999] = [0, 1, 0, 0]
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    sigma = np.tile(spacing * np.array([0.75, 0.75, 0.03]), (SPLATS, 1))
+    return GaussianCloud(means, quaternions, sigma, opacities, ((colors - 0.5) / SH_C0)[:, None])
+
+
+def add_truth(obj, texture: Path, like) -> None:
+    """The textured mesh, smooth, where the splat object ``like`` is."""
+    points, places, faces, texture_faces = obj
+    data = meshes.make_plain("Truth", points, faces)
+    data.update(calc_edges=True)
+    layer = data.uv_layers.new(name="UVMap")
+    layer.data.foreach_set("uv", places[texture_faces].astype(np.float32).ravel())
+    data.shade_smooth()
+    material = bpy.data.materials.new("Truth")
+    tree = versions.node_tree(material)
+    picture, surface, out = (
+        tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexImage", "BsdfDiffuse", "OutputMaterial")
+    )
+    picture.image = bpy.data.images.load(str(texture))
+    tree.links.new(picture.outputs["Color"], surface.inputs["Color"])
+    tree.links.new(surface.outputs[0], out.inputs["Surface"])
+    data.materials.append(material)
+    thing = bpy.data.objects.new("Truth", data)
+    thing.matrix_world = like.matrix_world
+    bpy.context.scene.collection.objects.link(thing)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Lit splats against a known surface.")
+    parser.add_argument("--data", type=Path, required=True, help="folder with meshes/spot_textured/spot")
+    parser.add_argument("--width", type=int, default=320)
+    parser.add_argument("--samples", type=int, default=48)
+    parser.add_argument("-o", "--output", type=Path, help="picture of all: a .png")
+    asked = parser.parse_args()
+    folder = asked.data / "meshes" / "spot_textured" / "spot"
+    obj = read_obj(folder / "spot_triangulated.obj")
+    texture = np.asarray(Image.open(folder / "spot_texture.png").convert("RGB"))
+    options = SceneOptions(light=LightOptions(sun=(130, 40)), samples=asked.samples)
+    height = asked.width * 3 // 4
+    view = None
+    shown, captions = [], []
+
+    def shot(made) -> np.ndarray:
+        with tempfile.TemporaryDirectory() as place:
+            pictures.render_to(made.scene, Path(place) / "picture.exr")
+            return pictures.read_pixels(Path(place) / "picture.exr")[..., :3]
+
+    def display(picture: np.ndarray) -> np.ndarray:
+        return linear_to_srgb(np.clip(picture, 0, 1))
+
+    rows = [
+        "| splats | material | PSNR, picture | PSNR, cow alone | shadow overlap | light, of the mesh's |",
+        "|---|---|---|---|---|---|",
+    ]
+    truth = ground = None
+    for kind, noisy in [("clean", False), ("noisy", True)]:
+        mesh = replace(convert(sample(obj, texture, noisy), mode="flat"), up=UP)
+        if view is None:
+            view = orbit(mesh, 1, elevation=25, azimuth=215, width=asked.width, height=height, distance=1.3)[
+                0
+            ]
+        layers, limit = subject.count(mesh, [view], options)
+        arrays, facts = subject.prepare(mesh, [view], options, layers)
+        if truth is None:
+            made = scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
+            made.thing.hide_render = True
+            ground = shot(made)
+            add_truth(obj, folder / "spot_texture.png", made.thing)
+            truth = shot(made)
+            shown.append(display(truth))
+            captions.append("textured mesh")
+        covered = render(mesh, view).alpha
+        floor = (covered < 0.02) & (ground.mean(axis=2) > 0.05)
+        shade = (truth.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
+        for material in ("plain diffuse", "--lit"):
+            taken = scene.Subject(**arrays, **facts)
+            if material == "plain diffuse":
+                taken = replace(taken, normals=None, faces=mesh.faces, self_shadow=0.0)
+            drawn = shot(scene.build(taken, [view], options, limit, edges=False))
+            dark = (drawn.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
+            cow = covered > 0.98
+            rows.append(
+                f"| {kind} | {material} | {psnr(display(drawn), display(truth)):.1f} dB |"
+                f" {psnr(display(drawn)[cow][None], display(truth)[cow][None]):.1f} dB |"
+                f" {(dark & shade).sum() / max((dark | shade).sum(), 1):.2f} |"
+                f" {drawn[cow].mean() / truth[cow].mean():.2f} |"
+            )
+            shown.append(display(drawn))
+            captions.append(f"{kind}, {material}")
+    print(f"\nBlender {bpy.app.version_string}, {asked.width} x {height}, {asked.samples} samples\n")
+    print("\n".join(rows))
+    if asked.output is not None:
+        save_png(asked.output, strip(shown, captions))
+
+
+if __name__ == "__main__":
+    main()
