@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -21,7 +21,6 @@ from meshsplats.cli.common import (
     Folder,
     Output,
     SplatOptions,
-    cameras_beside,
     check_outputs,
     configuration,
     load_scene,
@@ -31,6 +30,7 @@ from meshsplats.cli.common import (
     view_names,
     write_json,
 )
+from meshsplats.cli.finetune import TargetOptions
 from meshsplats.dataset import Dataset, load_dataset, splat_views
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation import SSIM_CONVENTION, Report, ScoredView, evaluate
@@ -173,16 +173,17 @@ class Evaluate:
             return load_dataset(self.data, background=background, **options)
         assert splats is not None
         assert self.splats is not None
-        drawing: dict[str, Any] = {
-            "sh_degree": self.sh_degree,
-            "background": background,
-            "threads": self.threads,
-        }
         if self.cameras is not None:
-            return Dataset((), splat_views(splats, load_cameras(self.cameras), **drawing), "splats")
-        from meshsplats.datasets.around import splat_dataset
-
-        return splat_dataset(splats, cameras=cameras_beside(self.splats), **drawing)
+            views = splat_views(
+                splats,
+                load_cameras(self.cameras),
+                sh_degree=self.sh_degree,
+                background=background,
+                threads=self.threads,
+            )
+            return Dataset((), views, "splats")
+        made = TargetOptions(sh_degree=self.sh_degree).make(splats, self.splats, background, self.threads)
+        return replace(made, train=())
 
     def _score(
         self,

@@ -7,7 +7,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -81,12 +81,15 @@ class TargetOptions:
     """With --data: pictures this many times smaller."""
     test_every: int = 8
     """With --data: every n-th view is held out, where the data set has no split of its own; 0: none."""
-    views: int = 64
+    views: int = 200
     """Without --data: number of pictures of the splats to learn from."""
     held_out: int = 8
     """Without --data: number of further pictures to measure with."""
     width: int = 400
     """Without --data: side of these pictures in pixels."""
+    distance: tuple[float, float] = (0.5, 1.2)
+    """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
+    subject just fits the picture."""
     placement: Literal["auto", "object", "surrounded", "inside"] = "auto"
     """Without --data: cameras all round an object, above the ground round an object in its surroundings, or
     inside a room."""
@@ -103,7 +106,7 @@ class TargetOptions:
 
     def check(self) -> None:
         """UsageError for options that would do nothing."""
-        idle = ("views", "held_out", "width", "placement", "cameras", "up", "sh_degree")
+        idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "sh_degree")
         names, source = (idle, "--data") if self.data is not None else (("downscale", "test_every"), "splats")
         for name in names:
             if getattr(self, name) != next(f.default for f in fields(self) if f.name == name):
@@ -119,7 +122,7 @@ class TargetOptions:
         self,
         scene: GaussianCloud | SplatMesh,
         source: Path,
-        background: tuple[float, float, float],
+        background: Sequence[float],
         threads: int | None,
     ) -> Dataset:
         """The data set."""
@@ -143,6 +146,7 @@ class TargetOptions:
             train=self.views,
             test=self.held_out,
             width=self.width,
+            distance=self.distance,
             up=None if self.up is None else parse_up(self.up),
             sh_degree=self.sh_degree,
             background=background,

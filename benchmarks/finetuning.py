@@ -1,0 +1,133 @@
+"""What fine-tuning gains: PSNR on views that were not trained on, before and after, preset by preset.
+
+    python benchmarks/finetuning.py --data ../shared/data --minutes 2
+    python benchmarks/finetuning.py --data ../shared/data --scenes lego --presets default --minutes 5
+
+Splat files are judged at the cameras `DATA/cameras/*_mid.json` on white at degree 0, at one sample a pixel;
+drawing the targets counts towards the time, judging does not. Photographs are judged on their held-out views.
+`--clock processor` counts the processor time of all threads, divided by --processors, instead of the clock on
+the wall: for machines that do other work at the same time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshsplats as ms
+from meshsplats.cli.finetune import TargetOptions
+from meshsplats.evaluation import evaluate
+from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config
+
+
+@dataclass(frozen=True)
+class Scene:
+    splats: str
+    cameras: str = ""
+    photographs: str = ""
+    downscale: int = 1
+    background: tuple[float, float, float] = (1, 1, 1)
+
+
+SCENES = {
+    "guitar": Scene("splats/guitar_sh0.ply", "cameras/guitar_mid.json"),
+    "playbot": Scene("splats/playbot_lod3_31k_sh2.ply", "cameras/playbot_mid.json"),
+    "truck": Scene("splats/tt_truck_sh0.ply", "cameras/truck_mid.json"),
+    "lego": Scene("splats/trained/lego_60k_sh0.ply", photographs="photos/lego"),
+    "lego-sh3": Scene("splats/trained/lego_60k_sh3.ply", photographs="photos/lego"),
+    "snowmiku": Scene(
+        "splats/trained/miku_58k_sh0.ply", photographs="photos/snowmiku", downscale=2, background=(0, 0, 0)
+    ),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True, help="folder of the real data")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
+    parser.add_argument("--presets", nargs="+", default=["default", "paper", "published"])
+    parser.add_argument("--minutes", type=float, default=2.0)
+    parser.add_argument("--steps", type=int, help="so many steps instead of a time")
+    parser.add_argument("--clock", choices=["wall", "processor"], default="wall")
+    parser.add_argument("--processors", type=int, default=2, help="that processor time is divided by")
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--sh-degree", type=int, default=0, help="of targets drawn from splats")
+    parser.add_argument("--test-views", type=int, default=40, help="at most so many views to judge by")
+    options = parser.parse_args()
+    print("| scene | preset | triangles | steps | seconds | splats | converted | tuned |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in options.scenes:
+        for preset in options.presets:
+            print(row(name, preset, options), flush=True)
+
+
+def row(name: str, preset: str, options: argparse.Namespace) -> str:
+    scene = SCENES[name]
+    clock = time.perf_counter if options.clock == "wall" else time.process_time
+    share = 1 if options.clock == "wall" else options.processors
+
+    def seconds() -> float:
+        return (clock() - start) / share
+
+    start = clock()
+    cloud = ms.load_gaussians(options.data / scene.splats)
+    if scene.photographs:
+        data = ms.load_dataset(
+            options.data / scene.photographs, downscale=scene.downscale, background=scene.background
+        )
+        judged = ms.Dataset((), data.test[:: -(-len(data.test) // options.test_views)])
+    else:
+        source = options.data / scene.splats
+        data = TargetOptions(sh_degree=options.sh_degree, held_out=1).make(
+            cloud, source, (1, 1, 1), options.threads
+        )
+        cameras = ms.load_cameras(options.data / scene.cameras)
+        judged = ms.Dataset((), ms.splat_views(cloud, cameras, sh_degree=options.sh_degree))
+    mesh = ms.convert(
+        cloud, preset="default" if preset == "default" else "paper", cameras=[v.camera for v in data.train]
+    )
+    length = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
+    config = make_config(preset, **length)
+    told = []
+    run = RunOptions(threads=options.threads, report_every=0, spent=seconds())
+    if options.clock == "wall" or options.steps:
+        tuned = finetune(mesh, ms.Dataset(data.train), config, run=run, on_progress=told.append)
+        steps = told[-1].step
+    else:
+        tuned, steps = by_processor_time(mesh, data, config, options, seconds)
+    used = seconds()
+
+    def psnr(**what) -> float:
+        return (
+            evaluate(what.pop("mesh", None), judged, threads=options.threads, **what).methods[0].mean("psnr")
+        )
+
+    splats = f"{psnr(splats=cloud):.2f}" if scene.photographs else ""
+    scores = f"{psnr(mesh=mesh):.2f} | {psnr(mesh=tuned):.2f}"
+    return f"| {name} | {preset} | {len(tuned.faces):,} | {steps} | {used:.0f} | {splats} | {scores} |"
+
+
+def by_processor_time(mesh, data, config: FinetuneConfig, options, seconds) -> tuple[ms.SplatMesh, int]:
+    """The same loop with rates and end by processor time."""
+    import torch
+
+    from meshsplats.finetuning.state import State
+    from meshsplats.finetuning.tuning import kept_faces, make_step
+
+    torch.set_num_threads(1)
+    state = State.begin(mesh, len(data.train), config, options.threads)
+    step, interval = 0, config.prune_interval(len(data.train))
+    while (fraction := seconds() / (options.minutes * 60)) < 1:
+        make_step(state, data.train, step, fraction)
+        step += 1
+        if interval and step % interval == 0:
+            state = state.prune(kept_faces(state, data.train))
+    return state.result(), step
+
+
+if __name__ == "__main__":
+    main()
