@@ -4,7 +4,8 @@ Install from Disk:
 
     python blender_extension/build.py -o dist
 
-The wheel is built from this source tree for the machine it runs on, or given with ``--wheel``.
+The wheel is built from this source tree for the machine it runs on, or given with ``--wheel``. Pillow, which
+.sog files need and Blender's Python lacks, is fetched for the same platform, or given with ``--pillow``.
 """
 
 from __future__ import annotations
@@ -26,6 +27,16 @@ PLATFORMS = [
     (r"win_amd64", "windows-x64"),
 ]
 """The end of a wheel's name, and what Blender calls that platform."""
+PYTHON = "3.11"
+"""Python of Blender 4.2 to 5.0. Newer ones read all but .sog files."""
+PIP_PLATFORMS = {
+    "linux-x64": ["manylinux_2_28_x86_64", "manylinux_2_27_x86_64", "manylinux2014_x86_64"],
+    "linux-arm64": ["manylinux_2_28_aarch64", "manylinux_2_27_aarch64", "manylinux2014_aarch64"],
+    "macos-arm64": ["macosx_11_0_arm64"],
+    "macos-x64": ["macosx_10_13_x86_64", "macosx_10_10_x86_64"],
+    "windows-x64": ["win_amd64"],
+}
+"""What pip calls Blender's platforms."""
 
 
 def platform_of(wheel: str) -> str:
@@ -38,33 +49,52 @@ def platform_of(wheel: str) -> str:
     raise ValueError(f"{wheel}: not a wheel of a platform that Blender runs on")
 
 
-def manifest(wheel: str) -> str:
-    """The manifest of the extension with ``wheel``, a file name, and its platform."""
+def manifest(wheels: list[str]) -> str:
+    """The manifest of the extension with ``wheels``, file names, the first that of MeshSplats."""
     text = (HERE / "blender_manifest.toml").read_text(encoding="utf-8")
-    version = wheel.split("-")[1]
+    version = wheels[0].split("-")[1]
     text = re.sub(r'(?m)^version = ".*"$', f'version = "{version}"', text, count=1)
-    lines = f'platforms = ["{platform_of(wheel)}"]\nwheels = ["./wheels/{wheel}"]'
+    paths = ", ".join(f'"./wheels/{wheel}"' for wheel in wheels)
+    lines = f'platforms = ["{platform_of(wheels[0])}"]\nwheels = [{paths}]'
     return re.sub(r"(?m)^# build\.py .*$", lines, text, count=1)
 
 
-def pack(wheel: Path, folder: Path) -> Path:
-    """Writes the extension with ``wheel`` into ``folder``; returns the .zip."""
-    name = f"meshsplats-{wheel.name.split('-')[1]}-{platform_of(wheel.name).replace('-', '_')}.zip"
+def pack(wheels: list[Path], folder: Path) -> Path:
+    """Writes the extension with ``wheels``, the first that of MeshSplats, into ``folder``; returns the .zip.
+
+    Raises ValueError for wheels of different platforms.
+    """
+    names = [wheel.name for wheel in wheels]
+    platforms = sorted({platform_of(name) for name in names})
+    if len(platforms) > 1:
+        raise ValueError(f"the wheels are for different platforms: {', '.join(platforms)}")
+    name = f"meshsplats-{names[0].split('-')[1]}-{platforms[0].replace('-', '_')}.zip"
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / name
     temporary = target.with_suffix(".part")
     try:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("blender_manifest.toml", manifest(wheel.name))
+            archive.writestr("blender_manifest.toml", manifest(names))
             for source in sorted(HERE.glob("*.py")):
                 if source.name != Path(__file__).name:
                     archive.write(source, source.name)
             archive.write(HERE / "LICENSE", "LICENSE")
-            archive.write(wheel, f"wheels/{wheel.name}", zipfile.ZIP_STORED)
+            for wheel in wheels:
+                archive.write(wheel, f"wheels/{wheel.name}", zipfile.ZIP_STORED)
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
     return target
+
+
+def fetch_pillow(platform: str, folder: Path) -> Path:
+    """A wheel of Pillow for Blender's Python on ``platform``, as Blender names it, from the package index."""
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
+    command += ["--python-version", PYTHON, "--dest", str(folder)]
+    for name in PIP_PLATFORMS[platform]:
+        command += ["--platform", name]
+    subprocess.run([*command, "pillow"], check=True)
+    return next(folder.glob("pillow-*.whl"))
 
 
 def build_wheel(folder: Path) -> Path:
@@ -81,10 +111,12 @@ def main() -> None:
     parser.add_argument(
         "--wheel", type=Path, help="a wheel of MeshSplats; built from the source tree if left out"
     )
+    parser.add_argument("--pillow", type=Path, help="a wheel of Pillow; fetched if left out")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         wheel = options.wheel or build_wheel(Path(folder))
-        print(pack(wheel, options.output))
+        pillow = options.pillow or fetch_pillow(platform_of(wheel.name), Path(folder))
+        print(pack([wheel, pillow], options.output))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ import pytest
 bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from _blender_scenes import ball_splats, random_mesh
+from conftest import SHARED
 
 from meshsplats import save_gaussians, save_mesh
 
@@ -45,13 +46,13 @@ def test_blenders_own_tool_accepts_the_package(packed):
     assert "Error" not in done.stdout + done.stderr
 
 
-def test_package_holds_one_wheel_for_one_platform(packed):
+def test_package_holds_the_wheels_of_one_platform(packed):
     with zipfile.ZipFile(packed) as archive:
         names = archive.namelist()
         manifest = archive.read("blender_manifest.toml").decode()
     wheels = [name for name in names if name.startswith("wheels/")]
-    assert len(wheels) == 1
-    assert f'wheels = ["./{wheels[0]}"]' in manifest
+    assert [wheel.split("/")[1].split("-")[0] for wheel in wheels] == ["meshsplats", "pillow"]
+    assert f'wheels = ["./{wheels[0]}", "./{wheels[1]}"]' in manifest
     assert 'license = ["SPDX:GPL-3.0-or-later"]' in manifest
     assert {"__init__.py", "LICENSE", "blender_manifest.toml"} <= set(names)
     assert "build.py" not in names
@@ -65,6 +66,12 @@ def test_platform_names():
     assert build.platform_of("meshsplats-0.1.0-py3-none-macosx_11_0_arm64.whl") == "macos-arm64"
     with pytest.raises(ValueError, match="not a wheel of a platform"):
         build.platform_of("meshsplats-0.1.0-py3-none-any.whl")
+    different = [
+        Path("meshsplats-0.1.0-py3-none-win_amd64.whl"),
+        Path("pillow-1-cp311-cp311-linux_x86_64.whl"),
+    ]
+    with pytest.raises(ValueError, match="different platforms: linux-x64, windows-x64"):
+        build.pack(different, Path("nowhere"))
 
 
 def test_a_whole_session(packed, tmp_path):
@@ -72,6 +79,7 @@ def test_a_whole_session(packed, tmp_path):
     save_gaussians(ball_splats(400)[0], tmp_path / "ball.ply")
     save_mesh(random_mesh(30), tmp_path / "mesh.npz")
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense")
+    sog = [path for path in [SHARED / "splats" / "monkey_0001.sog"] if path.exists()]
     environment = {
         **os.environ,
         "BLENDER_USER_RESOURCES": str(tmp_path / "blender"),
@@ -79,7 +87,7 @@ def test_a_whole_session(packed, tmp_path):
         "PYTHONNOUSERSITE": "1",
     }
     done = subprocess.run(
-        [sys.executable, str(SCRIPT), str(packed), str(tmp_path)],
+        [sys.executable, str(SCRIPT), str(packed), str(tmp_path), *map(str, sog)],
         capture_output=True,
         text=True,
         env=environment,
@@ -88,6 +96,7 @@ def test_a_whole_session(packed, tmp_path):
     told = json.loads((tmp_path / "told.json").read_text())
     assert str(tmp_path / "blender") in told["package"], "meshsplats comes from the wheel"
     assert told["imported"] == ["FINISHED"]
+    assert told["sog"] is None or 0 < told["sog"] <= 800
     assert told["triangles"]["default"] > told["triangles"]["fewer"] > 0
     assert told["materials"] == ["Splats, lit", "Splats, unlit"]
     assert told["moved"] == [1.0, 2.0, 3.0], "converting again leaves the object where it was"
