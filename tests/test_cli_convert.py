@@ -149,3 +149,58 @@ def test_not_splats(splats, tmp_path, capsys):
     assert run(splats, "-o", tmp_path / "mesh.ply") == 0
     assert run(tmp_path / "mesh.ply", "-o", tmp_path / "again.ply") == 1
     assert "not splats" in capsys.readouterr().err
+
+
+def test_splats_as_splats(splats, tmp_path, capsys):
+    """Cut out, by the limits one after the other, and otherwise unchanged."""
+    cloud = load_gaussians(splats)
+    box = (-1.0, -1.0, -1.0, 1.0, 1.5, 2.0)
+    out = tmp_path / "part.ply"
+    assert run(splats, "-o", out, "--as-splats", "--crop", *box, "--min-opacity", 0.5) == 0
+    kept = (cloud.means >= box[:3]).all(1) & (cloud.means <= box[3:]).all(1) & (cloud.opacities >= 0.5)
+    assert 3 < kept.sum() < 37
+    part = load_gaussians(out)
+    np.testing.assert_array_equal(part.means, cloud.means[kept])
+    np.testing.assert_allclose(part.opacities, cloud.opacities[kept], atol=1e-6)
+    assert capsys.readouterr().out.startswith(f"{kept.sum()} of 40 splats")
+    assert json.loads((tmp_path / "part.config.json").read_text())["options"]["as_splats"] is True
+    with Image.open(tmp_path / "part.preview.png") as image:
+        assert np.asarray(image)[300:500, 300:500].mean() < 250
+    assert run(splats, "-o", tmp_path / "few.ply", "--as-splats", "--max-splats", 5, "--no-preview") == 0
+    few = load_gaussians(tmp_path / "few.ply")
+    importance = cloud.opacities * np.sqrt(np.prod(cloud.scales.astype(float), axis=1)) ** (4 / 3)
+    assert len(few) == 5
+    ranks = np.argsort(np.argsort(-importance))[np.isin(cloud.means[:, 0], few.means[:, 0])]
+    assert ranks.max() < 12  # a rough measure of size agrees roughly
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "told"),
+    [
+        ("a.glb", [], "--as-splats writes .ply"),
+        ("a.ply", ["--lit"], "--lit: for a mesh"),
+        ("a.ply", ["--preset", "paper", "--rings", "2"], "--preset, --rings: for a mesh"),
+    ],
+)
+def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options, told):
+    assert run(splats, "-o", tmp_path / name, "--as-splats", *options) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
+
+
+def test_no_splats_left(splats, tmp_path, capsys):
+    assert run(splats, "-o", tmp_path / "a.ply", "--as-splats", "--min-opacity", 0.99) == 1
+    assert "all are fainter than 0.99" in capsys.readouterr().err
+    assert not (tmp_path / "a.ply").exists()
+
+
+@pytest.mark.parametrize("alpha", ["mask", "hash-friendly"])
+def test_alpha_reaches_the_file(splats, tmp_path, capsys, alpha):
+    out = tmp_path / "m.glb"
+    assert run(splats, "-o", out, "--alpha", alpha, "--no-preview") == 0
+    data = out.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert document["materials"][0]["alphaMode"] == "MASK"
+    assert document["materials"][0]["alphaCutoff"] == {"mask": 0.2, "hash-friendly": 0.5}[alpha]
+    assert run(splats, "-o", tmp_path / "m.npz", "--alpha", alpha) == 2
+    assert "--alpha and --compression are for .glb" in capsys.readouterr().err

@@ -30,8 +30,15 @@ from meshsplats.cli.common import (
     write_json,
 )
 from meshsplats.conversion import ConversionOptions, convert
+from meshsplats.conversion.selection import choose_splats
 from meshsplats.errors import FileFormatError
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+
+_CHOOSING = ("crop", "min_opacity", "max_splats")
+"""Options of the conversion that choose splats, and so serve --as-splats too."""
+_OF_SPLATS = ("input", "output", "as_splats", "no_preview", "conversion", "reading", "json", "force")
+"""Options of the command that do."""
 
 
 def _with_placeholders(options: type[ConversionOptions]) -> type[ConversionOptions]:
@@ -60,7 +67,7 @@ else:
 @dataclass(frozen=True)
 class Convert:
     """Turns splats into a mesh of translucent, vertex-coloured triangles: .glb, .ply or .npz by the name
-    given.
+    given. With --as-splats, into a splat .ply: other formats made plain, or a part cut out.
 
     Writes a preview picture and the configuration beside it.
     """
@@ -82,8 +89,14 @@ class Convert:
     """.glb, .usd: a material that lights and shadows act on, not one that shows the colours as they are."""
     color_type: Literal["uint16", "float32"] = "uint16"
     """.glb: how colours are stored."""
+    alpha: Literal["blend", "mask", "hash-friendly"] = "blend"
+    """.glb: blend: true opacities. For viewers that neither sort nor blend well: mask draws solid what is at
+    least 20 % opaque; hash-friendly gives each splat a cutoff of its own, right on average, grainy."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
+    as_splats: bool = False
+    """Write splats, not a mesh: a float .ply as the 3DGS code lays it out, of all splats or of those that
+    --crop, --min-opacity and --max-splats leave."""
     no_preview: bool = False
     """Draw no preview."""
     conversion: _Options = field(default_factory=_Options)
@@ -97,18 +110,24 @@ class Convert:
         from meshsplats.formats.meshes import MESH_SUFFIXES, save_mesh
 
         suffix = self.output.suffix.lower()
+        if self.as_splats:
+            self._save_splats(suffix)
+            return
         if suffix not in MESH_SUFFIXES:
             raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
         if self.lit and suffix != ".glb" and not suffix.startswith(".usd"):
             raise UsageError(f"--lit is for .glb and .usd files: {suffix} has no material")
-        if suffix != ".glb" and (self.color_type, self.compression) != ("uint16", "none"):
-            raise UsageError("--color-type and --compression are for .glb files")
+        if suffix != ".glb" and (self.color_type, self.alpha, self.compression) != (
+            "uint16",
+            "blend",
+            "none",
+        ):
+            raise UsageError("--color-type, --alpha and --compression are for .glb files")
         up = None if self.up is None else parse_up(self.up)
         preview = None if self.no_preview else self.output.with_suffix(".preview.png")
         config = self.output.with_suffix(".config.json")
         check_outputs([path for path in (self.output, preview, config) if path], self.force)
-        if identify(self.input) != "splats":
-            raise FileFormatError(f"{self.input}: not splats; convert needs a splat file or a model folder")
+        self._check_input()
         if self.data is not None:
             if self.cameras is not None:
                 raise UsageError("give --cameras or --data, not both")
@@ -129,6 +148,7 @@ class Convert:
             self.output,
             lit=True if self.lit else None,
             color_type=None if self.color_type == "uint16" else self.color_type,
+            alpha=None if self.alpha == "blend" else self.alpha,
             compression=None if self.compression == "none" else self.compression,
         )
         times.append(time.perf_counter())
@@ -155,6 +175,52 @@ class Convert:
             print(f"preview: {preview}")
         print(f"next: {self._next()}")
 
+    def _check_input(self) -> None:
+        if identify(self.input) != "splats":
+            raise FileFormatError(f"{self.input}: not splats; convert needs a splat file or a model folder")
+
+    def _save_splats(self, suffix: str) -> None:
+        """The splats themselves, in the format that everything reads."""
+        from meshsplats.formats.splats import save_gaussians
+
+        if suffix != ".ply":
+            raise UsageError(f"--as-splats writes .ply, got {self.output.name!r}")
+        standard = {f.name: f.default for f in fields(self) if f.name not in _OF_SPLATS}
+        idle = [name for name, value in standard.items() if getattr(self, name) != value]
+        given = asdict(self.conversion)
+        idle += [name for name, value in given.items() if value is not None and name not in _CHOOSING]
+        if idle:
+            flags = ", ".join("--" + name.replace("_", "-") for name in idle)
+            raise UsageError(f"{flags}: for a mesh, no effect with --as-splats")
+        self.conversion.resolved("paper", has_cameras=False)
+        preview = None if self.no_preview else self.output.with_suffix(".preview.png")
+        config = self.output.with_suffix(".config.json")
+        check_outputs([path for path in (self.output, preview, config) if path], self.force)
+        self._check_input()
+        start = time.perf_counter()
+        cloud = self.reading.load(self.input)
+        kept = choose_splats(cloud, **{name: given[name] for name in _CHOOSING})
+        save_gaussians(kept, self.output)
+        seconds = time.perf_counter() - start
+        write_json(config, configuration("convert", self))
+        if preview:
+            _draw_preview(kept, preview)
+        if self.json:
+            result = {
+                "splats": str(self.output),
+                "preview": str(preview) if preview else None,
+                "read": len(cloud),
+                "written": len(kept),
+                "bytes": self.output.stat().st_size,
+                "seconds": round(seconds, 4),
+            }
+            print(json.dumps(result, indent=1))
+            return
+        print(f"{len(kept):,} of {len(cloud):,} splats in {seconds:.2f} s")
+        print(f"{self.output} ({size_of(self.output)})")
+        if preview:
+            print(f"preview: {preview}")
+
     def _next(self) -> str:
         splats, mesh, folder = (
             shlex.quote(str(path)) for path in (self.input, self.output, self.output.with_suffix(""))
@@ -163,9 +229,12 @@ class Convert:
         return f"meshsplats compare {splats} {mesh + ' ' if readable else ''}-o {folder}-compare"
 
 
-def _draw_preview(mesh: SplatMesh, path: Path) -> None:
+def _draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
     from meshsplats.pictures import save_png
-    from meshsplats.rendering import render
+    from meshsplats.rendering import render, render_splats
 
-    camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
-    save_png(path, render(mesh, camera, samples=2).color)
+    camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
+    if isinstance(scene, SplatMesh):
+        save_png(path, render(scene, camera, samples=2).color)
+    else:
+        save_png(path, render_splats(scene, camera).color)

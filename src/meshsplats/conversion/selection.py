@@ -27,6 +27,30 @@ def mean_shadow(areas: np.ndarray) -> np.ndarray:
     return largest[:, 0] * np.power(np.power(unit, THOMSEN).sum(axis=1) / 3, 1 / THOMSEN)
 
 
+def choose_splats(
+    cloud: GaussianCloud,
+    *,
+    crop: tuple[float, ...] | None = None,
+    min_opacity: float | None = None,
+    max_splats: int | None = None,
+) -> GaussianCloud:
+    """The splats inside ``crop`` (x0 y0 z0 x1 y1 z1) of at least ``min_opacity``, of these the ``max_splats``
+    with the greatest opacity times mean projected area, in their old order. None: no such limit.
+
+    Raises ValueError if none is left.
+    """
+    keep = np.ones(len(cloud), bool) if crop is None else inside_box(cloud, crop)
+    if min_opacity is not None:
+        keep &= cloud.opacities >= min_opacity
+    rows = np.flatnonzero(keep)
+    if max_splats is not None and max_splats < len(rows):
+        importance = cloud.opacities[rows] * mean_shadow(disc_areas(cloud.scales[rows]))
+        rows = rows[most_important(importance, np.ones(len(rows), np.int64), max_splats, None)]
+    if not len(rows):
+        raise ValueError(f"none of the {len(cloud)} splats is left: all are fainter than {min_opacity:.4g}")
+    return cloud.select(rows)
+
+
 def inside_box(cloud: GaussianCloud, crop: tuple[float, ...]) -> np.ndarray:
     """(n,) bool: centres inside the box x0 y0 z0 x1 y1 z1, borders included. ValueError if there are none."""
     box = np.asarray(crop, np.float64)
