@@ -37,11 +37,13 @@ STANDARD = {
     "playbot": "playbot_lod3_31k_sh2.ply",
 }
 DISTANCES = ("close", "mid", "far")
+_WITHOUT_CAMERAS = ("none", "density", "framing")
 
 PRESETS: list[tuple[str, dict]] = [
     ("paper", dict(preset="paper")),
     ("paper, 3d", dict(preset="paper", mode="3d")),
     ("**default**", dict()),
+    ("**default**, no cameras known", dict(footprint="framing")),
 ]
 MODES: list[tuple[str, dict]] = [
     ("default, flat, 8 triangles", dict(mode="flat")),
@@ -58,7 +60,7 @@ VARIATIONS: list[tuple[str, dict]] = [
     ("footprint_px2 0.4", dict(footprint_px2=0.4)),
     ("footprint_px2 0.6", dict(footprint_px2=0.6)),
     ("footprint_px2 0.8", dict(footprint_px2=0.8)),
-    ("footprint from the density (no cameras known)", dict(footprint="density")),
+    ("footprint from the density", dict(footprint="density")),
     ("no compensation", dict(compensation=0.0)),
     ("compensation 0.5", dict(compensation=0.5)),
     ("always two ellipses (flat_below 0)", dict(flat_below=0.0)),
@@ -127,7 +129,7 @@ def measure(scene: Scene, options: dict) -> Measured:
     """Converts with ``options`` and compares."""
     distances = list(scene.cameras)
     options = dict(options)
-    if options.get("preset") != "paper" and options.get("footprint") not in ("none", "density"):
+    if options.get("preset") != "paper" and options.get("footprint") not in _WITHOUT_CAMERAS:
         options["cameras"] = scene.cameras[distances[0]]
     if options.get("max_triangles") == "half":
         options["max_triangles"] = 4 * len(scene.cloud)
