@@ -117,11 +117,8 @@ class Convert:
             raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
         if self.lit and suffix != ".glb" and not suffix.startswith(".usd"):
             raise UsageError(f"--lit is for .glb and .usd files: {suffix} has no material")
-        if suffix != ".glb" and (self.color_type, self.alpha, self.compression) != (
-            "uint16",
-            "blend",
-            "none",
-        ):
+        glb_only = (self.color_type, self.alpha, self.compression)
+        if suffix != ".glb" and glb_only != ("uint16", "blend", "none"):
             raise UsageError("--color-type, --alpha and --compression are for .glb files")
         up = None if self.up is None else parse_up(self.up)
         preview = None if self.no_preview else self.output.with_suffix(".preview.png")
