@@ -19,7 +19,7 @@ from pathlib import Path
 import meshsplats as ms
 from meshsplats.cli.finetune import TargetOptions
 from meshsplats.evaluation import evaluate
-from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config
+from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config, starting_mesh
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,7 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
         )
         cameras = ms.load_cameras(options.data / scene.cameras)
         judged = ms.Dataset((), ms.splat_views(cloud, cameras, sh_degree=options.sh_degree))
-    mesh = ms.convert(
-        cloud, preset="default" if preset == "default" else "paper", cameras=[v.camera for v in data.train]
-    )
+    mesh = starting_mesh(cloud, [view.camera for view in data.train], preset=preset)
     length = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
     config = make_config(preset, **length)
     told = []

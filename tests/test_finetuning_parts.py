@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, orbit
 from meshsplats.conversion import convert
 from meshsplats.dataset import Dataset, Picture, View
 from meshsplats.demo_scene import make_scene
@@ -23,6 +23,7 @@ from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, r
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
 from meshsplats.finetuning.sizes import vertex_sizes
+from meshsplats.finetuning.start import starting_mesh
 from meshsplats.mesh import SplatMesh
 
 ROOT = Path(__file__).parents[1]
@@ -137,6 +138,19 @@ def test_sizes_of_a_real_mesh_are_those_of_its_splats():
     first = mesh.faces[np.searchsorted(mesh.face_splat, np.arange(200)), 0]
     spread = np.log(sizes[first] / np.sort(cloud.scales, axis=1)[:, 1])
     assert spread.std() < 0.5
+
+
+def test_each_preset_begins_with_its_conversion():
+    cloud = make_scene(200)
+    cameras = orbit(cloud, 3, width=40, height=40)
+    assert len(starting_mesh(cloud, cameras).faces) == 8 * 200
+    vertices = starting_mesh(cloud, cameras).vertices
+    assert np.array_equal(vertices, convert(cloud, mode="flat", cameras=cameras).vertices)
+    assert len(starting_mesh(cloud, cameras, mode="flat", no_triag=4).faces) == 4 * 200
+    assert len(starting_mesh(cloud, cameras, mode="3d", no_triag=4).faces) == 12 * 200
+    for preset in ("paper", "published"):
+        paper = convert(cloud, preset="paper")
+        assert np.array_equal(starting_mesh(cloud, cameras, preset=preset).vertices, paper.vertices)
 
 
 # ---- Memory

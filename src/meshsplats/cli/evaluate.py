@@ -302,12 +302,14 @@ class Evaluate:
             if self.tune is None:
                 return scene, None, None
             return _tuned(scene, dataset, self.tune, self.threads), None, scene
-        from meshsplats.conversion import convert
-
-        start = "default" if self.tune in (None, "default") else "paper"
-        mesh = convert(scene, preset=start, cameras=[view.camera for view in dataset.train])
+        cameras = [view.camera for view in dataset.train]
         if self.tune is None:
-            return mesh, scene, None
+            from meshsplats.conversion import convert
+
+            return convert(scene, cameras=cameras), scene, None
+        from meshsplats.finetuning import starting_mesh
+
+        mesh = starting_mesh(scene, cameras, preset=self.tune)
         return _tuned(mesh, dataset, self.tune, self.threads), scene, mesh
 
 

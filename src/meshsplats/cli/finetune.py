@@ -36,7 +36,15 @@ from meshsplats.cli.common import (
 from meshsplats.cli.convert import _Options as ConversionOptions
 from meshsplats.dataset import Dataset, load_dataset
 from meshsplats.errors import MissingDependencyError
-from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions, finetune, make_config
+from meshsplats.finetuning import (
+    FinetuneConfig,
+    Interrupted,
+    Progress,
+    RunOptions,
+    finetune,
+    make_config,
+    starting_mesh,
+)
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -196,7 +204,8 @@ class Finetune:
     minutes: Number = None
     """Length: so much time for the whole command."""
     start: Literal["same", "default", "paper"] = "same"
-    """Preset of the conversion; same: that of --preset, which is paper for published."""
+    """What the splats are converted to; same: as --preset has it. default: one ellipse of 8 triangles a
+    splat. paper: the paper's conversion, also for published."""
     resume: bool = False
     """Go on where an interrupted run of the same command stopped."""
     target: TargetOptions = field(default_factory=TargetOptions)
@@ -280,13 +289,9 @@ class Finetune:
         check_outputs([files.mesh, files.config, files.preview], self.force)
 
     def _converted(self, cloud: GaussianCloud, dataset: Dataset) -> SplatMesh:
-        from meshsplats.conversion import convert
-
-        start = self.start
-        if start == "same":
-            start = "default" if self.preset == "default" else "paper"
+        start = self.preset if self.start == "same" else self.start
         cameras = [view.camera for view in dataset.train]
-        return convert(cloud, preset=start, cameras=cameras, **asdict(self.conversion))
+        return starting_mesh(cloud, cameras, preset=start, **asdict(self.conversion))
 
     def _tell(self, files: _Files, tuned: SplatMesh, seconds: float) -> None:
         from meshsplats.finetuning.journal import Journal
