@@ -1,4 +1,4 @@
-"""Formats that are written for other programs only: USD, .obj, compressed .glb."""
+"""Formats that are written for other programs first: USD, .obj, compressed .glb."""
 
 import builtins
 import os
@@ -106,13 +106,6 @@ def test_without_usd_core_the_error_names_the_extra(tmp_path, monkeypatch):
     with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[usd\]'"):
         save_mesh(MESH, tmp_path / "m.usdc")
     assert os.listdir(tmp_path) == []
-
-
-@pytest.mark.parametrize("head", [b"PXR-USDC\0\0", b"#usda 1.0\n"])
-def test_usd_is_not_read(tmp_path, head):
-    (tmp_path / "m.usd").write_bytes(head)
-    with pytest.raises(FileFormatError, match="USD files are written but not read"):
-        load_mesh(tmp_path / "m.usd")
 
 
 # -- .obj

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import importlib.util
 import io
 import json
 import struct
@@ -132,4 +133,5 @@ MESH_SEEDS = [
     _saved("glb", ".glb", inside=_in_json),
     _gltf(),
     Seed("obj", {"m.obj": _OBJ}, "m.obj", load=load_mesh),
+    *([_saved(s[1:], s, slow=True) for s in (".usdc", ".usda")] if importlib.util.find_spec("pxr") else []),
 ]

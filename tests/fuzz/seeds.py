@@ -31,6 +31,8 @@ class Seed:
     """Applies a change to the data inside a compressed file."""
     load: Callable[[Path], object] = load_gaussians
     """The reader under test."""
+    slow: bool = False
+    """Fuzzed only when asked for by name."""
 
 
 def _ply(name: str, encoding: str, degree: int, tables: bool) -> Seed:

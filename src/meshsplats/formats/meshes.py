@@ -17,6 +17,7 @@ from meshsplats.formats.mesh_ply import read_mesh_ply, write_mesh_ply
 from meshsplats.formats.npz import read_npz, write_npz
 from meshsplats.formats.obj import read_obj, write_obj
 from meshsplats.formats.usd import write_usd
+from meshsplats.formats.usd_reader import is_usd, read_usd
 from meshsplats.mesh import SplatMesh
 
 _USD = (".usdc", ".usda", ".usd")
@@ -35,15 +36,18 @@ MESH_SUFFIXES = tuple(_WRITERS)
 
 
 def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
-    """The mesh in a file: `.npz`, `.ply`, `.glb`, `.gltf` or `.obj`, recognised by what it holds.
+    """The mesh in a file: `.npz`, `.ply`, `.glb`, `.gltf`, `.usdc`, `.usda`, `.usd` or `.obj`, recognised by
+    what it holds.
 
-    A file that ``save_mesh`` wrote comes back with its positions, faces and extra arrays exactly; colours
-    are exact from `.npz` and `.ply` and within 1/2000 from `.glb`. Meshes of other programs are read as far
+    A file that ``save_mesh`` wrote comes back with its positions, faces and extra arrays exactly (`.obj` has
+    no extra arrays); colours are exact from `.npz` and `.ply`, within 1e-6 from USD and within 1/2000 from
+    `.glb`. Meshes of other programs are read as far
     as triangles and vertex colours go: polygons are cut into triangles, textures left out with a
     DataWarning.
 
     Raises FileNotFoundError or IsADirectoryError, and FileFormatError for a file that is broken, of
-    another kind or holds no mesh; the message says what is wrong and where.
+    another kind or holds no mesh; the message says what is wrong and where. MissingDependencyError for USD
+    without the extra ``usd``.
     """
     source = Path(path)
     with open(source, "rb") as file:
@@ -51,22 +55,24 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
     if not head:
         raise FileFormatError(f"{source}: the file is empty")
     if head[:4] in (b"PK\x03\x04", b"PK\x05\x06"):
+        if source.suffix.lower() == ".usdz":
+            raise FileFormatError(
+                f"{source}: .usdz packages are not read; unpack it: usdcat in.usdz -o out.usdc"
+            )
         return read_npz(source)
     if re.match(rb"ply[ \t]*[\r\n]", head):
         return read_mesh_ply(source)
     if head[:4] == b"glTF" or re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
         return read_gltf(source)
-    if head[:8] == b"PXR-USDC" or head[:5] == b"#usda":
-        raise FileFormatError(
-            f"{source}: USD files are written but not read here; load the .glb, .ply or .npz"
-        )
+    if is_usd(head):
+        return read_usd(source)
     if b"\0" not in head and (
         source.suffix.lower() == ".obj" or re.search(rb"(^|\n)v[ \t]+[-+.\d]", head) is not None
     ):
         return read_obj(source)
     raise FileFormatError(
         f"{source}: not a mesh file that is known here, it begins with {head[:8]!r};"
-        " expected .npz, .ply, .glb, .gltf or .obj"
+        " expected .npz, .ply, .glb, .gltf, .usdc, .usda or .obj"
     )
 
 
@@ -84,7 +90,7 @@ def save_mesh(
     - `.npz`, `.ply` keep everything exactly.
     - `.glb` keeps colours as linear values of 16 bits (within 1/2000 as display values), the rest exactly.
     - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat numbers and attributes become
-      primvars. Needs the extra ``usd``. Not read by ``load_mesh``.
+      primvars. Needs the extra ``usd``.
     - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
 
     Options, each for the formats named; given for another one they are a ValueError:

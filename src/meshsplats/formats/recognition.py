@@ -12,6 +12,7 @@ from meshsplats.formats.ply_header import read_header
 from meshsplats.formats.splat_gltf import has_splats
 from meshsplats.formats.splat_ply import is_float_splat
 from meshsplats.formats.splats import splat_format
+from meshsplats.formats.usd_reader import is_usd
 
 
 def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
@@ -27,6 +28,8 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
         found = splat_format(path)
         if found == "ply":
             return "splats" if is_float_splat(read_header(file, path)) else "mesh"
+    if is_usd(start):
+        return "mesh"
     if found == "sog" and start.startswith(b"PK"):
         return "mesh" if _holds_arrays(path) else "splats"
     if found == "gltf":
@@ -47,6 +50,8 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
 
 def _holds_arrays(path: Path) -> bool:
     """Whether a zip archive is an .npz."""
+    if path.suffix.lower() == ".usdz":  # its reader says what to do
+        return True
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith(".npy") for name in archive.namelist())

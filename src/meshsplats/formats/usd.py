@@ -5,7 +5,8 @@ Needs the optional package usd-core. One Mesh under an Xform that turns the mesh
 stage's +y; points are stored untouched, metersPerUnit is 1. Colour and opacity stand in the primvars
 displayColor (linear) and displayOpacity, one value a vertex, and a UsdPreviewSurface material reads them
 from there. Schemas: https://openusd.org/release/api/usd_geom_page_front.html and
-spec_usdpreviewsurface.html there.
+spec_usdpreviewsurface.html there. What the schemas have no place for stands in the mesh's custom data. The
+reader is ``usd_reader``.
 """
 
 from __future__ import annotations
@@ -69,17 +70,29 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
         if values is not None:
             new = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
             new.Set(Vt.IntArray.FromNumpy(values))
-    taken = {"displayColor", "displayOpacity", "face_splat", "depth_group"}
+    up = Gf.Vec3d(*(float(u) for u in mesh.up))
+    note: dict[str, Any] = {"version": 1, "blending": mesh.blending, "up": up}
+    note |= {name: True for name in ("face_splat", "depth_group") if getattr(mesh, name) is not None}
+    if lit and mesh.normals is None:
+        note["normals"] = "computed"
+    taken = {"displayColor", "displayOpacity", "normals", "face_splat", "depth_group"}
+    stored: list[tuple[str, str, int]] = []
     for name, values in mesh.attributes.items():
         columns = 1 if values.ndim == 1 else values.shape[1]
         plain = Tf.MakeValidIdentifier(name)
         while plain in taken:
             plain += "_"
         taken.add(plain)
+        stored.append((name, plain, -1 if values.ndim == 1 else columns))
+        if columns == 0:
+            continue
         new = primvars.CreatePrimvar(plain, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex, columns)
         new.Set(Vt.FloatArray.FromNumpy(values.reshape(-1)))
-    up = Gf.Vec3d(*(float(u) for u in mesh.up))
-    shape.GetPrim().SetCustomData({"meshsplats": {"version": 1, "blending": mesh.blending, "up": up}})
+    if stored:
+        names, plain_names, widths = zip(*stored, strict=True)
+        note |= {"attributes": Vt.StringArray(names), "primvars": Vt.StringArray(plain_names)}
+        note["columns"] = Vt.IntArray(widths)  # -1: one number a vertex, not a table of one column
+    shape.GetPrim().SetCustomData({"meshsplats": note})
     if not stage.GetRootLayer().Export(str(path)):
         raise OSError(f"usd-core could not write {path}")
 
