@@ -187,7 +187,7 @@ class Finetune:
     """Optimises a mesh until its pictures are those of the splats, or of photographs.
 
     Splats are converted first. Beside the result: its configuration, a preview picture, and a folder NAME.run
-    with metrics, previews and a checkpoint, from which --resume goes on after Ctrl-C, a kill or a power cut.
+    with metrics, previews and a checkpoint, from which --resume goes on after Ctrl-C or a kill.
     """
 
     input: tyro.conf.Positional[Path]

@@ -26,7 +26,7 @@ class FinetuneConfig:
     """The preset that these values began from; a name for the record."""
     epochs: float | None = None
     """Length: so many times all training views. Of the three lengths exactly one is given."""
-    steps: int | None = 1500
+    steps: int | None = 1000
     """Length: so many steps, one view each."""
     minutes: float | None = None
     """Length: so much time, with what came before (reading, converting, drawing the targets). The one length
@@ -45,7 +45,7 @@ class FinetuneConfig:
     """Adam's memory of the gradient."""
     beta2: float = 0.999
     """Adam's memory of the gradient's square."""
-    epsilon: float = 1e-8
+    epsilon: float = 1e-15
     """Adam's smallest divisor."""
     ssim_weight: float = 0.4
     """Share of SSIM, 0 to 1."""
@@ -146,6 +146,7 @@ _PAPER = FinetuneConfig(
     ssim_weight=0.4,
     background="white",
     prune_epochs=10,
+    epsilon=1e-8,
     prune_opacity=math.exp(-4),
     prune_importance=0.0,
 )

@@ -22,6 +22,10 @@ except ImportError as error:
     raise MissingDependencyError("fine-tuning needs torch: pip install 'meshsplats[finetune]'") from error
 
 
+IMPORTANCE_VIEWS = 64
+"""Most training views, evenly spread, that are drawn to find out what they show of each splat."""
+
+
 class Target(NamedTuple):
     """What a picture should look like."""
 
@@ -127,7 +131,9 @@ def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
     config, mesh = state.config, state.result()
     keep = (mesh.colors[mesh.faces, 3] >= config.prune_opacity).any(axis=1)
     if config.prune_importance > 0:
-        shown, before = importance(state, views)
+        every = max(1, -(-len(views) // IMPORTANCE_VIEWS))
+        shown, before = importance(state, views[::every])
+        shown *= every  # as if all had been looked at
         corners_shown, corners_before = shown[mesh.faces].sum(axis=1), before[mesh.faces].any(axis=1)
         if mesh.face_splat is not None and len(mesh.faces):
             starts = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) > 0]))
