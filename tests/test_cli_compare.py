@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from _splats import few_splats
 from PIL import Image
 
 from meshsplats.camera import load_cameras, orbit, save_cameras
@@ -14,21 +15,12 @@ from meshsplats.comparison import compare
 from meshsplats.conversion import convert
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
-from meshsplats.gaussians import GaussianCloud
 from meshsplats.pictures import CAPTION, GAP
 
 
 @pytest.fixture
 def splats(tmp_path):
-    rng = np.random.default_rng(0)
-    n = 40
-    cloud = GaussianCloud(
-        rng.normal(size=(n, 3)),
-        np.tile([1.0, 0, 0, 0], (n, 1)),
-        rng.uniform(0.05, 0.3, (n, 3)),
-        rng.uniform(0.2, 0.95, n),
-        rng.normal(size=(n, 1, 3)),
-    )
+    cloud = few_splats()
     save_gaussians(cloud, tmp_path / "scene.ply")
     save_cameras(orbit(cloud, 2, width=40, height=30), tmp_path / "two.json")
     return tmp_path / "scene.ply"

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from _splats import few_splats
 from PIL import Image
 
 from meshsplats.camera import orbit, save_cameras
@@ -13,20 +14,11 @@ from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
-from meshsplats.gaussians import GaussianCloud
 
 
 @pytest.fixture
 def splats(tmp_path):
-    rng = np.random.default_rng(0)
-    n = 40
-    cloud = GaussianCloud(
-        rng.normal(size=(n, 3)),
-        np.tile([1.0, 0, 0, 0], (n, 1)),
-        rng.uniform(0.05, 0.3, (n, 3)),
-        rng.uniform(0.2, 0.95, n),
-        rng.normal(size=(n, 1, 3)),
-    )
+    cloud = few_splats()
     save_gaussians(cloud, tmp_path / "my scene.ply")
     return tmp_path / "my scene.ply"
 

@@ -8,6 +8,7 @@ import _splat_encoders as encode
 import numpy as np
 import pytest
 from _splat_files import random_splats, splat_table, write_ply
+from _splats import harmonics_of_3dgs
 from conftest import shared_data
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,28 +21,8 @@ LUF = np.diag([-1.0, -1, 1])
 
 
 def colors_seen(cloud, direction):
-    """(n, 3) colours along one direction, with the constants of the 3DGS code typed out."""
-    x, y, z = direction
-    basis = np.array(
-        [
-            0.28209479177387814,
-            -0.4886025119029199 * y,
-            0.4886025119029199 * z,
-            -0.4886025119029199 * x,
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * z * z - x * x - y * y),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (x * x - y * y),
-            -0.5900435899266435 * y * (3 * x * x - y * y),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-            1.445305721320277 * z * (x * x - y * y),
-            -0.5900435899266435 * x * (x * x - 3 * y * y),
-        ]
-    )
+    """(n, 3) colours along one direction."""
+    basis = harmonics_of_3dgs(*direction)
     return np.einsum("k,nkc->nc", basis[: cloud.sh.shape[1]], cloud.sh)
 
 

@@ -26,7 +26,7 @@ from meshsplats.framing import (
 MAX_SIDE = 1 << 15
 """Largest picture side in pixels."""
 MAX_FILE_BYTES = 16 << 20
-"""A camera file larger than this is refused."""
+"""A larger file of cameras is refused."""
 MAX_CAMERAS = 20_000
 NEAR_SHARE = 0.01
 """Near plane of the cameras made here, as a share of their distance to the subject's middle."""
@@ -291,14 +291,7 @@ def load_cameras(path: str | Path) -> list[Camera]:
     path = Path(path)
     if path.is_dir():
         path = path / "cameras.json"
-    with open(path, "rb") as file:
-        text = file.read(MAX_FILE_BYTES + 1)
-    if len(text) > MAX_FILE_BYTES:
-        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no camera file is")
-    try:
-        entries = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not a JSON file ({error})") from None
+    entries = read_json(path)
     if not isinstance(entries, list):
         raise FileFormatError(
             f"{path}: a camera file is a JSON list of cameras, this is a JSON {_kind(entries)}"
@@ -310,6 +303,18 @@ def load_cameras(path: str | Path) -> list[Camera]:
             f"{path}: {len(entries)} cameras, more than the {MAX_CAMERAS} that are accepted"
         )
     return [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+
+
+def read_json(path: Path) -> Any:
+    """The content of a file of cameras. FileFormatError if it is no JSON, or larger than any such file is."""
+    with open(path, "rb") as file:
+        text = file.read(MAX_FILE_BYTES + 1)
+    if len(text) > MAX_FILE_BYTES:
+        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no file of cameras is")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not a JSON file ({str(error)[:120]})") from None
 
 
 def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:

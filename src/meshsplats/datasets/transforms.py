@@ -6,14 +6,13 @@ docs.nerf.studio/quickstart/data_conventions.html and the files of the NeRF-synt
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import MAX_FILE_BYTES, MAX_SIDE
+from meshsplats.camera import MAX_SIDE, read_json
 from meshsplats.datasets.lens import Lens
 from meshsplats.datasets.photographs import Frame, find, read_header
 from meshsplats.errors import FileFormatError
@@ -62,14 +61,7 @@ def read_transforms(path: Path) -> Transforms:
 
 
 def _read_json(path: Path) -> dict:
-    with open(path, "rb") as file:
-        text = file.read(MAX_FILE_BYTES + 1)
-    if len(text) > MAX_FILE_BYTES:
-        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no such file is")
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not a JSON file ({str(error)[:120]})") from None
+    content = read_json(path)
     if not isinstance(content, dict):
         raise FileFormatError(f"{path}: must be a JSON object with 'frames'")
     return content
