@@ -114,6 +114,14 @@ class GradientTile {
         int held = 0;
         int32_t numbers[Triangles::N];
         for (size_t i = 0; i < place_.size(); ++i) {
+            if (i + 24 < place_.size()) __builtin_prefetch(mesh_.faces + 3 * (int64_t)log.faces[i + 24]);
+            if (i + 12 < place_.size()) {
+                for (int k = 0; k < 3; ++k) {
+                    const int64_t corner = mesh_.faces[3 * (int64_t)log.faces[i + 12] + k];
+                    __builtin_prefetch(&scene_.vertices[corner]);
+                    __builtin_prefetch(mesh_.colors + 4 * corner);
+                }
+            }
             if (place_[i] < 0) continue;
             numbers[held++] = (int32_t)i;
             if (held == Triangles::N) {
@@ -394,7 +402,15 @@ class VertexGradients {
             const int64_t begin = mesh_.vertex_count * thread / threads_, end = mesh_.vertex_count * (thread + 1) / threads_;
             for (int i = 0; i < count; ++i) {
                 const float *extra = attributes[i].data();
-                for (const CornerGradients &g : tiles[i]) {
+                const size_t n = tiles[i].size();
+                for (size_t number = 0; number < n; ++number) {
+                    const CornerGradients &g = tiles[i][number];
+                    if (number + 8 < n) {
+                        for (int64_t v : tiles[i][number + 8].vertex) {
+                            __builtin_prefetch(out_.vertices + 3 * v, 1);
+                            __builtin_prefetch(out_.colors + 4 * v, 1);
+                        }
+                    }
                     for (int k = 0; k < 3; ++k, extra += attributes_) {
                         const int64_t v = g.vertex[k];
                         if (v < begin || v >= end) continue;

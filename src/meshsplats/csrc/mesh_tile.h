@@ -18,6 +18,8 @@ class MeshTile {
     Blend &blend() { return blend_; }
 
     void draw(int tile_x, int tile_y, const Entry *list, int64_t length) {
+        tile_x_ = tile_x;
+        tile_y_ = tile_y;
         area_ = TileArea(scene_.grid, tile_x, tile_y);
         blend_.begin(area_);
         full_ = takes_ = 0;
@@ -27,6 +29,8 @@ class MeshTile {
             if (blend_.open(block)) takes_ |= 1u << block;
         }
         for (int64_t i = 0; i < length && takes_; ++i) {
+            // Groups come in the order of depth, which is no order in memory: data is asked for some groups ahead.
+            if (i + 12 < length) __builtin_prefetch(scene_.boxes.data() + list[i + 12].first);
             if (i + 8 < length) prefetch_faces(list[i + 8]);
             if (i + 4 < length) prefetch_corners(list[i + 4]);
             hold_run(list[i]);
@@ -37,19 +41,21 @@ class MeshTile {
     }
 
   private:
-    static constexpr double SLACK = 0.01f;
-
-    // Groups come in the order of depth, which is no order in memory: their data is asked for some groups ahead.
+    bool touches(const TileBox &box) const {
+        return (box.x0 <= tile_x_) & (tile_x_ <= box.x1) & (box.y0 <= tile_y_) & (tile_y_ <= box.y1);
+    }
     void prefetch_faces(const Entry &run) const {
-        const int32_t *face = mesh_.faces + 3 * (int64_t)run.first;
-        __builtin_prefetch(face);
-        __builtin_prefetch(face + 16);
+        for (int32_t f = run.first; f < run.first + run.length; ++f)
+            if (touches(scene_.boxes[f])) __builtin_prefetch(mesh_.faces + 3 * (int64_t)f);
     }
     void prefetch_corners(const Entry &run) const {
-        const int32_t *face = mesh_.faces + 3 * (int64_t)run.first;
-        for (int i = 0; i < run.length; ++i, face += 3) {
-            __builtin_prefetch(&scene_.vertices[face[1]]);
-            __builtin_prefetch(mesh_.colors + 4 * (int64_t)face[1]);
+        for (int32_t f = run.first; f < run.first + run.length; ++f) {
+            if (!touches(scene_.boxes[f])) continue;
+            for (int k = 0; k < 3; ++k) {
+                const int64_t corner = mesh_.faces[3 * (int64_t)f + k];
+                __builtin_prefetch(&scene_.vertices[corner]);
+                __builtin_prefetch(mesh_.colors + 4 * corner);
+            }
         }
     }
 
@@ -68,21 +74,15 @@ class MeshTile {
 
     // Triangles that may touch the tile gather until there are enough to make ready side by side.
     void hold_run(const Entry &run) {
-        // The slack is more than the rounding of an edge function.
-        const double left = area_.x0 - SLACK, right = area_.x0 + area_.columns + SLACK, top = area_.y0 - SLACK,
-                     bottom = area_.y0 + area_.rows + SLACK;
         Triangles &t = triangles_;
-        const int32_t end = run.first + run.length;
-        const int32_t *corner = mesh_.faces + 3 * (int64_t)run.first;
-        for (int32_t f = run.first; f < end; ++f, corner += 3) {
+        const TileBox *box = scene_.boxes.data() + run.first;
+        for (int32_t i = 0; i < run.length; ++i) {
+            if (!touches(box[i])) continue;
+            const int32_t f = run.first + i;
+            const int32_t *corner = mesh_.faces + 3 * (int64_t)f;
             const Projected &p = scene_.vertices[corner[0]], &q = scene_.vertices[corner[1]],
                             &r = scene_.vertices[corner[2]];
-            const int behind = !(p.w > 0) + !(q.w > 0) + !(r.w > 0);
-            if (behind == 3) continue;
-            if (behind == 0 &&
-                !((std::min({p.x, q.x, r.x}) < right) & (std::max({p.x, q.x, r.x}) > left) &
-                  (std::min({p.y, q.y, r.y}) < bottom) & (std::max({p.y, q.y, r.y}) > top)))
-                continue;
+            const bool crosses = !(p.w > 0) | !(q.w > 0) | !(r.w > 0);
             const Projected *corners[3] = {&p, &q, &r};
             for (int k = 0; k < 3; ++k) {
                 t.x[k][held_] = corners[k]->x - area_.x0;
@@ -92,7 +92,7 @@ class MeshTile {
             }
             t.face[held_] = f;
             run_[held_] = run.first;
-            crossing_ |= (unsigned)(behind > 0) << held_;
+            crossing_ |= (unsigned)crosses << held_;
             if (++held_ < Triangles::N) continue;
             add_held();
             for (; full_; full_ &= full_ - 1) flush(__builtin_ctz(full_), run.key);
@@ -205,6 +205,7 @@ class MeshTile {
     const Scene &scene_;
     const MsMesh &mesh_;
     Blend blend_;
+    int tile_x_, tile_y_;
     TileArea area_;
     Triangles triangles_;
     int held_;                      // triangles gathered

@@ -14,6 +14,11 @@ struct DepthPlane {
     float q_min, q_max;
 };
 
+// The tiles that one triangle may touch, inclusive; none where x0 > x1.
+struct TileBox {
+    uint16_t x0, x1, y0, y1;
+};
+
 struct Scene {
     const MsMesh &mesh;
     const Grid &grid;
@@ -21,6 +26,7 @@ struct Scene {
     std::vector<Projected> vertices;
     std::vector<int32_t> group_start;  // triangles [group_start[g], group_start[g + 1]) are one group
     std::vector<DepthPlane> planes;    // by depth group
+    std::vector<TileBox> boxes;        // by triangle
     std::vector<Item> items;           // groups that may cover samples, nearest first
 
     // Items are needed to draw; without, just to follow a log.
@@ -119,6 +125,7 @@ struct Scene {
     void find_items(int threads) {
         int64_t groups = (int64_t)group_start.size() - 1;
         constexpr int64_t block = 1 << 14;
+        boxes.resize(mesh.face_count);
         std::vector<std::vector<Item>> parts((groups + block - 1) / block);
         parallel_blocks(threads, groups, block, [&](int64_t a, int64_t b, int) {
             auto &part = parts[a / block];
@@ -136,25 +143,29 @@ struct Scene {
         sort_items(items);
     }
 
-    // The box of a group on the sample grid and its nearest point; false if it covers no sample centre.
-    bool bound(int64_t group, Item &item) const {
+    // The tiles of a group and of each of its triangles, and its nearest point; false if it covers no sample centre.
+    bool bound(int64_t group, Item &item) {
         constexpr double inf = std::numeric_limits<double>::infinity();
-        double lo[2] = {inf, inf}, hi[2] = {-inf, -inf}, key = 0;
-        auto include = [&](double x, double y) {
-            lo[0] = std::min(lo[0], x);
-            hi[0] = std::max(hi[0], x);
-            lo[1] = std::min(lo[1], y);
-            hi[1] = std::max(hi[1], y);
-        };
+        double key = 0;
+        TileBox all{UINT16_MAX, 0, UINT16_MAX, 0};
         for (int64_t i = group_start[group]; i < group_start[group + 1]; ++i) {
+            boxes[i] = {1, 0, 1, 0};
+            double lo[2] = {inf, inf}, hi[2] = {-inf, -inf};
+            auto include = [&](double x, double y) {
+                lo[0] = std::min(lo[0], x);
+                hi[0] = std::max(hi[0], x);
+                lo[1] = std::min(lo[1], y);
+                hi[1] = std::max(hi[1], y);
+            };
             const int32_t *f = mesh.faces + 3 * i;
             const Projected *p[3] = {&vertices[f[0]], &vertices[f[1]], &vertices[f[2]]};
             int in_front = (p[0]->w > 0) + (p[1]->w > 0) + (p[2]->w > 0);
             if (in_front == 0) continue;
+            double nearest = 0;
             for (int k = 0; k < 3; ++k) {
                 if (p[k]->w > 0) {
                     include(p[k]->x, p[k]->y);
-                    key = std::max(key, p[k]->w);
+                    nearest = std::max(nearest, p[k]->w);
                 }
             }
             if (in_front < 3) {
@@ -167,19 +178,21 @@ struct Scene {
                     double t = (projection.near - a.z) / (b.z - a.z);
                     include((a.x + t * (b.x - a.x)) / projection.near, (a.y + t * (b.y - a.y)) / projection.near);
                 }
-                key = 1 / projection.near;
+                nearest = 1 / projection.near;
             }
+            int x0, x1, y0, y1;
+            if (!sample_range(lo[0], hi[0], grid.width, x0, x1) || !sample_range(lo[1], hi[1], grid.height, y0, y1))
+                continue;
+            const TileBox box{(uint16_t)(x0 / grid.side), (uint16_t)(x1 / grid.side), (uint16_t)(y0 / grid.side),
+                              (uint16_t)(y1 / grid.side)};
+            boxes[i] = box;
+            all = {std::min(all.x0, box.x0), std::max(all.x1, box.x1), std::min(all.y0, box.y0), std::max(all.y1, box.y1)};
             if (mesh.depth_group && mesh.depth_group[i] >= 0)
-                key = std::max(key, (double)planes[mesh.depth_group[i]].q_max);
+                nearest = std::max(nearest, (double)planes[mesh.depth_group[i]].q_max);
+            key = std::max(key, nearest);
         }
-        int x0, x1, y0, y1;
-        if (!sample_range(lo[0], hi[0], grid.width, x0, x1) || !sample_range(lo[1], hi[1], grid.height, y0, y1))
-            return false;
-        item = {{(float)key, group_start[group], group_start[group + 1] - group_start[group]},
-                (uint16_t)(x0 / grid.side),
-                (uint16_t)(x1 / grid.side),
-                (uint16_t)(y0 / grid.side),
-                (uint16_t)(y1 / grid.side)};
+        if (all.x0 > all.x1) return false;
+        item = {{(float)key, group_start[group], group_start[group + 1] - group_start[group]}, all.x0, all.x1, all.y0, all.y1};
         return true;
     }
 };

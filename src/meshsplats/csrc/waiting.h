@@ -83,11 +83,6 @@ class Waiting {
         limit_ = ENTRIES;
     }
 
-    // No run continues what was added before.
-    void close_run() {
-        if (count_ > 0) entries_[count_ - 1].run = -1;
-    }
-
     // Calls blend(place of the triangle, lanes, keys) for all that is nearer than `nearest_to_come`, at every lane
     // nearest first, of equal keys the lower face first. `open` are the lanes that take light; `blend` may close some.
     template <class Blend>
@@ -131,6 +126,7 @@ class Waiting {
             }
             entry.first = first;
             entry.pieces = (int)kept_pieces - first;
+            entry.run = -1;  // its pieces hold lanes that are done: none may be added to them
             entries_[kept] = entry;
             keys_[kept++] = keys_[i];
         }
