@@ -2,11 +2,11 @@
 
     python benchmarks/rendering.py [--repeat 5] [--threads 1 2] [--scenes 160k 1M 4M]
 
-Prints a Markdown table. render: a picture, exact at every pixel. log: the same, with a log to go back by. back:
-gradients of positions and colours from that of the picture. Medians of the clock in milliseconds; fragments
-blended a pixel, and a second by render; nanoseconds of log and back together for each fragment; the peak of the
-process's memory beyond what it held before, of render, and of log and back without the gradients (Linux). Each
-row runs in a process of its own.
+Prints a Markdown table. render: a picture, exact at every pixel. log: the same, with a log to go back by.
+back: gradients of positions and colours from that of the picture. Medians of the clock in milliseconds;
+fragments blended a pixel, and a second by render; nanoseconds of log and back together for each fragment; the
+peak of the process's memory beyond what it held before, of render, and of log and back without the gradients
+(Linux). Each row runs in a process of its own.
 """
 
 from __future__ import annotations
