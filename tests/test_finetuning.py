@@ -167,7 +167,8 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path):
     """Pruned by opacity and importance on the way, and stopped three times."""
     _, dataset, mesh = scene
     config = make_config(epochs=4, prune_epochs=1, prune_opacity=0.05, prune_importance=0.3, exposure=True)
-    whole = finetune(mesh, dataset, config)
+    unstopped = tmp_path / "unstopped"
+    whole = finetune(mesh, dataset, config, run=RunOptions(unstopped))
     assert len(whole.faces) < len(mesh.faces)
     folder = tmp_path / "run"
     for stop in (7, 8, 19):
@@ -184,8 +185,10 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path):
     assert same(tuned, whole)
     again = finetune(mesh, dataset, config, run=RunOptions(folder, resume=True))
     assert same(again, whole)
-    steps = [line["step"] for line in Journal(folder).metrics()]
-    assert steps == [0, 48]
+    metrics = [Journal(f).metrics() for f in (folder, unstopped)]
+    assert [line["step"] for line in metrics[0]] == [0, 48]
+    for name in ("loss", "psnr", "triangles"):
+        assert [line[name] for line in metrics[0]] == [line[name] for line in metrics[1]]
 
 
 def test_resuming_with_other_inputs_is_refused(scene, tmp_path):

@@ -197,7 +197,7 @@ def checkpoint(step: int = 3):
     pytest.importorskip("safetensors")
     from meshsplats.finetuning.checkpoint import Checkpoint
 
-    return Checkpoint(step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays())
+    return Checkpoint(step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays(), (0.25, 1 / 3))
 
 
 def test_checkpoints_come_back_to_the_last_bit(tmp_path):
@@ -207,7 +207,7 @@ def test_checkpoints_come_back_to_the_last_bit(tmp_path):
     save_checkpoint(saved, tmp_path / "c.safetensors")
     found = load_checkpoint(tmp_path / "c.safetensors")
     assert (found.step, found.seconds, found.mesh, found.dataset) == (3, 1.5, "mesh", "views")
-    assert found.config == saved.config
+    assert (found.config, found.losses) == (saved.config, saved.losses)
     assert all((found.arrays[name] == array).all() for name, array in saved.arrays.items())
     assert [p.name for p in tmp_path.iterdir()] == ["c.safetensors"]
 

@@ -23,7 +23,7 @@ from meshsplats.mesh import SplatMesh
 
 VERSION = 1
 _KEY = "meshsplats"
-_REQUIRED = ("version", "step", "seconds", "config", "mesh", "dataset")
+_REQUIRED = ("version", "step", "seconds", "config", "mesh", "dataset", "losses")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +41,15 @@ class Checkpoint:
     dataset: str
     """``fingerprint`` of the views."""
     arrays: dict[str, np.ndarray]
+    losses: tuple[float, ...] = ()
+    """Of the steps since the last line of the metrics."""
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
     """Writes ``checkpoint``, in place of an older one of that name once it is whole."""
     tensors = _safetensors()
-    header = {name: getattr(checkpoint, name) for name in ("step", "seconds", "config", "mesh", "dataset")}
+    names = ("step", "seconds", "config", "mesh", "dataset", "losses")
+    header = {name: getattr(checkpoint, name) for name in names}
     arrays = {name: np.array(array, order="C") for name, array in checkpoint.arrays.items()}
     with atomic_path(path) as temporary:
         metadata = {_KEY: json.dumps({"version": VERSION, **header})}
@@ -78,15 +81,18 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         raise FileFormatError(
             f"{path}: a checkpoint of version {header['version']}, this program reads version {VERSION}"
         )
-    step, seconds, config = header["step"], header["seconds"], header["config"]
+    step, seconds, config, losses = (header[name] for name in ("step", "seconds", "config", "losses"))
     if (
         not isinstance(step, int)
         or step < 0
         or not isinstance(seconds, (int, float))
         or not isinstance(config, dict)
+        or not isinstance(losses, list)
+        or not all(isinstance(loss, float) for loss in losses)
     ):
         raise FileFormatError(f"{path}: broken: step {step!r}, seconds {seconds!r}")
-    return Checkpoint(step, float(seconds), config, str(header["mesh"]), str(header["dataset"]), arrays)
+    made_of = str(header["mesh"]), str(header["dataset"])
+    return Checkpoint(step, float(seconds), config, *made_of, arrays, tuple(losses))
 
 
 def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -127,17 +127,17 @@ def finetune(
         check_same_run(found, config, *prints)
         blending = "linear" if config.blending == "linear" else mesh.blending
         state = State.resume(found.arrays, blending, views, config, run.threads)
-        step, spent = found.step, found.seconds
+        step, spent, losses = found.step, found.seconds, found.losses
     else:
         state = State.begin(mesh, views, config, run.threads)
-        step, spent = 0, 0.0
+        step, spent, losses = 0, 0.0, ()
         if journal is not None:
             journal.begin(config.to_dict())
     threads = torch.get_num_threads()
     try:
         # Sums over pixels then have one order; the core has threads of its own.
         torch.set_num_threads(1)
-        return _Run(state, dataset, config, run, journal, prints, step, spent, on_progress).go()
+        return _Run(state, dataset, config, run, journal, prints, step, spent, losses, on_progress).go()
     finally:
         torch.set_num_threads(threads)
 
@@ -155,6 +155,7 @@ class _Run:
         prints: tuple[str, str],
         step: int,
         spent: float,
+        losses: Sequence[float],
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
         self.state, self.dataset, self.config, self.run, self.journal = state, dataset, config, run, journal
@@ -163,7 +164,7 @@ class _Run:
         self.began = time.perf_counter() - (spent or run.spent)
         self.saved_at = time.perf_counter()
         self.first, self.first_seconds = step, self.seconds
-        self.losses: list[float] = []
+        self.losses = list(losses)
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = 0.0
@@ -267,7 +268,9 @@ class _Run:
             return
         arrays = self.state.arrays()
         config = self.config.to_dict()
-        self.journal.save(Checkpoint(self.step, self.seconds, config, *self.prints, arrays))
+        self.journal.save(
+            Checkpoint(self.step, self.seconds, config, *self.prints, arrays, tuple(self.losses))
+        )
 
     def _tell(self) -> None:
         if self.on_progress is None:
