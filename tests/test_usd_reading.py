@@ -73,11 +73,12 @@ def test_a_mesh_of_ours_that_was_moved_is_read_where_it_stands(tmp_path):
 
 
 @needs_usd
-def test_splat_numbers_that_no_longer_fit_are_left_out(tmp_path):
+@pytest.mark.parametrize("first", ["", "9, "], ids=["one too few", "not in order"])
+def test_splat_numbers_that_no_longer_fit_are_left_out(tmp_path, first):
     save_mesh(replace(MESH, normals=None, attributes={}), tmp_path / "m.usda")
     text = (tmp_path / "m.usda").read_text()
     at = text.index("int[] primvars:face_splat = [") + len("int[] primvars:face_splat = [")
-    arrays, told = read(tmp_path, text[:at] + text[text.index(",", at) + 1 :])
+    arrays, told = read(tmp_path, text[:at] + first + text[text.index(",", at) + 1 :])
     assert told["warnings"] == ["another program has altered the file, left out: face_splat"]
     assert "face_splat" not in arrays
     np.testing.assert_array_equal(arrays["depth_group"], MESH.depth_group)
