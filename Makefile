@@ -34,7 +34,7 @@ $(BIN)/python:
 
 # Editable installs: Python is used where it lies in src/; a change of the compiled core's source installs again.
 $(VENV)/installed: $(BUILD_INPUTS) | $(BIN)/python
-	@echo 'Compiling the core and installing MeshSplats: about half a minute'
+	@echo 'Compiling the core and installing MeshSplats: about a minute'
 	@$(PIP) install --editable . --constraint ci-constraints.txt
 	@touch $@
 
@@ -58,7 +58,7 @@ test: $(VENV)/installed-dev
 $(BLENDER_VENV)/wheel/made: $(BUILD_INPUTS) $(shell find src -name '*.py')
 	@if [ -z "$(BLENDER_PYTHON)" ]; then echo 'Blender needs Python 3.11 with venv, and it was not found.' \
 	  'Name it: make test-blender BLENDER_PYTHON=...' >&2; exit 1; fi
-	@echo 'Compiling the core: about half a minute'
+	@echo 'Compiling the core: about a minute'
 	@$(BLENDER_PYTHON) -m venv $(BLENDER_VENV)/build
 	@rm -f $(@D)/*.whl
 	@$(BLENDER_VENV)/build/bin/python -m pip --disable-pip-version-check --quiet wheel --no-deps \

@@ -96,18 +96,10 @@ class Waiting {
             active_[n] = {i, ready};
             n += ready != 0;
         }
-        if (n <= 4)
-            in_order<4>(n, blend);
-        else if (n <= 8)
-            in_order<8>(n, blend);
-        else if (n <= 12)
-            in_order<12>(n, blend);
-        else if (n <= 16)
-            in_order<16>(n, blend);
-        else if (n <= MOST_AT_ONCE)
-            in_order<MOST_AT_ONCE>(n, blend);
-        else
+        if (n > MOST_AT_ONCE)
             lane_by_lane(n, open, blend);
+        else if (n > 0)
+            in_order(n, blend);
         int kept = 0;
         size_t kept_pieces = 0;
         for (int i = 0; i < count_; ++i) {
@@ -190,25 +182,52 @@ class Waiting {
             if (uint32_t part = pieces_[p].lanes & due) blend(pieces_[p].place, part, keys_[entry].key);
     }
 
-    // n <= N active entries. Neighbouring samples nearly always agree on the order of two triangles, so mostly whole
-    // entries follow each other; where they pierce each other, only some of their lanes are due at a time.
-    template <int N, class Blend>
-    void in_order(const int n, Blend &blend) {
-        if (n == 0) return;
+    // Where each of the n active entries comes in the order of each lane, and the entries by the mean of that.
+    struct Order {
+        alignas(64) float rank[MOST_AT_ONCE][LANES];
+        int entry[MOST_AT_ONCE];
+    };
+
+    // n <= N.
+    template <int N>
+    void rank(const int n, Order &order) const {
         Lanes key[N], rank[N];
         // By lane, how many come before; lanes that an entry does not cover have keys of their own below all others.
         for (int i = 0; i < N; ++i) {
-            if (N > 16 && i == n) break;
             key[i] = i < n ? pick(active_[i].lanes, load_lanes(keys_[active_[i].entry].key), lanes(-1.0f - i)) : lanes(-1.0f - i);
             rank[i] = lanes(0);
         }
         uint32_t ties = 0;
 #pragma GCC unroll 16
         for (int j = 1; j < N; ++j) {
-            if (N > 16 && j == n) break;
 #pragma GCC unroll 16
             for (int i = 0; i < j; ++i) ties |= count_before(key[i], key[j], rank[i], rank[j]);
         }
+        finish_order(n, key, rank, ties, order);
+    }
+
+    void rank_more(const int n, Order &order) const {
+        // Where a block takes many vectors, longer code costs more than it gains.
+        if constexpr (PARTS <= 2) {
+            if (n <= 12) return rank<12>(n, order);
+            if (n <= 16) return rank<16>(n, order);
+        }
+        rank_many(n, order);
+    }
+
+    // The same for more.
+    void rank_many(const int n, Order &order) const {
+        Lanes key[MOST_AT_ONCE], rank[MOST_AT_ONCE];
+        uint32_t ties = 0;
+        for (int i = 0; i < n; ++i) {
+            key[i] = pick(active_[i].lanes, load_lanes(keys_[active_[i].entry].key), lanes(-1.0f - i));
+            rank[i] = lanes(0);
+            for (int j = 0; j < i; ++j) ties |= count_before(key[j], key[i], rank[j], rank[i]);
+        }
+        finish_order(n, key, rank, ties, order);
+    }
+
+    void finish_order(const int n, const Lanes *key, Lanes *rank, uint32_t ties, Order &order) const {
         if (ties) {
             for (int j = 1; j < n; ++j)
                 for (int i = 0; i < j; ++i)
@@ -218,24 +237,36 @@ class Waiting {
                         rank[j] = rank[j] + only(tie, lanes(1));
                     }
         }
-        alignas(64) float ranks[N][LANES];
-        float mean[N];
-        int order[N];
+        float mean[MOST_AT_ONCE];
         for (int i = 0; i < n; ++i) {
-            store_lanes(ranks[i], rank[i]);
+            store_lanes(order.rank[i], rank[i]);
             mean[i] = sum(only(active_[i].lanes, rank[i])) / __builtin_popcount(active_[i].lanes);
         }
         for (int i = 0; i < n; ++i) {
             int place = 0;
             for (int j = 0; j < n; ++j) place += (mean[j] < mean[i]) | ((mean[j] == mean[i]) & (j < i));
-            order[place] = i;
+            order.entry[place] = i;
         }
+    }
+
+    // Neighbouring samples nearly always agree on the order of two triangles, so mostly whole entries follow each other;
+    // where they pierce each other, only some of their lanes are due at a time.
+    template <class Blend>
+    void in_order(const int n, Blend &blend) {
+        Order order;
+        if (n <= 4)
+            rank<4>(n, order);
+        else if (n <= 8)
+            rank<8>(n, order);
+        else
+            rank_more(n, order);
         Lanes done = lanes(0);
         for (bool more = true; more;) {
             more = false;
             for (int place = 0; place < n; ++place) {
-                Active &a = active_[order[place]];
-                const uint32_t due = a.lanes & equal(load_lanes(ranks[order[place]]), done);
+                const int i = order.entry[place];
+                Active &a = active_[i];
+                const uint32_t due = a.lanes & equal(load_lanes(order.rank[i]), done);
                 if (due) emit(a.entry, due, blend);
                 done = done + only(due, lanes(1));
                 a.lanes &= ~due;
