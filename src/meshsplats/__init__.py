@@ -36,6 +36,8 @@ _HOME = {
     "Rendering": "meshsplats.rendering",
     "finetune": "meshsplats.finetuning",
     "FinetuneConfig": "meshsplats.finetuning",
+    "MeshPrior": "meshsplats.prior",
+    "load_prior": "meshsplats.prior",
     "evaluate": "meshsplats.evaluation",
     "Report": "meshsplats.evaluation",
     "psnr": "meshsplats.metrics",

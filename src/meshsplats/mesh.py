@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats.binding import Binding
 
 Blending = Literal["display", "linear"]
 
@@ -44,6 +45,8 @@ class SplatMesh:
     'linear'."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Further float32 arrays (v,) or (v, c) by name, one row a vertex."""
+    binding: Binding | None = None
+    """Where on the faces of a base mesh the vertices lie, for a mesh prior: each triangle on one face."""
 
     def __post_init__(self) -> None:
         vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
@@ -89,6 +92,12 @@ class SplatMesh:
                 )
             attributes[name] = checked_array(f"attribute {name!r}", value, np.float32, (v, None)[:ndim])
         set_("attributes", MappingProxyType(attributes))
+        if self.binding is not None:
+            if len(self.binding.vertex_face) != v:
+                raise ValueError(f"binding must bind {v} vertices, it binds {len(self.binding.vertex_face)}")
+            face = self.binding.vertex_face[faces]
+            if (face != face[:, :1]).any():
+                raise ValueError("all corners of a triangle must be bound to one face of the base")
 
     @property
     def splat_count(self) -> int | None:
@@ -114,6 +123,7 @@ class SplatMesh:
             normals=None if self.normals is None else self.normals[used],
             depth_group=None if self.depth_group is None else self.depth_group[keep],
             attributes={name: value[used] for name, value in self.attributes.items()},
+            binding=None if self.binding is None else self.binding.select(used),
         )
 
     def prune(self, min_opacity: float) -> SplatMesh:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats.binding import Binding
 from meshsplats.dataset import Dataset
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.finetuning.config import FinetuneConfig
@@ -23,6 +24,7 @@ from meshsplats.mesh import SplatMesh
 
 VERSION = 1
 _KEY = "meshsplats"
+_BINDING = ("base_vertices", "base_faces", "vertex_face", "weights", "layers")
 _REQUIRED = ("version", "step", "seconds", "config", "mesh", "dataset", "losses")
 
 
@@ -122,6 +124,9 @@ def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:
     for name in ("face_splat", "depth_group"):
         if getattr(mesh, name) is not None:
             arrays[f"mesh.{name}"] = getattr(mesh, name)
+    if mesh.binding is not None:
+        arrays |= {f"mesh.binding.{name}": getattr(mesh.binding, name) for name in _BINDING}
+        arrays["mesh.binding.lift"] = np.array(mesh.binding.lift)
     return arrays | {f"mesh.attribute.{name}": value for name, value in mesh.attributes.items()}
 
 
@@ -129,6 +134,10 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
     """The mesh in a checkpoint's arrays. FileFormatError if something is missing or does not fit."""
     prefix = "mesh.attribute."
     try:
+        binding = None
+        if "mesh.binding.lift" in arrays:
+            parts = {name: arrays[f"mesh.binding.{name}"] for name in _BINDING}
+            binding = Binding(**parts, lift=float(arrays["mesh.binding.lift"]))
         return SplatMesh(
             arrays["mesh.vertices"],
             arrays["mesh.faces"],
@@ -138,6 +147,7 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
             up=arrays["mesh.up"],
             blending=blending,  # type: ignore[arg-type]
             attributes={n[len(prefix) :]: a for n, a in arrays.items() if n.startswith(prefix)},
+            binding=binding,
         )
     except KeyError as error:
         raise FileFormatError(f"the checkpoint lacks {error}") from None
@@ -146,9 +156,12 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
 
 
 def mesh_fingerprint(mesh: SplatMesh) -> str:
-    """Changes with every bit of positions, triangles, colours and blending."""
+    """Changes with every bit of positions, triangles, colours, binding and blending."""
     digest = hashlib.sha256(mesh.blending.encode())
-    for array in (mesh.vertices, mesh.faces, mesh.colors):
+    arrays = [mesh.vertices, mesh.faces, mesh.colors]
+    if mesh.binding is not None:
+        arrays += [getattr(mesh.binding, name) for name in _BINDING]
+    for array in arrays:
         digest.update(repr(array.shape).encode())
         digest.update(array.data)
     return digest.hexdigest()

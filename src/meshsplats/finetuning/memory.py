@@ -11,6 +11,8 @@ from meshsplats.mesh import SplatMesh
 VERTEX_BYTES = 7 * 4 * 6 + 4
 """Values, gradients, two moments and their copies while a checkpoint is written, for position and colour, and
 the size of the vertex' splat."""
+BOUND_BYTES = 36 + 12 * 4
+"""More for a vertex that is bound to a base mesh: corners, weights and their copies."""
 FACE_BYTES = 12 + 4 + 4 + 64
 """A triangle, its splat and depth group, and the renderer's lists of them."""
 PIXEL_BYTES = 12 * 12 + 64
@@ -25,7 +27,7 @@ def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BY
     pixels = max((view.camera.width * view.camera.height for view in views), default=0)
     return (
         BASE_BYTES
-        + len(mesh.vertices) * VERTEX_BYTES
+        + len(mesh.vertices) * (VERTEX_BYTES + (BOUND_BYTES if mesh.binding is not None else 0))
         + len(mesh.faces) * FACE_BYTES
         + pixels * PIXEL_BYTES
         + min(dataset.memory, cache_bytes)

@@ -10,6 +10,7 @@ import numpy as np
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.finetuning.adam import RowAdam
+from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.sizes import vertex_sizes
@@ -30,7 +31,9 @@ class State:
         vertices: (v, 3) float32 leaf tensor, scene units.
         colors: (v, 4) float32 leaf tensor, straight RGBA in [0, 1], in the space of ``blending``.
         mesh: the mesh it began with, as far as it was not dropped: triangles, their splats, attributes.
-        sizes: (v,) float32, the unit of each vertex' position.
+        sizes: (v,) float32, the unit of each vertex' position or, on a base mesh, of its weights.
+        bound: the weights that are optimised instead of positions where the mesh is bound to a base, else
+            None; ``vertices`` follow them.
         exposures: (views, 6) float32 leaf tensor: gain and offset of red, green and blue of each training
             view; None if they are not fitted.
     """
@@ -50,8 +53,12 @@ class State:
             None if exposures is None else torch.from_numpy(exposures.copy()).requires_grad_(True)
         )
         adam = partial(RowAdam, betas=(config.beta1, config.beta2), eps=config.epsilon, threads=threads)
-        unit = sizes if config.position_unit == "splat" else None
-        self._positions = adam(self.vertices, lr=1.0, scale=unit)
+        self.bound = None if mesh.binding is None else BoundPositions(mesh.binding)
+        if self.bound is not None:
+            self._positions = adam(self.bound.weights, lr=1.0, scale=sizes)
+        else:
+            unit = sizes if config.position_unit == "splat" else None
+            self._positions = adam(self.vertices, lr=1.0, scale=unit)
         self._colors = adam(self.colors, lr=1.0, bounds=(0, 1))
         self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
 
@@ -59,6 +66,8 @@ class State:
     def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
         """That of a mesh before the first step."""
         mesh = replace(mesh, normals=None)  # they would not follow the positions
+        if mesh.binding is not None:
+            mesh = replace(mesh, vertices=mesh.binding.positions())
         if config.blending == "linear" and mesh.blending == "display":
             colors = mesh.colors.copy()
             colors[:, :3] = np.clip(srgb_to_linear(colors[:, :3]), 0, 1)
@@ -70,7 +79,11 @@ class State:
         exposures = None
         if config.exposure:
             exposures = np.tile(np.array([1, 1, 1, 0, 0, 0], np.float32), (views, 1))
-        return cls(mesh, vertex_sizes(mesh), exposures, config, threads)
+        if mesh.binding is not None:
+            sizes = weight_units(mesh, config.position_unit == "scene")
+        else:
+            sizes = vertex_sizes(mesh)
+        return cls(mesh, sizes, exposures, config, threads)
 
     @classmethod
     def resume(
@@ -111,6 +124,7 @@ class State:
             self.mesh,
             vertices=self.vertices.detach().numpy().copy(),
             colors=self.colors.detach().numpy().copy(),
+            binding=None if self.bound is None else self.bound.binding(),
         )
 
     def finite_gradients(self) -> bool:
@@ -134,7 +148,12 @@ class State:
         self._colors.step(self.colors.grad, reached)
         if position_rate > 0:
             self._positions.lr = position_rate
-            self._positions.step(self.vertices.grad, reached)
+            if self.bound is None:
+                self._positions.step(self.vertices.grad, reached)
+            else:
+                rows = np.flatnonzero(reached)
+                self._positions.step(self.bound.gradient(self.vertices.grad.numpy(), rows), reached)
+                self.bound.settle(rows, self.vertices.detach().numpy())
         if self._exposures is not None and self.exposures is not None and self.exposures.grad is not None:
             self._exposures.step(self.exposures.grad, np.array([view], np.int32))
             with torch.no_grad():
@@ -157,7 +176,8 @@ class State:
         exposures = None if self.exposures is None else self.exposures.detach().numpy()
         smaller = State(mesh, self.sizes[used], exposures, self.config, self.threads)
         rows = np.flatnonzero(used)
-        smaller._positions = self._positions.select(smaller.vertices, rows)
+        places = smaller.vertices if smaller.bound is None else smaller.bound.weights
+        smaller._positions = self._positions.select(places, rows)
         smaller._colors = self._colors.select(smaller.colors, rows)
         if self._exposures is not None:
             every = np.arange(len(self._exposures.mean))

@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats.mesh_checks import check_attribute_names
 from meshsplats.mesh import SplatMesh
@@ -182,6 +183,8 @@ def _document(
         elif columns:
             entry |= _raw(buffer, values)
         extras.setdefault("attributes", []).append(entry)
+    if mesh.binding is not None and with_extras:
+        extras["binding"] = _binding(buffer, mesh.binding)
     material: dict[str, Any] = {
         "name": "splats",
         "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
@@ -232,6 +235,24 @@ def _raw(buffer: _Buffer, values: np.ndarray) -> dict[str, Any]:
     program in between has renumbered or dropped the views."""
     view = buffer.view(values)
     return {"bufferView": view, "crc32": zlib.crc32(buffer.parts[view].data)}
+
+
+def _binding(buffer: _Buffer, binding: Binding) -> dict[str, Any]:
+    """What puts the vertices on another pose of the base, each array as it is in ``Binding``."""
+    entry: dict[str, Any] = {
+        "lift": binding.lift,
+        "baseVertexCount": len(binding.base_vertices),
+        "baseFaceCount": len(binding.base_faces),
+    }
+    for key, values in [
+        ("baseVertices", binding.base_vertices),
+        ("baseFaces", binding.base_faces),
+        ("vertexFace", binding.vertex_face),
+        ("weights", binding.weights),
+        ("layers", binding.layers),
+    ]:
+        entry[key] = _raw(buffer, values)
+    return entry
 
 
 def _semantic(name: str, taken: dict[str, int]) -> str:

@@ -12,11 +12,12 @@ from typing import Any, get_args
 
 import numpy as np
 
+from meshsplats.binding import Binding
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.glb import up_quaternion
 from meshsplats.formats.gltf_document import GltfDocument
-from meshsplats.formats.mesh_checks import checked_mesh, straight_colors
+from meshsplats.formats.mesh_checks import checked_binding, checked_mesh, straight_colors
 from meshsplats.mesh import Blending, SplatMesh
 
 _POINTS_TO_LINES = (0, 1, 2, 3)
@@ -213,6 +214,11 @@ def _join(
     }
     if note and len(own["primitives"]) == 1:
         arrays |= _restore(document, own, note, len(arrays["faces"]), colors)
+        if arrays.get("binding") is not None and not _still_there(arrays["binding"], arrays["vertices"]):
+            _warn(
+                f"{document.path}: another program has moved vertices, left out: the binding to a base mesh"
+            )
+            arrays["binding"] = None
     return checked_mesh(document.path, **arrays)
 
 
@@ -260,6 +266,10 @@ def _restore(
             lost.append("opacities")
         else:
             result["colors"] = np.concatenate([colors[:, :3], np.clip(true_alpha, 0, 1)], axis=1)
+    if "binding" in note:
+        result["binding"] = _binding(document, _dict(note["binding"]), v)
+        if result["binding"] is None:
+            lost.append("the binding to a base mesh")
     attributes: dict[str, np.ndarray] = {}
     stored = _dict(mesh["primitives"][0]["attributes"])
     entries = note.get("attributes", [])
@@ -274,6 +284,33 @@ def _restore(
     if lost:
         _warn(f"{document.path}: another program has altered the file, left out: {', '.join(lost)}")
     return result | {"attributes": attributes}
+
+
+def _binding(document: GltfDocument, entry: dict[str, Any], v: int) -> Binding | None:
+    """The binding of a mesh prior's v vertices; None where an array of it is gone or another."""
+    n = document.whole(entry, "baseVertexCount", "a binding")
+    m = document.whole(entry, "baseFaceCount", "a binding")
+    lift = float(document.numbers([entry.get("lift")], 1, "lift of a binding")[0])
+    wanted = {
+        "base_vertices": ("baseVertices", "<f4", (n, 3)),
+        "base_faces": ("baseFaces", "<i4", (m, 3)),
+        "vertex_face": ("vertexFace", "<i4", (v,)),
+        "weights": ("weights", "<f4", (v, 3)),
+        "layers": ("layers", "<i4", (v,)),
+    }
+    parts = {}
+    for name, (key, dtype, shape) in wanted.items():
+        values = _raw(document, _dict(entry.get(key)), dtype, shape[0] * (3 if len(shape) == 2 else 1))
+        if values is None:
+            return None
+        parts[name] = values.reshape(shape)
+    return checked_binding(document.path, lift=lift, **parts)
+
+
+def _still_there(binding: Binding, vertices: np.ndarray) -> bool:
+    """Whether the vertices are where the binding has them, but for rounding."""
+    size = float(np.abs(binding.base_vertices).max(initial=0))
+    return bool((np.abs(binding.positions() - vertices) <= 1e-4 * size).all())
 
 
 def _attribute(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats.binding import Binding
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.mesh import SplatMesh
 
@@ -87,6 +88,16 @@ def check_attribute_names(mesh: SplatMesh) -> None:
             raise ValueError(f"attribute name {name[:40]!r} is no valid text and cannot be stored") from None
         if b"\0" in encoded or len(encoded) > 200:
             raise ValueError(f"attribute name {name[:40]!r} cannot be stored (NUL in it, or over 200 bytes)")
+
+
+def checked_binding(path: Path, **parts) -> Binding:
+    """A Binding of arrays from a file; what does not fit together becomes a FileFormatError naming
+    ``path``."""
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return Binding(**parts)
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f"{path}: the binding to a base: {error}") from None
 
 
 def checked_mesh(path: Path, **arrays) -> SplatMesh:

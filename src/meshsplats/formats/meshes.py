@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.atomic import atomic_path
 from meshsplats.formats.glb import Alpha, ColorType, write_glb
 from meshsplats.formats.glb_compressed import Compression, write_compressed_glb
@@ -29,6 +30,8 @@ _WRITERS: dict[str, Callable[..., None]] = {
     ".obj": write_obj,
 }
 _GLB = (".glb",)
+_BOUND = (".npz", ".glb")
+"""Formats that keep the binding of a mesh prior."""
 _OPTION_SUFFIXES = {"lit": (*_GLB, *_USD), "color_type": _GLB, "alpha": _GLB, "compression": _GLB}
 
 MESH_SUFFIXES = tuple(_WRITERS)
@@ -87,11 +90,13 @@ def save_mesh(
 ) -> None:
     """Writes ``mesh`` in the format that the suffix of ``path`` names, whole or not at all.
 
-    - `.npz`, `.ply` keep everything exactly.
+    - `.npz`, `.ply` keep everything exactly, `.ply` without the binding to a base mesh.
     - `.glb` keeps colours as linear values of 16 bits (within 1/2000 as display values), the rest exactly.
     - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat numbers and attributes become
       primvars. Needs the extra ``usd``.
     - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
+
+    All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning.
 
     Options, each for the formats named; given for another one they are a ValueError:
 
@@ -121,6 +126,13 @@ def save_mesh(
         if suffix not in _OPTION_SUFFIXES[name]:
             suffixes = ", ".join(_OPTION_SUFFIXES[name])
             raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
+    if mesh.binding is not None and (suffix not in _BOUND or "compression" in options):
+        warnings.warn(
+            f"{target.name}: the binding to a base mesh is left out; only .npz or .glb keep what later poses"
+            " need",
+            DataWarning,
+            stacklevel=2,
+        )
     if "compression" in options:
         writer = write_compressed_glb
     with atomic_path(target) as temporary:

@@ -2,7 +2,9 @@
 
 Arrays: ``vertices`` (v, 3) float32, ``faces`` (f, 3) int32, ``vertex_colors`` (v, 4) float32 straight RGBA;
 where the mesh has them ``normals``, ``face_splat``, ``depth_group`` and one ``attribute_NAME`` for each
-attribute; ``up`` (3,) and ``blending`` (a text). The first three names are those of the published
+attribute; ``up`` (3,) and ``blending`` (a text); for a mesh prior its ``binding_base_vertices`` (n, 3),
+``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,), ``binding_weights`` (v, 3), ``binding_layers``
+(v,) and ``binding_lift``, as ``Binding`` names them. The first three names are those of the published
 MeshSplats code, whose files are read as well.
 """
 
@@ -20,8 +22,15 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats.binding import Binding
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.mesh_checks import Budget, check_attribute_names, checked_mesh, straight_colors
+from meshsplats.formats.mesh_checks import (
+    Budget,
+    check_attribute_names,
+    checked_binding,
+    checked_mesh,
+    straight_colors,
+)
 from meshsplats.mesh import SplatMesh
 
 _ATTRIBUTE = "attribute_"
@@ -39,7 +48,9 @@ _BROKEN_ZIP = (
     OverflowError,
 )
 """What the zip reader raises on broken archives; its own checks do not cover every field."""
-_OPTIONAL = ("normals", "face_splat", "depth_group", "up", "blending")
+_BINDING = ("base_vertices", "base_faces", "vertex_face", "weights", "layers", "lift")
+_BOUND = tuple(f"binding_{name}" for name in _BINDING)
+_OPTIONAL = ("normals", "face_splat", "depth_group", "up", "blending", *_BOUND)
 
 
 def write_npz(mesh: SplatMesh, path: Path) -> None:
@@ -58,6 +69,9 @@ def write_npz(mesh: SplatMesh, path: Path) -> None:
             arrays[name] = value
     for name, value in mesh.attributes.items():
         arrays[_ATTRIBUTE + name] = value
+    if mesh.binding is not None:
+        for stored, name in zip(_BOUND, _BINDING, strict=True):
+            arrays[stored] = np.asarray(getattr(mesh.binding, name))
     with open(path, "wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
@@ -123,6 +137,9 @@ def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
         budget.spend(member.info.file_size, f"array {name!r}")
     arrays = {name: _load(archive, member, name, path) for name, member in members.items()}
     blending = str(arrays.pop("blending", np.array("display")))
+    bound = {
+        name: arrays.pop(stored) for stored, name in zip(_BOUND, _BINDING, strict=True) if stored in arrays
+    }
     return checked_mesh(
         path,
         vertices=arrays.pop("vertices"),
@@ -134,8 +151,18 @@ def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
             for name in list(arrays)
             if name.startswith(_ATTRIBUTE)
         },
+        binding=_binding(bound, path),
         **arrays,
     )
+
+
+def _binding(parts: dict[str, np.ndarray], path: Path) -> Binding | None:
+    if not parts:
+        return None
+    missing = [name for name in _BINDING if name not in parts]
+    if missing:
+        raise FileFormatError(f"{path}: the binding to a base is not whole: binding_{missing[0]} is missing")
+    return checked_binding(path, lift=float(parts.pop("lift")), **parts)
 
 
 def _parse_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str, path: Path) -> _Member:
@@ -192,8 +219,11 @@ def _product(shape: tuple[int, ...]) -> int:
 def _check_shapes(members: dict[str, _Member], path: Path) -> None:
     """Whether the arrays fit each other, before any is allocated."""
     shapes = {name: member.shape for name, member in members.items()}
-    v = shapes["vertices"][0] if shapes["vertices"] else 0
-    f = shapes["faces"][0] if shapes["faces"] else 0
+
+    def rows_of(name: str) -> int:
+        return shapes[name][0] if shapes.get(name) else 0
+
+    v, f = rows_of("vertices"), rows_of("faces")
     wanted: dict[str, tuple[tuple[int, ...], ...]] = {
         "vertices": ((v, 3),),
         "faces": ((f, 3),),
@@ -203,6 +233,12 @@ def _check_shapes(members: dict[str, _Member], path: Path) -> None:
         "depth_group": ((f,),),
         "up": ((3,),),
         "blending": ((), (1,)),
+        "binding_base_vertices": ((rows_of("binding_base_vertices"), 3),),
+        "binding_base_faces": ((rows_of("binding_base_faces"), 3),),
+        "binding_vertex_face": ((v,),),
+        "binding_weights": ((v, 3),),
+        "binding_layers": ((v,),),
+        "binding_lift": ((),),
     }
     for name, shape in shapes.items():
         if name.startswith(_ATTRIBUTE):

@@ -1,0 +1,175 @@
+"""Binding: which face of a base mesh each vertex of a splat mesh lies on, and where on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from meshsplats._arrays import checked_array
+
+_ROWS = 1 << 15
+SUM_TOLERANCE = 1e-6
+"""By how much the weights of a vertex may miss the sum 1: a few roundings of float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Binding:
+    """V vertices on the faces of a base mesh of n vertices and m triangles (a mesh prior).
+
+    Concretely, vertex i stands at ``sum_k weights[i, k] * c_k``, where c_k is corner k of face
+    ``vertex_face[i]``: ``base_vertices[base_faces[vertex_face[i], k]]``, moved by ``layers[i] * lift`` along
+    the base's normal at that corner. The constructor checks and converts the arrays (C-contiguous).
+    """
+
+    base_vertices: np.ndarray
+    """(n, 3) float32 positions of the base, in the frame and units of the splat mesh."""
+    base_faces: np.ndarray
+    """(m, 3) int32 vertex numbers of the base."""
+    vertex_face: np.ndarray
+    """(v,) int32 number of the base face that each vertex lies on."""
+    weights: np.ndarray
+    """(v, 3) float32 barycentric coordinates there: none below 0, with the sum 1."""
+    layers: np.ndarray
+    """(v,) int32 layer of each vertex, from 0, which lies on the base."""
+    lift: float = 0.0
+    """Scene units from one layer to the next along the normals, below 0 to the inside; 0: all lie in the
+    base."""
+
+    def __post_init__(self) -> None:
+        points = checked_array("base_vertices", self.base_vertices, np.float32, (None, 3))
+        faces = checked_array("base_faces", self.base_faces, np.int32, (None, 3))
+        check_numbers("base_faces", faces, len(points), "vertices of the base")
+        vertex_face = checked_array("vertex_face", self.vertex_face, np.int32, (None,))
+        check_numbers("vertex_face", vertex_face, len(faces), "faces of the base")
+        v = len(vertex_face)
+        weights = checked_array("weights", self.weights, np.float32, (v, 3))
+        if v:
+            if weights.min() < 0:
+                raise ValueError(f"weights must not be negative, got {weights.min():.4g}")
+            off = float(np.abs(weights.sum(axis=1, dtype=np.float64) - 1).max())
+            if off > SUM_TOLERANCE:
+                raise ValueError(f"the weights of a vertex must have the sum 1, one misses it by {off:.3g}")
+        layers = checked_array("layers", self.layers, np.int32, (v,))
+        if v and layers.min() < 0:
+            raise ValueError(f"layers must be numbers >= 0, got {layers.min()}")
+        if not np.isfinite(self.lift):
+            raise ValueError(f"lift must be a finite length, got {self.lift}")
+        for name, value in [
+            ("base_vertices", points),
+            ("base_faces", faces),
+            ("vertex_face", vertex_face),
+            ("weights", weights),
+            ("layers", layers),
+            ("lift", float(self.lift)),
+        ]:
+            object.__setattr__(self, name, value)
+
+    def positions(self) -> np.ndarray:
+        """(v, 3) float32 positions of the vertices.
+
+        Summed in float64: a vertex at a corner stands there to the last bit.
+        """
+        result = np.empty((len(self.weights), 3), np.float32)
+        for part in self._parts():
+            result[part] = np.einsum("ik,ikc->ic", self.weights[part].astype(np.float64), self.corners(part))
+        return result
+
+    def corners(self, rows: np.ndarray | slice) -> np.ndarray:
+        """(r, 3, 3) float64 corners of the face of each of the chosen vertices, moved to its layer."""
+        numbers = self.base_faces[self.vertex_face[rows]]
+        result = self.base_vertices[numbers].astype(np.float64)
+        if self.lift:
+            result += (self.layers[rows] * self.lift)[:, None, None] * self.base_normals[numbers]
+        return result
+
+    def normals(self) -> np.ndarray:
+        """(v, 3) float32 unit normals of the base at the vertices: those of the corners, interpolated."""
+        result = np.empty((len(self.weights), 3), np.float32)
+        for part in self._parts():
+            numbers = self.base_faces[self.vertex_face[part]]
+            mixed = np.einsum("ik,ikc->ic", self.weights[part].astype(np.float64), self.base_normals[numbers])
+            length = np.sqrt(np.einsum("ij,ij->i", mixed, mixed))
+            # Where opposite corners cancel out, the face's own direction is what is left, or one corner's.
+            lost = np.flatnonzero(length < 1e-6)
+            if len(lost):
+                a, b, c = (self.base_vertices[numbers[lost, k]].astype(np.float64) for k in range(3))
+                mixed[lost] = np.cross(b - a, c - a)
+                length[lost] = np.linalg.norm(mixed[lost], axis=1)
+                flat = np.flatnonzero(length == 0)
+                mixed[flat], length[flat] = self.base_normals[numbers[flat, 0]], 1
+            result[part] = mixed / length[:, None]
+        return result
+
+    @cached_property
+    def base_normals(self) -> np.ndarray:
+        """(n, 3) float64 unit normals of the base at its vertices, which seams do not interrupt."""
+        return surface_normals(self.base_vertices, self.base_faces, self._same_place)
+
+    @property
+    def area(self) -> float:
+        """Of all faces of the base, square scene units."""
+        a, b, c = (self.base_vertices[self.base_faces[:, k]].astype(np.float64) for k in range(3))
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+
+    def _parts(self) -> Iterator[slice]:
+        """The vertices in portions that fit a processor's cache."""
+        return (slice(start, start + _ROWS) for start in range(0, len(self.weights), _ROWS))
+
+    @cached_property
+    def _same_place(self) -> np.ndarray:
+        """(n,) a number a place: vertices that a seam has split share one. The stored base decides, not a
+        moved one, in which a place could be shared by chance."""
+        points = self.base_vertices + np.float32(0)  # 0 and -0 are one place
+        order = np.lexsort(points.T)
+        new = (points[order[1:]] != points[order[:-1]]).any(axis=1)
+        number = np.zeros(len(points), np.int64)
+        number[order[1:]] = np.cumsum(new)
+        return number
+
+    def moved(self, base_vertices: np.ndarray, lift: float) -> Binding:
+        """The binding to the base with its vertices at (n, 3) ``base_vertices``. What was one place stays
+        one, whatever meets by chance now."""
+        made = replace(self, base_vertices=base_vertices, lift=lift)
+        made.__dict__["_same_place"] = self._same_place
+        return made
+
+    def select(self, rows: np.ndarray) -> Binding:
+        """The binding of the vertices ``rows``, numbers or a (v,) mask; the base stays whole."""
+        return replace(
+            self, vertex_face=self.vertex_face[rows], weights=self.weights[rows], layers=self.layers[rows]
+        )
+
+
+def check_numbers(name: str, numbers: np.ndarray, count: int, of: str) -> None:
+    """ValueError unless all int32 ``numbers`` lie in [0, count)."""
+    if numbers.size and (numbers.min() < 0 or numbers.max() >= count):
+        raise ValueError(
+            f"{name} must number the {count:,} {of} from 0, got {numbers.min()} to {numbers.max()}"
+        )
+
+
+def surface_normals(
+    vertices: np.ndarray, faces: np.ndarray, same_place: np.ndarray | None = None
+) -> np.ndarray:
+    """(n, 3) float64 unit normals of a mesh at its vertices: area-weighted means of the triangles there.
+
+    ``same_place`` (n,) has a number a place for vertices to be treated as one; without it, each is by itself.
+    A vertex without area round it gets a normal of +z.
+    """
+    number = np.arange(len(vertices)) if same_place is None else same_place
+    count = int(number.max()) + 1 if len(number) else 0
+    points = np.asarray(vertices, np.float64)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    # Twice the area times the normal.
+    own = np.cross(b - a, c - a)
+    sums = np.zeros((count, 3))
+    for k in range(3):
+        corner = number[faces[:, k]]
+        for axis in range(3):
+            sums[:, axis] += np.bincount(corner, own[:, axis], minlength=count)
+    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))
+    sums[length == 0] = (0, 0, 1)
+    return (sums / np.where(length > 0, length, 1)[:, None])[number]

@@ -1,0 +1,13 @@
+"""Mesh prior: splats bound to the faces of a classical mesh, trained on it and edited with it.
+
+Binding and posing need NumPy alone; training (``train``) the extra ``finetune``.
+"""
+
+from __future__ import annotations
+
+from meshsplats.prior.base import BaseMesh, Texture
+from meshsplats.prior.bind import bind
+from meshsplats.prior.model import LIFT, MeshPrior, load_prior
+from meshsplats.prior.training import train
+
+__all__ = ["LIFT", "BaseMesh", "MeshPrior", "Texture", "bind", "load_prior", "train"]

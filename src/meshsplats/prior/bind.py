@@ -1,0 +1,176 @@
+"""bind: splats laid on the faces of a base mesh."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import numpy as np
+
+from meshsplats.binding import Binding
+from meshsplats.dataset import View
+from meshsplats.errors import DataWarning
+from meshsplats.mesh import SplatMesh
+from meshsplats.prior.base import BaseMesh
+from meshsplats.prior.model import MeshPrior
+from meshsplats.prior.pattern import MOST, counts_by_area, face_pattern
+from meshsplats.prior.photographs import colors_from_views
+
+Source = Literal["auto", "texture", "vertices", "views", "grey"]
+MAX_LAYERS = 16
+MAX_TRIANGLES = 50_000_000
+LAYER_OPACITY = 0.1
+"""Share of the base's opacity that coplanar layers above the lowest begin with."""
+SHELL_OPACITY = 0.3
+"""Share of the base's opacity that all layers begin with where they are spaced."""
+
+
+def bind(
+    base: BaseMesh,
+    *,
+    triangles: int = 1,
+    by_area: bool = False,
+    layers: int = 1,
+    spacing: float = 0.0,
+    colors: Source = "auto",
+    views: Sequence[View] = (),
+    threads: int | None = None,
+) -> MeshPrior:
+    """Lays ``triangles`` triangles a layer on every face of ``base``.
+
+    Each layer covers each face exactly and begins with the base's colours. Triangles share no vertices: each
+    can go its own way on its face. Without ``spacing`` all layers lie in the base, and its picture is what
+    training begins with: the lowest layer is as opaque as the base, those above it are almost transparent.
+    In each face those of higher layers come first, as what is nearer does, and all share one depth group.
+
+    With ``spacing``, layers are shells: the base with its vertices moved along their normals. They begin
+    translucent, and together can show what lies in the depth between them, for a base that is not where the
+    surface is. The triangles of a face and shell share one depth group.
+
+    Faces without area carry no triangles, with a counted DataWarning.
+
+    Args:
+        base: the mesh. Any will do: open, in several parts, non-manifold.
+        triangles: a layer, 1 to 256; a square number fits without T-junctions.
+        by_area: that many on average, square numbers about in proportion to the faces' areas.
+        layers: 1 to 16.
+        spacing: scene units from one layer to the next along the base's normals; below 0 they go inwards,
+            as for a base that encloses its subject, a visual hull say.
+        colors: where colours come from: 'texture', 'vertices' (vertex colours), 'views' (the views that see
+            a place most squarely), 'grey'; 'auto': the first of these that there is. Where a textured base
+            has faces without texture, they take vertex colours, if any.
+        views: pictures with cameras, for 'views'.
+        threads: at most this many; all processors by default.
+
+    Raises ValueError for a base without a face that has an area, options out of range, and colours that the
+    base does not have.
+    """
+    if not 1 <= layers <= MAX_LAYERS:
+        raise ValueError(f"layers must be a number from 1 to {MAX_LAYERS}, got {layers}")
+    if not np.isfinite(spacing):
+        raise ValueError(f"spacing must be a finite length, got {spacing}")
+    if not 1 <= triangles <= MOST:
+        raise ValueError(f"triangles must be a number from 1 to {MOST}, got {triangles}")
+    source = _source(base, colors, views)
+    corners = base.vertices[base.faces].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    solid = np.flatnonzero(areas > 0)
+    if not len(solid):
+        raise ValueError(f"none of the base's {len(base.faces):,} faces has an area: nothing to bind to")
+    if len(solid) < len(base.faces):
+        warnings.warn(
+            f"{len(base.faces) - len(solid):,} of {len(base.faces):,} faces of the base have no area and"
+            " carry no splats",
+            DataWarning,
+            stacklevel=2,
+        )
+    counts = np.full(len(solid), triangles)
+    if by_area:
+        counts = counts_by_area(areas[solid], triangles)
+    total = int(counts.sum()) * layers
+    if total > MAX_TRIANGLES:
+        raise ValueError(
+            f"{total:,} triangles are more than the {MAX_TRIANGLES:,} that fit: use fewer a face, or a"
+            " coarser base"
+        )
+    face, weights, layer = _laid_out(solid, counts, layers)
+    vertex_face, vertex_layer = np.repeat(face, 3), np.repeat(layer, 3)
+    binding = Binding(base.vertices, base.faces, vertex_face, weights.reshape(-1, 3), vertex_layer, spacing)
+    rgba = _colors(base, binding, source, views, threads)
+    if spacing and layers > 1:
+        rgba[:, 3] *= SHELL_OPACITY
+        depth_group = face * np.int64(layers) + layer
+        depth_group = np.unique(depth_group, return_inverse=True)[1].reshape(-1)
+    else:
+        rgba[vertex_layer > 0, 3] *= LAYER_OPACITY
+        depth_group = face
+    mesh = SplatMesh(
+        binding.positions(),
+        np.arange(3 * total, dtype=np.int32).reshape(-1, 3),
+        rgba,
+        face_splat=face,
+        normals=binding.normals(),
+        depth_group=depth_group,
+        up=base.up,
+        binding=binding,
+    )
+    return MeshPrior(mesh)
+
+
+def _laid_out(
+    faces: np.ndarray, counts: np.ndarray, layers: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each triangle: its base face (f,), its corners' weights (f, 3, 3) and its layer (f,). By face, then
+    from the highest layer down."""
+    owners, weights, levels = [], [], []
+    for count in np.unique(counts):
+        here = faces[counts == count]
+        pattern = face_pattern(int(count))
+        owners.append(np.repeat(here, count * layers))
+        weights.append(np.tile(pattern, (len(here) * layers, 1, 1)))
+        levels.append(np.tile(np.repeat(np.arange(layers - 1, -1, -1), count), len(here)))
+    owner = np.concatenate(owners)
+    order = np.argsort(owner, kind="stable")
+    return (
+        owner[order].astype(np.int32),
+        np.concatenate(weights)[order],
+        np.concatenate(levels)[order].astype(np.int32),
+    )
+
+
+def _source(base: BaseMesh, colors: Source, views: Sequence[View]) -> Source:
+    there: dict[str, bool] = {
+        "texture": base.textured,
+        "vertices": base.colors is not None,
+        "views": len(views) > 0,
+        "grey": True,
+    }
+    if colors not in get_args(Source):
+        raise ValueError(f"colors must be one of {', '.join(get_args(Source))}, got {colors!r}")
+    if colors == "auto":
+        return next(name for name in get_args(Source) if there.get(name))
+    if not there[colors]:
+        what = {"texture": "the base has no texture", "vertices": "the base has no vertex colours"}
+        raise ValueError(f"colors is {colors!r}, but {what.get(colors, 'there are no views')}; use 'auto'")
+    return colors
+
+
+def _colors(
+    base: BaseMesh, binding: Binding, source: Source, views: Sequence[View], threads: int | None
+) -> np.ndarray:
+    """(v, 4) float32 display RGBA."""
+    face, weights = binding.vertex_face, binding.weights
+    if source == "vertices":
+        return base.vertex_colors_at(face, weights)
+    if source == "texture":
+        rgba = base.texture_at(face, weights)
+        bare = ~base.textured_faces()[face]
+        if base.colors is not None and bare.any():
+            rgba[bare] = base.vertex_colors_at(face[bare], weights[bare])
+        return rgba
+    rgba = np.full((len(face), 4), 0.5, np.float32)
+    rgba[:, 3] = 1
+    if source == "views":
+        rgba[:, :3] = colors_from_views(binding, views, threads=threads)
+    return rgba

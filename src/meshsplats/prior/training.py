@@ -1,0 +1,36 @@
+"""train: a mesh prior brought closer to pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from meshsplats.dataset import Dataset
+from meshsplats.prior.model import MeshPrior
+
+if TYPE_CHECKING:
+    from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
+
+
+def train(
+    prior: MeshPrior,
+    dataset: Dataset,
+    config: FinetuneConfig | None = None,
+    *,
+    run: RunOptions | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> MeshPrior:
+    """``prior`` with weights, colours and opacities optimised on the training views of ``dataset``:
+    photographs, or the splats' own pictures.
+
+    The loop is that of ``finetune``, with its losses, optimiser, pruning and checkpoints; positions are moved
+    by their weights on the base's faces, which after every step are not negative and have the sum 1. Rates of
+    positions are in units of the triangles' size (``position_unit`` 'splat') or of the scene.
+
+    Arguments and errors are those of ``finetune``.
+    """
+    from meshsplats.finetuning import finetune
+
+    return MeshPrior(
+        MeshPrior(finetune(prior.mesh, dataset, config, run=run, on_progress=on_progress)).pose()
+    )
