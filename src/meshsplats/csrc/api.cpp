@@ -39,7 +39,9 @@ int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int
 
 template <class Worker>
 void draw_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::Entry *list, int64_t length) {
-    worker.draw((int)(tile % grid.tiles_x), (int)(tile / grid.tiles_x), list, length);
+    int x, y;
+    grid.place(tile, x, y);
+    worker.draw(x, y, list, length);
 }
 
 using PictureWorker = ms::MeshTile<ms::PictureTile>;
@@ -103,8 +105,9 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
                     }
                     waiting[i].clear();
                     waiting_attributes[i].clear();
-                    worker->back.run((int)(tile % grid.tiles_x), (int)(tile / grid.tiles_x), *entries, waiting[i],
-                                     waiting_attributes[i]);
+                    int x, y;
+                    grid.place(tile, x, y);
+                    worker->back.run(x, y, *entries, waiting[i], waiting_attributes[i]);
                 }
             });
             sum.add(waiting.data(), waiting_attributes.data(), count);

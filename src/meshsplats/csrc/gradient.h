@@ -31,26 +31,26 @@ class GradientTile {
     // Adds a tile's gradients to the lists; of attributes, (3, attribute_count) numbers a triangle.
     void run(int tile_x, int tile_y, const TileLog &log, std::vector<CornerGradients> &out, std::vector<float> &out_attributes) {
         area_ = TileArea(grid_, tile_x, tile_y);
-        if (log.entries.empty() || !load_given()) return;
+        if (log.steps.empty() || !load_given()) return;
         set_up(log);
-        const int64_t n = (int64_t)log.entries.size(), chunks = (n + CHUNK - 1) / CHUNK;
+        const int64_t n = (int64_t)fragments_.size(), chunks = (n + CHUNK - 1) / CHUNK;
         // The light that comes through to each fragment is found from the front and kept for a chunk of them.
         before_.resize((size_t)std::min<int64_t>(n, CHUNK));
         starts_.resize((size_t)chunks * SAMPLES);
         for (int i = 0; i < SAMPLES; ++i) through_[i] = 1;
         for (int64_t chunk = 0; chunk < chunks; ++chunk) {
             std::copy(through_, through_ + SAMPLES, starts_.begin() + chunk * SAMPLES);
-            forth(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+            forth(chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
         }
         for (int64_t chunk = chunks - 1; chunk >= 0; --chunk) {
             if (chunk < chunks - 1) {
                 std::copy(starts_.begin() + chunk * SAMPLES, starts_.begin() + (chunk + 1) * SAMPLES, through_);
-                forth(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+                forth(chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
             }
             if (extra_)
-                back<true>(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+                back<true>(chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
             else
-                back<false>(log, chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
+                back<false>(chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
         }
         for (size_t first = 0; first < triangles_.size(); first += Triangles::N)
             finish(first, (int)std::min<size_t>(Triangles::N, triangles_.size() - first), out, out_attributes);
@@ -58,11 +58,20 @@ class GradientTile {
 
   private:
     static constexpr int64_t CHUNK = 1 << 14;
-    enum { SUMS = 5, MOMENTS = 16 };  // z g of r, g, b, a and z g v; times 1, x, y and one unused
+    enum { SUMS = 5 };  // z g of r, g, b, a and z g v
+
+    // A triangle's fragments in a block: lane 4 i + column for rgba and sums of all lanes for v, times 1, x and y.
+    struct Moments {
+        Lanes rgba[3], v[3];
+    };
+    // The samples of a block that take a fragment of one triangle.
+    struct Fragment {
+        int32_t place;
+        uint16_t lanes, block;
+    };
 
     // Positions count from a place of the triangle's own, close to it and to the tile: else small triangles would lose digits.
     struct Prepared {
-        alignas(64) float moments[MOMENTS];
         alignas(16) float a[4], b[4], c[4];
         alignas(16) float low[4], high[4], first[4];
         float qa, qb, qc, q_min, q_max;
@@ -108,7 +117,12 @@ class GradientTile {
     // Makes the triangles ready that the log names.
     void set_up(const TileLog &log) {
         place_.assign(log.faces.size(), -1);
-        for (const TileLog::Entry &entry : log.entries) place_[entry.triangle] = 0;
+        fragments_.clear();
+        for (const TileLog::Step &step : log.steps)
+            log.for_pieces(step.first, step.count, step.lanes, [&](uint32_t triangle, uint32_t lanes) {
+                place_[triangle] = 0;
+                fragments_.push_back({(int32_t)triangle, (uint16_t)lanes, step.block});
+            });
         triangles_.clear();
         planes_.clear();
         int held = 0;
@@ -130,6 +144,8 @@ class GradientTile {
             }
         }
         if (held) set_up_held(log, numbers, held);
+        for (Fragment &f : fragments_) f.place = place_[f.place];
+        moments_.assign(triangles_.size(), Moments{});
         extra_sums_.assign(triangles_.size() * extra_ * 3, 0.0f);
     }
 
@@ -163,7 +179,6 @@ class GradientTile {
                 p.s[i][1] = t.sb[i][k];
                 p.s[i][2] = t.sc[i][k];
             }
-            std::fill(p.moments, p.moments + MOMENTS, 0.0f);
             for (int c = 0; c < extra_; ++c) {
                 const int32_t *corner = mesh_.faces + 3 * (int64_t)p.face;
                 Plane plane{0, 0, 0, 0, 0, 0};
@@ -226,74 +241,76 @@ class GradientTile {
         y = TileArea::lane_y() + lanes(TileArea::block_y(block) - t.y0);
     }
     static Lanes depth(const Prepared &t, const Lanes &x, const Lanes &y) {
-        const Lanes q = (lanes(t.qa) * x + lanes(t.qb) * y) + lanes(t.qc);
+        const Lanes q = mul_add(lanes(t.qa), x, mul_add(lanes(t.qb), y, lanes(t.qc)));
         return lanes(1) / clamp(q, lanes(t.q_min), lanes(t.q_max));
     }
     static Lanes value(const Prepared &t, int channel, const Lanes &x, const Lanes &y, const Lanes &z) {
-        const Lanes linear = (lanes(t.a[channel]) * x + lanes(t.b[channel]) * y) + lanes(t.c[channel]);
+        const Lanes linear = mul_add(lanes(t.a[channel]), x, mul_add(lanes(t.b[channel]), y, lanes(t.c[channel])));
         return clamp(linear * z, lanes(t.low[channel]), lanes(t.high[channel]));
     }
 
-    // Notes the light before each entry, as the picture was drawn.
-    void forth(const TileLog &log, int64_t begin, int64_t end) {
+    // Notes the light before each fragment, as the picture was drawn.
+    void forth(int64_t begin, int64_t end) {
         const Lanes enough = lanes(options_.min_transmittance);
         for (int64_t i = begin; i < end; ++i) {
-            const TileLog::Entry &entry = log.entries[i];
-            const Prepared &t = triangles_[place_[entry.triangle]];
+            const Fragment &f = fragments_[i];
+            const Prepared &t = triangles_[f.place];
             Lanes x, y;
-            positions(t, entry.block, x, y);
+            positions(t, f.block, x, y);
             const Lanes alpha = value(t, 3, x, y, depth(t, x, y));
-            float *at = through_ + entry.block * LANES;
+            float *at = through_ + f.block * LANES;
             const Lanes before = load_lanes(at);
             before_[i - begin] = before;
             const Lanes after = before - before * alpha;
-            store_lanes(at, pick(entry.lanes, only(at_least(after, enough), after), before));
+            store_lanes(at, pick(f.lanes, only(at_least(after, enough), after), before));
         }
     }
 
     template <bool EXTRA>
-    void back(const TileLog &log, int64_t begin, int64_t end) {
+    void back(int64_t begin, int64_t end) {
         for (int64_t i = end - 1; i >= begin; --i) {
-            const TileLog::Entry &entry = log.entries[i];
-            const int32_t place = place_[entry.triangle];
-            Prepared &t = triangles_[place];
-            const uint32_t covered = entry.lanes;
+            const Fragment &f = fragments_[i];
+            const Prepared &t = triangles_[f.place];
             Lanes x, y;
-            positions(t, entry.block, x, y);
+            positions(t, f.block, x, y);
             const Lanes z = depth(t, x, y);
             Lanes rgba[4];
             for (int c = 0; c < 4; ++c) rgba[c] = value(t, c, x, y, z);
             Lanes g[3];
-            for (int c = 0; c < 3; ++c) g[c] = load_lanes(towards_[c] + entry.block * LANES);
-            Lanes own = (rgba[0] * g[0] + rgba[1] * g[1]) + rgba[2] * g[2];
+            for (int c = 0; c < 3; ++c) g[c] = load_lanes(towards_[c] + f.block * LANES);
+            Lanes own = mul_add(rgba[0], g[0], mul_add(rgba[1], g[1], rgba[2] * g[2]));
             if (EXTRA)
-                for (int c = 0; c < extra_; ++c) own = own + extra_value(place, c, x, y, z) * load_lanes(towards_extra(c, entry.block));
-            float *at = behind_ + entry.block * LANES;
+                for (int c = 0; c < extra_; ++c) own = own + extra_value(f.place, c, x, y, z) * load_lanes(towards_extra(c, f.block));
+            float *at = behind_ + f.block * LANES;
             const Lanes behind = load_lanes(at), contrast = own - behind;
-            store_lanes(at, pick(covered, behind + rgba[3] * contrast, behind));
+            store_lanes(at, pick(f.lanes, mul_add(rgba[3], contrast, behind), behind));
 
-            const Lanes light = only(covered, before_[i - begin] * z), opaque = light * rgba[3];
-            Lanes sums[16];
+            const Lanes light = only(f.lanes, before_[i - begin] * z), opaque = light * rgba[3];
+            Lanes sums[4], sums_y[4];
             for (int c = 0; c < 3; ++c) sums[c] = opaque * g[c];
             sums[3] = light * contrast;
-            sums[4] = sums[3] * (rgba[3] - lanes(t.first[3]));
-            for (int c = 0; c < 3; ++c) sums[4] = sums[4] + sums[c] * (rgba[c] - lanes(t.first[c]));
+            Lanes v = sums[0] * (rgba[0] - lanes(t.first[0]));
+            for (int c = 1; c < 4; ++c) v = mul_add(sums[c], rgba[c] - lanes(t.first[c]), v);
             if (EXTRA) {
                 for (int c = 0; c < extra_; ++c) {
-                    const Lanes sum = opaque * load_lanes(towards_extra(c, entry.block));
-                    sums[4] = sums[4] + sum * (extra_value(place, c, x, y, z) - lanes(planes_[(size_t)place * extra_ + c].first));
-                    float *to = &extra_sums_[((size_t)place * extra_ + c) * 3];
+                    const Lanes sum = opaque * load_lanes(towards_extra(c, f.block));
+                    v = v + sum * (extra_value(f.place, c, x, y, z) - lanes(planes_[(size_t)f.place * extra_ + c].first));
+                    float *to = &extra_sums_[((size_t)f.place * extra_ + c) * 3];
                     to[0] += ::ms::sum(sum * x);
                     to[1] += ::ms::sum(sum * y);
                     to[2] += ::ms::sum(sum);
                 }
             }
-            for (int j = 0; j < SUMS; ++j) {
-                sums[SUMS + j] = sums[j] * x;
-                sums[2 * SUMS + j] = sums[j] * y;
-            }
-            sums[15] = lanes(0);
-            add_totals(sums, t.moments);
+            for (int c = 0; c < 4; ++c) sums_y[c] = sums[c] * y;
+            Moments &m = moments_[f.place];
+            // x is the same in every row.
+            const Lanes rows = add_rows(sums);
+            m.rgba[0] = m.rgba[0] + rows;
+            m.rgba[1] = mul_add(rows, x, m.rgba[1]);
+            m.rgba[2] = m.rgba[2] + add_rows(sums_y);
+            m.v[0] = m.v[0] + v;
+            m.v[1] = mul_add(v, x, m.v[1]);
+            m.v[2] = mul_add(v, y, m.v[2]);
         }
     }
 
@@ -313,8 +330,13 @@ class GradientTile {
             for (int k = 0; k < 3; ++k)
                 for (int j = 0; j < 3; ++j) s[k][j][t] = p.s[k][j];
             // Times x, y and 1, in this order.
-            for (int j = 0; j < 3; ++j)
-                for (int c = 0; c < SUMS; ++c) sum[j][c][t] = p.moments[(j + 1) % 3 * SUMS + c];
+            for (int j = 0; j < 3; ++j) {
+                const Moments &m = moments_[first + std::min(t, held - 1)];
+                float rgba[4];
+                add_columns(m.rgba[(j + 1) % 3], rgba);
+                for (int c = 0; c < 4; ++c) sum[j][c][t] = rgba[c];
+                sum[j][4][t] = ::ms::sum(m.v[(j + 1) % 3]);
+            }
             for (int k = 0; k < 3; ++k)
                 for (int c = 0; c < 4; ++c) apart[k][c][t] = (double)mesh_.colors[4 * (int64_t)corner[k] + c] - p.first[c];
         }
@@ -383,7 +405,9 @@ class GradientTile {
     Triangles batch_;
     double origin_x_[Triangles::N], origin_y_[Triangles::N];
     std::vector<int32_t> place_;  // of the log's triangles
+    std::vector<Fragment> fragments_;
     std::vector<Prepared> triangles_;
+    std::vector<Moments> moments_;
     std::vector<Plane> planes_;
     std::vector<float> extra_sums_;
     std::vector<Lanes> before_;

@@ -24,6 +24,20 @@ struct Grid {
         : samples(samples), width(camera.width * samples), height(camera.height * samples),
           side(TILE / samples * samples), tiles_x((width + side - 1) / side), tiles_y((height + side - 1) / side) {}
     int64_t tiles() const { return (int64_t)tiles_x * tiles_y; }
+
+    // Tiles are numbered down and then across strips of a few rows, so that what one tile reads is still at hand for its
+    // neighbours in both directions.
+    static constexpr int STRIP = 4;
+    int64_t tile(int x, int y) const {
+        const int first = y / STRIP * STRIP;
+        return (int64_t)first * tiles_x + (int64_t)x * std::min(STRIP, tiles_y - first) + (y - first);
+    }
+    void place(int64_t tile, int &x, int &y) const {
+        const int first = (int)(tile / ((int64_t)STRIP * tiles_x)) * STRIP, rows = std::min(STRIP, tiles_y - first);
+        const int64_t rest = tile - (int64_t)first * tiles_x;
+        x = (int)(rest / rows);
+        y = first + (int)(rest % rows);
+    }
 };
 
 // Something to draw: a run of triangles, or a splat.
@@ -90,7 +104,7 @@ class TileLists {
             int32_t sum = 0;
             for (int x = 0; x < grid.tiles_x; ++x) {
                 sum += corner[(size_t)y * w + x];
-                count_[(size_t)y * grid.tiles_x + x] = sum + (y ? count_[(size_t)(y - 1) * grid.tiles_x + x] : 0);
+                count_[grid.tile(x, y)] = sum + (y ? count_[grid.tile(x, y - 1)] : 0);
             }
         }
     }
@@ -112,12 +126,15 @@ class TileLists {
             int n = total < 100000 ? 1 : threads_;
             int64_t a = bound(total * thread / n), b = bound(total * (thread + 1) / n);
             if (a >= b) return;
-            int row_a = (int)(a / grid_.tiles_x), row_b = (int)((b - 1) / grid_.tiles_x);
+            constexpr int strip = Grid::STRIP;
+            const int strip_a = (int)(a / ((int64_t)strip * grid_.tiles_x)), strip_b = (int)((b - 1) / ((int64_t)strip * grid_.tiles_x));
             for (const Item &item : items_) {
-                for (int y = std::max<int>(item.y0, row_a); y <= std::min<int>(item.y1, row_b); ++y) {
-                    int64_t row = (int64_t)y * grid_.tiles_x;
-                    int64_t first = std::max(row + item.x0, a), last = std::min(row + item.x1, b - 1);
-                    for (int64_t tile = first; tile <= last; ++tile) entries_[fill[tile - begin_]++] = item.entry;
+                const int y0 = std::max<int>(item.y0, strip_a * strip), y1 = std::min<int>(item.y1, strip_b * strip + strip - 1);
+                for (int y = y0; y <= y1; ++y) {
+                    const int64_t step = std::min(strip, grid_.tiles_y - y / strip * strip);
+                    int64_t tile = grid_.tile(item.x0, y);
+                    for (int x = item.x0; x <= item.x1; ++x, tile += step)
+                        if (tile >= a && tile < b) entries_[fill[tile - begin_]++] = item.entry;
                 }
             }
         });

@@ -2,6 +2,8 @@
 // at every vector width.
 #pragma once
 
+#include <cstring>
+
 #include "simd.h"
 
 namespace ms {
@@ -21,6 +23,11 @@ inline Lanes load_lanes(const float *p) {
     Lanes r;
     for (int i = 0; i < PARTS; ++i) r.part[i] = load(p + i * W);
     return r;
+}
+inline float lane_of(const Lanes &a, int lane) {
+    float v;
+    std::memcpy(&v, (const char *)&a + lane * sizeof v, sizeof v);
+    return v;
 }
 inline void store_lanes(float *p, const Lanes &a) {
     for (int i = 0; i < PARTS; ++i) store(p + i * W, a.part[i]);
@@ -42,6 +49,12 @@ MS_LANES(operator/, x / y)
 MS_LANES(least, vmin(x, y))
 MS_LANES(most, vmax(x, y))
 #undef MS_LANES
+
+inline Lanes mul_add(const Lanes &a, const Lanes &b, const Lanes &c) {
+    Lanes r;
+    for (int i = 0; i < PARTS; ++i) r.part[i] = mul_add(a.part[i], b.part[i], c.part[i]);
+    return r;
+}
 
 // Limits a to [low, high]; NaN becomes low.
 inline Lanes clamp(const Lanes &a, const Lanes &low, const Lanes &high) { return least(most(a, low), high); }
@@ -97,25 +110,33 @@ inline float sum(const Lanes &a) {
     return (s[0] + s[2]) + (s[1] + s[3]);
 }
 
-// Adds the sum of each of 16 `terms` to `totals`; each is summed as by sum().
-inline void add_totals(const Lanes terms[16], float *totals) {
+// Lane 4 i + column: the sum over rows, four lanes each, of terms[i].
+inline Lanes add_rows(const Lanes terms[4]) {
+    Lanes r;
 #if defined(__AVX512F__)
-    // Halves the vectors and their lanes in each of four rounds.
-    __m512 a[16];
-    for (int i = 0; i < 16; ++i) a[i] = terms[i].part[0];
-    for (int i = 0; i < 8; ++i)
-        a[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a[2 * i], a[2 * i + 1], 0x44), _mm512_shuffle_f32x4(a[2 * i], a[2 * i + 1], 0xEE));
-    for (int i = 0; i < 4; ++i)
-        a[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a[2 * i], a[2 * i + 1], 0x88), _mm512_shuffle_f32x4(a[2 * i], a[2 * i + 1], 0xDD));
-    for (int i = 0; i < 2; ++i)
-        a[i] = _mm512_add_ps(_mm512_shuffle_ps(a[2 * i], a[2 * i + 1], 0x44), _mm512_shuffle_ps(a[2 * i], a[2 * i + 1], 0xEE));
-    const __m512 s = _mm512_add_ps(_mm512_shuffle_ps(a[0], a[1], 0x88), _mm512_shuffle_ps(a[0], a[1], 0xDD));
-    // Lane 4 b + c holds the sum of vector 4 c + b.
-    const __m512i order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
-    store(totals, load(totals) + _mm512_permutexvar_ps(order, s));
+    __m512 half[2];
+    for (int i = 0; i < 2; ++i) {
+        const __m512 a = terms[2 * i].part[0], b = terms[2 * i + 1].part[0];
+        half[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xEE));
+    }
+    r.part[0] = _mm512_add_ps(_mm512_shuffle_f32x4(half[0], half[1], 0x88), _mm512_shuffle_f32x4(half[0], half[1], 0xDD));
 #else
-    for (int i = 0; i < 16; ++i) totals[i] += sum(terms[i]);
+    f4 sums[4];
+    for (int i = 0; i < 4; ++i) {
+        f4 row[4];
+        std::memcpy(row, &terms[i], sizeof row);
+        sums[i] = (row[0] + row[2]) + (row[1] + row[3]);
+    }
+    std::memcpy(&r, sums, sizeof r);
 #endif
+    return r;
+}
+
+// The sums of each four lanes.
+inline void add_columns(const Lanes &a, float out[4]) {
+    alignas(64) float v[LANES];
+    store_lanes(v, a);
+    for (int i = 0; i < 4; ++i) out[i] = (v[4 * i] + v[4 * i + 2]) + (v[4 * i + 1] + v[4 * i + 3]);
 }
 
 }  // namespace ms

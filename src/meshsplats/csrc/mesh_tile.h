@@ -24,16 +24,17 @@ class MeshTile {
         blend_.begin(area_);
         full_ = takes_ = 0;
         held_ = 0;
-        crossing_ = 0;
         for (int block = 0; block < BLOCKS; ++block) {
             if (blend_.open(block)) takes_ |= 1u << block;
         }
+        // Groups come in the order of depth, which is no order in memory: data is asked for some groups ahead.
+        for (int64_t i = 0; i < std::min<int64_t>(length, FACES_AHEAD); ++i) ask_for_faces(list, i);
+        for (int64_t i = 0; i < std::min<int64_t>(length, CORNERS_AHEAD); ++i) ask_for_corners(list, i);
         for (int64_t i = 0; i < length && takes_; ++i) {
-            // Groups come in the order of depth, which is no order in memory: data is asked for some groups ahead.
-            if (i + 12 < length) __builtin_prefetch(scene_.boxes.data() + list[i + 12].first);
-            if (i + 8 < length) prefetch_faces(list[i + 8]);
-            if (i + 4 < length) prefetch_corners(list[i + 4]);
-            hold_run(list[i]);
+            if (i + BOXES_AHEAD < length) __builtin_prefetch(scene_.boxes.data() + list[i + BOXES_AHEAD].first);
+            if (i + FACES_AHEAD < length) ask_for_faces(list, i + FACES_AHEAD);
+            if (i + CORNERS_AHEAD < length) ask_for_corners(list, i + CORNERS_AHEAD);
+            hold_run(list[i], touching_[i % RING]);
         }
         if (takes_) add_held();
         for (int block = 0; block < BLOCKS; ++block) flush(block, -1);
@@ -41,20 +42,28 @@ class MeshTile {
     }
 
   private:
-    bool touches(const TileBox &box) const {
-        return (box.x0 <= tile_x_) & (tile_x_ <= box.x1) & (box.y0 <= tile_y_) & (tile_y_ <= box.y1);
+    static constexpr int BOXES_AHEAD = 12, FACES_AHEAD = 8, CORNERS_AHEAD = 3, RING = 16;
+
+    // Which triangles of a run may touch the tile: a bit each.
+    uint64_t touching(const Entry &run) const {
+        const TileBox *box = scene_.boxes.data() + run.first;
+        uint64_t bits = 0;
+        for (int i = 0; i < run.length; ++i)
+            bits |= (uint64_t)((box[i].x0 <= tile_x_) & (tile_x_ <= box[i].x1) & (box[i].y0 <= tile_y_) & (tile_y_ <= box[i].y1)) << i;
+        return bits;
     }
-    void prefetch_faces(const Entry &run) const {
-        for (int32_t f = run.first; f < run.first + run.length; ++f)
-            if (touches(scene_.boxes[f])) __builtin_prefetch(mesh_.faces + 3 * (int64_t)f);
+    void ask_for_faces(const Entry *list, int64_t i) {
+        touching_[i % RING] = touching(list[i]);
+        const char *faces = (const char *)(mesh_.faces + 3 * (int64_t)list[i].first);
+        for (int64_t byte = 0; byte < list[i].length * (int64_t)(3 * sizeof(int32_t)); byte += 64) __builtin_prefetch(faces + byte);
     }
-    void prefetch_corners(const Entry &run) const {
-        for (int32_t f = run.first; f < run.first + run.length; ++f) {
-            if (!touches(scene_.boxes[f])) continue;
+    // (GCC takes a function that only prefetches for one without effect, and drops calls that it does not inline first.)
+    __attribute__((always_inline)) void ask_for_corners(const Entry *list, int64_t i) {
+        for (uint64_t rest = touching_[i % RING]; rest; rest &= rest - 1) {
+            const int32_t *face = mesh_.faces + 3 * ((int64_t)list[i].first + __builtin_ctzll(rest));
             for (int k = 0; k < 3; ++k) {
-                const int64_t corner = mesh_.faces[3 * (int64_t)f + k];
-                __builtin_prefetch(&scene_.vertices[corner]);
-                __builtin_prefetch(mesh_.colors + 4 * corner);
+                __builtin_prefetch(&scene_.vertices[face[k]]);
+                __builtin_prefetch(mesh_.colors + 4 * (int64_t)face[k]);
             }
         }
     }
@@ -62,144 +71,190 @@ class MeshTile {
     void flush(int block, float nearest_to_come) {
         Waiting &waiting = waiting_[block];
         if (!waiting.count()) return;
-        blend_.blend(block, waiting, pool_, nearest_to_come);
+        blend_.blend(block, waiting, nearest_to_come);
         if (!blend_.open(block)) {
             takes_ &= ~(1u << block);
-            waiting.clear(pool_);
+            waiting.clear();
         }
         // A pile of triangles that all begin near the camera, where nothing can be blended before the last has come,
         // would fill the memory.
-        if (waiting.many()) blend_.drop_hidden(block, waiting, pool_);
+        if (waiting.many()) blend_.drop_hidden(block, waiting);
     }
 
-    // Triangles that may touch the tile gather until there are enough to make ready side by side.
-    void hold_run(const Entry &run) {
-        Triangles &t = triangles_;
-        const TileBox *box = scene_.boxes.data() + run.first;
-        for (int32_t i = 0; i < run.length; ++i) {
-            if (!touches(box[i])) continue;
-            const int32_t f = run.first + i;
-            const int32_t *corner = mesh_.faces + 3 * (int64_t)f;
-            const Projected &p = scene_.vertices[corner[0]], &q = scene_.vertices[corner[1]],
-                            &r = scene_.vertices[corner[2]];
-            const bool crosses = !(p.w > 0) | !(q.w > 0) | !(r.w > 0);
-            const Projected *corners[3] = {&p, &q, &r};
-            for (int k = 0; k < 3; ++k) {
-                t.x[k][held_] = corners[k]->x - area_.x0;
-                t.y[k][held_] = corners[k]->y - area_.y0;
-                t.w[k][held_] = corners[k]->w;
-                t.rgba[k][held_] = mesh_.colors + 4 * (int64_t)corner[k];
-            }
-            t.face[held_] = f;
-            run_[held_] = run.first;
-            crossing_ |= (unsigned)crosses << held_;
-            if (++held_ < Triangles::N) continue;
-            add_held();
-            for (; full_; full_ &= full_ - 1) flush(__builtin_ctz(full_), run.key);
-            if (!takes_) return;
+    // Triangles gather until there are enough to make ready side by side; those of a run stay together if they can.
+    void hold_run(const Entry &run, uint64_t touching) {
+        if (held_ + __builtin_popcountll(touching) > Triangles::N && held_ > 0 && !add_and_flush(run.key)) return;
+        for (; touching; touching &= touching - 1) {
+            if (held_ == Triangles::N && !add_and_flush(run.key)) return;
+            hold(run.first, run.first + __builtin_ctzll(touching));
         }
+    }
+
+    void hold(int32_t run, int32_t face) {
+        Triangles &t = triangles_;
+        const int32_t *corner = mesh_.faces + 3 * (int64_t)face;
+        for (int k = 0; k < 3; ++k) {
+            const Projected &p = scene_.vertices[corner[k]];
+            t.x[k][held_] = p.x - area_.x0;
+            t.y[k][held_] = p.y - area_.y0;
+            t.w[k][held_] = p.w;
+            t.rgba[k][held_] = mesh_.colors + 4 * (int64_t)corner[k];
+        }
+        t.face[held_] = face;
+        run_[held_++] = run;
+    }
+
+    // Nothing of the groups to come is nearer than `nearest_to_come`. False when no block takes light any more.
+    bool add_and_flush(float nearest_to_come) {
+        add_held();
+        for (; full_; full_ &= full_ - 1) flush(__builtin_ctz(full_), nearest_to_come);
+        return takes_;
     }
 
     void add_held() {
         Triangles &t = triangles_;
         t.set_up_in_front();
-        for (unsigned rest = crossing_; rest; rest &= rest - 1) {
+        unsigned crossing = 0;
+        for (int k = 0; k < held_; ++k) crossing |= (unsigned)(!(t.w[0][k] > 0) | !(t.w[1][k] > 0) | !(t.w[2][k] > 0)) << k;
+        for (unsigned rest = crossing; rest; rest &= rest - 1) {
             int k = __builtin_ctz(rest);
             Vec3 v[3];
             scene_.homogeneous(mesh_.faces + 3 * (int64_t)t.face[k], area_.x0, area_.y0, v);
             t.set_up_crossing(k, v, scene_.projection.near);
         }
-        for (int k = 0; k < held_; ++k) {
-            const bool visible = (t.rgba[0][k][3] > 0) | (t.rgba[1][k][3] > 0) | (t.rgba[2][k][3] > 0);
-            if (!(t.area[k] > 0) || (!visible && !blend_.keeps_invisible())) continue;
-            const bool shared_depth = mesh_.depth_group && mesh_.depth_group[t.face[k]] >= 0;
-            const bool crosses = crossing_ >> k & 1;
-            if (crosses || shared_depth)
-                add_triangle<true>(k, run_[k], crosses, shared_depth);
+        for (int end, begin = 0; begin < held_; begin = end) {
+            for (end = begin + 1; end < held_ && run_[end] == run_[begin];) ++end;
+            if (crossing || mesh_.depth_group || blend_.needs_weights())
+                add_run<true>(begin, end, crossing);
             else
-                add_triangle<false>(k, run_[k], false, false);
+                add_run<false>(begin, end, 0);
         }
         held_ = 0;
-        crossing_ = 0;
     }
 
-    // Adds the fragments of a triangle to the lists of the blocks it touches.
+    // The functions of a triangle that samples need, each as (a x + b y inside a block) + (a x + b y + c at its corner).
+    struct Functions {
+        Lanes inside[8];  // edges, 1 / depth, RGBA / depth
+        Lanes corner[8];  // by block
+        alignas(16) float low[4], high[4];  // range of RGBA over the corners
+    };
+
+    // Adds the fragments of the held triangles [begin, end), of one run, to the lists of the blocks they touch.
     template <bool GENERAL>
-    void add_triangle(int k, int32_t run, bool crossing, bool shared_depth) {
+    void add_run(int begin, int end, unsigned crossing) {
         const Triangles &t = triangles_;
-        // Each linear function is (a x + b y inside a block) + (a x + b y + c at the block's corner).
-        const Lanes x = TileArea::lane_x(), y = TileArea::lane_y();
-        alignas(64) static const float block_x[BLOCKS] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12},
-                                       block_y[BLOCKS] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
-        Lanes inside_block[4];
-        alignas(64) float at_block[4][BLOCKS];
-        unsigned blocks = takes_;
-        for (int i = 0; i < 4; ++i) {
-            float a = i < 3 ? t.ea[i][k] : t.qa[k], b = i < 3 ? t.eb[i][k] : t.qb[k], c = i < 3 ? t.ec[i][k] : t.qc[k];
-            const Lanes va = lanes(a), vb = lanes(b);
-            inside_block[i] = va * x + vb * y;
-            const Lanes corners = va * load_lanes(block_x) + (vb * load_lanes(block_y) + lanes(c));
-            store_lanes(at_block[i], corners);
-            if (i == 3) continue;
-            // No sample of a block exceeds its corner's value by more than this, rounding included.
-            float most = std::max(a * 0.5f, a * 3.5f) + std::max(b * 0.5f, b * 3.5f);
-            blocks &= at_least(corners + lanes(most), lanes(t.threshold[i][k]));
-        }
-        if (!blocks) return;
-        const Lanes q_min = lanes(t.q_min[k]), q_max = lanes(t.q_max[k]);
-        const int32_t place = prepare(k, !shared_depth);
-        TileTriangle &triangle = pool_[place];
-        for (; blocks; blocks &= blocks - 1) {
-            int block = __builtin_ctz(blocks);
-            unsigned inside = blend_.open(block);
-            for (int i = 0; i < 3; ++i)
-                inside &= at_least(inside_block[i] + lanes(at_block[i][block]), lanes(t.threshold[i][k]));
-            Lanes q = inside_block[3] + lanes(at_block[3][block]);
-            if (GENERAL && crossing) inside &= at_least(q_max, q);
-            q = clamp(q, q_min, q_max);
-            if (GENERAL && shared_depth) {
-                const DepthPlane &plane = scene_.planes[mesh_.depth_group[t.face[k]]];
-                double corner = plane.q.c + plane.q.a * (area_.x0 + block_x[block]) + plane.q.b * (area_.y0 + block_y[block]);
-                q = lanes((float)plane.q.a) * x + (lanes((float)plane.q.b) * y + lanes((float)corner));
-                q = clamp(q, lanes(plane.q_min), lanes(plane.q_max));
+        uint8_t touching[BLOCKS] = {};
+        TileLog *log = blend_.pieces();
+        uint32_t number[Triangles::N];
+        unsigned blocks = 0;
+        for (int k = begin; k < end; ++k) {
+            unsigned touched = prepare(k);
+            blocks |= touched;
+            if (log && touched) {
+                number[k] = (uint32_t)log->faces.size();
+                log->faces.push_back(t.face[k]);
             }
+            for (; touched; touched &= touched - 1) touching[__builtin_ctz(touched)] |= 1u << k;
+        }
+        for (; blocks; blocks &= blocks - 1) {
+            const int block = __builtin_ctz(blocks);
+            const unsigned open = blend_.open(block);
             Waiting &waiting = waiting_[block];
-            waiting.add(triangle, place, run, inside, q);
+            Fragments f{};
+            FragmentWeights weights{};
+            unsigned covered = 0;
+            int32_t face = 0;
+            uint32_t first_piece = 0, pieces = 0;
+            auto add = [&] {
+                waiting.add(covered, face, f, GENERAL && blend_.needs_weights() ? &weights : nullptr, first_piece, pieces);
+            };
+            for (unsigned rest = touching[block]; rest; rest &= rest - 1) {
+                const int k = __builtin_ctz(rest);
+                const Functions &of = functions_[k];
+                unsigned inside = open;
+                for (int i = 0; i < 3; ++i) inside &= at_least(of.inside[i] + corner(of, i, block), lanes(t.threshold[i][k]));
+                Lanes q = of.inside[3] + corner(of, 3, block);
+                if (GENERAL && crossing >> k & 1) inside &= at_least(lanes(t.q_max[k]), q);
+                if (!inside) continue;
+                if (covered & inside) {
+                    add();
+                    covered = pieces = 0;
+                    f = {};
+                }
+                q = clamp(q, lanes(t.q_min[k]), lanes(t.q_max[k]));
+                const Lanes z = lanes(1) / q;
+                f.key = pick(inside, GENERAL ? key(k, block, q) : q, f.key);
+                for (int c = 0; c < 4; ++c) {
+                    const Lanes value = (of.inside[4 + c] + corner(of, 4 + c, block)) * z;
+                    f.rgba[c] = pick(inside, clamp(value, lanes(of.low[c]), lanes(of.high[c])), f.rgba[c]);
+                }
+                if (!covered) face = t.face[k];
+                covered |= inside;
+                if (log) {
+                    if (!pieces) first_piece = (uint32_t)log->pieces.size();
+                    log->pieces.push_back({number[k], inside});
+                    ++pieces;
+                }
+                if (GENERAL && blend_.needs_weights()) {
+                    const float x = TileArea::block_x(block), y = TileArea::block_y(block);
+                    weights.z = pick(inside, z, weights.z);
+                    for (int i = 0; i < 3; ++i) {
+                        const Lanes b = (lanes(t.sa[i][k]) * TileArea::lane_x() + lanes(t.sb[i][k]) * TileArea::lane_y()) +
+                                        lanes(t.sa[i][k] * x + (t.sb[i][k] * y + t.sc[i][k]));
+                        weights.b[i] = pick(inside, b * z, weights.b[i]);
+                    }
+                }
+            }
+            if (!covered) continue;
+            add();
             full_ |= (unsigned)waiting.full() << block;
         }
-        if (triangle.uses == 0) pool_.drop(place);
     }
 
-    int32_t prepare(int k, bool keys_are_depths) {
+    static Lanes corner(const Functions &of, int function, int block) { return lanes(((const float *)&of.corner[function])[block]); }
+
+    // What the fragments of triangle k are sorted by, where 1 / depth is q.
+    Lanes key(int k, int block, const Lanes &q) const {
+        const int32_t group = mesh_.depth_group ? mesh_.depth_group[triangles_.face[k]] : -1;
+        if (group < 0) return q;
+        const DepthPlane &plane = scene_.planes[group];
+        const double corner = plane.q.c + plane.q.a * (area_.x0 + TileArea::block_x(block)) + plane.q.b * (area_.y0 + TileArea::block_y(block));
+        const Lanes common = lanes((float)plane.q.a) * TileArea::lane_x() +
+                             (lanes((float)plane.q.b) * TileArea::lane_y() + lanes((float)corner));
+        return clamp(common, lanes(plane.q_min), lanes(plane.q_max));
+    }
+
+    // Fills the functions of triangle k; returns the blocks it may touch.
+    unsigned prepare(int k) {
         const Triangles &t = triangles_;
-        int32_t place = pool_.take();
-        TileTriangle &p = pool_[place];
         const f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
-        auto mix = [&](float *out, const float s[3][Triangles::N]) {
-            store4(out, set4(s[0][k]) * c[0] + set4(s[1][k]) * c[1] + set4(s[2][k]) * c[2]);
+        const f4 high = max4(max4(c[0], c[1]), c[2]);
+        if (!(t.area[k] > 0) || (!(high[3] > 0) && !blend_.keeps_invisible())) return 0;
+        Functions &of = functions_[k];
+        const Lanes x = TileArea::lane_x(), y = TileArea::lane_y(), block_x = TileArea::blocks_x(), block_y = TileArea::blocks_y();
+        auto split = [&](int i, float a, float b, float c) {
+            const Lanes va = lanes(a), vb = lanes(b);
+            of.inside[i] = va * x + vb * y;
+            of.corner[i] = va * block_x + (vb * block_y + lanes(c));
         };
-        mix(p.a, t.sa);
-        mix(p.b, t.sb);
-        mix(p.c, t.sc);
-        store4(p.low, min4(min4(c[0], c[1]), c[2]));
-        store4(p.high, max4(max4(c[0], c[1]), c[2]));
-        p.qa = t.qa[k];
-        p.qb = t.qb[k];
-        p.qc = t.qc[k];
-        p.q_min = t.q_min[k];
-        p.q_max = t.q_max[k];
-        p.face = t.face[k];
-        p.number = blend_.number(t.face[k]);
-        p.uses = 0;
-        p.keys_are_depths = keys_are_depths;
-        if (blend_.needs_weights()) {
-            for (int i = 0; i < 3; ++i) {
-                p.sa[i] = t.sa[i][k];
-                p.sb[i] = t.sb[i][k];
-                p.sc[i] = t.sc[i][k];
-            }
+        unsigned blocks = takes_;
+        for (int i = 0; i < 3; ++i) {
+            const float a = t.ea[i][k], b = t.eb[i][k];
+            split(i, a, b, t.ec[i][k]);
+            // No sample of a block exceeds its corner's value by more than this, rounding included.
+            const float most = std::max(a * 0.5f, a * 3.5f) + std::max(b * 0.5f, b * 3.5f);
+            blocks &= at_least(of.corner[i] + lanes(most), lanes(t.threshold[i][k]));
         }
-        return place;
+        if (!blocks) return 0;
+        split(3, t.qa[k], t.qb[k], t.qc[k]);
+        alignas(16) float plane[3][4];
+        const float(*const s[3])[Triangles::N] = {t.sa, t.sb, t.sc};
+        for (int i = 0; i < 3; ++i)
+            store4(plane[i], set4(s[i][0][k]) * c[0] + set4(s[i][1][k]) * c[1] + set4(s[i][2][k]) * c[2]);
+        for (int i = 0; i < 4; ++i) split(4 + i, plane[0][i], plane[1][i], plane[2][i]);
+        store4(of.low, min4(min4(c[0], c[1]), c[2]));
+        store4(of.high, high);
+        return blocks;
     }
 
     const Scene &scene_;
@@ -207,11 +262,11 @@ class MeshTile {
     Blend blend_;
     int tile_x_, tile_y_;
     TileArea area_;
+    uint64_t touching_[RING];  // of the groups to come
     Triangles triangles_;
-    int held_;                      // triangles gathered
-    unsigned crossing_;             // those of them that cross the near plane
+    int held_;                 // triangles gathered
     int32_t run_[Triangles::N];
-    TilePool pool_;
+    Functions functions_[Triangles::N];
     Waiting waiting_[BLOCKS];
     unsigned takes_;  // blocks that still take light
     unsigned full_;   // blocks whose lists have become long

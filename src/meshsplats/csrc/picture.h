@@ -4,6 +4,7 @@
 #include "scene.h"
 #include "tile_area.h"
 #include "tile_log.h"
+#include "waiting.h"
 
 namespace ms {
 
@@ -31,11 +32,8 @@ class PictureTile {
     // opaque one is followed as if it let some light through: for gradients, that is what making it translucent shows.
     void record(TileLog *log) { log_ = log; }
     const TileLog *log() const { return log_; }
-    uint32_t number(int32_t face) {
-        if (!log_) return 0;
-        log_->faces.push_back(face);
-        return (uint32_t)log_->faces.size() - 1;
-    }
+    // Where to note which triangle covers what, or null.
+    TileLog *pieces() { return log_ ? log_ : extras_.any ? &own_pieces_ : nullptr; }
     bool keeps_invisible() const { return log_; }
     bool needs_weights() const { return extras_.any; }
     int64_t fragments() const { return fragments_; }
@@ -43,7 +41,7 @@ class PictureTile {
 
     void begin(const TileArea &area) {
         area_ = area;
-        if (log_) log_->clear();
+        if (pieces()) pieces()->clear();
         for (int i = 0; i < SAMPLES; ++i) {
             layers_[i] = 0;
             color_[0][i] = color_[1][i] = color_[2][i] = 0;
@@ -54,15 +52,15 @@ class PictureTile {
     }
 
     // Blends what is nearer than anything with 1 / depth <= nearest_to_come.
-    void blend(int block, Waiting &waiting, TilePool &pool, float nearest_to_come) {
+    void blend(int block, Waiting &waiting, float nearest_to_come) {
         if (extras_.any || options_.max_layers || log_)
-            blend_entries<true>(block, waiting, pool, nearest_to_come);
+            blend_entries<true>(block, waiting, nearest_to_come);
         else
-            blend_entries<false>(block, waiting, pool, nearest_to_come);
+            blend_entries<false>(block, waiting, nearest_to_come);
     }
 
     // Takes from the list what surely stays hidden behind other entries of it.
-    void drop_hidden(int block, Waiting &waiting, TilePool &pool) {
+    void drop_hidden(int block, Waiting &waiting) {
         // Half: more in front can only lower the light, but for the rounding of the last bit.
         const Lanes enough = lanes(std::max(0.5f * options_.min_transmittance, 1e-30f));
         Lanes through = load_lanes((log_ ? reach_ : through_) + block * LANES);
@@ -71,12 +69,10 @@ class PictureTile {
         int left[LANES];
         for (int i = 0; i < LANES; ++i)
             left[i] = options_.max_layers ? options_.max_layers - layers_[block * LANES + i] : waiting.count();
-        waiting.keep(pool, open, [&](int32_t place, uint32_t ready, const float *keys) {
-            const TileTriangle &t = pool[place];
-            Lanes rgba[4];
-            area_.values(t, block, area_.depth(t, block, load_lanes(keys)), rgba);
-            const uint32_t seen = ready & open & (log_ ? ~0u : greater(rgba[3], lanes(0)));
-            through = through - only(seen, through * least(rgba[3], most_opaque));
+        waiting.keep(open, [&](int entry, uint32_t ready) {
+            const Lanes alpha = waiting.fragments(entry).rgba[3];
+            const uint32_t seen = ready & open & (log_ ? ~0u : greater(alpha, lanes(0)));
+            through = through - only(seen, through * least(alpha, most_opaque));
             open &= at_least(through, enough);
             for (uint32_t rest = seen; rest; rest &= rest - 1)
                 if (--left[__builtin_ctz(rest)] == 0) open &= ~(rest & -rest);
@@ -124,19 +120,16 @@ class PictureTile {
     static constexpr float MOST_OPAQUE = 0.9f;
 
     template <bool GENERAL>
-    void blend_entries(int block, Waiting &waiting, TilePool &pool, float nearest_to_come) {
+    void blend_entries(int block, Waiting &waiting, float nearest_to_come) {
         float *at = through_ + block * LANES;
         Lanes through = load_lanes(at), reach = load_lanes(reach_ + block * LANES), color[3];
         for (int c = 0; c < 3; ++c) color[c] = load_lanes(color_[c] + block * LANES);
         const Lanes enough = lanes(options_.min_transmittance);
         uint32_t open = open_[block], lit = at_least(through, enough);
-        waiting.take(pool, nearest_to_come, open, [&](int32_t place, uint32_t ready, const float *keys) {
-            const TileTriangle &t = pool[place];
-            const Lanes z = area_.depth(t, block, load_lanes(keys));
-            Lanes rgba[4];
-            area_.values(t, block, z, rgba);
-            const Lanes weight = only(ready & (GENERAL ? lit & open : open), through * rgba[3]);
-            for (int c = 0; c < 3; ++c) color[c] = color[c] + weight * rgba[c];
+        waiting.take(nearest_to_come, open, [&](int entry, uint32_t ready) {
+            const Fragments &f = waiting.fragments(entry);
+            const Lanes weight = only(ready & (GENERAL ? lit & open : open), through * f.rgba[3]);
+            for (int c = 0; c < 3; ++c) color[c] = color[c] + weight * f.rgba[c];
             through = through - weight;
             const uint32_t seen = greater(weight, lanes(0));
             fragments_ += __builtin_popcount(seen);
@@ -147,20 +140,25 @@ class PictureTile {
             lit = at_least(through, enough);
             if (log_) {
                 if (ready & open)
-                    log_->entries.push_back({t.number, (uint16_t)(ready & open), (uint16_t)block});
-                reach = reach - only(ready & open, reach * least(rgba[3], lanes(MOST_OPAQUE)));
+                    log_->steps.push_back({waiting.first_piece(entry), (uint16_t)(ready & open), (uint8_t)waiting.pieces(entry), (uint8_t)block});
+                reach = reach - only(ready & open, reach * least(f.rgba[3], lanes(MOST_OPAQUE)));
                 open &= lit | at_least(reach, enough);
             } else {
                 open &= lit;
             }
-            if (!extras_.any && !options_.max_layers) return;
-            alignas(64) float weights[LANES], depths[LANES];
-            store_lanes(weights, weight);
-            store_lanes(depths, z);
-            for (uint32_t rest = seen; rest; rest &= rest - 1) {
-                int lane = __builtin_ctz(rest), sample = block * LANES + lane;
-                if (extras_.any) add_extras(sample, t, depths[lane], weights[lane]);
-                if (options_.max_layers && ++layers_[sample] >= options_.max_layers) open &= ~(1u << lane);
+            if (extras_.any) {
+                alignas(64) float weights[LANES];
+                store_lanes(weights, weight);
+                pieces()->for_pieces(waiting.first_piece(entry), waiting.pieces(entry), seen, [&](uint32_t triangle, uint32_t part) {
+                    for (; part; part &= part - 1) {
+                        const int lane = __builtin_ctz(part);
+                        add_extras(block * LANES + lane, pieces()->faces[triangle], waiting.weights(entry), lane, weights[lane]);
+                    }
+                });
+            }
+            if (options_.max_layers) {
+                for (uint32_t rest = seen; rest; rest &= rest - 1)
+                    if (++layers_[block * LANES + __builtin_ctz(rest)] >= options_.max_layers) open &= ~(rest & -rest);
             }
         });
         open_[block] = open;
@@ -169,14 +167,15 @@ class PictureTile {
         for (int c = 0; c < 3; ++c) store_lanes(color_[c] + block * LANES, color[c]);
     }
 
-    void add_extras(int sample, const TileTriangle &t, float z, float weight) {
+    void add_extras(int sample, int32_t face, const FragmentWeights &at, int lane, float weight) {
         const MsMesh &mesh = scene_.mesh;
         float *sum = sums_.data() + (size_t)sample * extras_.channels;
-        const int32_t *corner = mesh.faces + 3 * (int64_t)t.face;
+        const int32_t *corner = mesh.faces + 3 * (int64_t)face;
         const float x = TileArea::column(sample) + 0.5f, y = TileArea::row(sample) + 0.5f;
+        const float z = lane_of(at.z, lane);
         float b[3], total = 0;
         for (int k = 0; k < 3; ++k) {
-            b[k] = std::min(std::max((t.sc[k] + t.sb[k] * y + t.sa[k] * x) * z, 0.0f), 1.0f);
+            b[k] = std::min(std::max(lane_of(at.b[k], lane), 0.0f), 1.0f);
             total += b[k];
         }
         for (int k = 0; k < 3; ++k) b[k] = total > 0 ? b[k] / total : k == 0;
@@ -231,6 +230,7 @@ class PictureTile {
     alignas(64) float through_[SAMPLES];
     alignas(64) float reach_[SAMPLES];  // the same if nothing were more opaque than MOST_OPAQUE
     TileLog *log_ = nullptr;
+    TileLog own_pieces_;
     int32_t layers_[SAMPLES];
     uint32_t open_[BLOCKS];  // per block, the samples that still take light
     std::vector<float> sums_;

@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "grid.h"
+#include "large.h"
 #include "triangle.h"
 
 namespace ms {
@@ -23,10 +24,10 @@ struct Scene {
     const MsMesh &mesh;
     const Grid &grid;
     Projection projection;
-    std::vector<Projected> vertices;
+    Large<Projected> vertices;
     std::vector<int32_t> group_start;  // triangles [group_start[g], group_start[g + 1]) are one group
     std::vector<DepthPlane> planes;    // by depth group
-    std::vector<TileBox> boxes;        // by triangle
+    Large<TileBox> boxes;        // by triangle
     std::vector<Item> items;           // groups that may cover samples, nearest first
 
     // Items are needed to draw; without, just to follow a log.

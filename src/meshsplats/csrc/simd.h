@@ -43,6 +43,15 @@ inline f4 min4(f4 a, f4 b) { return a < b ? a : b; }
 inline f4 max4(f4 a, f4 b) { return a > b ? a : b; }
 #endif
 
+// a b + c, in one rounding where the processor can: for what need not be the same on every processor.
+#if defined(__AVX512F__)
+inline vf mul_add(vf a, vf b, vf c) { return _mm512_fmadd_ps(a, b, c); }
+#elif defined(__FMA__) && defined(__AVX2__)
+inline vf mul_add(vf a, vf b, vf c) { return _mm256_fmadd_ps(a, b, c); }
+#else
+inline vf mul_add(vf a, vf b, vf c) { return a * b + c; }
+#endif
+
 // Masks, one flag a lane.
 #if defined(__AVX512F__)
 typedef __mmask16 vm;

@@ -1,8 +1,8 @@
-// The samples of a tile, and the values of its triangles there.
+// The samples of a tile.
 #pragma once
 
 #include "grid.h"
-#include "waiting.h"
+#include "lanes.h"
 
 namespace ms {
 
@@ -24,6 +24,15 @@ struct TileArea {
     // Corner of a block.
     static float block_x(int block) { return 4.0f * (block % 4); }
     static float block_y(int block) { return 4.0f * (block / 4); }
+    // Of all blocks.
+    static Lanes blocks_x() {
+        alignas(64) static const float x[BLOCKS] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
+        return load_lanes(x);
+    }
+    static Lanes blocks_y() {
+        alignas(64) static const float y[BLOCKS] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
+        return load_lanes(y);
+    }
     // Its samples, from that corner.
     static Lanes lane_x() {
         alignas(64) static const float x[LANES] = {.5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5};
@@ -42,25 +51,6 @@ struct TileArea {
             if (column(sample) < columns && row(sample) < rows) bits |= 1u << lane;
         }
         return bits;
-    }
-
-    // Depth of a triangle at the samples of a block, where its keys are `key`; positive and finite everywhere.
-    static Lanes depth(const TileTriangle &t, int block, const Lanes &key) {
-        if (t.keys_are_depths) return ms::lanes(1) / key;
-        const float corner = t.qa * block_x(block) + (t.qb * block_y(block) + t.qc);
-        const Lanes q = (ms::lanes(t.qa) * lane_x() + ms::lanes(t.qb) * lane_y()) + ms::lanes(corner);
-        return ms::lanes(1) / clamp(q, ms::lanes(t.q_min), ms::lanes(t.q_max));
-    }
-
-    // RGBA of a triangle at the samples of a block, where its depth is z.
-    static void values(const TileTriangle &t, int block, const Lanes &z, Lanes rgba[4]) {
-        alignas(16) float corner[4];
-        store4(corner, load4(t.a) * set4(block_x(block)) + (load4(t.b) * set4(block_y(block)) + load4(t.c)));
-        const Lanes x = lane_x(), y = lane_y();
-        for (int i = 0; i < 4; ++i) {
-            const Lanes linear = (ms::lanes(t.a[i]) * x + ms::lanes(t.b[i]) * y) + ms::lanes(corner[i]);
-            rgba[i] = clamp(linear * z, ms::lanes(t.low[i]), ms::lanes(t.high[i]));
-        }
     }
 };
 

@@ -10,17 +10,35 @@
 namespace ms {
 
 struct TileLog {
-    struct Entry {
+    // The samples of one block that a triangle covers.
+    struct Piece {
         uint32_t triangle;  // which one of `faces`
-        uint16_t lanes;     // samples of the block
-        uint16_t block;
+        uint32_t lanes;
+    };
+    // Samples of a block that take their fragments of some pieces; no two of these share a sample.
+    struct Step {
+        uint32_t first;  // of `pieces`
+        uint16_t lanes;
+        uint8_t count, block;
     };
     std::vector<int32_t> faces;
-    std::vector<Entry> entries;  // at every sample nearest first
+    std::vector<Piece> pieces;
+    std::vector<Step> steps;  // at every sample nearest first
 
     void clear() {
         faces.clear();
-        entries.clear();
+        pieces.clear();
+        steps.clear();
+    }
+    int64_t bytes() const {
+        return (int64_t)(faces.size() * sizeof(int32_t) + pieces.size() * sizeof(Piece) + steps.size() * sizeof(Step));
+    }
+
+    // Calls call(triangle, lanes) for the pieces that have some of the lanes.
+    template <class Call>
+    void for_pieces(uint32_t first, uint32_t count, uint32_t lanes, Call &&call) const {
+        for (uint32_t i = first; i < first + count; ++i)
+            if (const uint32_t part = pieces[i].lanes & lanes) call(pieces[i].triangle, part);
     }
 };
 
@@ -31,15 +49,12 @@ class PictureLog {
 
     // Not for one tile by two threads.
     void keep(int64_t tile, const TileLog &log) {
-        const int64_t bytes = (int64_t)(log.faces.size() * sizeof(int32_t) + log.entries.size() * sizeof(TileLog::Entry));
+        const int64_t bytes = log.bytes();
         if (left_.fetch_sub(bytes) < bytes) {
             left_.fetch_add(bytes);
             return;
         }
-        auto kept = std::make_unique<TileLog>();
-        kept->faces = log.faces;  // copies are as large as what they hold
-        kept->entries = log.entries;
-        tiles_[tile] = std::move(kept);
+        tiles_[tile] = std::make_unique<TileLog>(log);  // a copy is as large as what it holds
     }
     const TileLog *find(int64_t tile) const { return tiles_[tile].get(); }
     bool complete() const {
