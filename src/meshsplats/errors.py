@@ -15,6 +15,14 @@ class DataWarning(UserWarning):
     """Something in the data was left out or altered; the message counts it."""
 
 
+class NoColorsWarning(DataWarning):
+    """A mesh file without vertex colours was read as grey."""
+
+
+class NoTextureWarning(DataWarning):
+    """The textures of a mesh file were left out."""
+
+
 class DivergenceError(ValueError):
     """Values that are not finite turned up in an optimisation; the message names the view that brought
     them."""

@@ -3,6 +3,7 @@ needed."""
 
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from collections.abc import Iterable, Sequence
@@ -96,9 +97,11 @@ def read_header(path: Path) -> Header:
         return Header(image.width, image.height, _has_alpha(image))
 
 
-def load_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """uint8 (h, w, 3) RGB, and uint8 (h, w) straight alpha or None. FileFormatError for a broken picture."""
-    with _opened(path) as image:
+def load_picture(path: Path, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """uint8 (h, w, 3) RGB, and uint8 (h, w) straight alpha or None. FileFormatError for a broken picture.
+
+    ``data`` is a picture that lies inside another file, which ``path`` then names in messages."""
+    with _opened(path, data) as image:
         try:
             if image.mode.startswith("I;16") or image.mode == "I":
                 grey = np.asarray(image, np.int64)
@@ -117,13 +120,13 @@ def load_picture(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
             raise FileFormatError(f"{path}: a broken picture: {str(error)[:120]}") from None
 
 
-def _opened(path: Path) -> Any:
+def _opened(path: Path, data: bytes | None = None) -> Any:
     try:
         from PIL import Image
     except ImportError:
         raise MissingDependencyError("reading photographs needs Pillow: pip install pillow") from None
     try:
-        image = Image.open(path, formats=FORMATS)
+        image = Image.open(path if data is None else io.BytesIO(data), formats=FORMATS)
     except FileNotFoundError:
         raise
     except PermissionError:

@@ -231,21 +231,25 @@ class GltfDocument:
             data = self._chunk
         elif not isinstance(uri, str):
             raise self.error(f"the URI of buffer {index} must be a text")
-        elif uri.startswith("data:"):
-            head, _, body = uri.partition(",")
-            if not head.endswith(";base64"):
-                raise self.error(f"the data URI of buffer {index} is not base64")
-            try:
-                data = memoryview(base64.b64decode(body))
-            except (binascii.Error, ValueError):
-                raise self.error(f"the data URI of buffer {index} is broken") from None
         else:
-            data = self._beside(uri)
+            data = self.uri_bytes(uri, f"buffer {index}")
         length = self.whole(buffer, "byteLength", "a buffer")
         if length > len(data):
             raise self.error(f"buffer {index} should have {length:,} bytes, has {len(data):,}")
         self._buffers[index] = data[:length]
         return self._buffers[index]
+
+    def uri_bytes(self, uri: str, what: str) -> memoryview:
+        """What a URI stands for: base64 data in itself, or a file beside this one."""
+        if not uri.startswith("data:"):
+            return self._beside(uri)
+        head, _, body = uri.partition(",")
+        if not head.endswith(";base64"):
+            raise self.error(f"the data URI of {what} is not base64")
+        try:
+            return memoryview(base64.b64decode(body))
+        except (binascii.Error, ValueError):
+            raise self.error(f"the data URI of {what} is broken") from None
 
     def _beside(self, uri: str) -> memoryview:
         """A file that a .gltf file refers to. It must lie in the folder of the .gltf file or below."""
@@ -255,7 +259,7 @@ class GltfDocument:
         if ":" in uri or "\\" in name or os.path.isabs(name) or folder not in target.parents:
             raise self.error(f"refers to {uri[:80]!r} outside its folder; refused")
         if not target.is_file():
-            raise self.error(f"its buffer file {uri[:80]!r} is missing")
+            raise self.error(f"its file {uri[:80]!r} is missing")
         self.budget.extend(target.stat().st_size)
         return memoryview(target.read_bytes())
 

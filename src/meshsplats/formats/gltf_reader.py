@@ -14,13 +14,13 @@ import numpy as np
 
 from meshsplats.binding import Binding
 from meshsplats.colors import linear_to_srgb
-from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
 from meshsplats.formats.glb import up_quaternion
 from meshsplats.formats.gltf_document import GltfDocument
 from meshsplats.formats.mesh_checks import checked_binding, checked_mesh, straight_colors
 from meshsplats.mesh import Blending, SplatMesh
 
-_POINTS_TO_LINES = (0, 1, 2, 3)
+POINTS_TO_LINES = (0, 1, 2, 3)
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
@@ -58,19 +58,20 @@ def _read(document: GltfDocument) -> SplatMesh:
             matrix = np.eye(4)
         elif note:  # someone has moved the mesh in the scene
             note["up"] = [0.0, 1.0, 0.0]
-        for primitive in _objects(document, mesh.get("primitives"), "primitives of a mesh"):
+        for primitive in objects_in(document, mesh.get("primitives"), "primitives of a mesh"):
             mode = primitive.get("mode", _TRIANGLES)
-            if mode in _POINTS_TO_LINES:
+            if mode in POINTS_TO_LINES:
                 skipped += 1
                 _refuse_splats(document, primitive)
                 continue
-            material = _material(document, primitive)
-            textured += "baseColorTexture" in _pbr(material)
+            material = material_of(document, primitive)
+            textured += "baseColorTexture" in pbr_of(material)
             pieces.append(_piece(document, primitive, material, matrix))
     if skipped:
         _warn(f"{path}: {skipped:,} primitives of points or lines were left out")
     if textured:
-        _warn(f"{path}: {textured:,} primitives have a texture, which was left out; colours may differ")
+        message = f"{path}: {textured:,} primitives have a texture, which was left out; colours may differ"
+        warnings.warn(message, NoTextureWarning, stacklevel=3)
     if not pieces:
         raise document.error("the scene holds no triangles")
     return _join(document, pieces, own, note)
@@ -129,13 +130,13 @@ def _piece(
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict) or "POSITION" not in attributes:
         raise document.error("a primitive has no POSITION")
-    if "KHR_draco_mesh_compression" in _dict(primitive.get("extensions")):
+    if "KHR_draco_mesh_compression" in dict_or_empty(primitive.get("extensions")):
         raise document.compressed()
     vertices = document.floats(attributes["POSITION"], "POSITION")
     v = len(vertices)
-    faces = _faces(document, primitive, v)
+    faces = primitive_faces(document, primitive, v)
     document.budget.spend(64 * v + 12 * len(faces), "a mesh")
-    factor = document.numbers(_pbr(material).get("baseColorFactor", [1, 1, 1, 1]), 4, "baseColorFactor")
+    factor = document.numbers(pbr_of(material).get("baseColorFactor", [1, 1, 1, 1]), 4, "baseColorFactor")
     linear = np.ones((v, 4), np.float32)
     if "COLOR_0" in attributes:
         colors = document.floats(attributes["COLOR_0"], "COLOR_0")
@@ -164,7 +165,7 @@ def _piece(
     return _Piece(vertices, faces, linear, normals)
 
 
-def _faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
+def primitive_faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
     if "indices" in primitive:
         stored = document.accessor(primitive["indices"], "indices")
         if stored.dtype.kind != "u" or stored.shape[1] != 1:
@@ -227,7 +228,7 @@ def _join(
 
 def _our_note(mesh: dict[str, Any]) -> dict[str, Any]:
     """The entry ``extras.meshsplats`` of a mesh where it is one of ours and in order, else an empty one."""
-    note = _dict(_dict(mesh.get("extras")).get("meshsplats"))
+    note = dict_or_empty(dict_or_empty(mesh.get("extras")).get("meshsplats"))
     up = note.get("up")
     good = (
         isinstance(up, list) and len(up) == 3 and all(isinstance(u, (int, float)) and abs(u) <= 2 for u in up)
@@ -253,7 +254,7 @@ def _restore(
     v = len(colors)
     for name in ("face_splat", "depth_group"):
         if name in note:
-            values = _raw(document, _dict(note[name]), "<i4", f)
+            values = _raw(document, dict_or_empty(note[name]), "<i4", f)
             if values is None:
                 lost.append(name)
             else:
@@ -267,14 +268,14 @@ def _restore(
         else:
             result["colors"] = np.concatenate([colors[:, :3], np.clip(true_alpha, 0, 1)], axis=1)
     if "binding" in note:
-        result["binding"] = _binding(document, _dict(note["binding"]), v)
+        result["binding"] = _binding(document, dict_or_empty(note["binding"]), v)
         if result["binding"] is None:
             lost.append("the binding to a base mesh")
     attributes: dict[str, np.ndarray] = {}
-    stored = _dict(mesh["primitives"][0]["attributes"])
+    stored = dict_or_empty(mesh["primitives"][0]["attributes"])
     entries = note.get("attributes", [])
     for entry in entries if isinstance(entries, list) else []:
-        key, columns = _dict(entry).get("name"), _dict(entry).get("columns")
+        key, columns = dict_or_empty(entry).get("name"), dict_or_empty(entry).get("columns")
         if isinstance(key, str) and (columns is None or (isinstance(columns, int) and 0 <= columns <= 4096)):
             values = _attribute(document, stored, entry, v, 1 if columns is None else columns)
             if values is None:
@@ -300,7 +301,9 @@ def _binding(document: GltfDocument, entry: dict[str, Any], v: int) -> Binding |
     }
     parts = {}
     for name, (key, dtype, shape) in wanted.items():
-        values = _raw(document, _dict(entry.get(key)), dtype, shape[0] * (3 if len(shape) == 2 else 1))
+        values = _raw(
+            document, dict_or_empty(entry.get(key)), dtype, shape[0] * (3 if len(shape) == 2 else 1)
+        )
         if values is None:
             return None
         parts[name] = values.reshape(shape)
@@ -345,22 +348,22 @@ def _raw(document: GltfDocument, entry: dict[str, Any], dtype: str, count: int) 
 # -- small change
 
 
-def _material(document: GltfDocument, primitive: dict[str, Any]) -> dict[str, Any]:
+def material_of(document: GltfDocument, primitive: dict[str, Any]) -> dict[str, Any]:
     if "material" not in primitive:
         return {}
     return document.item("materials", primitive["material"], "a primitive")
 
 
-def _pbr(material: dict[str, Any]) -> dict[str, Any]:
-    return _dict(material.get("pbrMetallicRoughness"))
+def pbr_of(material: dict[str, Any]) -> dict[str, Any]:
+    return dict_or_empty(material.get("pbrMetallicRoughness"))
 
 
 def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:
-    if any("gaussian_splatting" in name for name in _dict(primitive.get("extensions"))):
+    if any("gaussian_splatting" in name for name in dict_or_empty(primitive.get("extensions"))):
         raise document.error("holds Gaussian splats, not a mesh; read it with load_gaussians")
 
 
-def _dict(value: object) -> dict[str, Any]:
+def dict_or_empty(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
@@ -370,7 +373,7 @@ def _list(document: GltfDocument, value: object, what: str) -> list[Any]:
     return value
 
 
-def _objects(document: GltfDocument, value: object, what: str) -> list[dict[str, Any]]:
+def objects_in(document: GltfDocument, value: object, what: str) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(x, dict) for x in value):
         raise document.error(f"{what} must be an array of objects")
     return value

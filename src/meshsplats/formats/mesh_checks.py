@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats.binding import Binding
-from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning
 from meshsplats.mesh import SplatMesh
 
 _BASE_BYTES = 256 << 20
@@ -55,7 +55,7 @@ def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:
     result = np.ones((len(colors), 4), np.float32)
     if colors.shape[1] == 0:
         result[:, :3] = 0.5
-        warnings.warn(f"{path}: no vertex colours; the mesh is shown in grey", DataWarning, stacklevel=2)
+        warnings.warn(f"{path}: no vertex colours; the mesh is shown in grey", NoColorsWarning, stacklevel=2)
         return result
     if colors.dtype.kind == "u":
         result[:, : colors.shape[1]] = colors

@@ -72,7 +72,7 @@ def read_obj(path: Path) -> SplatMesh:
     up = np.array([0.0, 1.0, 0.0])
     positions, colors, lengths, corners = array("d"), array("d"), array("q"), array("q")
     with open(path, "rb") as file:
-        for number, words in _statements(file.read()):
+        for number, words in statements(file.read()):
             try:
                 if words[:3] == _UP_COMMENT.encode().split():
                     up = np.array([float(u) for u in words[3:6]])
@@ -104,7 +104,7 @@ def read_obj(path: Path) -> SplatMesh:
     )
 
 
-def _statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
+def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
     """The words of each line with its number; a backslash at the end joins the next line."""
     joined = b""
     for number, line in enumerate(data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n"), 1):

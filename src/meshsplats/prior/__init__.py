@@ -5,7 +5,7 @@ Binding and posing need NumPy alone; training (``train``) the extra ``finetune``
 
 from __future__ import annotations
 
-from meshsplats.prior.base import BaseMesh, Texture
+from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.prior.bind import bind
 from meshsplats.prior.model import LIFT, MeshPrior, load_prior
 from meshsplats.prior.training import train

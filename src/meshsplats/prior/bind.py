@@ -8,11 +8,11 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
 from meshsplats.dataset import View
 from meshsplats.errors import DataWarning
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior.base import BaseMesh
 from meshsplats.prior.model import MeshPrior
 from meshsplats.prior.pattern import MOST, counts_by_area, face_pattern
 from meshsplats.prior.photographs import colors_from_views

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats.base_mesh import BaseMesh
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior.base import BaseMesh
 
 LIFT = 2e-5
 """Distance between two layers in exported meshes, as a share of the diagonal of the base's box: enough for
