@@ -41,10 +41,10 @@ class FinetuneConfig:
     """Both rates fall exponentially over the whole length, to this share of what they were."""
     color_step_decay: float = 1.0
     """The colour rate is also multiplied by this after every step."""
-    beta1: float = 0.9
-    """Adam's memory of the gradient."""
-    beta2: float = 0.999
-    """Adam's memory of the gradient's square."""
+    beta1: float = 0.5
+    """Adam's memory of the gradient. Short: the next views look at other vertices, or from elsewhere."""
+    beta2: float = 0.9
+    """Adam's memory of the gradient's square. Short, for a vertex is seen tens of times, not thousands."""
     epsilon: float = 1e-15
     """Adam's smallest divisor."""
     ssim_weight: float = 0.4
@@ -143,6 +143,8 @@ _PAPER = FinetuneConfig(
     position_unit="scene",
     final_share=1.0,
     color_step_decay=0.999,
+    beta1=0.9,
+    beta2=0.999,
     ssim_weight=0.4,
     background="white",
     prune_epochs=10,
