@@ -88,8 +88,8 @@ def test_identity_the_picture_is_the_base(triangles):
 def test_one_triangle_a_face_has_the_bases_corners_to_the_last_bit():
     base = bumpy()
     mesh = bind(base).mesh
-    np.testing.assert_array_equal(mesh.vertices.reshape(-1, 3, 3), base.vertices[base.faces])
-    np.testing.assert_array_equal(mesh.colors.reshape(-1, 3, 4), base.colors[base.faces])
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], base.vertices[base.faces])
+    np.testing.assert_array_equal(mesh.colors[mesh.faces], base.colors[base.faces])
 
 
 def test_layers_come_from_the_highest_down_in_one_depth_group_a_face():
@@ -136,8 +136,8 @@ def test_colors_come_from_the_views_that_see_a_place():
     axis = np.abs(middle).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(middle, axis[:, None], 1)[:, 0] < 0)
     inner = np.abs(np.sort(np.abs(mesh.vertices), axis=1)[:, 1] - 0.5) > 1e-3  # corners and edges see several
-    color = mesh.colors.reshape(-1, 3, 4)[..., :3]
-    rows, corners = np.nonzero(inner.reshape(-1, 3))
+    color = mesh.colors[mesh.faces, :3]
+    rows, corners = np.nonzero(inner[mesh.faces])
     assert len(rows)
     np.testing.assert_allclose(color[rows, corners], wanted[side[rows]], atol=1e-6)
 

@@ -75,7 +75,9 @@ def test_projection_leaves_corners_edges_and_the_inside_alone():
 def test_the_gradient_of_weights_is_the_slope_along_the_face(spacing):
     """Against differences of a linear function of the positions, along directions that keep the sum."""
     prior = bind(cube(), triangles=4, layers=2, spacing=spacing)
-    binding, rng = prior.mesh.binding, np.random.default_rng(0)
+    rng = np.random.default_rng(0)
+    inside = rng.dirichlet((1, 1, 1), len(prior.mesh.vertices))
+    binding = replace(prior.mesh.binding, weights=inside)
     slope = rng.normal(size=prior.mesh.vertices.shape).astype(np.float32)
     rows = np.arange(0, len(slope), 3)
     found = BoundPositions(binding).gradient(slope, rows)
@@ -87,6 +89,49 @@ def test_the_gradient_of_weights_is_the_slope_along_the_face(spacing):
         np.testing.assert_allclose((found @ step)[rows], wanted[rows], atol=1e-6)
     others = np.setdiff1d(np.arange(len(slope)), rows)
     np.testing.assert_array_equal(found[others], 0)
+
+
+def test_what_is_on_an_edge_slides_along_it():
+    """Weights that are 0 have no gradient and stay 0, and the others go on as if they alone were there."""
+    base = bumpy(2)
+    mesh = bind(base, triangles=9).mesh
+    bound = BoundPositions(mesh.binding)
+    rng, rows = np.random.default_rng(1), np.arange(len(mesh.vertices))
+    slope = rng.normal(size=mesh.vertices.shape).astype(np.float32)
+    found = bound.gradient(slope, rows)
+    zero = mesh.binding.weights == 0
+    assert (found[zero] == 0).all()
+    assert np.abs(found.sum(axis=1)).max() < 1e-6
+    assert (found[zero.sum(axis=1) == 1] != 0).sum(axis=1).max() == 2
+    before = bound.weights.copy()
+    bound.weights += rng.normal(size=before.shape).astype(np.float32) * 0.3
+    positions = mesh.vertices.copy()
+    bound.settle(before, rows, positions)
+    after = bound.binding()
+    check_constraint(after)
+    assert (after.weights[zero] == 0).all()
+    np.testing.assert_array_equal(positions, after.positions())
+    np.testing.assert_array_equal(after.weights[zero.sum(axis=1) == 2], before[zero.sum(axis=1) == 2])
+    assert (after.weights != before).any()
+
+
+def test_training_opens_no_gaps(task):
+    """However far vertices go, an opaque layer goes on covering the base, but for folds."""
+    base, data = task
+    prior = bind(base, triangles=9)
+    config = make_config(steps=30, position_rate=0.02)
+    state = State.begin(prior.mesh, len(data.train), config, 1)
+    for step in range(30):
+        make_step(state, data.train, step, step / 30)
+    mesh = state.result()
+    moved = np.abs(mesh.binding.weights - prior.mesh.binding.weights).max(axis=1)
+    assert moved.max() > 0.02
+    solid = np.concatenate([mesh.colors[:, :3], np.ones((len(mesh.colors), 1))], axis=1)
+    for view in data.test:
+        before, after = (
+            render(replace(m, colors=solid), view.camera, threads=1).alpha for m in (prior.mesh, mesh)
+        )
+        np.testing.assert_allclose(after, before, atol=1e-5)
 
 
 def test_units_are_shares_of_the_face_whatever_its_shape():

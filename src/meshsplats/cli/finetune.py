@@ -55,8 +55,9 @@ STARTING_UP = 1.0
 """Seconds that Python and the libraries take before the command's own clock begins."""
 
 
-def _described(config: type[FinetuneConfig]) -> type[FinetuneConfig]:
-    """The choices of a configuration as options that may be left out; their docstrings are the help."""
+def _described(config: type[FinetuneConfig], standard: FinetuneConfig | None = None) -> type[FinetuneConfig]:
+    """The choices of a configuration as options that may be left out; their docstrings are the help. Values
+    that they have then are those of ``standard``, or the preset default's."""
     typed: dict[str, Any] = {}
     values: dict[str, Any] = {"__post_init__": lambda self: None}
     for name, hint in get_type_hints(config).items():
@@ -65,8 +66,10 @@ def _described(config: type[FinetuneConfig]) -> type[FinetuneConfig]:
         else:
             choices = "{" + ",".join(map(str, get_args(hint))) + "}"
             metavar = {int: "N", float: "X", bool: "{True,False}"}.get(hint, choices)
-            standard = f"(default preset: {getattr(FinetuneConfig, name)})"
-            typed[name] = Annotated[hint | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=standard)]
+            told = f"(default preset: {getattr(FinetuneConfig, name)})"
+            if standard is not None:
+                told = f"(default: {getattr(standard, name)})"
+            typed[name] = Annotated[hint | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=told)]
         values[name] = None
     about = "What is not given is left to the preset."
     made = type("TuningOptions", (config,), {"__annotations__": typed, "__doc__": about, **values})
@@ -232,7 +235,7 @@ class Finetune:
         config = self.configured()
         self.target.check()
         files = _Files(self.output)
-        self._check_files(files)
+        check_run_files(files, resume=self.resume, force=self.force)
         _need_torch()
         scene = load_scene(self.input, self.reading)
         background = (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
@@ -276,18 +279,6 @@ class Finetune:
             raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
         return make_config(self.preset, **given, **lengths)
 
-    def _check_files(self, files: _Files) -> None:
-        from meshsplats.finetuning.journal import CHECKPOINT
-
-        checkpoint = files.run / CHECKPOINT
-        if self.resume and not checkpoint.is_file():
-            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to begin anew")
-        if checkpoint.exists() and not (self.resume or self.force):
-            raise FileExistsError(
-                f"{checkpoint} is left from an earlier run: --resume goes on with it, --force begins anew"
-            )
-        check_outputs([files.mesh, files.config, files.preview], self.force)
-
     def _converted(self, cloud: GaussianCloud, dataset: Dataset) -> SplatMesh:
         start = self.preset if self.start == "same" else self.start
         cameras = [view.camera for view in dataset.train]
@@ -319,6 +310,21 @@ class Finetune:
         splats = f"--splats {shlex.quote(str(self.input))}"
         quoted = shlex.quote(str(files.mesh)), shlex.quote(str(files.mesh.with_suffix("")) + "-evaluation")
         print(f"next: meshsplats evaluate {quoted[0]} {data or splats} -o {quoted[1]}")
+
+
+def check_run_files(files: _Files, *, resume: bool, force: bool) -> None:
+    """Before the work: OSError if something would be overwritten, cannot be written, or is missing to go on
+    from."""
+    from meshsplats.finetuning.journal import CHECKPOINT
+
+    checkpoint = files.run / CHECKPOINT
+    if resume and not checkpoint.is_file():
+        raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to begin anew")
+    if checkpoint.exists() and not (resume or force):
+        raise FileExistsError(
+            f"{checkpoint} is left from an earlier run: --resume goes on with it, --force begins anew"
+        )
+    check_outputs([files.mesh, files.config, files.preview], force)
 
 
 @contextmanager

@@ -92,6 +92,9 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
     if len(mesh.vertices):
         found |= _extent(mesh.vertices, scene_bounds(mesh))
         found["opacity_5_50_95_percent"] = _quantiles(mesh.colors[:, 3])
+    if mesh.binding is not None:
+        base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"
+        found["bound_to_base_of"] = base
     return found | {
         "up": _rounded(mesh.up),
         "blending": mesh.blending,

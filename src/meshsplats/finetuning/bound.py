@@ -35,20 +35,29 @@ class BoundPositions:
         """(v, 3) float32 gradient of the weights from that of the ``positions`` (v, 3), for the chosen rows
         only; valid until the next call.
 
-        With x = sum_k w_k c_k it is g . c_k; of this the part along the plane sum w = 1 counts, which is
-        g . (c_k - c) with c the mean of the corners, wherever the origin lies.
+        With x = sum_k w_k c_k it is g . c_k. Of this the part counts that leaves the sum of the weights as it
+        is, and those at 0 there, which is g . (c_k - c) with c the mean of the corners with a weight; it is
+        the same wherever the origin lies.
         """
         for part in _portions(rows):
-            corners, along = self._corners[part], positions[part]
-            corners -= (corners[:, 0] + corners[:, 1] + corners[:, 2])[:, None] / np.float32(3)
-            self._gradient[part] = np.einsum("ikc,ic->ik", corners, along)
+            corners, along, free = self._corners[part], positions[part], self.weights[part] > 0
+            shares = free / np.maximum(free.sum(axis=1, keepdims=True), 1).astype(np.float32)
+            middle = sum(shares[:, k, None] * corners[:, k] for k in range(3))
+            for k in range(3):
+                slope = ((corners[:, k] - middle) * along).sum(axis=1)
+                self._gradient[part, k] = np.where(free[:, k], slope, 0)
         return self._gradient
 
-    def settle(self, rows: np.ndarray, positions: np.ndarray) -> None:
+    def settle(self, before: np.ndarray, rows: np.ndarray, positions: np.ndarray) -> None:
         """Moves the weights of the chosen rows to the nearest ones that are not negative and have the sum 1,
-        and ``positions`` (v, 3) with them."""
-        for part in _portions(rows):
-            settled = nearest_convex(self.weights[part])
+        and ``positions`` (v, 3) with them. ``before`` (r, 3) are their weights before the step.
+
+        What was 0 stays 0: a vertex on an edge of its face slides along it, and one in a corner stays there,
+        so that no gap opens between neighbours. Nothing in a picture's gradient would close it again.
+        """
+        for start in range(0, len(rows), _ROWS):
+            part, held = rows[start : start + _ROWS], before[start : start + _ROWS] == 0
+            settled = nearest_convex(np.where(held, np.float32(-10), self.weights[part]))
             self.weights[part] = settled
             corners, exact = self._corners[part], settled.astype(np.float64)
             positions[part] = sum(exact[:, k, None] * corners[:, k] for k in range(3))

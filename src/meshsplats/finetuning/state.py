@@ -151,9 +151,12 @@ class State:
             if self.bound is None:
                 self._positions.step(self.vertices.grad, reached)
             else:
-                rows = np.flatnonzero(reached)
-                self._positions.step(self.bound.gradient(self.vertices.grad.numpy(), rows), reached)
-                self.bound.settle(rows, self.vertices.detach().numpy())
+                # A vertex in a corner of its face has nowhere to go.
+                movable = reached & (self.bound.weights < 1).all(axis=1)
+                rows = np.flatnonzero(movable)
+                before = self.bound.weights[rows]
+                self._positions.step(self.bound.gradient(self.vertices.grad.numpy(), rows), movable)
+                self.bound.settle(before, rows, self.vertices.detach().numpy())
         if self._exposures is not None and self.exposures is not None and self.exposures.grad is not None:
             self._exposures.step(self.exposures.grad, np.array([view], np.int32))
             with torch.no_grad():

@@ -30,7 +30,7 @@ _WRITERS: dict[str, Callable[..., None]] = {
     ".obj": write_obj,
 }
 _GLB = (".glb",)
-_BOUND = (".npz", ".glb")
+BOUND_SUFFIXES = (".npz", ".glb")
 """Formats that keep the binding of a mesh prior."""
 _OPTION_SUFFIXES = {"lit": (*_GLB, *_USD), "color_type": _GLB, "alpha": _GLB, "compression": _GLB}
 
@@ -126,7 +126,7 @@ def save_mesh(
         if suffix not in _OPTION_SUFFIXES[name]:
             suffixes = ", ".join(_OPTION_SUFFIXES[name])
             raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
-    if mesh.binding is not None and (suffix not in _BOUND or "compression" in options):
+    if mesh.binding is not None and (suffix not in BOUND_SUFFIXES or "compression" in options):
         warnings.warn(
             f"{target.name}: the binding to a base mesh is left out; only .npz or .glb keep what later poses"
             " need",

@@ -8,6 +8,6 @@ from __future__ import annotations
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.prior.bind import bind
 from meshsplats.prior.model import LIFT, MeshPrior, load_prior
-from meshsplats.prior.training import train
+from meshsplats.prior.training import prior_config, train
 
-__all__ = ["LIFT", "BaseMesh", "MeshPrior", "Texture", "bind", "load_prior", "train"]
+__all__ = ["LIFT", "BaseMesh", "MeshPrior", "Texture", "bind", "load_prior", "prior_config", "train"]

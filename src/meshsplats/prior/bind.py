@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -39,10 +39,11 @@ def bind(
 ) -> MeshPrior:
     """Lays ``triangles`` triangles a layer on every face of ``base``.
 
-    Each layer covers each face exactly and begins with the base's colours. Triangles share no vertices: each
-    can go its own way on its face. Without ``spacing`` all layers lie in the base, and its picture is what
-    training begins with: the lowest layer is as opaque as the base, those above it are almost transparent.
-    In each face those of higher layers come first, as what is nearer does, and all share one depth group.
+    Each layer covers each face exactly and begins with the base's colours. Its triangles on a face share
+    vertices; those of different faces do not, so each face has colours of its own. Without ``spacing`` all
+    layers lie in the base, and its picture is what training begins with: the lowest layer is as opaque as
+    the base, those above it are almost transparent. In each face those of higher layers come first, as what
+    is nearer does, and all share one depth group.
 
     With ``spacing``, layers are shells: the base with its vertices moved along their normals. They begin
     translucent, and together can show what lies in the depth between them, for a base that is not where the
@@ -94,20 +95,20 @@ def bind(
             f"{total:,} triangles are more than the {MAX_TRIANGLES:,} that fit: use fewer a face, or a"
             " coarser base"
         )
-    face, weights, layer = _laid_out(solid, counts, layers)
-    vertex_face, vertex_layer = np.repeat(face, 3), np.repeat(layer, 3)
-    binding = Binding(base.vertices, base.faces, vertex_face, weights.reshape(-1, 3), vertex_layer, spacing)
+    laid = _laid_out(solid, counts, layers)
+    face = laid.vertex_face[laid.triangles[:, 0]]
+    binding = Binding(base.vertices, base.faces, laid.vertex_face, laid.weights, laid.layers, spacing)
     rgba = _colors(base, binding, source, views, threads)
+    depth_group = face
     if spacing and layers > 1:
         rgba[:, 3] *= SHELL_OPACITY
-        depth_group = face * np.int64(layers) + layer
-        depth_group = np.unique(depth_group, return_inverse=True)[1].reshape(-1)
+        shells = face * np.int64(layers) + laid.layers[laid.triangles[:, 0]]
+        depth_group = np.unique(shells, return_inverse=True)[1].reshape(-1).astype(np.int32)
     else:
-        rgba[vertex_layer > 0, 3] *= LAYER_OPACITY
-        depth_group = face
+        rgba[laid.layers > 0, 3] *= LAYER_OPACITY
     mesh = SplatMesh(
         binding.positions(),
-        np.arange(3 * total, dtype=np.int32).reshape(-1, 3),
+        laid.triangles,
         rgba,
         face_splat=face,
         normals=binding.normals(),
@@ -118,25 +119,37 @@ def bind(
     return MeshPrior(mesh)
 
 
-def _laid_out(
-    faces: np.ndarray, counts: np.ndarray, layers: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each triangle: its base face (f,), its corners' weights (f, 3, 3) and its layer (f,). By face, then
-    from the highest layer down."""
-    owners, weights, levels = [], [], []
+class _Laid(NamedTuple):
+    triangles: np.ndarray
+    """(f, 3) int32 vertices, by face, then from the highest layer down."""
+    vertex_face: np.ndarray
+    """(v,) int32."""
+    weights: np.ndarray
+    """(v, 3) float32."""
+    layers: np.ndarray
+    """(v,) int32."""
+
+
+def _laid_out(faces: np.ndarray, counts: np.ndarray, layers: int) -> _Laid:
+    """Patterns of ``counts`` (m,) triangles on the base's ``faces`` (m,), once for each layer. Triangles of a
+    face and layer share vertices; others do not."""
+    triangles, owners, weights, levels = [], [], [], []
+    start = 0
     for count in np.unique(counts):
-        here = faces[counts == count]
-        pattern = face_pattern(int(count))
-        owners.append(np.repeat(here, count * layers))
-        weights.append(np.tile(pattern, (len(here) * layers, 1, 1)))
-        levels.append(np.tile(np.repeat(np.arange(layers - 1, -1, -1), count), len(here)))
-    owner = np.concatenate(owners)
-    order = np.argsort(owner, kind="stable")
-    return (
-        owner[order].astype(np.int32),
-        np.concatenate(weights)[order],
-        np.concatenate(levels)[order].astype(np.int32),
-    )
+        here = faces[counts == count].astype(np.int32)
+        corners, numbers = np.unique(face_pattern(int(count)).reshape(-1, 3), axis=0, return_inverse=True)
+        copies, size = len(here) * layers, len(corners)
+        first = start + size * np.arange(copies, dtype=np.int64)[:, None, None]
+        triangles.append((first + numbers.reshape(1, -1, 3)).reshape(-1, 3))
+        owners.append(np.repeat(here, size * layers))
+        weights.append(np.tile(corners, (copies, 1)))
+        levels.append(np.tile(np.repeat(np.arange(layers - 1, -1, -1, dtype=np.int32), size), len(here)))
+        start += size * copies
+    if start > np.iinfo(np.int32).max:
+        raise ValueError(f"{start:,} vertices are more than a mesh can number; use fewer triangles a face")
+    owner, every = np.concatenate(owners), np.concatenate(triangles)
+    order = np.argsort(owner[every[:, 0]], kind="stable")
+    return _Laid(every[order].astype(np.int32), owner, np.concatenate(weights), np.concatenate(levels))
 
 
 def _source(base: BaseMesh, colors: Source, views: Sequence[View]) -> Source:

@@ -47,6 +47,12 @@ class MeshPrior:
         return self.mesh.binding.base_faces
 
     @property
+    def lift(self) -> float:
+        """Scene units from one layer to the next, below 0 inwards; 0: all lie in the base."""
+        assert self.mesh.binding is not None
+        return self.mesh.binding.lift
+
+    @property
     def export_lift(self) -> float:
         """Scene units between two layers that exported meshes are given where the prior's own layers are
         coplanar: ``LIFT`` times the diagonal of the box round the base."""

@@ -1,0 +1,136 @@
+"""What a mesh prior gains: PSNR on held-out views, against the same base drawn opaque and against fan mode.
+
+    python benchmarks/prior.py --data ../shared/data --steps 200
+    python benchmarks/prior.py --data ../shared/data --steps 400 --only 'layers=6 spacing=-0.02'
+
+The base is a visual hull (`meshes/lego_visual_hull_40k_vertexcolor.ply`), the pictures `photos/lego`, with its
+own 40 test views. Rows: the base opaque with the vertex colours it came with; the same with its vertex colours
+optimised by the same losses, rates and number of steps (positions and opacity fixed); priors of several forms;
+and the fans of splats that were trained on the same photographs, fine-tuned. Seconds are processor time of the
+steps alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import meshsplats as ms
+from meshsplats.finetuning import make_config, starting_mesh
+from meshsplats.finetuning.config import FinetuneConfig, rates
+from meshsplats.finetuning.state import State
+from meshsplats.finetuning.tuning import kept_faces, loss_of, make_step, target_of, view_of_step
+from meshsplats.formats.base_meshes import load_base
+from meshsplats.prior import bind, prior_config
+from meshsplats.rendering.autograd import rasterize
+
+FORMS = (
+    "triangles=1",
+    "triangles=4",
+    "triangles=9",
+    "triangles=1 layers=2",
+    "triangles=4 layers=2",
+    "layers=2 spacing=-0.03",
+    "layers=4 spacing=-0.02",
+    "layers=6 spacing=-0.02",
+    "triangles=4 layers=4 spacing=-0.02",
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True, help="folder of the real data")
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--test-every", type=int, default=1, help="judge by every n-th test view only")
+    parser.add_argument("--only", nargs="+", help="forms such as 'triangles=4 layers=2'; baseline; fans")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    data = ms.load_dataset(options.data / "photos/lego")
+    judged = ms.Dataset((), data.test[:: options.test_every])
+    base = load_base(options.data / "meshes/lego_visual_hull_40k_vertexcolor.ply")
+    config = prior_config(steps=options.steps)
+
+    def row(name: str, mesh: ms.SplatMesh, steps: int, seconds: float) -> None:
+        scores = ms.evaluate(mesh, judged, threads=options.threads).methods[0]
+        psnr, ssim = scores.mean("psnr"), scores.mean("ssim")
+        print(
+            f"| {name} | {len(mesh.faces):,} | {steps} | {seconds:.0f} | {psnr:.2f} | {ssim:.4f} |",
+            flush=True,
+        )
+
+    wanted = options.only or ["baseline", *FORMS, "fans"]
+    print("| form | triangles | steps | processor s | PSNR | SSIM |\n|---|---|---|---|---|---|", flush=True)
+    if "baseline" in wanted:
+        opaque = ms.SplatMesh(base.vertices, base.faces, base.colors)
+        row("base, opaque, its own colours", opaque, 0, 0)
+        for name, loss in (
+            ("", config),
+            (", loss of 3DGS", make_config(steps=options.steps, color_rate=0.05)),
+        ):
+            tuned, seconds = opaque_colors(opaque, data, loss, options.threads)
+            row(f"base, opaque, vertex colours optimised{name}", tuned, options.steps, seconds)
+    for form in wanted:
+        if "=" in form:
+            laid = {
+                k: float(v) if "." in v else int(v) for k, v in (part.split("=") for part in form.split())
+            }
+            mesh = bind(base, views=data.train, threads=options.threads, **laid).mesh
+            row(f"prior, {form}", *trained(mesh, data, config, options.threads))
+    if "fans" in wanted:
+        cloud = ms.load_gaussians(options.data / "splats/trained/lego_60k_sh0.ply")
+        mesh = starting_mesh(cloud, [view.camera for view in data.train])
+        row("fans of 60,000 splats", *trained(mesh, data, make_config(steps=options.steps), options.threads))
+
+
+def trained(
+    mesh: ms.SplatMesh, data: ms.Dataset, config: FinetuneConfig, threads: int
+) -> tuple[ms.SplatMesh, int, float]:
+    """``mesh`` after all steps, their number, and their processor time."""
+    state = State.begin(mesh, len(data.train), config, threads)
+    steps, interval = config.total_steps(len(data.train)) or 0, config.prune_interval(len(data.train))
+    start = time.process_time()
+    for step in range(steps):
+        make_step(state, data.train, step, step / steps)
+        if interval and (step + 1) % interval == 0 and step + 1 < steps:
+            state = state.prune(kept_faces(state, data.train))
+    return state.result(), steps, time.process_time() - start
+
+
+def opaque_colors(
+    mesh: ms.SplatMesh, data: ms.Dataset, config: FinetuneConfig, threads: int
+) -> tuple[ms.SplatMesh, float]:
+    """``mesh`` with its vertex colours optimised, all of it opaque and where it was."""
+    vertices = torch.from_numpy(mesh.vertices.copy())
+    colors = torch.from_numpy(mesh.colors[:, :3].copy()).requires_grad_(True)
+    ones = torch.ones(len(colors), 1)
+    adam = torch.optim.Adam([colors], betas=(config.beta1, config.beta2), eps=config.epsilon)
+    steps = config.total_steps(len(data.train)) or 0
+    start = time.process_time()
+    for step in range(steps):
+        view = data.train[view_of_step(config, step, len(data.train))]
+        target = target_of(view, config, step)
+        rgba = torch.cat([colors, ones], 1)
+        drawn = rasterize(
+            vertices, mesh.faces, rgba, view.camera, background=target.background, threads=threads
+        )
+        adam.param_groups[0]["lr"] = rates(config, step, step / steps)[0]
+        adam.zero_grad()
+        loss_of(drawn.color, target, config, threads).backward()
+        adam.step()
+        with torch.no_grad():
+            colors.clamp_(0, 1)
+    seconds = time.process_time() - start
+    rgba = np.concatenate([colors.detach().numpy(), np.ones((len(colors), 1), np.float32)], axis=1)
+    return replace(mesh, colors=rgba), seconds
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""``meshsplats deform``: the splats of a mesh prior moved to an edited base."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import Number, Output, check_outputs, plural, size_of, track
+from meshsplats.mesh import SplatMesh
+
+
+@dataclass(frozen=True)
+class Deform:
+    """Moves splats with the mesh that they are bound to; nothing is trained.
+
+    Several bases, the frames of an animation say, give a file each.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """What 'meshsplats prior' wrote: .npz or .glb."""
+    base: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE...")]
+    """The edited base, or several: the same vertices and faces in the same order, at other places."""
+    output: Output
+    """The moved splats: .glb, .npz (both can be moved again), .ply, .usdc, .obj. With several bases the files
+    are numbered: edited.glb becomes edited_0001.glb, edited_0002.glb ..."""
+    lift: Number = None
+    """Scene units from one layer to the next along the normals. Default: the prior's own spacing; where its
+    layers are coplanar, 0 for .npz and 1/50000 of the base's diagonal for other formats, whose readers do not
+    know the order of coplanar layers."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.formats.base_meshes import load_base
+        from meshsplats.formats.meshes import MESH_SUFFIXES
+        from meshsplats.prior import load_prior
+
+        start = time.perf_counter()
+        if self.output.suffix.lower() not in MESH_SUFFIXES:
+            raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
+        if not self.base:
+            raise UsageError("give the edited base with --base")
+        targets = self.targets()
+        check_outputs(targets, self.force)
+        prior = load_prior(self.input)
+        bases = [load_base(path, textures=False) for path in self.base]
+        for path, base in zip(self.base, bases, strict=True):  # all, before anything is written
+            try:
+                prior.check_topology(base)
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
+        lift = self.lift
+        if lift is None and self.output.suffix.lower() != ".npz" and not prior.lift:
+            lift = prior.export_lift
+        for base, target in track(list(zip(bases, targets, strict=True)), "moving", len(targets)):
+            _save(prior.pose(base.vertices, lift=lift), target)
+        seconds = time.perf_counter() - start
+        if self.json:
+            files = [str(target) for target in targets]
+            print(
+                json.dumps({"files": files, "triangles": len(prior.mesh.faces), "seconds": round(seconds, 3)})
+            )
+            return
+        more = f" to {targets[-1]}" if len(targets) > 1 else ""
+        print(
+            f"{targets[0]}{more} ({plural(len(prior.mesh.faces), 'triangle')}, {size_of(targets[0])}):"
+            f" {plural(len(targets), 'pose')} in {seconds:.2f} s"
+        )
+
+    def targets(self) -> list[Path]:
+        """Where each base's splats go."""
+        if len(self.base) == 1:
+            return [self.output]
+        width = max(4, len(str(len(self.base))))
+        stem, suffix = self.output.stem, self.output.suffix
+        return [self.output.with_name(f"{stem}_{i:0{width}d}{suffix}") for i in range(1, len(self.base) + 1)]
+
+
+def _save(mesh: SplatMesh, target: Path) -> None:
+    from dataclasses import replace
+
+    from meshsplats.formats.meshes import BOUND_SUFFIXES, save_mesh
+
+    # Where there is no place for the binding, that is what was asked for.
+    bound = target.suffix.lower() in BOUND_SUFFIXES
+    save_mesh(mesh if bound else replace(mesh, binding=None), target)

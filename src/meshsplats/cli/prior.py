@@ -1,0 +1,233 @@
+"""``meshsplats prior``: splats on a classical mesh, trained on photographs or on splats."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import signal
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import tyro
+
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.camera import Camera
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import (
+    Count,
+    File,
+    Number,
+    Output,
+    SplatOptions,
+    configuration,
+    size_of,
+    write_json,
+)
+from meshsplats.cli.finetune import (
+    STARTING_UP,
+    TargetOptions,
+    _described,
+    _draw_preview,
+    _Files,
+    _need_torch,
+    _say,
+    _shown,
+    check_run_files,
+)
+from meshsplats.dataset import Dataset
+from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
+from meshsplats.finetuning.memory import available_memory, check_memory, readable
+from meshsplats.framing import guess_up
+from meshsplats.mesh import SplatMesh
+from meshsplats.prior import MeshPrior, bind, prior_config, train
+
+SUFFIXES = (".npz", ".glb")
+
+if TYPE_CHECKING:
+    _Training = FinetuneConfig
+else:
+    _Training = _described(FinetuneConfig, prior_config())
+
+
+@dataclass(frozen=True)
+class LayOptions:
+    """How splats are laid on the base."""
+
+    triangles: int = 1
+    """Triangles on each face, in each layer: 1 to 256; square numbers fit without T-junctions."""
+    by_area: bool = False
+    """So many on average, more on larger faces."""
+    layers: int = 1
+    """Layers of triangles on each face: 1 to 16."""
+    spacing: float = 0.0
+    """Scene units from one layer to the next along the base's normals; below 0 inwards, as for a base that
+    encloses its subject. 0: all layers lie in the base."""
+    colors: Literal["auto", "texture", "vertices", "views", "grey"] = "auto"
+    """Where colours begin: the base's texture, its vertex colours, the pictures that see a place most
+    squarely; auto: the first of these that there is."""
+    texture: File = None
+    """Picture that is laid on the base by its texture coordinates, where its file names none."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Lays splats on a mesh and optimises them until they look like photographs, or like other splats.
+
+    They stay bound to the mesh: 'meshsplats deform' moves them as the mesh is edited. Beside the result: its
+    configuration, a preview picture, and a folder NAME.run with metrics, previews and a checkpoint, from
+    which --resume goes on.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Base mesh: .obj, .ply, .glb, .gltf, .npz, USD. In the frame of the photographs or splats."""
+    output: Output
+    """The result with its binding to the base: .npz, which keeps everything exactly, or .glb."""
+    splats: File = None
+    """Splats to learn from, in place of --data: a file or a model folder."""
+    epochs: Number = None
+    """Length: so many times all training views."""
+    steps: Count = None
+    """Length: so many steps."""
+    minutes: Number = None
+    """Length: so much time for the whole command."""
+    resume: bool = False
+    """Go on where an interrupted run of the same command stopped."""
+    laying: LayOptions = field(default_factory=LayOptions)
+    target: TargetOptions = field(default_factory=TargetOptions)
+    tuning: _Training = field(default_factory=_Training)
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    report_every: int = 100
+    """Steps from one score on held-out views to the next."""
+    preview_every: int = 500
+    """Steps from one preview picture of the run to the next; 0: none."""
+    threads: Count = None
+    """At most N threads. Default: all processors."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> int:
+        from meshsplats.formats.base_meshes import load_base
+        from meshsplats.formats.meshes import save_mesh
+
+        began = time.perf_counter() - STARTING_UP
+        config = self.configured()
+        self._check()
+        files = _Files(self.output)
+        check_run_files(files, resume=self.resume, force=self.force)
+        _need_torch()
+        wants_texture = self.laying.colors in ("auto", "texture")
+        base = load_base(self.input, texture=self.laying.texture, textures=wants_texture)
+        dataset = self._dataset(base, config)
+        up = guess_up(SplatMesh(base.vertices, base.faces, _grey(base), up=base.up), _cameras(dataset))
+        laid = {name: getattr(self.laying, name) for name in ("triangles", "by_area", "layers", "spacing")}
+        prior = bind(
+            replace(base, up=up),
+            **laid,
+            colors=self.laying.colors,
+            views=dataset.train,
+            threads=self.threads,
+        )
+        needed = check_memory(prior.mesh, dataset, cache_bytes=self.target.cache_bytes)
+        free = available_memory()
+        _say(
+            f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles;"
+            f" {len(dataset.train)} training views, {len(dataset.test)} held out; memory: about"
+            f" {readable(needed)}" + (f" of {readable(free)} free" if free else "")
+        )
+        options = RunOptions(
+            folder=files.run,
+            resume=self.resume,
+            report_every=self.report_every,
+            preview_every=self.preview_every,
+            threads=self.threads,
+            spent=time.perf_counter() - began,
+            cache_bytes=self.target.cache_bytes,
+        )
+        try:
+            with _shown() as show:
+                trained = train(prior, dataset, config, run=options, on_progress=show)
+        except Interrupted as stop:
+            _say(f"stopped after step {stop.step:,}; the checkpoint is in {files.run}: the same command with")
+            _say("  --resume goes on from there")
+            return 128 + (stop.signal or signal.SIGINT)
+        save_mesh(exported(trained, files.mesh), files.mesh)
+        write_json(files.config, configuration("prior", self) | {"tuning": config.to_dict()})
+        _draw_preview(trained.mesh, files.preview)
+        self._tell(files, trained, time.perf_counter() - began)
+        return 0
+
+    def configured(self) -> FinetuneConfig:
+        """The configuration with what was given."""
+        given = {k: v for k, v in asdict(self.tuning).items() if v is not None}
+        lengths = {name: getattr(self, name) for name in ("epochs", "steps", "minutes")}
+        lengths = {name: value for name, value in lengths.items() if value is not None}
+        if len(lengths) > 1:
+            raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
+        return prior_config(**given, **lengths)
+
+    def _check(self) -> None:
+        """UsageError for options that contradict each other or would do nothing."""
+        if self.output.suffix.lower() not in SUFFIXES:
+            known = " or ".join(SUFFIXES)
+            raise UsageError(f"-o must end in {known}, which keep the binding, got {self.output.name!r}")
+        if (self.splats is None) == (self.target.data is None):
+            raise UsageError("give photographs with --data, or splats with --splats, to learn from")
+        if self.laying.texture is not None and self.laying.colors not in ("auto", "texture"):
+            raise UsageError(f"--texture has no effect with --colors {self.laying.colors}")
+        if self.laying.spacing and self.laying.layers == 1:
+            raise UsageError("--spacing has no effect with one layer; give --layers")
+        self.target.check()
+
+    def _dataset(self, base: BaseMesh, config: FinetuneConfig) -> Dataset:
+        background = (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
+        if self.splats is None:
+            mesh = SplatMesh(base.vertices, base.faces, _grey(base))
+            return self.target.make(mesh, self.input, background, self.threads)
+        return self.target.make(self.reading.load(self.splats), self.splats, background, self.threads)
+
+    def _tell(self, files: _Files, trained: MeshPrior, seconds: float) -> None:
+        from meshsplats.finetuning.journal import Journal
+
+        lines = Journal(files.run).metrics()
+        scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
+        result = {
+            "mesh": str(files.mesh),
+            "steps": lines[-1]["step"] if lines else 0,
+            "seconds": round(seconds, 2),
+            "base_faces": len(trained.base_faces),
+            "triangles": len(trained.mesh.faces),
+            "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
+            "run": str(files.run),
+        }
+        if self.json:
+            print(json.dumps(result, indent=1))
+            return
+        size = f"{size_of(files.mesh)}, {result['triangles']:,} triangles on {result['base_faces']:,} faces"
+        print(
+            f"{files.mesh} ({size}): {result['steps']:,} steps in {seconds:.1f} s"
+            + (f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else "")
+        )
+        print(f"preview: {files.preview}; metrics: {files.run}/metrics.jsonl")
+        print(f"next: edit {self.input}, moving its vertices, and")
+        print(f"  meshsplats deform {shlex.quote(str(files.mesh))} --base edited.obj -o edited.glb")
+
+
+def exported(prior: MeshPrior, path: Path) -> SplatMesh:
+    """The mesh of ``prior`` as it stands, for the format of ``path``: layers that are coplanar are set apart
+    by ``export_lift`` where other programs are to draw them."""
+    if path.suffix.lower() == ".npz":
+        return prior.mesh
+    return prior.pose(lift=prior.export_lift)
+
+
+def _grey(base: BaseMesh) -> np.ndarray:
+    return np.full((len(base.vertices), 4), 0.5, np.float32)
+
+
+def _cameras(dataset: Dataset) -> list[Camera]:
+    return [view.camera for view in dataset.train]
