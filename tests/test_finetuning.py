@@ -72,6 +72,19 @@ def test_held_out_pictures_get_better_and_the_loss_falls(scene):
     assert set(tuned.face_splat) <= set(mesh.face_splat)
 
 
+def test_soft_edges_stay_soft(scene):
+    """Rims keep the opacity 0 while all else moves; without the rule they drift up."""
+    _, dataset, mesh = scene
+    clear = mesh.colors[:, 3] == 0
+    assert clear.any()
+    held = finetune(mesh, dataset, make_config(epochs=2, prune_epochs=0))
+    assert (held.colors[clear, 3] == 0).all()
+    assert (held.colors[clear, :3] != mesh.colors[clear, :3]).any()
+    assert (held.vertices[clear] != mesh.vertices[clear]).any()
+    free = finetune(mesh, dataset, make_config(epochs=2, prune_epochs=0, soft_edges=False))
+    assert (free.colors[clear, 3] > 0).mean() > 0.2
+
+
 @pytest.mark.parametrize("preset", ["paper", "published"])
 def test_the_papers_presets_improve_its_conversion(scene, preset):
     cloud, dataset, _ = scene

@@ -20,6 +20,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import memory
 from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, rates
+from meshsplats.finetuning.edges import on_open_edges
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
 from meshsplats.finetuning.sizes import vertex_sizes
@@ -44,6 +45,7 @@ def test_presets_are_pinned():
         assert (preset.color_step_decay, preset.final_share) == (0.999, 1)
         assert (preset.background, preset.position_unit, preset.exposure) == ("white", "scene", False)
         assert (preset.beta1, preset.beta2, preset.epsilon) == (0.9, 0.999, 1e-8)
+        assert preset.soft_edges is False
     assert PRESETS["default"] == FinetuneConfig()
 
 
@@ -138,6 +140,18 @@ def test_sizes_of_a_real_mesh_are_those_of_its_splats():
     first = mesh.faces[np.searchsorted(mesh.face_splat, np.arange(200)), 0]
     spread = np.log(sizes[first] / np.sort(cloud.scales, axis=1)[:, 1])
     assert spread.std() < 0.5
+
+
+def test_open_edges_are_those_of_one_triangle():
+    tetrahedron = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], np.int32)
+    assert not on_open_edges(tetrahedron, 4).any()
+    assert on_open_edges(tetrahedron[:1], 4).tolist() == [True, True, True, False]
+    assert not on_open_edges(np.zeros((0, 3), np.int32), 0).any()
+    mesh = convert(make_scene(200), mode="flat")
+    rims = on_open_edges(mesh.faces, len(mesh.vertices))
+    assert np.array_equal(np.flatnonzero(~rims), np.arange(200) * 9)  # all but the centres
+    shuffled = np.roll(mesh.faces[::-1], 1, axis=1)
+    assert np.array_equal(on_open_edges(shuffled, len(mesh.vertices)), rims)
 
 
 def test_each_preset_begins_with_its_conversion():

@@ -37,6 +37,9 @@ class FinetuneConfig:
     """Adam's rate of the positions, in ``position_unit``; 0: they stay."""
     position_unit: Unit = "splat"
     """splat: the size of the splat that a vertex belongs to. scene: scene units, as the paper has it."""
+    soft_edges: bool = True
+    """Opacities that are 0 at the mesh's open edges, as on the rims of fans, stay 0. An edge that shows has
+    no gradient that would move it back, and opacities, which cannot fall below 0, would drift up there."""
     final_share: float = 0.1
     """Both rates fall exponentially over the whole length, to this share of what they were."""
     color_step_decay: float = 1.0
@@ -92,8 +95,9 @@ class FinetuneConfig:
         ]:
             if getattr(self, name) not in kind:
                 raise ValueError(f"{name} must be one of {', '.join(kind)}, got {getattr(self, name)!r}")
-        if not isinstance(self.exposure, bool):
-            raise ValueError(f"exposure must be True or False, got {self.exposure!r}")
+        for name in ("exposure", "soft_edges"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
@@ -141,6 +145,7 @@ _PAPER = FinetuneConfig(
     color_rate=5e-3,
     position_rate=math.exp(-3) * 5e-3,
     position_unit="scene",
+    soft_edges=False,
     final_share=1.0,
     color_step_decay=0.999,
     beta1=0.9,

@@ -13,6 +13,7 @@ from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.edges import on_open_edges
 from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.mesh import SplatMesh
 
@@ -60,6 +61,8 @@ class State:
             unit = sizes if config.position_unit == "splat" else None
             self._positions = adam(self.vertices, lr=1.0, scale=unit)
         self._colors = adam(self.colors, lr=1.0, bounds=(0, 1))
+        # Of the triangles alone, so that a resumed run has the same.
+        self._edges = on_open_edges(mesh.faces, len(mesh.vertices)) if config.soft_edges else None
         self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
 
     @classmethod
@@ -144,8 +147,12 @@ class State:
         assert self.vertices.grad is not None
         # Nothing in a picture moves without its opacity mattering; one column is quick to look through.
         reached = self.colors.grad[:, 3].numpy() != 0
+        opacity = self.colors.detach().numpy()[:, 3]
+        clear = None if self._edges is None else self._edges & (opacity == 0)
         self._colors.lr = color_rate
         self._colors.step(self.colors.grad, reached)
+        if clear is not None:
+            opacity[clear] = 0
         if position_rate > 0:
             self._positions.lr = position_rate
             if self.bound is None:
