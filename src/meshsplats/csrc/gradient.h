@@ -33,9 +33,9 @@ class GradientTile {
         area_ = TileArea(grid_, tile_x, tile_y);
         if (log.steps.empty() || !load_given()) return;
         set_up(log);
-        const int64_t n = (int64_t)fragments_.size(), chunks = (n + CHUNK - 1) / CHUNK;
-        // The light that comes through to each fragment is found from the front and kept for a chunk of them.
-        before_.resize((size_t)std::min<int64_t>(n, CHUNK));
+        const int64_t n = fragment_count_, chunks = (n + CHUNK - 1) / CHUNK;
+        // The light that reaches each fragment is found from the front and kept for a chunk of them.
+        if (found_.size() < (size_t)std::min<int64_t>(n, CHUNK)) found_.resize((size_t)std::min<int64_t>(n, CHUNK));
         starts_.resize((size_t)chunks * SAMPLES);
         for (int i = 0; i < SAMPLES; ++i) through_[i] = 1;
         for (int64_t chunk = 0; chunk < chunks; ++chunk) {
@@ -52,17 +52,16 @@ class GradientTile {
             else
                 back<false>(chunk * CHUNK, std::min(n, (chunk + 1) * CHUNK));
         }
-        for (size_t first = 0; first < triangles_.size(); first += Triangles::N)
-            finish(first, (int)std::min<size_t>(Triangles::N, triangles_.size() - first), out, out_attributes);
+        out.resize(triangles_.size());
+        out_attributes.reserve(triangles_.size() * extra_ * 3);
+        for (size_t i = 0; i < triangles_.size(); ++i) finish(i, out[i], out_attributes);
     }
 
   private:
     static constexpr int64_t CHUNK = 1 << 14;
-    enum { SUMS = 5 };  // z g of r, g, b, a and z g v
-
-    // A triangle's fragments in a block: lane 4 i + column for rgba and sums of all lanes for v, times 1, x and y.
+    // Row c: sums of z g of channel c of RGBA, times 1, x and y; last column: the same of z g v.
     struct Moments {
-        Lanes rgba[3], v[3];
+        alignas(64) float sum[4][4];
     };
     // The samples of a block that take a fragment of one triangle.
     struct Fragment {
@@ -76,8 +75,15 @@ class GradientTile {
         alignas(16) float low[4], high[4], first[4];
         float qa, qb, qc, q_min, q_max;
         float x0, y0;
-        float s[3][3];  // 1 / depth times the corners' weights: the matrix A
-        int32_t face;
+    };
+    // What only its corners need.
+    struct Corners {
+        alignas(16) float apart[2][4];  // RGBA of the other two minus that of the first
+        alignas(16) float s[3][4];      // a, b, c of 1 / depth times the weight of each: the matrix A
+        int32_t vertex[3];
+    };
+    struct Found {
+        Lanes z, light;  // depth; the light that reaches the fragment, times depth, 0 where there is none
     };
     struct Plane {
         float a, b, c, low, high, first;
@@ -117,13 +123,20 @@ class GradientTile {
     // Makes the triangles ready that the log names.
     void set_up(const TileLog &log) {
         place_.assign(log.faces.size(), -1);
-        fragments_.clear();
-        for (const TileLog::Step &step : log.steps)
-            log.for_pieces(step.first, step.count, step.lanes, [&](uint32_t triangle, uint32_t lanes) {
-                place_[triangle] = 0;
-                fragments_.push_back({(int32_t)triangle, (uint16_t)lanes, step.block});
-            });
+        size_t n = 0;
+        for (const TileLog::Step &step : log.steps) {
+            if (fragments_.size() < n + step.count) fragments_.resize(std::max(n + step.count, 2 * n));
+            for (uint32_t i = step.first; i < step.first + step.count; ++i) {
+                const TileLog::Piece &piece = log.pieces[i];
+                const uint32_t lanes = piece.lanes & step.lanes;
+                fragments_[n] = {(int32_t)piece.triangle, (uint16_t)lanes, step.block};
+                place_[piece.triangle] &= lanes ? 0 : -1;
+                n += lanes != 0;
+            }
+        }
+        fragment_count_ = (int64_t)n;
         triangles_.clear();
+        corners_.clear();
         planes_.clear();
         int held = 0;
         int32_t numbers[Triangles::N];
@@ -144,7 +157,7 @@ class GradientTile {
             }
         }
         if (held) set_up_held(log, numbers, held);
-        for (Fragment &f : fragments_) f.place = place_[f.place];
+        for (int64_t i = 0; i < fragment_count_; ++i) fragments_[i].place = place_[fragments_[i].place];
         moments_.assign(triangles_.size(), Moments{});
         extra_sums_.assign(triangles_.size() * extra_ * 3, 0.0f);
     }
@@ -154,7 +167,9 @@ class GradientTile {
         for (int k = 0; k < held; ++k) {
             place_[numbers[k]] = (int32_t)triangles_.size();
             triangles_.emplace_back();
+            corners_.emplace_back();
             Prepared &p = triangles_.back();
+            Corners &corners = corners_.back();
             const Triangles &t = batch_;
             const f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
             auto mix = [&](float *out, const float s[3][Triangles::N]) {
@@ -166,6 +181,8 @@ class GradientTile {
             store4(p.low, min4(min4(c[0], c[1]), c[2]));
             store4(p.high, max4(max4(c[0], c[1]), c[2]));
             store4(p.first, c[0]);
+            store4(corners.apart[0], c[1] - c[0]);
+            store4(corners.apart[1], c[2] - c[0]);
             p.qa = t.qa[k];
             p.qb = t.qb[k];
             p.qc = t.qc[k];
@@ -173,17 +190,15 @@ class GradientTile {
             p.q_max = t.q_max[k];
             p.x0 = (float)origin_x_[k];
             p.y0 = (float)origin_y_[k];
-            p.face = t.face[k];
+            const int32_t *vertex = mesh_.faces + 3 * (int64_t)t.face[k];
             for (int i = 0; i < 3; ++i) {
-                p.s[i][0] = t.sa[i][k];
-                p.s[i][1] = t.sb[i][k];
-                p.s[i][2] = t.sc[i][k];
+                store4(corners.s[i], f4{t.sa[i][k], t.sb[i][k], t.sc[i][k], 0});
+                corners.vertex[i] = vertex[i];
             }
             for (int c = 0; c < extra_; ++c) {
-                const int32_t *corner = mesh_.faces + 3 * (int64_t)p.face;
                 Plane plane{0, 0, 0, 0, 0, 0};
                 for (int i = 0; i < 3; ++i) {
-                    const float v = mesh_.attributes[(int64_t)corner[i] * extra_ + c];
+                    const float v = mesh_.attributes[(int64_t)vertex[i] * extra_ + c];
                     plane.a += t.sa[i][k] * v;
                     plane.b += t.sb[i][k] * v;
                     plane.c += t.sc[i][k] * v;
@@ -216,8 +231,9 @@ class GradientTile {
                 t.rgba[i][k] = mesh_.colors + 4 * (int64_t)corner[i];
             }
             // Whole numbers: the distances of samples from it are exact.
-            origin_x_[k] = std::floor(std::min(std::max(sum_x / in_front, 0.0), (double)TILE));
-            origin_y_[k] = std::floor(std::min(std::max(sum_y / in_front, 0.0), (double)TILE));
+            const double share = in_front == 3 ? 1.0 / 3 : 1.0 / std::max(in_front, 1);
+            origin_x_[k] = std::floor(std::min(std::max(sum_x * share, 0.0), (double)TILE));
+            origin_y_[k] = std::floor(std::min(std::max(sum_y * share, 0.0), (double)TILE));
             for (int i = 0; i < 3; ++i) {
                 const Projected &p = scene_.vertices[corner[i]];
                 t.x[i][k] = p.x - (area_.x0 + origin_x_[k]);
@@ -249,7 +265,7 @@ class GradientTile {
         return clamp(linear * z, lanes(t.low[channel]), lanes(t.high[channel]));
     }
 
-    // Notes the light before each fragment, as the picture was drawn.
+    // Notes the light that reaches each fragment, as the picture was drawn.
     void forth(int64_t begin, int64_t end) {
         const Lanes enough = lanes(options_.min_transmittance);
         for (int64_t i = begin; i < end; ++i) {
@@ -257,12 +273,11 @@ class GradientTile {
             const Prepared &t = triangles_[f.place];
             Lanes x, y;
             positions(t, f.block, x, y);
-            const Lanes alpha = value(t, 3, x, y, depth(t, x, y));
+            const Lanes z = depth(t, x, y), alpha = only(f.lanes, value(t, 3, x, y, z));
             float *at = through_ + f.block * LANES;
             const Lanes before = load_lanes(at);
-            before_[i - begin] = before;
-            const Lanes after = before - before * alpha;
-            store_lanes(at, pick(f.lanes, only(at_least(after, enough), after), before));
+            store_lanes(at, before - before * alpha);
+            found_[i - begin] = {z, only(f.lanes & at_least(before, enough), before * z)};
         }
     }
 
@@ -273,7 +288,7 @@ class GradientTile {
             const Prepared &t = triangles_[f.place];
             Lanes x, y;
             positions(t, f.block, x, y);
-            const Lanes z = depth(t, x, y);
+            const Lanes z = found_[i - begin].z, light = found_[i - begin].light;
             Lanes rgba[4];
             for (int c = 0; c < 4; ++c) rgba[c] = value(t, c, x, y, z);
             Lanes g[3];
@@ -282,10 +297,10 @@ class GradientTile {
             if (EXTRA)
                 for (int c = 0; c < extra_; ++c) own = own + extra_value(f.place, c, x, y, z) * load_lanes(towards_extra(c, f.block));
             float *at = behind_ + f.block * LANES;
-            const Lanes behind = load_lanes(at), contrast = own - behind;
-            store_lanes(at, pick(f.lanes, mul_add(rgba[3], contrast, behind), behind));
+            const Lanes behind = load_lanes(at), contrast = own - behind, alpha = only(f.lanes, rgba[3]);
+            store_lanes(at, mul_add(behind, lanes(1) - alpha, alpha * own));
 
-            const Lanes light = only(f.lanes, before_[i - begin] * z), opaque = light * rgba[3];
+            const Lanes opaque = light * rgba[3];
             Lanes sums[4], sums_y[4];
             for (int c = 0; c < 3; ++c) sums[c] = opaque * g[c];
             sums[3] = light * contrast;
@@ -302,15 +317,12 @@ class GradientTile {
                 }
             }
             for (int c = 0; c < 4; ++c) sums_y[c] = sums[c] * y;
-            Moments &m = moments_[f.place];
+            const Lanes sums_v[4] = {v, v * x, v * y, lanes(0)};
             // x is the same in every row.
-            const Lanes rows = add_rows(sums);
-            m.rgba[0] = m.rgba[0] + rows;
-            m.rgba[1] = mul_add(rows, x, m.rgba[1]);
-            m.rgba[2] = m.rgba[2] + add_rows(sums_y);
-            m.v[0] = m.v[0] + v;
-            m.v[1] = mul_add(v, x, m.v[1]);
-            m.v[2] = mul_add(v, y, m.v[2]);
+            Lanes columns[4] = {add_rows(sums), lanes(0), add_rows(sums_y), add_rows(sums_v)};
+            columns[1] = columns[0] * x;
+            float *to = moments_[f.place].sum[0];
+            store_lanes(to, load_lanes(to) + add_columns(columns));
         }
     }
 
@@ -320,73 +332,51 @@ class GradientTile {
         return clamp(((lanes(p.a) * x + lanes(p.b) * y) + lanes(p.c)) * z, lanes(p.low), lanes(p.high));
     }
 
-    // From sums over samples to the corners, for some triangles side by side.
-    void finish(size_t first, int held, std::vector<CornerGradients> &out, std::vector<float> &out_attributes) {
-        constexpr int N = Triangles::N;
-        alignas(64) double s[3][3][N], sum[3][SUMS][N], apart[3][4][N], g[3][3][N], h[3][3][N], move[3][3][N];
-        for (int t = 0; t < N; ++t) {
-            const Prepared &p = triangles_[first + std::min(t, held - 1)];
-            const int32_t *corner = mesh_.faces + 3 * (int64_t)p.face;
-            for (int k = 0; k < 3; ++k)
-                for (int j = 0; j < 3; ++j) s[k][j][t] = p.s[k][j];
-            // Times x, y and 1, in this order.
-            for (int j = 0; j < 3; ++j) {
-                const Moments &m = moments_[first + std::min(t, held - 1)];
-                float rgba[4];
-                add_columns(m.rgba[(j + 1) % 3], rgba);
-                for (int c = 0; c < 4; ++c) sum[j][c][t] = rgba[c];
-                sum[j][4][t] = ::ms::sum(m.v[(j + 1) % 3]);
-            }
-            for (int k = 0; k < 3; ++k)
-                for (int c = 0; c < 4; ++c) apart[k][c][t] = (double)mesh_.colors[4 * (int64_t)corner[k] + c] - p.first[c];
+    // From sums over samples to the corners.
+    void finish(size_t place, CornerGradients &out, std::vector<float> &out_attributes) const {
+        const Prepared &t = triangles_[place];
+        const Corners &p = corners_[place];
+        const auto &m = moments_[place].sum;
+        // Vectors have an element for x, y and 1, in this order, or for r, g, b and a.
+        const f4 s[3] = {load4(p.s[0]), load4(p.s[1]), load4(p.s[2])};
+        f4 sums[3];
+        for (int j = 0; j < 3; ++j) {
+            const int column = (j + 1) % 3;
+            sums[j] = f4{m[0][column], m[1][column], m[2][column], m[3][column]};
         }
         for (int k = 0; k < 3; ++k)
-            for (int j = 0; j < 3; ++j)
-                for (int t = 0; t < N; ++t) {
-                    double v = -sum[j][4][t];
-                    for (int c = 0; c < 4; ++c) v += apart[k][c][t] * sum[j][c][t];
-                    g[k][j][t] = v;
-                }
-        for (int c = 0; c < extra_; ++c) {
-            for (int t = 0; t < held; ++t) {
-                const size_t place = (first + t) * extra_ + c;
-                const int32_t *corner = mesh_.faces + 3 * (int64_t)triangles_[first + t].face;
-                for (int k = 0; k < 3; ++k) {
-                    const double d = (double)mesh_.attributes[(int64_t)corner[k] * extra_ + c] - planes_[place].first;
-                    for (int j = 0; j < 3; ++j) g[k][j][t] += d * extra_sums_[place * 3 + j];
-                }
-            }
+            store4(out.rgba[k], set4(s[k][0]) * sums[0] + (set4(s[k][1]) * sums[1] + set4(s[k][2]) * sums[2]));
+        // G, a row a corner.
+        f4 g[3];
+        g[0] = g[1] = g[2] = -f4{m[1][3], m[2][3], m[0][3], 0};
+        for (int c = 0; c < 4; ++c) {
+            const f4 by_channel = {m[c][1], m[c][2], m[c][0], 0};
+            for (int k = 1; k < 3; ++k) g[k] = g[k] + set4(p.apart[k - 1][c]) * by_channel;
         }
-        for (int i = 0; i < 3; ++i)
-            for (int k = 0; k < 3; ++k)
-                for (int t = 0; t < N; ++t)
-                    h[i][k][t] = g[i][0][t] * s[k][0][t] + g[i][1][t] * s[k][1][t] + g[i][2][t] * s[k][2][t];
-        const Projection &pr = scene_.projection;
         for (int k = 0; k < 3; ++k) {
-            for (int t = 0; t < N; ++t) {
-                double d[3];
-                for (int i = 0; i < 3; ++i) d[i] = -(s[0][i][t] * h[0][k][t] + s[1][i][t] * h[1][k][t] + s[2][i][t] * h[2][k][t]);
-                const Prepared &p = triangles_[first + std::min(t, held - 1)];
-                d[2] += (pr.cx - area_.x0 - p.x0) * d[0] + (pr.cy - area_.y0 - p.y0) * d[1];
-                d[0] *= pr.fx;
-                d[1] *= pr.fy;
-                for (int j = 0; j < 3; ++j) move[k][j][t] = pr.m[j] * d[0] + pr.m[4 + j] * d[1] + pr.m[8 + j] * d[2];
+            for (int c = 0; c < extra_; ++c) {
+                const float *e = &extra_sums_[(place * extra_ + c) * 3];
+                const f4 sums_e = {e[0], e[1], e[2], 0}, products = s[k] * sums_e;
+                out_attributes.push_back((products[0] + products[1]) + products[2]);
+                const float d = mesh_.attributes[(int64_t)p.vertex[k] * extra_ + c] - planes_[place * extra_ + c].first;
+                g[k] = g[k] + set4(d) * sums_e;
             }
         }
-        for (int t = 0; t < held; ++t) {
-            const Prepared &p = triangles_[first + t];
-            out.emplace_back();
-            CornerGradients &o = out.back();
-            for (int k = 0; k < 3; ++k) {
-                o.vertex[k] = mesh_.faces[3 * (int64_t)p.face + k];
-                for (int j = 0; j < 3; ++j) o.position[k][j] = (float)move[k][j][t];
-                for (int c = 0; c < 4; ++c)
-                    o.rgba[k][c] = (float)(s[k][0][t] * sum[0][c][t] + s[k][1][t] * sum[1][c][t] + s[k][2][t] * sum[2][c][t]);
-                for (int c = 0; c < extra_; ++c) {
-                    const float *m = &extra_sums_[((first + t) * extra_ + c) * 3];
-                    out_attributes.push_back((float)(s[k][0][t] * m[0] + s[k][1][t] * m[1] + s[k][2][t] * m[2]));
-                }
+        const Projection &pr = scene_.projection;
+        const f4 rows[3] = {{(float)pr.m[0], (float)pr.m[1], (float)pr.m[2], 0},
+                            {(float)pr.m[4], (float)pr.m[5], (float)pr.m[6], 0},
+                            {(float)pr.m[8], (float)pr.m[9], (float)pr.m[10], 0}};
+        const float to_x = (float)(pr.cx - area_.x0 - t.x0), to_y = (float)(pr.cy - area_.y0 - t.y0);
+        for (int k = 0; k < 3; ++k) {
+            out.vertex[k] = p.vertex[k];
+            f4 d = set4(0);
+            for (int i = 0; i < 3; ++i) {
+                const f4 h = g[i] * s[k];
+                d = d - s[i] * set4((h[0] + h[1]) + h[2]);
             }
+            const float z = d[2] + to_x * d[0] + to_y * d[1];
+            const f4 move = rows[0] * set4((float)pr.fx * d[0]) + (rows[1] * set4((float)pr.fy * d[1]) + rows[2] * set4(z));
+            for (int j = 0; j < 3; ++j) out.position[k][j] = move[j];
         }
     }
 
@@ -406,11 +396,13 @@ class GradientTile {
     double origin_x_[Triangles::N], origin_y_[Triangles::N];
     std::vector<int32_t> place_;  // of the log's triangles
     std::vector<Fragment> fragments_;
+    int64_t fragment_count_ = 0;
     std::vector<Prepared> triangles_;
+    std::vector<Corners> corners_;
     std::vector<Moments> moments_;
     std::vector<Plane> planes_;
     std::vector<float> extra_sums_;
-    std::vector<Lanes> before_;
+    std::vector<Found> found_;
     std::vector<float> starts_;
 };
 

@@ -132,11 +132,25 @@ inline Lanes add_rows(const Lanes terms[4]) {
     return r;
 }
 
-// The sums of each four lanes.
-inline void add_columns(const Lanes &a, float out[4]) {
-    alignas(64) float v[LANES];
-    store_lanes(v, a);
-    for (int i = 0; i < 4; ++i) out[i] = (v[4 * i] + v[4 * i + 2]) + (v[4 * i + 1] + v[4 * i + 3]);
+// Lane 4 i + j: the sum of lanes 4 i to 4 i + 3 of terms[j].
+inline Lanes add_columns(const Lanes terms[4]) {
+    Lanes r;
+#if defined(__AVX512F__)
+    __m512 half[2];
+    for (int i = 0; i < 2; ++i) {
+        const __m512 a = terms[2 * i].part[0], b = terms[2 * i + 1].part[0];
+        half[i] = _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x44), _mm512_shuffle_ps(a, b, 0xEE));
+    }
+    r.part[0] = _mm512_add_ps(_mm512_shuffle_ps(half[0], half[1], 0x88), _mm512_shuffle_ps(half[0], half[1], 0xDD));
+#else
+    float sums[LANES], v[LANES];
+    for (int j = 0; j < 4; ++j) {
+        store_lanes(v, terms[j]);
+        for (int i = 0; i < 4; ++i) sums[4 * i + j] = (v[4 * i] + v[4 * i + 2]) + (v[4 * i + 1] + v[4 * i + 3]);
+    }
+    r = load_lanes(sums);
+#endif
+    return r;
 }
 
 }  // namespace ms
