@@ -5,9 +5,9 @@
 
 The base is a visual hull (`meshes/lego_visual_hull_40k_vertexcolor.ply`), the pictures `photos/lego`, with
 its own 40 test views. Rows: the base opaque with the vertex colours it came with; the same with its vertex
-colours optimised by the same losses, rates and number of steps (positions and opacity fixed); priors of several
-forms; and the fans of splats that were trained on the same photographs, fine-tuned. Seconds are processor time
-of the steps alone.
+colours optimised by the same losses, rates and number of steps (positions and opacity fixed); priors of
+several forms; and the fans of splats that were trained on the same photographs, fine-tuned. Seconds are
+processor time of the steps alone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """MeshSplats for Blender: Gaussian splats, and meshes made of them, by File > Import or drag and drop."""
 
-from . import import_operator, object_operators, panel, settings
+from . import following, import_operator, object_operators, panel, settings
 
 
 def register():
@@ -9,9 +9,11 @@ def register():
     import_operator.register()
     object_operators.register()
     panel.register()
+    following.register()
 
 
 def unregister():
+    following.unregister()
     panel.unregister()
     object_operators.unregister()
     import_operator.unregister()

@@ -102,7 +102,27 @@ class SetUpRender(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (ConvertAgain, SetShading, SetUpRender)
+class FollowBase(bpy.types.Operator):
+    """Move the splats to where their base is now; after edits and on each frame this happens by itself"""
+
+    bl_idname = "object.meshsplats_follow"
+    bl_label = "Follow Base Now"
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
+
+    @classmethod
+    def poll(cls, context):
+        return context.object is not None and context.object.get("meshsplats_base") is not None
+
+    def execute(self, context):
+        from meshsplats.blender.inside import priors
+
+        if not priors.follow([context.object], context.evaluated_depsgraph_get()):
+            self.report({"ERROR"}, context.object[priors.PROBLEM])
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+CLASSES = (ConvertAgain, SetShading, SetUpRender, FollowBase)
 
 
 def register():

@@ -4,7 +4,7 @@
 import bpy
 
 from .import_operator import ImportMeshSplats
-from .object_operators import ConvertAgain, SetShading, SetUpRender
+from .object_operators import ConvertAgain, FollowBase, SetShading, SetUpRender
 from .settings import draw_choices
 
 
@@ -35,6 +35,13 @@ class MeshSplatsPanel(bpy.types.Panel):
             draw_choices(thing.meshsplats, box)
             box.label(text=f"{len(thing.data.polygons):,} triangles")
             box.operator(ConvertAgain.bl_idname, icon="FILE_REFRESH")
+        base = thing.get("meshsplats_base")
+        if base is not None:
+            box = layout.box()
+            box.label(text=f"Follows {base.name}", icon="MOD_MESHDEFORM")
+            if thing.get("meshsplats_problem"):
+                box.label(text=thing["meshsplats_problem"], icon="ERROR")
+            box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
         layout.label(text="Material of this object")
         row = layout.row(align=True)
         row.operator(SetShading.bl_idname, text="Unlit").shading = "unlit"

@@ -69,6 +69,22 @@ try:
 except RuntimeError as error:
     told["broken"] = str(error)
 
+# A mesh prior comes with its base, and its splats follow that.
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "prior.npz"))
+splats = bpy.context.object
+base = splats.parent
+heights = [vertex.co.z for vertex in splats.data.vertices]
+for vertex in base.data.vertices:
+    vertex.co.z += 1
+base.data.update()
+bpy.context.view_layer.update()
+told["followed"] = [vertex.co.z - z for vertex, z in zip(splats.data.vertices, heights, strict=True)]
+told["base"] = base.name
+bpy.context.view_layer.objects.active = splats
+told["follow"] = sorted(bpy.ops.object.meshsplats_follow())
+bpy.data.objects.remove(splats)
+bpy.data.objects.remove(base)
+
 # All splats again, for a picture of the ball: it stands at (1, 2, 3) and has radius 1.
 bpy.context.view_layer.objects.active = thing
 thing.meshsplats.max_triangles = 0
@@ -183,5 +199,7 @@ told["left"] = [
     ]
     if name in dir(getattr(bpy.ops, group))
 ]
+handlers = bpy.app.handlers.depsgraph_update_post[:] + bpy.app.handlers.frame_change_post[:]
+told["left"] += [h.__name__ for h in handlers if h.__module__.startswith(addon)]
 told["left"] += [name for name in dir(bpy.types.Object) if name == "meshsplats"]
 (folder / "told.json").write_text(json.dumps(told))

@@ -21,6 +21,8 @@ from _blender_scenes import ball_splats, random_mesh
 from conftest import SHARED
 
 from meshsplats import save_gaussians, save_mesh
+from meshsplats.base_mesh import BaseMesh
+from meshsplats.prior import bind
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("_extension_session.py")
@@ -78,6 +80,8 @@ def test_a_whole_session(packed, tmp_path):
     """In a process of its own, where meshsplats comes from the extension's wheel alone."""
     save_gaussians(ball_splats(400)[0], tmp_path / "ball.ply")
     save_mesh(random_mesh(30), tmp_path / "mesh.npz")
+    base = BaseMesh(np.eye(3), [[0, 1, 2]])
+    save_mesh(bind(base, triangles=4, layers=2).mesh, tmp_path / "prior.npz")
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense")
     sog = [path for path in [SHARED / "splats" / "monkey_0001.sog"] if path.exists()]
     environment = {
@@ -104,6 +108,9 @@ def test_a_whole_session(packed, tmp_path):
     assert told["broken"].startswith("Error: ")
     assert "broken.ply" in told["broken"]
     assert told["left"] == []
+    assert told["base"] == "prior base"
+    assert told["followed"] == pytest.approx([1.0] * 12, abs=1e-4)
+    assert told["follow"] == ["FINISHED"]
     assert told["triangles"]["again"] > told["triangles"]["fewer"]
     assert told["edge"] == pytest.approx(1, abs=0.01)
     assert told["middle"] == pytest.approx(0.7, abs=0.1), "the grey ball is drawn"

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import foreign, frame, materials, meshes, pictures, versions
+from meshsplats.blender.inside import foreign, frame, materials, meshes, pictures, priors, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.subject import lit_arrays
 from meshsplats.mesh import Blending, SplatMesh
+from meshsplats.prior.model import MeshPrior
 
 LIT = "meshsplats_lit"
 """Property of the mesh data: whether its colours are linear light and its material lit."""
@@ -23,7 +25,11 @@ LAYERS = "meshsplats_layers"
 
 
 def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
-    """All that takes time and does not touch Blender: may run in another thread."""
+    """All that takes time and does not touch Blender: may run in another thread. Coplanar layers of a mesh
+    prior are set apart, as exports are."""
+    if mesh.binding is not None and mesh.normals is not None:
+        prior = MeshPrior(mesh)
+        mesh = prior.pose(lift=prior.export_lift)
     arrays: dict[str, Any] = {"faces": mesh.faces, "colors": mesh.colors, "normals": None, "self_shadow": 0.0}
     if lit:
         made, arrays["self_shadow"] = lit_arrays(mesh)
@@ -32,8 +38,11 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
 
 
 def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
-    """A new object in ``collection``, upright in Blender's frame, with its material."""
+    """A new object in ``collection``, upright in Blender's frame, with its material; that of a mesh prior
+    hangs on an object of its base, which it follows."""
     thing = meshes.make_object(_data(prepared, name), name, frame.to_blender(prepared["mesh"].up), collection)
+    if prepared["mesh"].binding is not None:
+        priors.give_base(thing, prepared["mesh"].binding, collection)
     bpy.context.view_layer.objects.active = thing
     return thing
 
@@ -56,6 +65,8 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
         normals=prepared["normals"],
         face_splat=mesh.face_splat,
     )
+    if mesh.binding is not None:
+        priors.store(data, mesh.binding)
     if prepared["lit"]:
         data.materials.append(materials.lit(self_shadow=prepared["self_shadow"]))
     else:
@@ -96,9 +107,13 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
             owner = None
     up = np.array(data[UP])
     blending: Blending = "linear" if data[LINEAR] else "display"
-    return SplatMesh(
+    found = SplatMesh(
         vertices.reshape(-1, 3), faces.reshape(-1, 3), colors, face_splat=owner, up=up, blending=blending
     )
+    if priors.base_of(thing) is None:
+        return found
+    binding = priors.binding_of(thing)
+    return replace(found, vertices=binding.positions(), normals=binding.normals(), binding=binding)
 
 
 def render_settings(scene: Any, things: list[Any], lit: bool) -> int:

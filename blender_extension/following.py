@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Splats of mesh priors go where their base goes: after every change of its shape, and on every frame."""
+
+import bpy
+from bpy.app.handlers import persistent
+
+BASE = "meshsplats_base"
+"""Property of splats that follow a base; ``meshsplats.blender.inside.priors`` sets it."""
+
+
+def _anything_to_do(scene):
+    return any(BASE in thing for thing in scene.objects)
+
+
+@persistent
+def after_update(scene, depsgraph):
+    if _anything_to_do(scene):
+        from meshsplats.blender.inside import priors
+
+        priors.after_update(scene, depsgraph)
+
+
+@persistent
+def after_frame(scene, depsgraph):
+    if _anything_to_do(scene):
+        from meshsplats.blender.inside import priors
+
+        priors.after_frame(scene, depsgraph)
+
+
+def register():
+    bpy.app.handlers.depsgraph_update_post.append(after_update)
+    bpy.app.handlers.frame_change_post.append(after_frame)
+
+
+def unregister():
+    bpy.app.handlers.frame_change_post.remove(after_frame)
+    bpy.app.handlers.depsgraph_update_post.remove(after_update)
