@@ -98,7 +98,7 @@ class TargetOptions:
     """Without --data: number of further pictures to measure with."""
     width: int = 400
     """Without --data: side of these pictures in pixels."""
-    distance: tuple[float, float] = (0.6, 1.0)
+    distance: tuple[float, float] = (0.7, 1.0)
     """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
     subject just fits the picture."""
     placement: Literal["auto", "object", "surrounded", "inside"] = "auto"

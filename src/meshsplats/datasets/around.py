@@ -27,12 +27,14 @@ STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
 """Steps of Kronecker's sequence for azimuth, height and distance: its points modulo 1 fill the unit cube
 evenly wherever one begins and however many are taken. The first two are powers of the plastic number's
 inverse, which are the most even pair known: directions matter most."""
-OBJECT_ELEVATIONS = (-20.0, 70.0)
+OBJECT_ELEVATIONS = (-10.0, 60.0)
 SURROUNDED_ELEVATIONS = (3.0, 60.0)
-"""Degrees above the horizon; of a scene with ground there is nothing to be seen from below."""
+"""Degrees above the horizon, where people look from; of a scene with ground there is nothing to be seen from
+below."""
 INSIDE_ELEVATIONS = (-35.0, 35.0)
-DISTANCES = (0.7, 1.2)
-"""Multiples of the distance from which the subject just fits: details, and the whole of it."""
+DISTANCES = (0.7, 1.0)
+"""Multiples of the distance from which the subject just fits: details, and the whole of it. A mesh is not
+filtered as splats are, so it cannot be right at every size: the wider this range, the less so at each."""
 SURROUNDINGS_SHARE = 0.01
 """More of the opacity than this beyond the subject, and it stands in surroundings."""
 STANDS = 12
