@@ -157,9 +157,6 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
     assert {command[1] for command in commands} >= set(cli.COMMANDS) - {"blender"}
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.ply").write_bytes(scene_file.read_bytes())
-    corners = "v -1 -1 -1\nv 1 -1 -1\nv -1 1 -1\nv -1 -1 1\n"
-    for name in ("base.obj", "edited.obj"):
-        (tmp_path / name).write_text(corners + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     for command in commands:
         small = ["--width", "48"] if command[1] in ("render", "compare") and "--width" not in command else []
         if command[1] == "finetune":
@@ -167,6 +164,10 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
             at = command.index("--minutes")
             command[at : at + 2] = []
             small = ["--width", "48", "--views", "3", "--held-out", "1", "--steps", "2"]
+        if command[1] == "base":
+            small = ["--resolution", "16", "--views", "6"]
+        if command[1] == "deform":
+            (tmp_path / "edited.obj").write_bytes((tmp_path / "base.obj").read_bytes())
         if command[1] == "prior":
             small = ["--width", "48", "--views", "3", "--held-out", "1", "--steps", "2"]
         assert cli.main([*command[1:], *small]) == 0, f"{shlex.join(command)}\n{capsys.readouterr().err}"

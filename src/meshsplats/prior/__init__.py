@@ -8,6 +8,17 @@ from __future__ import annotations
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.prior.bind import bind
 from meshsplats.prior.model import LIFT, MeshPrior, load_prior
+from meshsplats.prior.surface import base_surface
 from meshsplats.prior.training import prior_config, train
 
-__all__ = ["LIFT", "BaseMesh", "MeshPrior", "Texture", "bind", "load_prior", "prior_config", "train"]
+__all__ = [
+    "LIFT",
+    "BaseMesh",
+    "MeshPrior",
+    "Texture",
+    "base_surface",
+    "bind",
+    "load_prior",
+    "prior_config",
+    "train",
+]

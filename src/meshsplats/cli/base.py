@@ -1,0 +1,70 @@
+"""``meshsplats base``: a classical mesh from splats, for a mesh prior."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import Count, File, Output, SplatOptions, check_outputs, load_scene, size_of
+from meshsplats.mesh import SplatMesh
+
+
+@dataclass(frozen=True)
+class Base:
+    """Makes a closed mesh of the surface that splats form, to be edited and to carry a mesh prior.
+
+    For objects that can be seen from all round; what no picture sees becomes inside.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Splats, a model folder, or a mesh of them, fine-tuned say."""
+    output: Output
+    """The mesh, coloured and opaque: .ply, .obj, .glb, .npz, .usdc."""
+    resolution: int = 96
+    """Voxels along the longest side, 8 to 512: the more, the finer, and the more triangles."""
+    views: int = 48
+    """Number of places round the object from which it is looked at."""
+    cameras: File = None
+    """Camera file to look from instead."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """At most N threads. Default: all processors."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.camera import load_cameras
+        from meshsplats.formats.meshes import MESH_SUFFIXES, save_mesh
+        from meshsplats.prior.surface import base_surface
+
+        start = time.perf_counter()
+        if self.output.suffix.lower() not in MESH_SUFFIXES:
+            raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
+        if self.cameras is not None and self.views != type(self).views:
+            raise UsageError("--views has no effect with --cameras")
+        check_outputs([self.output], self.force)
+        scene = load_scene(self.input, self.reading)
+        base = base_surface(
+            scene,
+            resolution=self.resolution,
+            cameras=self.views if self.cameras is None else load_cameras(self.cameras),
+            threads=self.threads,
+        )
+        assert base.colors is not None
+        save_mesh(SplatMesh(base.vertices, base.faces, base.colors, up=base.up), self.output)
+        seconds = time.perf_counter() - start
+        if self.json:
+            result = {"mesh": str(self.output), "triangles": len(base.faces), "seconds": round(seconds, 2)}
+            print(json.dumps(result, indent=1))
+            return
+        print(f"{self.output} ({len(base.faces):,} triangles, {size_of(self.output)}) in {seconds:.1f} s")
+        splats = shlex.quote(str(self.input))
+        print(f"next: meshsplats prior {shlex.quote(str(self.output))} --splats {splats} -o prior.npz")

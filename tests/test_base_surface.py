@@ -1,0 +1,135 @@
+"""Base meshes from splats: closed, where the surface is, in its colours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import shared_data
+
+from meshsplats import GaussianCloud, SplatMesh, load_gaussians, load_mesh, psnr, save_gaussians
+from meshsplats.cli import main
+from meshsplats.prior import bind
+from meshsplats.prior.surface import base_surface, surface_net
+
+
+def ball(radius=1.0, center=(0.0, 0, 0), n=40) -> SplatMesh:
+    """An opaque ball, red above z = 0 and blue below."""
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, n + 1), np.linspace(0, np.pi, n + 1), indexing="ij")
+    points = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], -1).reshape(-1, 3)
+    number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    colors = np.where(points[:, 2:] > 0, [0.9, 0.1, 0.1, 1], [0.1, 0.1, 0.9, 1])
+    return SplatMesh(points * radius + center, faces, colors, up=(0, 0, 1))
+
+
+def open_edges(faces) -> int:
+    """Edges that are not passed once in each direction."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    found = {(int(a), int(b)) for a, b in edges}
+    return sum((b, a) not in found for a, b in found)
+
+
+def volume(vertices, faces) -> float:
+    return float(np.linalg.det(vertices[faces].astype(float)).sum()) / 6
+
+
+def test_the_net_of_a_plane_and_of_a_ball():
+    grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3, indexing="ij"), -1)
+    vertices, faces = surface_net(grid[..., 0] - 4.25)
+    np.testing.assert_allclose(vertices[:, 0], 4.25)
+    normals = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
+    assert (normals[:, 0] > 0).all(), "faces look where the field is positive"
+    distance = np.linalg.norm(grid - 5.4, axis=-1) - 4
+    vertices, faces = surface_net(distance)
+    assert open_edges(faces) == 0
+    np.testing.assert_allclose(np.linalg.norm(vertices - 5.4, axis=1), 4, atol=0.15)
+    # Of so few voxels it is a coarse ball, whose chords lie inside.
+    assert volume(vertices, faces) == pytest.approx(4 / 3 * np.pi * 64, rel=0.1)
+    for empty in (np.ones((4, 4, 4)), -np.ones((4, 4, 4))):
+        assert len(surface_net(empty)[1]) == 0
+
+
+def test_the_surface_of_a_ball():
+    center = np.array([3.0, -2, 5])
+    base = base_surface(ball(2, center), resolution=32, cameras=24, threads=1)
+    assert open_edges(base.faces) == 0
+    away = base.vertices - center
+    voxel = 4 * 1.1 / 32
+    assert np.abs(np.linalg.norm(away, axis=1) - 2).max() < 1.2 * voxel
+    assert volume(away, base.faces) == pytest.approx(4 / 3 * np.pi * 8, rel=0.08)
+    upper, lower = away[:, 2] > 0.3, away[:, 2] < -0.3
+    assert np.abs(base.colors[upper] - [0.9, 0.1, 0.1, 1]).max() < 0.1
+    assert np.abs(base.colors[lower] - [0.1, 0.1, 0.9, 1]).max() < 0.1
+    np.testing.assert_allclose(base.up, [0, 0, 1], atol=1e-6)
+
+
+def test_crumbs_are_left_out():
+    large, crumb = ball(), ball(0.08, (1.4, 0, 0), n=8)
+    both = SplatMesh(
+        np.concatenate([large.vertices, crumb.vertices]),
+        np.concatenate([large.faces, crumb.faces + len(large.vertices)]),
+        np.concatenate([large.colors, crumb.colors]),
+    )
+    base = base_surface(both, resolution=32, cameras=16, threads=1)
+    assert base.vertices[:, 0].max() < 1.2
+
+
+def test_what_cannot_be_done():
+    mesh = ball()
+    for options, message in [
+        ({"resolution": 4}, "resolution must be"),
+        ({"resolution": 600}, "resolution must be"),
+        ({"cameras": 2}, "cameras must be"),
+        ({"cameras": []}, "no cameras"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            base_surface(mesh, **options)
+    haze = SplatMesh(mesh.vertices, mesh.faces, mesh.colors * (1, 1, 1, 0.1))
+    with pytest.raises(ValueError, match="nothing solid"):
+        base_surface(haze, resolution=16, cameras=8)
+
+
+def discs(count=1500) -> GaussianCloud:
+    """Flat splats on a ball of radius 1."""
+    heights = 1 - 2 * (np.arange(count) + 0.5) / count
+    angles = np.pi * (3 - 5**0.5) * np.arange(count)
+    ring = np.sqrt(1 - heights**2)
+    normals = np.stack([ring * np.cos(angles), ring * np.sin(angles), heights], axis=1)
+    quaternions = np.stack([1 + heights, -normals[:, 1], normals[:, 0], np.zeros(count)], axis=1)
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    size = 0.7 * np.sqrt(4 * np.pi / count)
+    colors = np.where(heights[:, None] > 0, [0.9, 0.1, 0.1], [0.1, 0.1, 0.9])
+    return GaussianCloud(
+        normals,
+        quaternions,
+        np.tile([size, size, 0.02 * size], (count, 1)),
+        np.full(count, 0.95),
+        ((colors - 0.5) / 0.28209479177387814)[:, None],
+    )
+
+
+def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
+    save_gaussians(discs(), tmp_path / "scene.ply")
+    out = tmp_path / "base.obj"
+    options = ["--resolution", "24", "--views", "16"]
+    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out), *options]) == 0
+    assert "next: meshsplats prior" in capsys.readouterr().out
+    base = load_mesh(out)
+    assert np.abs(np.linalg.norm(base.vertices, axis=1) - 1).max() < 0.15
+    assert open_edges(base.faces) == 0
+    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out)]) == 1
+    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
+
+
+def test_a_base_of_real_splats_looks_like_them():
+    from meshsplats import orbit, render, render_splats
+
+    cloud = load_gaussians(shared_data("splats/playbot_lod5_3k_sh2.ply"))
+    base = base_surface(cloud, resolution=64, cameras=32, threads=1)
+    assert open_edges(base.faces) == 0
+    mesh = bind(base).mesh
+    for camera in orbit(cloud, 2, width=96, height=96):
+        assert psnr(render(mesh, camera).color, render_splats(cloud, camera).color) > 17
