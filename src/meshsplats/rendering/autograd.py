@@ -54,7 +54,7 @@ def rasterize(
     the pictures as drawn: values move with the interpolation (perspective included) and the blending; which
     triangles a sample sees and in which order is constant, so an edge that passes over a sample gives no
     gradient. An opacity of 1 is no exception: its gradient tells what is behind (at least six layers
-    of it). Memory for the way back is a log of at most ``log_bytes`` a picture, about a byte for each
+    of it). Memory for the way back is a log of at most ``log_bytes`` a picture, about two bytes for each
     fragment; tiles beyond are drawn once more. Every result has the same bits in every run, with any number
     of threads.
 

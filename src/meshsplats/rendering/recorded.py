@@ -12,8 +12,8 @@ from meshsplats.rendering import core
 from meshsplats.rendering.api import MIN_TRANSMITTANCE, Alive, camera_struct, checked_options, compact_groups
 
 LOG_BYTES = 128 << 20
-"""Most memory that the log of one picture takes: about a byte for each fragment. Going back, tiles whose log
-did not fit are drawn once more."""
+"""Most memory that the log of one picture takes: about two bytes for each fragment. Going back, tiles whose
+log did not fit are drawn once more."""
 
 
 class RecordedPicture:

@@ -1,0 +1,241 @@
+"""What one step of fine-tuning costs, how it grows, and what others take for the same.
+
+    python benchmarks/training_step.py                        steps at 160k, 1 M and 4 M triangles
+    python benchmarks/training_step.py --growth               with triangles, pixels and layers, one at a time
+    python benchmarks/training_step.py --beside               beside torch and, where installed, Mitsuba 3
+
+A step draws a picture, takes 0.6 L1 + 0.4 (1 - SSIM) and its gradient back to positions and colours, and
+moves all vertices by Adam; scenes are those of benchmarks/rendering.py. Medians by the clock in milliseconds;
+parts are timed within the same steps. --beside takes a picture and the gradients of its colours of one small
+scene: by this program, by the float64 reference in torch, and by Mitsuba's path integrator with automatic
+differentiation (llvm_ad_rgb, which needs an LLVM library), one sample a pixel. Mitsuba draws the same
+triangles as diffuse surfaces with an opacity under a white sky, not the same picture: it has no unlit
+blending. Needs torch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from rendering import SCENES, random_fans
+
+from meshsplats.camera import Camera
+from meshsplats.finetuning.adam import RowAdam
+from meshsplats.finetuning.losses import photometric_loss
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import reference_autograd, render
+from meshsplats.rendering.autograd import rasterize
+from meshsplats.rendering.core import available_variants
+
+
+def table(heads: list[str]) -> None:
+    print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
+
+
+def row(*cells: str) -> None:
+    print("| " + " | ".join(cells) + " |", flush=True)
+
+
+class Step:
+    """One step of fine-tuning on one view, timed in parts."""
+
+    parts = ("draw", "loss", "back", "Adam")
+
+    def __init__(self, mesh: SplatMesh, camera: Camera, threads: int) -> None:
+        self.mesh, self.camera, self.threads = mesh, camera, threads
+        self.vertices = torch.from_numpy(mesh.vertices.copy()).requires_grad_()
+        self.colors = torch.from_numpy(mesh.colors.copy()).requires_grad_()
+        generator = torch.Generator().manual_seed(0)
+        self.truth = torch.rand(camera.height, camera.width, 3, generator=generator)
+        # Rates so small that every step draws the same scene.
+        self.optimizers = [RowAdam(self.vertices, lr=1e-9), RowAdam(self.colors, lr=1e-9, bounds=(0, 1))]
+
+    def draw(self) -> torch.Tensor:
+        return rasterize(
+            self.vertices,
+            self.mesh.faces,
+            self.colors,
+            self.camera,
+            face_splat=self.mesh.face_splat,
+            threads=self.threads,
+        ).color
+
+    def __call__(self) -> list[float]:
+        times = [time.perf_counter()]
+        picture = self.draw()
+        times.append(time.perf_counter())
+        loss = photometric_loss(picture, self.truth, threads=self.threads)
+        times.append(time.perf_counter())
+        loss.backward()
+        times.append(time.perf_counter())
+        for optimizer, values in zip(self.optimizers, (self.vertices, self.colors), strict=True):
+            optimizer.step(values.grad)
+            values.grad = None
+        times.append(time.perf_counter())
+        return list(np.diff(times))
+
+
+def timed(step: Step, repeat: int) -> list[float]:
+    step()
+    return list(1e3 * np.median([step() for _ in range(repeat)], axis=0))
+
+
+def steps(scenes: list[str], threads: list[int], repeat: int) -> None:
+    table(["triangles", "picture", "threads", *Step.parts, "step"])
+    for name in scenes:
+        mesh, camera = random_fans(*SCENES[name])
+        for count in threads:
+            torch.set_num_threads(count)
+            times = timed(Step(mesh, camera, count), repeat)
+            size = f"{camera.width} x {camera.height}"
+            row(f"{len(mesh.faces):,}", size, f"{count}", *(f"{t:.0f}" for t in (*times, sum(times))))
+
+
+def growth(repeat: int) -> None:
+    """From a scene of 160k triangles, each of triangles, pixels and layers grows by itself."""
+    table(["what grows", "triangles", "picture", "fragments a pixel", "draw", "back", "ns a fragment"])
+    fans, radius, opacity, side = SCENES["160k"]
+    cases = []
+    for by in (0.25, 1, 4):
+        # As many fragments in all, of smaller triangles.
+        cases.append(("triangles", int(fans * by), radius / by**0.5, opacity, side))
+    for by in (0.5, 1, 2):
+        cases.append(("pixels", fans, radius, opacity, int(side * by)))
+    for by in (0.25, 1, 4):
+        # Fainter where there are more, so that the same share of light is spent.
+        cases.append(("layers", int(fans * by), radius, opacity / by, side))
+    for what, *scene in cases:
+        mesh, camera = random_fans(*scene)
+        step = Step(mesh, camera, 2)
+        draw, _, back, _ = timed(step, repeat)
+        fragments = render(mesh, camera).fragments
+        row(
+            what,
+            f"{len(mesh.faces):,}",
+            f"{camera.width} x {camera.height}",
+            f"{fragments / camera.width / camera.height:.1f}",
+            f"{draw:.0f}",
+            f"{back:.0f}",
+            f"{1e6 * (draw + back) / fragments:.1f}",
+        )
+
+
+def seconds(work: Callable[[], object], repeat: int) -> float:
+    taken = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - start)
+    return statistics.median(taken)
+
+
+def mitsuba_picture(mesh: SplatMesh, camera: Camera) -> tuple[str, Callable[[], object]] | None:
+    """Drawing with gradients of the colours by Mitsuba 3, and its variant; None where it is missing."""
+    try:
+        import mitsuba as mi
+    except ImportError:
+        return None
+    try:
+        mi.set_variant("llvm_ad_rgb")
+        import drjit as dr
+
+        dr.eval(mi.Float(1))
+    except Exception:
+        return None
+    settings = mi.Properties()
+    surface = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    settings["bsdf"] = mi.load_dict(
+        {
+            "type": "mask",
+            "opacity": {"type": "mesh_attribute", "name": "vertex_opacity"},
+            "bsdf": {"type": "twosided", "bsdf": surface},
+        }
+    )
+    shape = mi.Mesh("fans", len(mesh.vertices), len(mesh.faces), props=settings)
+    shape.add_attribute("vertex_color", 3, mesh.colors[:, :3].ravel())
+    shape.add_attribute("vertex_opacity", 1, mesh.colors[:, 3].copy())
+    params = mi.traverse(shape)
+    params["vertex_positions"] = mesh.vertices.ravel()
+    params["faces"] = mesh.faces.astype(np.uint32).ravel()
+    params.update()
+    fov = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.fx)))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 256, "rr_depth": 256},
+            "light": {"type": "constant"},
+            "sensor": {
+                "type": "perspective",
+                "fov": fov,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
+                "film": {"type": "hdrfilm", "width": camera.width, "height": camera.height},
+                "sampler": {"type": "independent", "sample_count": 1},
+            },
+            "fans": shape,
+        }
+    )
+    params = mi.traverse(scene)
+    key = next(name for name, _ in params if name.endswith("vertex_color"))
+
+    def work() -> object:
+        dr.enable_grad(params[key])
+        params.update()
+        picture = mi.render(scene, params, spp=1)
+        dr.backward(dr.mean(picture))
+        return np.array(dr.grad(params[key]))
+
+    return mi.variant(), work
+
+
+def beside(fans: int, repeat: int) -> None:
+    radius, opacity, side = 0.12, 0.05, 100
+    mesh, camera = random_fans(fans, radius, opacity, side)
+    torch.set_num_threads(2)
+    vertices = torch.from_numpy(mesh.vertices.copy())
+    colors = torch.from_numpy(mesh.colors.copy()).requires_grad_()
+    given = {"face_splat": mesh.face_splat, "threads": 2}
+    draw = lambda: rasterize(vertices, mesh.faces, colors, camera, **given)  # noqa: E731
+    fragments = render(mesh, camera).fragments
+    layers = fragments / side**2
+    print(f"{len(mesh.faces):,} triangles, {side} x {side}, {layers:.1f} fragments a pixel, 2 threads.\n")
+    ours = seconds(lambda: draw().color.mean().backward(), 20 * repeat)
+    found: dict[str, float] = {"meshsplats": ours}
+    reference = reference_autograd.rasterize(vertices, mesh.faces, colors, camera).color.mean()
+    order = seconds(lambda: reference_autograd.rasterize(vertices, mesh.faces, colors, camera), 1)
+    found["torch, float64 reference"] = seconds(lambda: reference.backward(retain_graph=True), 1) + order
+    other = mitsuba_picture(mesh, camera)
+    if other:
+        other[1]()  # compiles its kernels
+        found[f"Mitsuba 3, {other[0]}"] = seconds(other[1], repeat)
+    table(["picture and gradients of colours", "ms", "of ours"])
+    for name, taken in found.items():
+        row(name, f"{1e3 * taken:.1f}", f"{taken / ours:.1f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--growth", action="store_true")
+    parser.add_argument("--beside", action="store_true")
+    parser.add_argument("--fans", type=int, default=1250, help="of the scene of --beside")
+    args = parser.parse_args()
+    print(f"Core: {available_variants()[0]}; torch {torch.__version__}.\n")
+    if args.growth:
+        growth(args.repeat)
+    elif args.beside:
+        beside(args.fans, args.repeat)
+    else:
+        steps(args.scenes, args.threads, args.repeat)
+
+
+if __name__ == "__main__":
+    main()
