@@ -158,6 +158,24 @@ def test_ties_go_by_face_number():
     assert np.abs(render(swapped, camera(20, 18)).color - picture.color).max() > 0.01
 
 
+@pytest.mark.parametrize("count", [3, 5, 7, 11, 15, 30, 200, 600])
+def test_ties_where_planes_cross(count):
+    """Planes that face the camera, and in turn others that cross them at the samples of one column exactly."""
+    view = Camera(np.eye(4), 16, 16, 8, 8, 16, 16)
+    pixels = np.array([(-23.5, -24), (72.5, -24), (-23.5, 104)])
+    facing, tilted = np.full(3, 2.0), np.array([4.0, 1, 4])  # 1 / depth is 1/2 where x is 8.5
+    depths = np.array([tilted if k % 2 else facing for k in range(count)])
+    points = np.concatenate([(pixels - 8) / 16 * depths[..., None], depths[..., None]], axis=2)
+    rgba = np.random.default_rng(1).random((count, 4)) * (1, 1, 1, 3 / count)
+    mesh = SplatMesh(
+        points.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), np.clip(np.repeat(rgba, 3, axis=0), 0, 1)
+    )
+    picture = assert_mesh_is_exact(mesh, view, flips=0)
+    backwards = render(replace(mesh, faces=mesh.faces[::-1]), view)
+    differs = np.abs(backwards.color - picture.color).max(axis=(0, 2)) > 1e-4
+    assert differs[8]
+
+
 @pytest.mark.parametrize("depths", ["apart", "the same", "nearly the same"])
 def test_five_thousand_layers(depths):
     rng = np.random.default_rng(2)

@@ -103,6 +103,15 @@ inline unsigned count_before(const Lanes &a, const Lanes &b, Lanes &rank_a, Lane
     return ties;
 }
 
+// Where a is greater than `most`, puts a there and b into `which`.
+inline void pick_greater(const Lanes &a, const Lanes &b, Lanes &most, Lanes &which) {
+    for (int i = 0; i < PARTS; ++i) {
+        const vm m = greater(a.part[i], most.part[i]);
+        most.part[i] = pick(m, a.part[i], most.part[i]);
+        which.part[i] = pick(m, b.part[i], which.part[i]);
+    }
+}
+
 inline float sum(const Lanes &a) {
     alignas(64) float v[LANES];
     store_lanes(v, a);

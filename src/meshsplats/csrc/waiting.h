@@ -87,7 +87,9 @@ class Waiting {
 
   private:
     static constexpr int ENTRIES = 8;  // a list is blended as far as possible once it is so long
-    static constexpr int MANY_ENTRIES = 64, MOST_AT_ONCE = 64;
+    static constexpr int MANY_ENTRIES = 64;
+    // Where a block takes many vectors, longer code to rank costs more than it gains.
+    static constexpr int MOST_TO_RANK = PARTS <= 2 ? 16 : 8, MOST_TO_SEARCH = 512;
 
     struct Entry {
         uint32_t lanes;
@@ -117,16 +119,18 @@ class Waiting {
 
     template <class Blend>
     void visit(int n, const uint32_t &open, Blend &&blend) {
-        if (n > MOST_AT_ONCE)
+        if (n > MOST_TO_SEARCH)
             lane_by_lane(n, open, blend);
+        else if (n > MOST_TO_RANK)
+            nearest_first(n, open, blend);
         else if (n > 0)
             in_order(n, blend);
     }
 
     // Where each of the n active entries comes in the order of each lane, and the entries by the mean of that.
     struct Order {
-        Lanes rank[MOST_AT_ONCE];
-        int entry[MOST_AT_ONCE];
+        Lanes rank[MOST_TO_RANK];
+        int entry[MOST_TO_RANK];
     };
 
     // n <= N.
@@ -147,27 +151,6 @@ class Waiting {
         finish_order(n, key, rank, ties, order);
     }
 
-    void rank_more(const int n, Order &order) const {
-        // Where a block takes many vectors, longer code costs more than it gains.
-        if constexpr (PARTS <= 2) {
-            if (n <= 12) return rank<12>(n, order);
-            if (n <= 16) return rank<16>(n, order);
-        }
-        rank_many(n, order);
-    }
-
-    // The same for more.
-    void rank_many(const int n, Order &order) const {
-        Lanes key[MOST_AT_ONCE], rank[MOST_AT_ONCE];
-        uint32_t ties = 0;
-        for (int i = 0; i < n; ++i) {
-            key[i] = pick(active_[i].lanes, fragments_[active_[i].entry].key, lanes(-1.0f - i));
-            rank[i] = lanes(0);
-            for (int j = 0; j < i; ++j) ties |= count_before(key[j], key[i], rank[j], rank[i]);
-        }
-        finish_order(n, key, rank, ties, order);
-    }
-
     void finish_order(const int n, const Lanes *key, Lanes *rank, uint32_t ties, Order &order) const {
         if (ties) {
             for (int j = 1; j < n; ++j)
@@ -178,7 +161,7 @@ class Waiting {
                         rank[j] = rank[j] + only(tie, lanes(1));
                     }
         }
-        float mean[MOST_AT_ONCE];
+        float mean[MOST_TO_RANK];
         for (int i = 0; i < n; ++i) {
             order.rank[i] = rank[i];
             mean[i] = sum(only(active_[i].lanes, rank[i])) / __builtin_popcount(active_[i].lanes);
@@ -197,10 +180,12 @@ class Waiting {
         Order order;
         if (n <= 4)
             rank<4>(n, order);
+        else if (n <= 6)
+            rank<6>(n, order);
         else if (n <= 8)
             rank<8>(n, order);
-        else
-            rank_more(n, order);
+        else if constexpr (MOST_TO_RANK > 8)
+            n <= 12 ? rank<12>(n, order) : rank<16>(n, order);
         Lanes done = lanes(0);
         for (bool more = true; more;) {
             more = false;
@@ -216,7 +201,45 @@ class Waiting {
         }
     }
 
-    // For long lists.
+    // For longer lists, of which mostly only the nearest matter: finds those of every lane, again and again.
+    template <class Blend>
+    void nearest_first(const int n, const uint32_t &open, Blend &blend) {
+        constexpr float NONE = -1, DONE = -2;
+        if (left_.size() < (size_t)n) left_.resize(n);
+        for (int i = 0; i < n; ++i) left_[i] = pick(active_[i].lanes, fragments_[active_[i].entry].key, lanes(DONE));
+        for (;;) {
+            Lanes nearest = lanes(NONE), which = lanes(0);
+            for (int i = 0; i < n; ++i) {
+                const uint32_t ties = equal(left_[i], nearest);
+                pick_greater(left_[i], lanes((float)i), nearest, which);
+                if (ties) lower_face(i, ties, which);
+            }
+            uint32_t rest = open & greater(nearest, lanes(NONE));
+            if (!rest) return;
+            alignas(64) float places[LANES];
+            store_lanes(places, which);
+            while (rest) {
+                const float place = places[__builtin_ctz(rest)];
+                const uint32_t due = rest & equal(which, lanes(place));
+                left_[(int)place] = pick(due, lanes(DONE), left_[(int)place]);
+                blend(active_[(int)place].entry, due);
+                rest &= ~due;
+            }
+        }
+    }
+
+    // At `ties`, leaves in `which` that of both entries that has the lower face.
+    void lower_face(int i, uint32_t ties, Lanes &which) const {
+        alignas(64) float places[LANES];
+        store_lanes(places, which);
+        for (; ties; ties &= ties - 1) {
+            float &place = places[__builtin_ctz(ties)];
+            if (entries_[active_[i].entry].face < entries_[active_[(int)place].entry].face) place = (float)i;
+        }
+        which = load_lanes(places);
+    }
+
+    // For very long lists.
     template <class Blend>
     void lane_by_lane(const int n, const uint32_t &open, Blend &blend) {
         struct Fragment {
@@ -246,6 +269,7 @@ class Waiting {
     std::vector<Fragments> fragments_;
     std::vector<FragmentWeights> weights_;
     std::vector<Active> active_;
+    std::vector<Lanes> left_;
     int count_ = 0, limit_ = ENTRIES;
 };
 
