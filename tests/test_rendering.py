@@ -160,7 +160,7 @@ def test_ties_go_by_face_number():
 
 @pytest.mark.parametrize("count", [3, 5, 7, 11, 15, 30, 200, 600])
 def test_ties_where_planes_cross(count):
-    """Planes that face the camera, and in turn others that cross them at the samples of one column exactly."""
+    """Planes that face the camera, and in turn others that cross them exactly at the samples of a column."""
     view = Camera(np.eye(4), 16, 16, 8, 8, 16, 16)
     pixels = np.array([(-23.5, -24), (72.5, -24), (-23.5, 104)])
     facing, tilted = np.full(3, 2.0), np.array([4.0, 1, 4])  # 1 / depth is 1/2 where x is 8.5
