@@ -129,7 +129,8 @@ def measure(scene: Scene, options: dict) -> Measured:
     """Converts with ``options`` and compares."""
     distances = list(scene.cameras)
     options = dict(options)
-    if options.get("preset") != "paper" and options.get("footprint") not in _WITHOUT_CAMERAS:
+    footprint = options.get("footprint", "none" if options.get("preset") == "paper" else "cameras")
+    if footprint not in _WITHOUT_CAMERAS:
         options["cameras"] = scene.cameras[distances[0]]
     if options.get("max_triangles") == "half":
         options["max_triangles"] = 4 * len(scene.cloud)
