@@ -260,14 +260,15 @@ def test_same_bits_whatever_the_threads_and_the_log():
 
 @pytest.mark.parametrize("variant", core.VARIANTS)
 def test_same_gradients_on_every_instruction_set(variant, tmp_path):
-    """But for rounding: where there is a fused multiply-add, it is used. (Pictures are the same to the last bit.)"""
+    """But for rounding: fused multiply-adds are used where there are some. (Pictures: the same bits.)"""
     if variant not in core.available_variants():
         pytest.skip(f"this processor or build has no variant {variant}")
     code = (
         f"import sys; sys.path.insert(0, {str(HERE)!r}); import numpy as np, test_rasterize as t; "
         f"np.savez({str(tmp_path / 'found.npz')!r}, *t.all_gradients())"
     )
-    subprocess.run([sys.executable, "-c", code], env={**os.environ, "MESHSPLATS_VARIANT": variant}, check=True)
+    environment = {**os.environ, "MESHSPLATS_VARIANT": variant}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
     expected = all_gradients()
     with np.load(tmp_path / "found.npz") as found:
         assert len(found.files) == len(expected) == 20
