@@ -50,7 +50,7 @@ class Bounds:
 
 def weighted_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
     """Smallest of ``values`` (k,) at which the sorted ``weights`` add up to ``q`` (0 to 1) of their sum."""
-    order = np.argsort(values, kind="stable")
+    order = np.argsort(values)  # equal values may stand in any order
     total = np.cumsum(weights[order])
     return float(values[order[min(np.searchsorted(total, q * total[-1]), len(order) - 1)]])
 

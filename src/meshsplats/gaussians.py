@@ -102,11 +102,7 @@ class GaussianCloud:
 
     def select(self, index: np.ndarray) -> GaussianCloud:
         """The splats chosen by a boolean mask or an index array, in that order."""
-        return replace(
-            self,
-            means=self.means[index],
-            quaternions=self.quaternions[index],
-            scales=self.scales[index],
-            opacities=self.opacities[index],
-            sh=self.sh[index],
-        )
+        # Taking rows by number is several times as quick as indexing, where they are as short as these.
+        rows = np.arange(len(self))[index]
+        fields = ("means", "quaternions", "scales", "opacities", "sh")
+        return replace(self, **{name: np.take(getattr(self, name), rows, axis=0) for name in fields})

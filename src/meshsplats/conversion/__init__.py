@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -63,7 +64,11 @@ def convert(
     chosen = make_options(options).resolved(preset, has_cameras=bool(cameras))
     direction = guess_up(None, cameras) if up is None else unit_up(up)
     rows = _worth_drawing(cloud, chosen)
-    part = cloud if len(rows) == len(cloud) else cloud.select(rows)
+    part = cloud
+    if chosen.colors == "degree0" and cloud.sh_degree:
+        part = replace(part, sh=part.sh[:, :1])
+    if len(rows) < len(cloud):
+        part = part.select(rows)
 
     views = None
     if cameras and (chosen.footprint == "cameras" or chosen.colors == "cameras"):
@@ -74,7 +79,7 @@ def convert(
     areas = disc_areas(sigma)
     shadow = mean_shadow(areas)
     shapes, choice = _shapes(sigma, chosen)
-    triangles = np.array([len(shape.pattern.faces) for shape in shapes])[choice]
+    triangles = len(shapes[0].pattern.faces)  # a splat, whatever its shape
 
     keep = areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(part), bool)
     if not keep.any():
@@ -93,8 +98,9 @@ def convert(
     if chosen.colors == "cameras" and part.sh_degree > 0 and views is not None:
         colors = views.mean_colors(part.sh)
     everything = bool(keep.all())
-    pick = (lambda array: array) if everything else (lambda array: array[keep])
-    vertices, faces, rgba, face_count = build(
+    chosen_rows = np.flatnonzero(keep)
+    pick = (lambda array: array) if everything else (lambda array: np.take(array, chosen_rows, axis=0))
+    vertices, faces, rgba = build(
         shapes,
         pick(choice),
         pick(part.means),
@@ -104,7 +110,7 @@ def convert(
         pick(colors),
         pick(opacity),
     )
-    return SplatMesh(vertices, faces, rgba, face_splat=np.repeat(pick(rows), face_count), up=direction)
+    return SplatMesh(vertices, faces, rgba, face_splat=np.repeat(pick(rows), triangles), up=direction)
 
 
 def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:
@@ -163,11 +169,13 @@ def _by_size(scales: np.ndarray) -> np.ndarray:
     """(n, 3) stable descending order of three columns, by comparisons: much quicker than a sort along short
     rows."""
     a, b, c = scales.T
-    ab, ac, bc = a >= b, a >= c, b >= c
-    places = np.stack([2 - ab - ac, 1 + ab - bc, ac.astype(np.int8) + bc], axis=1).astype(np.int8)
-    order = np.empty_like(places)
-    np.put_along_axis(order, places, np.broadcast_to(np.arange(3, dtype=np.int8), places.shape), axis=1)
-    return order
+    return _ORDERS[(a >= b) * np.int8(4) + (a >= c) * np.int8(2) + (b >= c)]
+
+
+_ORDERS = np.array(
+    [[2, 1, 0], [1, 2, 0], [2, 1, 0], [1, 0, 2], [2, 0, 1], [2, 0, 1], [0, 2, 1], [0, 1, 2]], np.int8
+)
+"""By which of a >= b, a >= c and b >= c hold; third and sixth cannot be."""
 
 
 def _shapes(sigma: np.ndarray, options: ConversionOptions) -> tuple[list[Shape], np.ndarray]:
@@ -198,8 +206,6 @@ def _shapes(sigma: np.ndarray, options: ConversionOptions) -> tuple[list[Shape],
 def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
     """(n,) mean area of a splat's projection over all directions, over that of its ellipses: |cos| is 1/2 on
     average."""
-    drawn = np.empty(len(areas), np.float32)
-    for number, shape in enumerate(shapes):
-        own = choice == number
-        drawn[own] = 0.5 * areas[own][:, : shape.pattern.ellipses].sum(axis=1)
+    sums = [0.5 * areas[:, : shape.pattern.ellipses].sum(axis=1) for shape in shapes]
+    drawn = sums[0] if len(sums) == 1 else np.where(choice == 0, *sums)
     return np.divide(shadow, drawn, out=np.ones_like(shadow), where=drawn > 0)

@@ -7,8 +7,9 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from meshsplats.conversion.products import thin_product
+from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.profiles import Profile
 
 CHUNK = 1 << 13
@@ -94,18 +95,24 @@ def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
 
 
 def semi_axes(quaternions: np.ndarray, order: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) float32 one-sigma semi-axes in the world frame; row k is ``sigma[:, k]`` along axis
-    ``order[:, k]``."""
+    """(3, 3, n) float32 one-sigma semi-axes in the world frame; [k] holds x, y and z of ``sigma[:, k]`` along
+    axis ``order[:, k]`` of ``quaternions`` (n, 4)."""
+    n = len(quaternions)
     w, x, y, z = np.ascontiguousarray(quaternions.T)
     two = np.float32(2)
-    columns = np.empty((3, 3, len(w)), np.float32)
+    columns = np.empty((3, 3, n), np.float32)
     columns[0] = 1 - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)
     columns[1] = two * (x * y - w * z), 1 - two * (x * x + z * z), two * (y * z + w * x)
     columns[2] = two * (x * z + w * y), two * (y * z - w * x), 1 - two * (x * x + y * y)
-    own = np.ascontiguousarray(columns.transpose(2, 0, 1))
-    own = own[np.arange(len(w))[:, None], order]
-    own *= sigma[:, :, None]
-    return own
+    result = np.empty((order.shape[1], 3, n), np.float32)
+    for k in range(order.shape[1]):
+        numbers = order[:, k] * np.int64(3 * n)
+        numbers += np.arange(n)
+        for coordinate in range(3):
+            np.take(columns, numbers, out=result[k, coordinate], mode="clip")
+            numbers += n
+        result[k] *= sigma[:, k]
+    return result
 
 
 def build(
@@ -117,75 +124,53 @@ def build(
     sigma: np.ndarray,
     rgb: np.ndarray,
     opacity: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (v, 3), faces (f, 3), colours (v, 4) and (n,) how many of the faces each splat has, in order.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (v, 3), faces (f, 3) and colours (v, 4), splat after splat.
 
-    ``choice`` (n,) numbers each splat's shape; ``order`` (n, 3) and ``sigma`` (n, 3) give its axes as in
-    ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the product is clamped to 1.
+    All ``shapes`` have the same number of faces; ``choice`` (n,) numbers each splat's. ``order`` (n, 3) and
+    ``sigma`` (n, 3) give its axes as in ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the
+    product is clamped to 1.
     """
     n = len(centers)
-    vertex_count = np.array([len(s.pattern.level) for s in shapes], np.int64)[choice]
-    face_count = np.array([len(s.pattern.faces) for s in shapes], np.int64)[choice]
-    v, f = int(vertex_count.sum()), int(face_count.sum())
+    corners = np.stack([shape.pattern.faces.ravel() for shape in shapes])
+    count = np.array([len(shape.pattern.level) for shape in shapes], np.int64)[choice]
+    ends = np.cumsum(count)
+    v, f = int(ends[-1]) if n else 0, n * corners.shape[1] // 3
     if max(v, f) > np.iinfo(np.int32).max:
         raise ValueError(f"the mesh would have {v} vertices and {f} triangles, too many: use max_triangles")
+    first = np.subtract(ends, count, out=ends)
     vertices = np.empty((v, 3), np.float32)
     colors = np.empty((v, 4), np.float32)
-    faces = np.empty((f, 3), np.int32)
+    faces = np.empty((n, corners.shape[1]), np.int32)
     recipes = [_recipe(shape) for shape in shapes]
-    first_vertex = first_face = 0
-    for begin in range(0, n, CHUNK):
-        part = slice(begin, min(begin + CHUNK, n))
-        own_vertices, own_faces, own_choice = vertex_count[part], face_count[part], choice[part]
-        start = first_vertex + np.cumsum(own_vertices) - own_vertices
-        blocks: list[tuple[np.ndarray, ...]] = []
-        sequence = []
+
+    for part in chunks(n, CHUNK):
+        np.take(corners, choice[part], axis=0, out=faces[part], mode="clip")
+        faces[part] += first[part].astype(np.int32)[:, None]
         for number, (shape, (place, tint)) in enumerate(zip(shapes, recipes, strict=True)):
-            rows = np.flatnonzero(own_choice == number)
+            rows = np.flatnonzero(choice[part] == number)
             if not len(rows):
                 continue
-            sequence.append(rows)
-            own = rows + begin
-            profile = shape.profile
-            axes = semi_axes(quaternions[own], order[own], sigma[own])
+            own = [
+                np.take(array[part], rows, axis=0)
+                for array in (first, centers, quaternions, order, sigma, rgb, opacity)
+            ]
+            levels = np.array(shape.profile.opacities, np.float32)
             used = shape.pattern.directions.shape[1]
-            parts = np.concatenate([centers[own], axes[:, :used].reshape(len(own), -1)], axis=1)
-            levels = np.minimum(
-                opacity[own][:, None] * np.array(profile.opacities, np.float32), np.float32(1)
-            )
-            paint = thin_product(np.concatenate([rgb[own], levels], axis=1), tint)
-            corners = start[rows].astype(np.int32)[:, None] + shape.pattern.faces.reshape(1, -1)
-            blocks.append(
-                (thin_product(parts, place).reshape(-1, 3), corners.reshape(-1, 3), paint.reshape(-1, 4))
-            )
-        end_vertex, end_face = first_vertex + int(own_vertices.sum()), first_face + int(own_faces.sum())
-        points, corners, paint = zip(*blocks, strict=True)
-        _weave(points, sequence, own_vertices, vertices[first_vertex:end_vertex])
-        _weave(paint, sequence, own_vertices, colors[first_vertex:end_vertex])
-        _weave(corners, sequence, own_faces, faces[first_face:end_face])
-        first_vertex, first_face = end_vertex, end_face
-    return vertices, faces, colors, face_count
+            axes = semi_axes(own[2], own[3][:, :used], own[4][:, :used])
+            parts = np.concatenate([own[1].T, axes.reshape(3 * used, -1)])
+            paint = np.concatenate([own[5].T, np.minimum(levels[:, None] * own[6], np.float32(1))])
+            _put(vertices, own[0], thin_product(parts.T, place))
+            _put(colors, own[0], thin_product(paint.T, tint))
+    return vertices, faces.reshape(-1, 3), colors
 
 
-def _weave(
-    blocks: tuple[np.ndarray, ...], sequence: list[np.ndarray], count: np.ndarray, out: np.ndarray
-) -> None:
-    """Writes the rows of ``blocks`` to ``out``, splat after splat.
-
-    Block i holds the splats ``sequence[i]``, each with its ``count`` rows.
-    """
-    if len(blocks) == 1:
-        out[:] = blocks[0]
-        return
-    splats = np.concatenate(sequence)
-    length = count[splats]
-    source = np.empty(len(count), np.int64)
-    source[splats] = np.cumsum(length) - length
-    shift = source - (np.cumsum(count) - count)
-    rows = np.repeat(shift, count)
-    rows += np.arange(len(rows))
-    # Much quicker than to assign to scattered rows.
-    np.take(np.concatenate(blocks), rows, axis=0, out=out, mode="clip")
+def _put(out: np.ndarray, first: np.ndarray, blocks: np.ndarray) -> None:
+    """Writes each row of ``blocks`` (k, m * c) as m rows of ``out`` (v, c), from row ``first`` on."""
+    width = out.shape[1]
+    # Every run of m rows as one item: written whole, much quicker than row by row.
+    runs = sliding_window_view(out.reshape(-1), blocks.shape[1], writeable=True)
+    runs[first * width] = blocks
 
 
 def _recipe(shape: Shape) -> tuple[np.ndarray, np.ndarray]:

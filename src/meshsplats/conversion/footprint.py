@@ -7,15 +7,15 @@ start.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from meshsplats.camera import Camera, orbit
+from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.options import ConversionOptions
-from meshsplats.conversion.products import thin_product
 from meshsplats.framing import SAMPLE
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
 
 FILTER_PX2 = {"3dgs": 0.5, "antialiased": 0.4, "2dgs": 0.3}
@@ -58,37 +58,47 @@ class Views:
             means[:: max(1, len(means) // 1000)].mean(axis=0, dtype=np.float64) if len(means) else np.zeros(3)
         )
 
-    def chunks(self):
-        """Yields a slice of splats, (k, c, 3) offsets from each camera's centre and (k, c) weights; 0: not
-        seen."""
-        rotations = np.stack([camera.world_to_camera[:3, :3] for camera in self.cameras])
-        centers = np.stack([camera.center for camera in self.cameras]) - self.origin
-        matrix = np.ascontiguousarray(rotations.reshape(-1, 3).T, np.float32)
-        shift = -np.einsum("cij,cj->ci", rotations, centers).astype(np.float32).reshape(-1)
-        fx, fy, cx, cy, width, height, near = (
-            np.array([getattr(camera, name) for camera in self.cameras], np.float32)
-            for name in ("fx", "fy", "cx", "cy", "width", "height", "near")
-        )
-        for begin in range(0, len(self.means), _CHUNK):
-            part = slice(begin, min(begin + _CHUNK, len(self.means)))
-            offsets = (self.means[part] - self.origin).astype(np.float32)
-            seen_from = thin_product(offsets, matrix) + shift
-            x, y, z = seen_from.reshape(len(seen_from), -1, 3).transpose(2, 0, 1)
-            inside = z > near
-            # On the picture: |fx x / z + cx - w / 2| <= w / 2, without the division.
-            inside &= np.abs(fx * x + (cx - width / 2) * z) <= width / 2 * z
-            inside &= np.abs(fy * y + (cy - height / 2) * z) <= height / 2 * z
-            square = np.maximum(x * x + y * y + z * z, np.float32(1e-30))
-            yield part, seen_from, np.where(inside, fx * fy / square, np.float32(0))
+    def _each(self, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """For each camera: (3, k) offsets of the splats ``part`` from its centre in the world frame, (k,) the
+        squares of their lengths, (k,) bool which of them it sees, and (k,) weights; 0: not seen."""
+        points = np.ascontiguousarray((self.means[part] - self.origin).T, np.float32)
+        for camera in self.cameras:
+            rotation, center = camera.world_to_camera[:3, :3], camera.center - self.origin
+            fx, fy = camera.fx, camera.fy
+            # Rows that give 2 x' / width * z and 2 y' / height * z, with x' and y' pixels from the middle of
+            # the picture, and z: on the picture is what has none of the first two larger than z.
+            lens = np.array(
+                [
+                    [2 * fx / camera.width, 0, 2 * camera.cx / camera.width - 1],
+                    [0, 2 * fy / camera.height, 2 * camera.cy / camera.height - 1],
+                    [0, 0, 1],
+                ]
+            )
+            matrix = lens @ rotation
+            across = matrix.astype(np.float32) @ points
+            across -= (matrix @ center).astype(np.float32)[:, None]
+            z = across[2]
+            seen = z > camera.near
+            np.abs(across[:2], out=across[:2])
+            seen &= across[0] <= z
+            seen &= across[1] <= z
+            away = points - center.astype(np.float32)[:, None]
+            square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
+            np.maximum(square, np.float32(1e-30), out=square)
+            weight = np.float32(fx * fy) / square
+            weight *= seen
+            yield away, square, seen, weight
 
     def pixel_sizes(self) -> np.ndarray:
         """(n,) float32 size of a pixel at each splat in scene units: d / f with 1 / d^2 averaged over the
         cameras that see it, so that near views, where it covers more pixels, count for more. 0 where no
         camera sees the splat."""
         sizes = np.empty(len(self.means), np.float32)
-        for part, _, weight in self.chunks():
-            count = (weight > 0).sum(axis=1)
-            total = weight.sum(axis=1)
+        for part in chunks(len(sizes), _CHUNK):
+            count, total = np.zeros((2, part.stop - part.start), np.float32)
+            for _, _, seen, weight in self._each(part):
+                count += seen
+                total += weight
             sizes[part] = np.sqrt(np.divide(count, total, out=np.zeros_like(total), where=count > 0))
         return sizes
 
@@ -99,24 +109,54 @@ class Views:
         Views count by the pixels that the splat covers. Averaged first, clipped after. Degree 0 for unseen
         splats.
         """
-        degree = int(sh.shape[1] ** 0.5) - 1
         colors = np.empty((len(sh), 3), np.float32)
-        rotations = [camera.world_to_camera[:3, :3].astype(np.float32) for camera in self.cameras]
-        for part, seen_from, weight in self.chunks():
-            offsets = seen_from.reshape(len(seen_from), -1, 3)
-            # Coefficient by coefficient, as sh_basis lays them out.
-            mean = np.zeros((sh.shape[1], len(weight)), np.float32).T
-            for c, rotation in enumerate(rotations):
-                ray = thin_product(offsets[:, c], rotation)
-                ray /= np.sqrt(np.einsum("ni,ni->n", ray, ray) + np.float32(1e-30))[:, None]
-                basis = sh_basis(ray, degree)
-                basis *= weight[:, c, None]
-                mean += basis
-            total = weight.sum(axis=1)
-            mean /= np.where(total > 0, total, 1)[:, None]
-            mean[total == 0, 0] = sh_basis(np.zeros((1, 3), np.float32), 0)[0, 0]
-            colors[part] = np.clip(0.5 + np.einsum("nk,nkc->nc", mean, sh[part]), 0, 1)
+        degree = int(sh.shape[1] ** 0.5) - 1
+        matrix = _from_monomials(degree)
+        # Each coefficient three times, as colours lie in memory; and the sum over the coefficients.
+        spread = np.repeat(matrix, 3, axis=1)
+        gather = np.tile(np.eye(3, dtype=np.float32), (sh.shape[1], 1))
+        terms = MONOMIALS[1 : len(matrix)]
+        for part in chunks(len(sh), _CHUNK):
+            k = part.stop - part.start
+            # Harmonics are polynomials of the direction: the means of its monomials are all that is needed.
+            mean = np.zeros((len(matrix), k), np.float32)
+            values = np.empty_like(mean)
+            for away, square, _, weight in self._each(part):
+                away /= np.sqrt(square)
+                values[0] = weight
+                for value, (factor, axis) in zip(values[1:], terms, strict=True):
+                    np.multiply(values[factor], away[axis], out=value)
+                mean += values
+            unseen = mean[0] == 0
+            mean /= np.where(unseen, np.float32(1), mean[0])
+            shade = thin_product(mean.T, spread)
+            shade[unseen] = np.repeat(np.eye(1, len(matrix), dtype=np.float32) * SH_C0, 3)
+            shade *= sh[part].reshape(k, -1)
+            color = thin_product(shade, gather)
+            color += np.float32(0.5)
+            np.clip(color, 0, 1, out=colors[part])
         return colors
+
+
+MONOMIALS = [
+    (-1, -1),  # 1
+    *[(0, 0), (0, 1), (0, 2)],  # x y z
+    *[(1, 0), (1, 1), (2, 1), (1, 2), (2, 2)],  # xx xy yy xz yz
+    *[(4, 0), (4, 1), (6, 0), (6, 1), (4, 2), (5, 2), (6, 2)],  # xxx xxy xyy yyy xxz xyz yyz
+]
+"""Monomials of a direction up to degree 3, each as the product of an earlier one, by number, and an axis.
+zz is 1 - xx - yy on the sphere, so those of degree d and less are as many as spherical harmonics."""
+
+
+def _from_monomials(degree: int) -> np.ndarray:
+    """((degree + 1)^2, (degree + 1)^2) float32 whose product with ``MONOMIALS`` of a direction, in rows, is
+    ``sh_basis`` of it."""
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    values = np.ones((64, (degree + 1) ** 2))
+    for number, (factor, axis) in list(enumerate(MONOMIALS))[1 : values.shape[1]]:
+        values[:, number] = values[:, factor] * directions[:, axis]
+    return np.linalg.lstsq(values, sh_basis(directions, degree), rcond=None)[0].astype(np.float32)
 
 
 def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:

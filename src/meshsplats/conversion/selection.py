@@ -22,9 +22,10 @@ def mean_shadow(areas: np.ndarray) -> np.ndarray:
     shadow of an ellipsoid; the mean shadow of a convex body is a quarter of its surface (Cauchy), for which
     Thomsen's formula stands.
     """
-    largest = areas.max(axis=1, keepdims=True)
-    unit = areas / np.where(largest > 0, largest, 1)
-    return largest[:, 0] * np.power(np.power(unit, THOMSEN).sum(axis=1) / 3, 1 / THOMSEN)
+    a, b, c = areas.T
+    largest = np.maximum(np.maximum(a, b), c)
+    unit = np.power(areas.T / np.where(largest > 0, largest, 1), THOMSEN)
+    return largest * np.power((unit[0] + unit[1] + unit[2]) / 3, 1 / THOMSEN)
 
 
 def choose_splats(
@@ -45,7 +46,7 @@ def choose_splats(
     rows = np.flatnonzero(keep)
     if max_splats is not None and max_splats < len(rows):
         importance = cloud.opacities[rows] * mean_shadow(disc_areas(cloud.scales[rows]))
-        rows = rows[most_important(importance, np.ones(len(rows), np.int64), max_splats, None)]
+        rows = rows[most_important(importance, 1, max_splats, None)]
     if not len(rows):
         raise ValueError(f"none of the {len(cloud)} splats is left: all are fainter than {min_opacity:.4g}")
     return cloud.select(rows)
@@ -65,28 +66,21 @@ def inside_box(cloud: GaussianCloud, crop: tuple[float, ...]) -> np.ndarray:
 
 
 def most_important(
-    importance: np.ndarray, triangles: np.ndarray, max_splats: int | None, max_triangles: int | None
+    importance: np.ndarray, triangles: int, max_splats: int | None, max_triangles: int | None
 ) -> np.ndarray:
     """(n,) bool: the splats of greatest ``importance`` (ties: lower number first) that both limits admit.
 
-    With ``max_triangles`` splats are taken in order of importance until the next one's ``triangles`` (n,)
-    would be too many. ValueError if not even one fits.
+    Each splat has ``triangles`` triangles. ValueError if not even one fits.
     """
     n = len(importance)
-    keep = np.ones(n, bool)
-    if (max_splats is None or max_splats >= n) and (
-        max_triangles is None or max_triangles >= triangles.sum()
-    ):
-        return keep
-    order = np.argsort(-importance, kind="stable")
     count = n if max_splats is None else min(n, max_splats)
     if max_triangles is not None:
-        count = min(count, int(np.searchsorted(np.cumsum(triangles[order]), max_triangles, side="right")))
+        count = min(count, max_triangles // triangles)
         if count == 0:
-            raise ValueError(
-                f"max_triangles must be at least {triangles[order[0]]}, one splat's, got {max_triangles}"
-            )
-    keep[order[count:]] = False
+            raise ValueError(f"max_triangles must be at least {triangles}, one splat's, got {max_triangles}")
+    keep = np.ones(n, bool)
+    if count < n:
+        keep[np.argsort(-importance, kind="stable")[count:]] = False
     return keep
 
 

@@ -1,4 +1,4 @@
-"""Products of a long, thin matrix with a small one."""
+"""Work on long arrays, a cache's worth at a time."""
 
 from __future__ import annotations
 
@@ -16,3 +16,8 @@ def thin_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     for begin in range(0, len(a), step):
         np.matmul(a[begin : begin + step], b, out=out[begin : begin + step])
     return out
+
+
+def chunks(n: int, size: int) -> list[slice]:
+    """Slices of ``size`` (the last may be shorter) that together are 0 to ``n``."""
+    return [slice(begin, min(begin + size, n)) for begin in range(0, n, size)]
