@@ -76,12 +76,12 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
 
     // Gradients of a few tiles at a time wait to be added in order.
     constexpr int WAVE = 256;
-    std::vector<std::vector<ms::CornerGradients>> waiting(WAVE);
-    std::vector<std::vector<float>> waiting_attributes(WAVE);
+    std::vector<ms::TileGradients> waiting(WAVE);
     struct Worker {
         ms::GradientTile back;
         std::unique_ptr<PictureWorker> again;
         ms::TileLog log;
+        ms::PackedLog packed;
     };
     std::vector<std::unique_ptr<Worker>> workers(threads);
     auto run = [&](int64_t begin, int64_t end, ms::TileLists *lists) {
@@ -91,26 +91,25 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
             ms::on_threads(threads, [&](int thread) {
                 auto &worker = workers[thread];
                 if (!worker)
-                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}});
+                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}, {}});
                 for (int i; (i = next.fetch_add(1)) < count;) {
                     const int64_t tile = wave + i;
-                    const ms::TileLog *entries = log.find(tile);
+                    const ms::PackedLog *entries = log.find(tile);
                     if (!entries) {
                         if (!worker->again) {
                             worker->again = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, nothing, camera));
                             worker->again->blend().record(&worker->log);
                         }
                         draw_tile(grid, *worker->again, tile, lists->list(tile), lists->length(tile));
-                        entries = &worker->log;
+                        worker->packed.pack(worker->log);
+                        entries = &worker->packed;
                     }
-                    waiting[i].clear();
-                    waiting_attributes[i].clear();
                     int x, y;
                     grid.place(tile, x, y);
-                    worker->back.run(x, y, *entries, waiting[i], waiting_attributes[i]);
+                    worker->back.run(x, y, *entries, waiting[i]);
                 }
             });
-            sum.add(waiting.data(), waiting_attributes.data(), count);
+            sum.add(waiting.data(), count);
         }
     };
     if (!redraws) return run(0, grid.tiles(), nullptr);

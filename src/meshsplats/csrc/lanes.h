@@ -56,6 +56,12 @@ inline Lanes mul_add(const Lanes &a, const Lanes &b, const Lanes &c) {
     return r;
 }
 
+inline Lanes reciprocal(const Lanes &a) {
+    Lanes r;
+    for (int i = 0; i < PARTS; ++i) r.part[i] = reciprocal(a.part[i]);
+    return r;
+}
+
 // Limits a to [low, high]; NaN becomes low.
 inline Lanes clamp(const Lanes &a, const Lanes &low, const Lanes &high) { return least(most(a, low), high); }
 
@@ -160,6 +166,19 @@ inline Lanes add_columns(const Lanes terms[4]) {
     r = load_lanes(sums);
 #endif
     return r;
+}
+
+// Lane i: first[i * stride], for i < count; 0 beyond.
+inline Lanes column(const float *first, int count, int stride) {
+    alignas(64) float v[LANES] = {};
+    for (int i = 0; i < count; ++i) v[i] = first[(long)i * stride];
+    return load_lanes(v);
+}
+// The way back.
+inline void put_column(const Lanes &a, float *first, int count, int stride) {
+    alignas(64) float v[LANES];
+    store_lanes(v, a);
+    for (int i = 0; i < count; ++i) first[(long)i * stride] = v[i];
 }
 
 }  // namespace ms

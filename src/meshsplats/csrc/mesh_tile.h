@@ -42,6 +42,8 @@ class MeshTile {
     }
 
   private:
+    using Triangles = ms::Triangles<8>;
+
     static constexpr int BOXES_AHEAD = 12, FACES_AHEAD = 8, CORNERS_AHEAD = 3, RING = 16;
 
     // Which triangles of a run may touch the tile: a bit each.
@@ -150,10 +152,7 @@ class MeshTile {
         for (int k = begin; k < end; ++k) {
             unsigned touched = prepare(k);
             blocks |= touched;
-            if (log && touched) {
-                number[k] = (uint32_t)log->faces.size();
-                log->faces.push_back(t.face[k]);
-            }
+            number[k] = UINT32_MAX;
             for (; touched; touched &= touched - 1) touching[__builtin_ctz(touched)] |= 1u << k;
         }
         for (; blocks; blocks &= blocks - 1) {
@@ -191,6 +190,10 @@ class MeshTile {
                 if (!covered) face = t.face[k];
                 covered |= inside;
                 if (log) {
+                    if (number[k] == UINT32_MAX) {
+                        number[k] = (uint32_t)log->faces.size();
+                        log->faces.push_back(t.face[k]);
+                    }
                     if (!pieces) first_piece = (uint32_t)log->pieces.size();
                     log->pieces.push_back({number[k], inside});
                     ++pieces;

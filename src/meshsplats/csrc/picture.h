@@ -140,7 +140,7 @@ class PictureTile {
             lit = at_least(through, enough);
             if (log_) {
                 if (ready & open)
-                    log_->steps.push_back({waiting.first_piece(entry), (uint16_t)(ready & open), (uint8_t)waiting.pieces(entry), (uint8_t)block});
+                    log_->steps[block].push_back({waiting.first_piece(entry), (uint16_t)(ready & open), (uint16_t)waiting.pieces(entry)});
                 reach = reach - only(ready & open, reach * least(f.rgba[3], lanes(MOST_OPAQUE)));
                 open &= lit | at_least(reach, enough);
             } else {

@@ -52,6 +52,16 @@ inline vf mul_add(vf a, vf b, vf c) { return _mm256_fmadd_ps(a, b, c); }
 inline vf mul_add(vf a, vf b, vf c) { return a * b + c; }
 #endif
 
+// 1 / a for normal a, within a unit or two of the last place: also for what need not be the same everywhere.
+#if defined(__AVX512F__)
+inline vf reciprocal(vf a) {
+    const vf r = _mm512_rcp14_ps(a);
+    return _mm512_fmadd_ps(r, _mm512_fnmadd_ps(a, r, set1(1)), r);
+}
+#else
+inline vf reciprocal(vf a) { return 1 / a; }
+#endif
+
 // Masks, one flag a lane.
 #if defined(__AVX512F__)
 typedef __mmask16 vm;

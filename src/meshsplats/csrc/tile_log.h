@@ -7,6 +7,8 @@
 #include <memory>
 #include <vector>
 
+#include "tile_area.h"
+
 namespace ms {
 
 struct TileLog {
@@ -18,20 +20,16 @@ struct TileLog {
     // Samples of a block that take their fragments of some pieces; no two of these share a sample.
     struct Step {
         uint32_t first;  // of `pieces`
-        uint16_t lanes;
-        uint8_t count, block;
+        uint16_t lanes, count;
     };
     std::vector<int32_t> faces;
     std::vector<Piece> pieces;
-    std::vector<Step> steps;  // at every sample nearest first
+    std::vector<Step> steps[BLOCKS];  // at every sample nearest first
 
     void clear() {
         faces.clear();
         pieces.clear();
-        steps.clear();
-    }
-    int64_t bytes() const {
-        return (int64_t)(faces.size() * sizeof(int32_t) + pieces.size() * sizeof(Piece) + steps.size() * sizeof(Step));
+        for (auto &block : steps) block.clear();
     }
 
     // Calls call(triangle, lanes) for the pieces that have some of the lanes.
@@ -42,6 +40,33 @@ struct TileLog {
     }
 };
 
+// The same, no larger than it must be.
+struct PackedLog {
+    std::vector<int32_t> faces;
+    std::vector<TileLog::Piece> pieces;
+    std::vector<TileLog::Step> steps;
+    uint32_t end[BLOCKS];  // of each block's steps
+
+    static int64_t bytes(const TileLog &log) {
+        int64_t sum = (int64_t)(log.faces.size() * sizeof(int32_t) + log.pieces.size() * sizeof(TileLog::Piece));
+        for (auto &block : log.steps) sum += (int64_t)(block.size() * sizeof(TileLog::Step));
+        return sum;
+    }
+
+    void pack(const TileLog &log) {
+        faces = log.faces;  // a copy is as large as what it holds
+        pieces = log.pieces;
+        size_t sum = 0;
+        for (auto &block : log.steps) sum += block.size();
+        steps.clear();
+        steps.reserve(sum);
+        for (int block = 0; block < BLOCKS; ++block) {
+            steps.insert(steps.end(), log.steps[block].begin(), log.steps[block].end());
+            end[block] = (uint32_t)steps.size();
+        }
+    }
+};
+
 // The logs of a picture's tiles, as far as they fit a budget of memory; other tiles have to be drawn again.
 class PictureLog {
   public:
@@ -49,14 +74,15 @@ class PictureLog {
 
     // Not for one tile by two threads.
     void keep(int64_t tile, const TileLog &log) {
-        const int64_t bytes = log.bytes();
+        const int64_t bytes = PackedLog::bytes(log);
         if (left_.fetch_sub(bytes) < bytes) {
             left_.fetch_add(bytes);
             return;
         }
-        tiles_[tile] = std::make_unique<TileLog>(log);  // a copy is as large as what it holds
+        tiles_[tile] = std::make_unique<PackedLog>();
+        tiles_[tile]->pack(log);
     }
-    const TileLog *find(int64_t tile) const { return tiles_[tile].get(); }
+    const PackedLog *find(int64_t tile) const { return tiles_[tile].get(); }
     bool complete() const {
         for (auto &tile : tiles_)
             if (!tile) return false;
@@ -64,7 +90,7 @@ class PictureLog {
     }
 
   private:
-    std::vector<std::unique_ptr<TileLog>> tiles_;
+    std::vector<std::unique_ptr<PackedLog>> tiles_;
     std::atomic<int64_t> left_;
 };
 

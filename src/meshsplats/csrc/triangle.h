@@ -54,8 +54,9 @@ struct Linear {
 
 // A few triangles made ready for a tile, side by side; positions count from the tile's corner.
 // Everything a sample needs is linear in its position: the edge functions E_i, 1 / depth and RGBA / depth.
+template <int COUNT>
 struct Triangles {
-    static constexpr int N = 8;
+    static constexpr int N = COUNT;
 
     // In: corners of projected triangles, relative to the tile.
     alignas(64) double x[3][N], y[3][N], w[3][N];
