@@ -121,7 +121,7 @@ def _move(thing: Any, depsgraph: Any) -> None:
         raise ValueError("the base has vertices at no finite place")
     moved = binding.moved(places, binding.lift)
     data = thing.data
-    data.vertices.foreach_set("co", moved.positions().ravel())
+    versions.set_positions(data, moved.positions())
     if meshes.NORMAL in data.attributes:
         normals = moved.normals()
         data.attributes[meshes.NORMAL].data.foreach_set("vector", normals.ravel())

@@ -109,7 +109,8 @@ def build(
             caster = meshes.make_plain(
                 f"{subject.name} shadow", subject.caster_vertices, subject.caster_faces
             )
-            caster.update(calc_edges=edges)
+            if edges:
+                caster.update(calc_edges=True)
             caster.materials.append(materials.plain("Shadow", stage.GREY))
             stand_in = meshes.make_object(caster, caster.name, rotation, splats)
             stand_in.visible_camera = False

@@ -10,6 +10,9 @@ from meshsplats.blender.inside.host import bpy
 
 OLDEST = (4, 2, 0)
 
+_CUSTOM_NORMAL = "custom_normal"
+"""Blender's own name for the attribute that replaces a mesh's normals, from 4.5 on."""
+
 
 def engine_name(engine: str) -> str:
     """Blender's identifier of 'cycles' or 'eevee'."""
@@ -34,16 +37,48 @@ def socket(sockets: Any, *names: str) -> Any:
     raise KeyError(f"none of the sockets {', '.join(names)}; there are {', '.join(s.name for s in sockets)}")
 
 
+def set_positions(mesh: Any, vertices: np.ndarray) -> None:
+    """Gives the vertices of a bpy mesh their (v, 3) positions."""
+    flat = np.ascontiguousarray(vertices, np.float32).ravel()
+    # The attribute is filled by one copy, ``vertices`` one number at a time: a hundredth of the time.
+    if "position" in mesh.attributes:
+        mesh.attributes["position"].data.foreach_set("vector", flat)
+    else:
+        mesh.vertices.foreach_set("co", flat)
+
+
+def set_corners(mesh: Any, faces: np.ndarray) -> None:
+    """Gives the corners of a bpy mesh of triangles their vertices, (f, 3)."""
+    flat = np.ascontiguousarray(faces, np.int32).ravel()
+    if ".corner_vert" in mesh.attributes:  # as above; but the name is Blender's own affair
+        mesh.attributes[".corner_vert"].data.foreach_set("value", flat)
+    else:
+        mesh.loops.foreach_set("vertex_index", flat)
+
+
+def shade_flat(mesh: Any) -> None:
+    """Gives each face of a bpy mesh its own normal, so that no vertex normals are computed and stored."""
+    flat = mesh.attributes.new("sharp_face", "BOOLEAN", "FACE")
+    flat.data.foreach_set("value", np.ones(len(mesh.polygons), bool))
+
+
 def set_normals(mesh: Any, normals: np.ndarray) -> None:
     """Gives each vertex of a bpy mesh its (v, 3) normal; the faces must wind so that their own agree with
     it."""
     normals = np.ascontiguousarray(normals, np.float32)
     if bpy.app.version < (4, 5, 0):
+        if not len(mesh.edges):  # which Blender reads here
+            mesh.update(calc_edges=True)
         mesh.normals_split_custom_set_from_vertices(normals)
         return
-    attribute = mesh.attributes.new("custom_normal", "FLOAT_VECTOR", "POINT")
+    attribute = mesh.attributes.get(_CUSTOM_NORMAL)
+    if attribute is None or (attribute.data_type, attribute.domain) != ("FLOAT_VECTOR", "POINT"):
+        if attribute is not None:
+            mesh.attributes.remove(attribute)
+        attribute = mesh.attributes.new(_CUSTOM_NORMAL, "FLOAT_VECTOR", "POINT")
     attribute.data.foreach_set("vector", normals.ravel())
-    mesh.update()
+    if len(mesh.edges):  # else they would be made
+        mesh.update()
 
 
 def set_if_there(owner: Any, **values: Any) -> None:
