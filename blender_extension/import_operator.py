@@ -63,6 +63,9 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
             # All that the scene holds, as rays pass through several of them.
             every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
             objects.render_settings(context.scene, every, self.shading == "lit")
+            clash = objects.clash(every, self.shading == "lit")
+            if clash:
+                self.report({"WARNING"}, f"MeshSplats: {clash}")
         count = sum(len(thing.data.polygons) for thing in things)
         self.report({"INFO"}, f"MeshSplats: {len(things)} imported, {count:,} triangles")
 

@@ -93,7 +93,11 @@ class SetUpRender(bpy.types.Operator):
         from meshsplats.blender.inside import objects
 
         every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
-        limit = objects.render_settings(context.scene, every, self.shading == "lit")
+        lit = self.shading == "lit"
+        limit = objects.render_settings(context.scene, every, lit)
+        clash = objects.clash(every, lit)
+        if clash:
+            self.report({"WARNING"}, f"MeshSplats: {clash}")
         layers = sum(int(thing.data[objects.LAYERS]) for thing in every)
         if layers > limit:
             self.report(

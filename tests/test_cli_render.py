@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from PIL import Image
 
 from meshsplats.camera import load_cameras, look_at, orbit, save_cameras
 from meshsplats.cli import main
-from meshsplats.formats.meshes import save_mesh
+from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -62,6 +63,18 @@ def test_one_picture_of_a_mesh(triangle, tmp_path, capsys):
     assert config["command"] == "render"
     assert config["options"]["background"] == "0,0,1"
     assert len(load_cameras(tmp_path / "a.cameras.json")) == 1
+
+
+def test_linear_meshes_are_blended_in_linear_light_and_encoded(triangle, tmp_path):
+    mesh = load_mesh(triangle)
+    save_mesh(replace(mesh, colors=mesh.colors * [0.5, 1, 1, 1], blending="linear"), tmp_path / "l.npz")
+    places = ["--cameras", tmp_path / "one.json"]
+    out = tmp_path / "a.png"
+    assert run(tmp_path / "l.npz", "-o", out, *places, "--background", "0,0,1") == 0
+    # Half of red 0.5 and half of blue 1: linear light 0.25 and 0.5, which sRGB encodes as 0.5371 and 0.7354.
+    np.testing.assert_array_equal(picture(out), np.full((8, 12, 3), (137, 0, 188)))
+    assert run(tmp_path / "l.npz", "-o", tmp_path / "t.png", *places, "--transparent") == 0
+    np.testing.assert_array_equal(picture(tmp_path / "t.png"), np.full((8, 12, 4), (188, 0, 0, 128)))
 
 
 def test_transparent_and_depth(triangle, tmp_path):

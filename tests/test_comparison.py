@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from meshsplats.camera import orbit
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.comparison import Comparison, ViewScore, compare, compare_views
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -47,6 +49,16 @@ def test_scores_are_those_of_the_pictures():
     assert result.views == tuple(view.score for view in views)
     assert result.psnr == pytest.approx(np.mean([view.score.psnr for view in views]))
     assert result.ssim == pytest.approx(np.mean([view.score.ssim for view in views]))
+
+
+def test_a_mesh_for_linear_blending_is_compared_as_it_is_shown():
+    cloud, mesh, cameras = scene()
+    mesh = replace(mesh, colors=mesh.colors * np.float32([0.5, 0.5, 0.5, 1]), blending="linear")
+    background = (0.1, 0.5, 1)
+    behind = srgb_to_linear(np.float32(background))
+    for view in compare_views(cloud, mesh, cameras, samples=1, background=background):
+        drawn = render(mesh, view.camera, background=behind).color
+        np.testing.assert_allclose(view.mesh, linear_to_srgb(drawn), atol=1e-6)
 
 
 def test_options_reach_the_pictures():

@@ -79,16 +79,23 @@ def compare_views(
     ----------
     sh_degree: spherical harmonics of the splats up to this degree; all by default. A mesh has one colour a
         vertex: 0 leaves the change of colour with the view out of the comparison.
-    background, threads: as in ``render``; pictures are clipped to [0, 1] as they are when saved.
+    background, threads: as in ``render``, display RGB; pictures are clipped to [0, 1] as they are when saved.
+        A mesh made for blending in linear light is drawn so, and encoded for display after.
     samples, max_layers: as in ``render``, for the mesh.
     """
+    from meshsplats.colors import linear_to_srgb, srgb_to_linear
     from meshsplats.metrics import psnr, ssim
     from meshsplats.rendering import render, render_splats
 
+    linear = mesh.blending == "linear"
+    behind = srgb_to_linear(np.asarray(background, np.float32)) if linear else background
+    options: dict[str, Any] = {"samples": samples, "max_layers": max_layers, "threads": threads}
     for i, camera in enumerate(cameras):
-        common: dict[str, Any] = {"background": background, "threads": threads}
-        a = np.clip(render_splats(cloud, camera, sh_degree=sh_degree, **common).color, 0, 1)
-        b = np.clip(render(mesh, camera, samples=samples, max_layers=max_layers, **common).color, 0, 1)
+        a = render_splats(cloud, camera, sh_degree=sh_degree, background=background, threads=threads).color
+        a = np.clip(a, 0, 1)
+        b = np.clip(render(mesh, camera, background=behind, **options).color, 0, 1)
+        if linear:
+            b = linear_to_srgb(b)
         yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))
 
 

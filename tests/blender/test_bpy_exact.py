@@ -18,6 +18,7 @@ from meshsplats import convert, load_gaussians, orbit, render
 from meshsplats.blender import SceneOptions, draw
 from meshsplats.blender.inside.pictures import read_pixels
 from meshsplats.camera import look_at
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.mesh import SplatMesh
 from meshsplats.metrics import psnr
 from meshsplats.pictures import load_png, to_bytes
@@ -65,6 +66,18 @@ def test_png_pictures_agree_to_a_step(tmp_path, samples):
     difference = np.abs(drawn.astype(int) - expected)
     assert np.mean(difference > 1) < 2e-3
     assert psnr(drawn / 255, expected / 255) > 55
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_linear_meshes_are_blended_in_linear_light_and_shown_encoded(tmp_path, samples):
+    mesh, background = random_mesh(blending="linear"), (0.2, 0.6, 0.9)
+    view = cameras()[1]
+    options = SceneOptions(samples=samples, background=background)
+    expected = render(mesh, view, samples=samples, background=srgb_to_linear(np.array(background))).color
+    draw(mesh, [view, view], pictures=[tmp_path / "a.exr", tmp_path / "a.png"], options=options)
+    assert psnr(read_pixels(tmp_path / "a.exr")[..., :3], expected) > 60
+    shown = to_bytes(linear_to_srgb(expected)) / 255
+    assert psnr(load_png(tmp_path / "a.png") / 255, shown) > 60
 
 
 def test_many_layers_are_not_cut_off(tmp_path):

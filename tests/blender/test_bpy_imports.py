@@ -92,6 +92,23 @@ def test_one_click_gives_the_exact_picture(tmp_path, suffix, least):
     assert psnr(shot(view, tmp_path / "p.exr"), render(mesh, view).color) > least
 
 
+def test_a_glb_for_linear_blending_stays_so(tmp_path):
+    mesh = random_mesh(150, up=UP, blending="linear")
+    view = cameras()[1]
+    thing = opened(mesh, ".glb", tmp_path)
+    objects.dress(thing, lit=False)
+    assert objects.as_splat_mesh(thing).blending == "linear"
+    assert psnr(shot(view, tmp_path / "p.exr"), render(mesh, view).color) > 50
+    scene = bpy.context.scene
+    objects.render_settings(scene, [thing], lit=False)
+    assert scene.view_settings.view_transform == "Standard"
+    other = bpy.data.objects.new("other", bpy.data.meshes.new("display"))
+    assert "too dark" in objects.clash([thing, other], lit=False)
+    objects.render_settings(scene, [thing, other], lit=False)
+    assert scene.view_settings.view_transform == "Raw"
+    assert objects.clash([thing, other], lit=True) == objects.clash([thing], lit=False) == ""
+
+
 def test_a_glb_needs_no_click(tmp_path):
     mesh = random_mesh(150, up=UP)
     view = cameras()[0]

@@ -43,7 +43,8 @@ def draw(
     """Has Blender render ``mesh`` from ``cameras``, or save the scene, or both; existing files are replaced.
 
     Unlit (``options.light`` None), Cycles draws what ``meshsplats.render`` draws, and the values of an .exr
-    are those of ``Rendering.color``, in the space of the mesh's colours. Lit, colours are turned to linear
+    are those of ``Rendering.color``, in the space of the mesh's colours; a .png shows display values, for
+    which those of a mesh with linear ``blending`` are encoded (sRGB). Lit, colours are turned to linear
     light; an .exr holds that, a .png is shown through Blender's view transform Standard (sRGB).
 
     Args:

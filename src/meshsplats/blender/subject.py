@@ -54,6 +54,7 @@ def prepare(
         "reach": float(np.linalg.norm(mesh.vertices - bounds.center, axis=1).max()),
         "layers": layers,
         "self_shadow": 0.0,
+        "linear": mesh.blending == "linear",
     }
     arrays = {
         "vertices": mesh.vertices,

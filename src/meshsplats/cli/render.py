@@ -165,10 +165,15 @@ class Render:
     def _draw(
         self, scene: GaussianCloud | SplatMesh, cameras: Sequence[Camera], files: _Files, unit: float | None
     ) -> None:
+        from meshsplats.colors import linear_to_srgb, srgb_to_linear
         from meshsplats.pictures import save_array, save_depth_png, save_png, straight_rgba
         from meshsplats.rendering import render, render_splats
 
         background = (0.0, 0.0, 0.0) if self.transparent else parse_color(self.draw.background)
+        # A mesh made for blending in linear light is drawn so and encoded for display after.
+        linear = isinstance(scene, SplatMesh) and scene.blending == "linear"
+        if linear:
+            background = tuple(srgb_to_linear(np.array(background)).tolist())
         samples = self.draw.samples
         if samples is None:
             samples = 1 if isinstance(scene, GaussianCloud) else 2
@@ -186,6 +191,8 @@ class Render:
             if not files.pictures[i].parent.exists():
                 files.pictures[i].parent.mkdir()  # not before something is there to be written
             picture = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color
+            if linear:
+                picture[..., :3] = linear_to_srgb(picture[..., :3])
             save_png(files.pictures[i], picture)
             if drawn.depth is None:
                 continue

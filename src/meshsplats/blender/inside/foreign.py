@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.colors import linear_to_srgb
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import Blending, SplatMesh
 
 _OPACITIES = ("displayOpacity",)
 """Attributes that hold the opacity apart from the colour, as USD has it."""
@@ -19,9 +19,10 @@ def splat_mesh(thing: Any) -> SplatMesh:
     """The mesh of ``thing``, an object with vertex colours that Blender or another add-on made, in its own
     frame.
 
-    The colours are taken for linear light, as Blender keeps colours, and come back as display colours: .glb
-    and .usd hold it so, and a .ply comes in so with the importer's default, sRGB. Of colours that differ at
-    the corners of a vertex, the mean is taken. Raises ValueError for an object without triangles or colours.
+    The colours are taken for linear light, as Blender keeps colours: .glb and .usd hold it so, and a .ply
+    comes in so with the importer's default, sRGB. They come back as display colours, unless a .glb says that
+    its mesh was made for blending in linear light. Of colours that differ at the corners of a vertex, the
+    mean is taken. Raises ValueError for an object without triangles or colours.
     """
     data: Any = thing.data if thing is not None and thing.type == "MESH" else None
     if data is None or not len(data.color_attributes):
@@ -39,7 +40,9 @@ def splat_mesh(thing: Any) -> SplatMesh:
         if name in data.attributes and data.attributes[name].data_type == "FLOAT":
             colors[:, 3] = _at_vertices(data, data.attributes[name], "value", 1, faces)[:, 0]
     colors = np.nan_to_num(np.clip(colors, 0, 1))
-    colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
+    blending = _blending(data)
+    if blending == "display":
+        colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
     # Up in Blender's world, as the object lies in it.
     up = np.array(thing.matrix_world.to_3x3().inverted_safe())[:, 2]
     return SplatMesh(
@@ -48,7 +51,17 @@ def splat_mesh(thing: Any) -> SplatMesh:
         colors,
         face_splat=_owner(data),
         up=up if np.linalg.norm(up) > 0 else np.array([0, 0, 1]),
+        blending=blending,
     )
+
+
+def _blending(data: Any) -> Blending:
+    """What our .glb files say of themselves. Blender keeps it with the mesh: as properties, or, where a
+    number is too large for one, as Python would print it."""
+    note = data.get("meshsplats")
+    if isinstance(note, str):
+        return "linear" if "'blending': 'linear'" in note else "display"
+    return "linear" if hasattr(note, "get") and note.get("blending") == "linear" else "display"
 
 
 def _at_vertices(data: Any, attribute: Any, name: str, width: int, corners: np.ndarray) -> np.ndarray:

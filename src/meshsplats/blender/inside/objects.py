@@ -119,17 +119,27 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
 def render_settings(scene: Any, things: list[Any], lit: bool) -> int:
     """Sets the scene up for ``things``: engine settings, colour management and the limit on transparent
     bounces, which is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor
-    EEVEE)."""
+    EEVEE). One scene cannot be right for both unlit meshes of display and of linear blending: where there are
+    both, it is for the former."""
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
     layers = sum(int(thing.data.get(LAYERS, 256)) for thing in things)
+    linear = bool(things) and all(thing.data.get(LINEAR) for thing in things)
     limit = bounce_limit(layers)
     if lit:
         pictures.lit_settings(scene, engine, limit=limit)
     else:
-        pictures.exact_settings(scene, engine)
+        pictures.exact_settings(scene, engine, linear=linear)
         limit = 1024
     return limit
+
+
+def clash(things: list[Any], lit: bool) -> str:
+    """What cannot be right in one unlit scene of ``things``, or ''."""
+    kinds = {bool(thing.data.get(LINEAR)) for thing in things}
+    if lit or len(kinds) < 2:
+        return ""
+    return "some meshes blend display values and others linear light: unlit, the latter look too dark here"
 
 
 def dress(thing: Any, lit: bool) -> None:

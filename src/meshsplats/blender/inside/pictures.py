@@ -12,9 +12,10 @@ from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
 
 
-def exact_settings(scene: Any, engine: str) -> None:
-    """Colours come out as they went in: no view transform, no dither, one sample at each pixel's centre."""
-    _common(scene, engine, "Raw")
+def exact_settings(scene: Any, engine: str, *, linear: bool = False) -> None:
+    """Colours come out as they went in, with no dither and one sample at each pixel's centre: without a view
+    transform, or, where they are ``linear`` light, encoded for display (sRGB)."""
+    _common(scene, engine, "Standard" if linear else "Raw")
     cycles = scene.cycles
     cycles.samples = 1
     cycles.pixel_filter_type = "GAUSSIAN"
@@ -149,7 +150,8 @@ def _save(pixels: np.ndarray, path: Path, scene: Any) -> None:
     height, width = pixels.shape[:2]
     image = bpy.data.images.new("mean", width, height, alpha=True, float_buffer=True)
     try:
-        image.colorspace_settings.name = "Non-Color"
+        # The space of Blender's own results: the scene's view transform is applied as to them.
+        image.colorspace_settings.name = "Linear Rec.709"
         image.alpha_mode = "PREMUL"
         image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())
         image.save_render(os.fspath(path), scene=scene)

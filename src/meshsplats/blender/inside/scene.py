@@ -39,6 +39,8 @@ class Subject:
     """Most layers behind each other."""
     self_shadow: float
     """Distance within which layers do not shade each other, scene units."""
+    linear: bool = False
+    """Whether the mesh was made for blending in linear light: unlit colours are linear light then, too."""
     normals: np.ndarray | None = None
     """(v, 3) float32 unit shading normals, where lit."""
     face_splat: np.ndarray | None = None
@@ -95,8 +97,9 @@ def build(
     light = options.light
     if light is None:
         mesh.materials.append(materials.unlit())
-        stage.even_world(options.background or (0, 0, 0))
-        pictures.exact_settings(scene, options.engine)
+        behind = np.array(options.background or (0, 0, 0))
+        stage.even_world((srgb_to_linear(behind) if subject.linear else behind).tolist())
+        pictures.exact_settings(scene, options.engine, linear=subject.linear)
     else:
         material = materials.lit(
             self_shadow=subject.self_shadow,
