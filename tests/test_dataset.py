@@ -270,6 +270,24 @@ def test_distances_lie_between_the_given_multiples(cloud):
         assert abs(np.corrcoef(ratio, angle)[0, 1]) < 0.2
 
 
+def test_the_fitting_distance_is_that_of_a_sphere_with_nine_tenths_of_the_opacity():
+    rng = np.random.default_rng(0)
+    shell = rng.normal(size=(3000, 3))
+    shell *= (2 / np.linalg.norm(shell, axis=1))[:, None]
+    ball = cloud_at(np.concatenate([shell, shell[:150] * 1.5]))
+    center = scene_bounds(ball).center
+    np.testing.assert_allclose(center, 0, atol=0.2)
+    for fov in (50.0, 90.0):
+        for camera in outside_cameras(ball, 5, distance=(1, 1), fov=fov, width=40, height=20):
+            away = np.linalg.norm(camera.center - center)
+            assert away == pytest.approx(2 / np.sin(np.radians(fov / 2)), rel=0.05)
+    # Surroundings with most of the opacity do not push the cameras away.
+    far = rng.normal(size=(2000, 3)) * 60
+    within = cloud_at(np.concatenate([shell, far]))
+    cameras = outside_cameras(within, 5, distance=(1, 1))
+    assert max(np.linalg.norm(camera.center) for camera in cameras) < 4 * 2.5 / np.sin(np.radians(25))
+
+
 def test_surroundings_are_noticed_and_keep_cameras_above_the_ground():
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(2000, 3)) * 0.3
@@ -279,8 +297,8 @@ def test_surroundings_are_noticed_and_keep_cameras_above_the_ground():
     assert has_surroundings(within)
     below = angles_of([v.camera for v in splat_dataset(alone, width=8).train], alone)[1].min()
     above = angles_of([v.camera for v in splat_dataset(within, width=8).train], within)[1].min()
-    assert below < -10
-    assert above > 0
+    assert 0 <= below < 1.5
+    assert 3 <= above < 5
 
 
 def test_inside_cameras_stand_in_free_space_and_look_all_round():

@@ -98,9 +98,9 @@ class TargetOptions:
     """Without --data: number of further pictures to measure with."""
     width: int = 400
     """Without --data: side of these pictures in pixels."""
-    distance: tuple[float, float] = (0.7, 1.0)
+    distance: tuple[float, float] = (0.9, 1.1)
     """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
-    subject just fits the picture."""
+    sphere with 90 % of the splats' opacity just fits the picture. The mesh looks best from there."""
     placement: Literal["auto", "object", "surrounded", "inside"] = "auto"
     """Without --data: cameras all round an object, above the ground round an object in its surroundings, or
     inside a room."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from meshsplats.camera import MAX_SIDE, NEAR_SHARE, Camera, look_at, round_subject
+from meshsplats.camera import MAX_SIDE, NEAR_SHARE, Camera, look_at
 from meshsplats.dataset import CACHE_BYTES, WHITE, Dataset, View, splat_views
 from meshsplats.framing import (
     SAMPLE,
@@ -27,14 +26,14 @@ STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
 """Steps of Kronecker's sequence for azimuth, height and distance: its points modulo 1 fill the unit cube
 evenly wherever one begins and however many are taken. The first two are powers of the plastic number's
 inverse, which are the most even pair known: directions matter most."""
-OBJECT_ELEVATIONS = (-10.0, 60.0)
+OBJECT_ELEVATIONS = (0.0, 60.0)
 SURROUNDED_ELEVATIONS = (3.0, 60.0)
-"""Degrees above the horizon, where people look from; of a scene with ground there is nothing to be seen from
-below."""
+"""Degrees above the horizon, where people look from. Few captures have anything to show from below, and flat
+ground seen from the side is so hard to match that such views spoil the others."""
 INSIDE_ELEVATIONS = (-35.0, 35.0)
-DISTANCES = (0.7, 1.0)
-"""Multiples of the distance from which the subject just fits: details, and the whole of it. A mesh is not
-filtered as splats are, so it cannot be right at every size: the wider this range, the less so at each."""
+DISTANCES = (0.9, 1.1)
+"""Multiples of the distance from which the subject just fits. A mesh is not filtered as splats are, so it
+cannot be right at every size: the wider this range, the less so at each."""
 SURROUNDINGS_SHARE = 0.01
 """More of the opacity than this beyond the subject, and it stands in surroundings."""
 STANDS = 12
@@ -67,11 +66,11 @@ def splat_dataset(
 
     Parameters
     ----------
-    placement: 'object': cameras on all sides, a little below the horizon too. 'surrounded': an object in its
-        surroundings, as of a walk round it; cameras above the ground only. 'inside': cameras that stand where
-        it is free between the splats and look outwards, for rooms and other scenes taken from inside. 'auto':
-        'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object'. 'inside' must
-        be asked for: splats do not tell a room from a hollow thing.
+    placement: 'object': cameras on all sides, from the horizon up. 'surrounded': an object in its
+        surroundings, as of a walk round it; cameras a little above the ground. 'inside': cameras that stand
+        where it is free between the splats and look outwards, for rooms and other scenes taken from inside.
+        'auto': 'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object'.
+        'inside' must be asked for: splats do not tell a room from a hollow thing.
     cameras: where the scene was trained from, as in a model folder's cameras.json. They are used in place of
         a placement: as many as are asked for, spread over all, those held out between the others, scaled to
         ``width``. ``height``, ``fov``, ``distance`` and ``up`` then have no part.
@@ -80,7 +79,8 @@ def splat_dataset(
     width, height: size in pixels; height: as width.
     fov: degrees that the shorter side spans; 50, or 75 inside.
     distance: nearest and farthest camera of 'object' and 'surrounded', as multiples of the distance from
-        which the subject just fits the picture.
+        which the sphere just fits the picture that holds 90 % of the splats' opacity (or all of the subject,
+        if it is smaller than that).
     up: (3,) direction; None: ``framing.guess_up``.
     sh_degree, background, samples, threads, cache_bytes: as in ``dataset.splat_views``.
 
@@ -154,18 +154,32 @@ def outside_cameras(
     height: int = 400,
     fov: float = 50.0,
 ) -> list[Camera]:
-    """``count`` cameras round the subject, spread evenly over directions and distances.
+    """``count`` cameras that look at the subject's middle, spread evenly over directions and distances.
 
     Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
     Each run of these cameras is even by itself. The rest is as in ``splat_dataset``.
     """
+    axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
+    bounds = scene_bounds(cloud)  # refuses an empty cloud
+    # Surroundings may hold most of the opacity; then it is the subject alone that has to fit.
+    reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max(initial=0))
+    fit = (min(bounds.radius, reach) or bounds.radius) / np.sin(np.radians(fov / 2))
     turns, heights, share = _sequence(count)
     low, high = np.sin(np.radians(elevations))
-    elevation = np.degrees(np.arcsin(low + (high - low) * heights))
-    angles = list(zip((360 * turns).tolist(), elevation.tolist(), strict=True))
-    cameras = round_subject(cloud, angles, up, width, height, fov, 1.0)
-    factors = distance[0] * (distance[1] / distance[0]) ** share
-    return [_away(camera, float(f)) for camera, f in zip(cameras, factors, strict=True)]
+    away = fit * distance[0] * (distance[1] / distance[0]) ** share
+    return [
+        look_at(
+            bounds.center + away[i] * _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i]),
+            bounds.center,
+            up=axes[1],
+            width=width,
+            height=height,
+            fov=fov,
+            near=away[i] * NEAR_SHARE,
+            name=f"view_{i:04d}",
+        )
+        for i in range(count)
+    ]
 
 
 def _sequence(count: int) -> np.ndarray:
@@ -173,11 +187,11 @@ def _sequence(count: int) -> np.ndarray:
     return (0.5 + np.outer(STEPS, np.arange(count))) % 1
 
 
-def _away(camera: Camera, factor: float) -> Camera:
-    """A camera of ``round_subject`` drawn back to ``factor`` times its distance from what it looks at."""
-    matrix = camera.world_to_camera.copy()
-    matrix[2, 3] += (factor - 1) * camera.near / NEAR_SHARE
-    return replace(camera, world_to_camera=matrix, near=camera.near * factor)
+def _towards(axes: np.ndarray, turn: float, height: float) -> np.ndarray:
+    """(3,) unit direction ``turn`` radians round the up axis; ``height``: the sine of its elevation."""
+    right, upward, forward = axes
+    level = np.sqrt(1 - height * height)
+    return level * (np.sin(turn) * right + np.cos(turn) * forward) + height * upward
 
 
 def inside_cameras(
@@ -201,14 +215,12 @@ def inside_cameras(
     cameras = []
     for i in range(count):
         stand = i % len(places)
-        turn, h = 2 * np.pi * turns[i], low + (high - low) * heights[i]
-        right, upward, forward = axes
-        direction = (1 - h * h) ** 0.5 * (np.sin(turn) * right + np.cos(turn) * forward) + h * upward
+        direction = _towards(axes, 2 * np.pi * turns[i], low + (high - low) * heights[i])
         cameras.append(
             look_at(
                 places[stand],
                 places[stand] + clearances[stand] * direction,
-                up=upward,
+                up=axes[1],
                 width=width,
                 height=height,
                 fov=fov,
