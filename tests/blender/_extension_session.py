@@ -63,6 +63,32 @@ if len(sys.argv) > 3:  # its pictures are decoded by the other wheel, Pillow
 directory = str(folder) + "/"
 bpy.ops.import_scene.meshsplats(directory=directory, files=[{"name": "mesh.npz"}, {"name": "ball.ply"}])
 assert {"mesh", "ball.001"} <= set(bpy.data.objects.keys())
+# Blender asks these of a file that is dropped on a window, and then calls the operator as above.
+handler = bpy.types.IMPORT_FH_meshsplats
+told["dropped"] = {
+    "operator": handler.bl_import_operator,
+    "suffixes": handler.bl_file_extensions.split(";"),
+    "places": [
+        kind
+        for kind in ("VIEW_3D", "OUTLINER", "TEXT_EDITOR")
+        if handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type=kind)))
+    ],
+}
+
+# Alone in the scene, a mesh for linear blending is shown encoded; beside others, that is told.
+told["linear"] = []
+hidden = [thing for thing in bpy.context.scene.objects if thing.type == "MESH"]
+for other in hidden:
+    bpy.context.scene.collection.objects.unlink(other)
+bpy.ops.import_scene.meshsplats(filepath=str(folder / "linear.npz"))
+told["linear"].append(bpy.context.scene.view_settings.view_transform)
+for other in hidden:
+    bpy.context.scene.collection.objects.link(other)
+bpy.ops.scene.meshsplats_set_up(shading="unlit")
+told["linear"].append(bpy.context.scene.view_settings.view_transform)
+bpy.data.objects.remove(bpy.data.objects["linear"])
+bpy.context.view_layer.objects.active = thing
+
 try:
     bpy.ops.import_scene.meshsplats(filepath=str(folder / "broken.ply"))
     told["broken"] = "nothing was said"
@@ -199,6 +225,7 @@ told["left"] = [
     ]
     if name in dir(getattr(bpy.ops, group))
 ]
+told["left"] += [name for name in dir(bpy.types) if "meshsplats" in name.lower()]
 handlers = bpy.app.handlers.depsgraph_update_post[:] + bpy.app.handlers.frame_change_post[:]
 told["left"] += [h.__name__ for h in handlers if h.__module__.startswith(addon)]
 told["left"] += [name for name in dir(bpy.types.Object) if name == "meshsplats"]

@@ -80,8 +80,9 @@ def test_a_whole_session(packed, tmp_path):
     """In a process of its own, where meshsplats comes from the extension's wheel alone."""
     save_gaussians(ball_splats(400)[0], tmp_path / "ball.ply")
     save_mesh(random_mesh(30), tmp_path / "mesh.npz")
+    save_mesh(random_mesh(30, blending="linear"), tmp_path / "linear.npz")
     base = BaseMesh(np.eye(3), [[0, 1, 2]])
-    save_mesh(bind(base, triangles=4, layers=2).mesh, tmp_path / "prior.npz")
+    save_mesh(bind(base, triangles=4, layers=2, spacing=0).mesh, tmp_path / "prior.npz")
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense")
     sog = [path for path in [SHARED / "splats" / "monkey_0001.sog"] if path.exists()]
     environment = {
@@ -108,6 +109,10 @@ def test_a_whole_session(packed, tmp_path):
     assert told["broken"].startswith("Error: ")
     assert "broken.ply" in told["broken"]
     assert told["left"] == []
+    assert told["dropped"]["operator"] == "import_scene.meshsplats"
+    assert {".ply", ".splat", ".spz", ".sog", ".npz", ".glb"} <= set(told["dropped"]["suffixes"])
+    assert told["dropped"]["places"] == ["VIEW_3D", "OUTLINER"]
+    assert told["linear"] == ["Standard", "Raw"]
     assert told["base"] == "prior base"
     assert told["followed"] == pytest.approx([1.0] * 12, abs=1e-4)
     assert told["follow"] == ["FINISHED"]

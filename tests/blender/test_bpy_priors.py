@@ -27,7 +27,7 @@ def sheet(n: int = 6) -> BaseMesh:
 
 def prior_mesh(layers: int = 2) -> SplatMesh:
     rng = np.random.default_rng(0)
-    mesh = bind(sheet(), triangles=4, layers=layers).mesh
+    mesh = bind(sheet(), triangles=4, layers=layers, spacing=0).mesh
     binding = replace(mesh.binding, weights=rng.dirichlet((1, 1, 1), len(mesh.vertices)))
     return MeshPrior(replace(mesh, colors=rng.random(mesh.colors.shape), binding=binding)).pose()
 

@@ -43,6 +43,10 @@ def test_executable_that_is_not_blender(program, tmp_path):
         launch.command(program("Blender 3.6.5"))
     with pytest.raises(ValueError, match=r"not Blender.*'GIMP 2.10'"):
         launch.command(program("GIMP 2.10"))
+    broken = program("", "")
+    broken.write_text("#!/bin/sh\necho 'cannot open libX11.so.6' >&2\nexit 127\n")
+    with pytest.raises(ValueError, match=r"not Blender.*cannot open libX11\.so\.6"):
+        launch.command(broken)
     command = launch.command(program("Blender 4.2.1 LTS"))
     assert command[1:3] == ["--background", "--factory-startup"]
     assert command[-2].endswith("worker.py")
@@ -78,6 +82,17 @@ def test_missing_graphics_libraries_are_named(program, monkeypatch, tmp_path):
     monkeypatch.setattr(ctypes, "CDLL", absent)
     with pytest.raises(MissingDependencyError, match=r"libEGL\.so\.1.*apt install libegl1.*--engine cycles"):
         launch.run_job({}, {}, [], SceneOptions(engine="eevee"), limit=1, executable=program("Blender 5.0.1"))
+
+
+@pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="libraries have other names")
+def test_missing_system_libraries_are_named(monkeypatch, tmp_path):
+    """bpy is there, but a library that it is linked with is not."""
+    (tmp_path / "bpy.py").write_text("raise ImportError('libSM.so.6: cannot open shared object file')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(MissingDependencyError, match=r"libSM\.so\.6: cannot open.*apt install .*libsm6"):
+        draw(random_mesh(3), cameras()[:1], pictures=[tmp_path / "a.png"])
+    assert not (tmp_path / "a.png").exists()
 
 
 @pytest.mark.parametrize(

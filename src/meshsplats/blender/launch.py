@@ -26,6 +26,14 @@ from meshsplats.errors import MissingDependencyError
 
 OLDEST = (4, 2)
 
+_GRAPHICS = "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
+_LIBRARIES = (
+    " It needs these libraries of the system, even where there is no screen; on Debian and Ubuntu:"
+    " apt install libx11-6 libxrender1 libxxf86vm1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 libgomp1"
+    if sys.platform.startswith("linux")
+    else ""
+)
+
 
 class BlenderError(ChildProcessError):
     """Blender could not do its job; the message holds what it said."""
@@ -45,12 +53,13 @@ def command(executable: Path | None) -> list[str]:
     if found is None:
         raise FileNotFoundError(f"{executable}: there is no such program; --executable names Blender's own")
     try:
-        told = subprocess.run([found, "--version"], capture_output=True, text=True, timeout=60).stdout
+        answer = subprocess.run([found, "--version"], capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ValueError(f"{found}: cannot be run as Blender ({error})") from None
+    told = answer.stdout or answer.stderr  # the latter where libraries are missing
     version = re.search(r"Blender (\d+)\.(\d+)", told)
     if version is None:
-        raise ValueError(f"{found}: not Blender; asked for its version, it says {told.strip()[:80]!r}")
+        raise ValueError(f"{found}: not Blender; asked for its version, it says {told.strip()[:200]!r}")
     if (int(version[1]), int(version[2])) < OLDEST:
         raise ValueError(f"{found}: Blender {version[1]}.{version[2]} is too old; 4.2 or newer is needed")
     flags = ["--background", "--factory-startup", "--python-exit-code", "1", "--python"]
@@ -74,8 +83,8 @@ def run_job(
     ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called after each
     picture. Returns ``{"blender": version, "build_seconds": s, "picture_seconds": [s, ...]}``.
 
-    Raises BlenderError with Blender's own words if it fails, besides what ``command`` raises. Ctrl-C ends
-    Blender too.
+    Raises BlenderError with Blender's own words if it fails, MissingDependencyError if the system lacks
+    libraries that it needs, besides what ``command`` raises. Ctrl-C ends Blender too.
     """
     start = command(executable)
     if options.engine == "eevee":
@@ -109,7 +118,7 @@ def _watch(
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
     result: dict[str, Any] = {"picture_seconds": []}
     said: deque[str] = deque(maxlen=40)
-    finished, failure = False, None
+    finished, failure, unloadable = False, None, None
     process = subprocess.Popen(
         arguments,
         stdin=subprocess.DEVNULL,
@@ -134,6 +143,7 @@ def _watch(
                     progress()
             finished |= "done" in message
             failure = message.get("error", failure)
+            unloadable = message.get("unloadable", unloadable)
         status = process.wait()
     except BaseException:
         process.terminate()
@@ -146,6 +156,8 @@ def _watch(
     finally:
         if process.stdout is not None:
             process.stdout.close()
+    if unloadable is not None:
+        raise MissingDependencyError(f"Blender's module bpy cannot be loaded: {unloadable}.{_LIBRARIES}")
     if failure is not None:
         raise BlenderError(f"Blender stopped: {failure}")
     if not finished:
@@ -162,7 +174,7 @@ def _post_mortem(status: int, said: Sequence[str], options: SceneOptions) -> str
     elif options.engine == "eevee":
         advice = (
             " EEVEE needs OpenGL 4.3, with or without a screen; on Debian and Ubuntu:"
-            " apt install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri. --engine cycles needs none of it."
+            f" apt install {_GRAPHICS}. --engine cycles does without."
         )
     return f"Blender ended {how} before it was done.{advice} It said: {words}"
 
@@ -173,14 +185,13 @@ def _check_graphics() -> None:
         return
     import ctypes
 
-    for name in ("libEGL.so.1", "libGL.so.1"):
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            raise MissingDependencyError(
-                f"EEVEE draws with OpenGL, and {name} is not on this system; on Debian and Ubuntu:"
-                " apt install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri. --engine cycles needs none of it"
-            ) from None
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        raise MissingDependencyError(
+            "EEVEE draws with OpenGL, and libEGL.so.1 is not on this system; on Debian and Ubuntu:"
+            f" apt install {_GRAPHICS}. --engine cycles does without"
+        ) from None
 
 
 def _plain_camera(camera: Camera) -> dict[str, Any]:

@@ -21,8 +21,15 @@ def tell(**message: object) -> None:
 
 
 def main(job_path: str) -> None:
-    import bpy
     import numpy as np
+
+    try:
+        import bpy
+    except ModuleNotFoundError:
+        raise
+    except ImportError as error:
+        tell(unloadable=str(error))
+        sys.exit(1)
 
     from meshsplats.blender.inside import meshes, pictures, stage, versions
     from meshsplats.blender.inside.scene import Subject, build
