@@ -39,7 +39,8 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(scene):
     out = scene / "prior.npz"
-    options = ["--steps", "30", "--triangles", "4", "--layers", "2", "--report-every", "10", "--json"]
+    options = ["--steps", "30", "--triangles", "4", "--report-every", "10", "--json"]
+    options += ["--layers", "2", "--spacing", "0"]
     assert run("prior", scene / "base.obj", "--data", scene / "photos", "-o", out, *options) == 0
     return out
 
@@ -138,7 +139,7 @@ def test_another_topology_writes_nothing(scene, trained, tmp_path, capsys):
     [
         ([], 2, "give photographs with --data, or splats with --splats"),
         (["--data", "d", "--splats", "s.ply"], 2, "give photographs with --data, or splats"),
-        (["--data", "d", "--spacing", "0.1"], 2, "--spacing has no effect with one layer"),
+        (["--data", "d", "--layers", "1", "--spacing", "0.1"], 2, "--spacing has no effect with one layer"),
         (["--data", "d", "--texture", "t.png", "--colors", "grey"], 2, "--texture has no effect"),
         (["--data", "d", "--steps", "1", "--epochs", "1"], 2, "give one of --epochs"),
         (["--data", "nowhere"], 1, "no such data set"),

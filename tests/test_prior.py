@@ -17,6 +17,7 @@ from meshsplats.binding import Binding, surface_normals
 from meshsplats.dataset import Picture, View
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
+from meshsplats.prior.bind import LAYERS, SHELLS_DEPTH
 from meshsplats.prior.pattern import MOST, counts_by_area, face_pattern
 
 
@@ -75,7 +76,7 @@ def test_counts_follow_areas(seed, mean):
 @pytest.mark.parametrize("triangles", [1, 4, 6, 9])
 def test_identity_the_picture_is_the_base(triangles):
     base = bumpy()
-    mesh = bind(base, triangles=triangles).mesh
+    mesh = bind(base, triangles=triangles, layers=1).mesh
     assert len(mesh.faces) == triangles * len(base.faces)
     for camera in orbit(mesh, 3, width=96, height=96, elevation=40):
         drawn, wanted = render(mesh, camera).color, base_picture(base, camera)
@@ -85,16 +86,35 @@ def test_identity_the_picture_is_the_base(triangles):
             assert psnr(drawn, wanted) > 60
 
 
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_identity_by_default_shells_are_hidden_in_the_base(inside_out):
+    base = cube()
+    if inside_out:
+        base = replace(base, faces=base.faces[:, ::-1])
+    prior = bind(base)
+    mesh = prior.mesh
+    layers = mesh.binding.layers
+    assert layers.max() + 1 == LAYERS
+    np.testing.assert_array_equal(mesh.colors[layers == 0, 3], 1)
+    assert (mesh.colors[layers > 0, 3] < 0.5).all()
+    assert abs(prior.lift) * (LAYERS - 1) == pytest.approx(SHELLS_DEPTH * 3**0.5)
+    away = np.linalg.norm(mesh.vertices - prior.pose(lift=0).vertices, axis=1)
+    np.testing.assert_allclose(away, abs(prior.lift) * layers, atol=1e-6)
+    assert (np.abs(mesh.vertices[layers > 0]) < 0.5).all()
+    for camera in orbit(mesh, 3, width=96, height=96, elevation=40):
+        np.testing.assert_array_equal(render(mesh, camera).color, base_picture(base, camera))
+
+
 def test_one_triangle_a_face_has_the_bases_corners_to_the_last_bit():
     base = bumpy()
-    mesh = bind(base).mesh
+    mesh = bind(base, layers=1).mesh
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], base.vertices[base.faces])
     np.testing.assert_array_equal(mesh.colors[mesh.faces], base.colors[base.faces])
 
 
 def test_layers_come_from_the_highest_down_in_one_depth_group_a_face():
     base = cube()
-    mesh = bind(base, triangles=4, layers=3).mesh
+    mesh = bind(base, triangles=4, layers=3, spacing=0).mesh
     layer = mesh.binding.layers[mesh.faces]
     assert (layer == layer[:, :1]).all()
     np.testing.assert_array_equal(layer[:, 0].reshape(12, 3, 4), np.tile([[[2], [1], [0]]], (12, 1, 4)))
@@ -109,7 +129,7 @@ def test_layers_come_from_the_highest_down_in_one_depth_group_a_face():
 def test_by_area_large_faces_carry_more():
     base = bumpy()
     stretched = replace(base, vertices=base.vertices * np.where(base.vertices[:, :1] > 0, 5, 1))
-    mesh = bind(stretched, triangles=8, by_area=True).mesh
+    mesh = bind(stretched, triangles=8, by_area=True, layers=1).mesh
     counts = np.bincount(mesh.depth_group, minlength=len(base.faces))
     assert counts.mean() == pytest.approx(8, rel=0.2)
     corners = stretched.vertices[stretched.faces]
@@ -131,7 +151,7 @@ def test_colors_come_from_the_views_that_see_a_place():
         matrix[:3, :3], matrix[:3, 3] = turn, -turn @ (axis * 4)
         camera = Camera(matrix, 60, 60, 16, 16, 32, 32)
         views.append(View(camera, Picture(np.tile(wanted[side], (32, 32, 1)))))
-    mesh = bind(base, triangles=4, views=views).mesh
+    mesh = bind(base, triangles=4, layers=1, views=views).mesh
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     axis = np.abs(middle).argmax(axis=1)
     side = 2 * axis + (np.take_along_axis(middle, axis[:, None], 1)[:, 0] < 0)
@@ -140,6 +160,24 @@ def test_colors_come_from_the_views_that_see_a_place():
     rows, corners = np.nonzero(inner[mesh.faces])
     assert len(rows)
     np.testing.assert_allclose(color[rows, corners], wanted[side[rows]], atol=1e-6)
+
+
+def test_shells_take_the_colours_that_views_show_behind_the_base():
+    """A base that floats above the sheet in the pictures, with a shell where the sheet is."""
+    n, height = 24, 0.3
+    sheet = bumpy(n)
+    flat = sheet.vertices * np.float32([1, 1, 0])
+    shade = np.repeat(0.5 + 0.5 * np.sin(5 * flat[:, :1]), 3, axis=1)
+    truth = SplatMesh(flat, sheet.faces, np.column_stack([shade, np.ones(len(flat))]), up=sheet.up)
+    cameras = orbit(truth, 12, width=160, height=160, elevation=50)
+    views = [View(camera, Picture(render(truth, camera, background=(0, 0, 0)).color)) for camera in cameras]
+    above = BaseMesh(flat + np.float32([0, 0, height]), sheet.faces, up=sheet.up)
+    mesh = bind(above, layers=2, spacing=-height, views=views).mesh
+    middle = np.abs(mesh.vertices[:, :2]).max(axis=1) < 0.5
+    wanted = 0.5 + 0.5 * np.sin(5 * mesh.vertices[:, 0])
+    error = np.abs(mesh.colors[:, 0] - wanted)
+    assert error[middle & (mesh.binding.layers == 1)].max() < 0.05
+    assert error[middle & (mesh.binding.layers == 0)].max() > 0.2
 
 
 def test_what_no_view_sees_takes_the_colours_next_to_it():
@@ -188,7 +226,7 @@ def test_faces_without_area_carry_nothing_and_are_counted():
     base = cube()
     faces = np.concatenate([base.faces, [[0, 0, 1], [2, 2, 2]]])
     with pytest.warns(DataWarning, match="2 of 14 faces of the base have no area"):
-        mesh = bind(replace(base, faces=faces), triangles=4).mesh
+        mesh = bind(replace(base, faces=faces), triangles=4, layers=1).mesh
     assert len(mesh.faces) == 48
     np.testing.assert_array_equal(MeshPrior(mesh).base_faces, faces)  # it stays the base that it was
     with pytest.raises(ValueError, match="none of the base's 2 faces has an area"):
@@ -216,10 +254,13 @@ def test_any_base_will_do(kind):
         vertices = np.concatenate([CUBE, [[9, 9, 9]]])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        prior = bind(BaseMesh(vertices, faces), triangles=5, layers=2)
+        prior = bind(BaseMesh(vertices, faces), triangles=5, layers=2, spacing=0)
+        shells = bind(BaseMesh(vertices, faces), layers=3)
     assert len(prior.mesh.faces) == 10 * len(faces)
     normals = prior.mesh.normals
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    assert len(shells.mesh.faces) == 3 * len(faces)
+    assert np.isfinite(shells.mesh.vertices).all()
     moved = prior.pose(vertices * 2 + 1)
     np.testing.assert_allclose(moved.vertices, prior.mesh.vertices * 2 + 1, atol=1e-6)
     if kind == "seams":  # what a seam has split is one surface: normals of a cube's corners point outwards
@@ -236,7 +277,7 @@ def test_a_million_faces():
         [np.stack([corners[i] for i in t], -1).reshape(-1, 3) for t in ((0, 1, 2), (0, 2, 3))]
     )
     base = BaseMesh(np.stack([x, y, 0 * x], -1).reshape(-1, 3), faces)
-    prior = bind(base)
+    prior = bind(base, layers=1)
     assert len(prior.mesh.faces) == 2 * n * n > 10**6
     np.testing.assert_array_equal(prior.pose(base.vertices).vertices, prior.mesh.vertices)
 
@@ -247,7 +288,7 @@ def test_a_million_faces():
 def trained_looking(base, triangles=4, layers=2, seed=0) -> MeshPrior:
     """As if training had moved everything: random weights, some on edges and in corners, random RGBA."""
     rng = np.random.default_rng(seed)
-    mesh = bind(base, triangles=triangles, layers=layers).mesh
+    mesh = bind(base, triangles=triangles, layers=layers, spacing=0).mesh
     v = len(mesh.vertices)
     weights = rng.dirichlet((1, 1, 1), v).astype(np.float32)
     weights[::7] = np.eye(3, dtype=np.float32)[rng.integers(0, 3, len(weights[::7]))]
@@ -295,8 +336,8 @@ def test_layers_do_not_flicker():
     """Fifty tiny moves of the camera: coplanar layers change no more from picture to picture than one opaque
     layer does."""
     base = cube()
-    opaque = bind(base).mesh
-    stacked, rng = bind(base, triangles=6, layers=8).mesh, np.random.default_rng(5)
+    opaque = bind(base, layers=1).mesh
+    stacked, rng = bind(base, triangles=6, layers=8, spacing=0).mesh, np.random.default_rng(5)
     # Each layer divides the faces in another way, and none is parallel to an axis: depths differ by rounding.
     turned = (np.arange(3) - stacked.binding.layers[:, None]) % 3
     binding = replace(stacked.binding, weights=np.take_along_axis(stacked.binding.weights, turned, 1))
@@ -338,7 +379,7 @@ def test_exported_layers_are_lifted_along_the_normal():
         np.testing.assert_allclose(lifted.vertices[rows], wanted, atol=1e-7)
     assert binding.lift == lift
     np.testing.assert_array_equal(MeshPrior(lifted).pose(lift=0).vertices, prior.mesh.vertices)
-    assert bind(cube()).export_lift == 0
+    assert bind(cube(), layers=1).export_lift == 0
 
 
 def test_shells_lie_at_their_distance_and_grow_with_the_base():
@@ -417,7 +458,7 @@ def test_a_binding_checks_itself(changes, message):
 
 
 def test_a_mesh_checks_its_binding():
-    mesh = bind(cube()).mesh
+    mesh = bind(cube(), layers=1).mesh
     with pytest.raises(ValueError, match="binding must bind 36 vertices"):
         replace(mesh, binding=mesh.binding.select(np.arange(35)))
     with pytest.raises(ValueError, match="bound to one face"):
@@ -427,6 +468,6 @@ def test_a_mesh_checks_its_binding():
 def test_the_lego_hull():
     mesh = load_mesh(shared_data("meshes/lego_visual_hull_40k_vertexcolor.ply"))
     base = BaseMesh(mesh.vertices, mesh.faces, mesh.colors, up=mesh.up)
-    prior = bind(base)
+    prior = bind(base, layers=1)
     camera = orbit(mesh, 1, width=160, height=160, up=(0, 0, 1))[0]
     np.testing.assert_array_equal(render(prior.mesh, camera).color, render(mesh, camera).color)

@@ -96,7 +96,7 @@ def test_the_gradient_of_weights_is_the_slope_along_the_face(spacing):
 def test_what_is_on_an_edge_slides_along_it():
     """Weights that are 0 have no gradient and stay 0, and the others go on as if they alone were there."""
     base = bumpy(2)
-    mesh = bind(base, triangles=9).mesh
+    mesh = bind(base, triangles=9, layers=1).mesh
     bound = BoundPositions(mesh.binding)
     rng, rows = np.random.default_rng(1), np.arange(len(mesh.vertices))
     slope = rng.normal(size=mesh.vertices.shape).astype(np.float32)
@@ -169,7 +169,7 @@ def test_the_constraint_holds_after_every_step(task, layers, spacing):
 
 def test_training_brings_the_pictures_closer_and_moves_with_the_base(task, tmp_path):
     base, data = task
-    prior = bind(base, triangles=4, layers=2)
+    prior = bind(base, triangles=4, layers=2, spacing=0)
     config = make_config(steps=60, position_rate=0.005, color_rate=0.05, prune_epochs=0)
     trained = train(prior, data, config, run=RunOptions(folder=tmp_path / "run", threads=1, report_every=20))
     before, after = (evaluate(p.mesh, data, threads=1).methods[0].mean("psnr") for p in (prior, trained))
@@ -189,7 +189,9 @@ def test_training_brings_the_pictures_closer_and_moves_with_the_base(task, tmp_p
         View(replace(v.camera, world_to_camera=v.camera.world_to_camera @ np.linalg.inv(motion)), v.source)
         for v in data.train
     ]
-    elsewhere = train(bind(away, triangles=4, layers=2), Dataset(views), config, run=RunOptions(threads=1))
+    elsewhere = train(
+        bind(away, triangles=4, layers=2, spacing=0), Dataset(views), config, run=RunOptions(threads=1)
+    )
     moved = elsewhere.pose(base.vertices)
     camera = data.test[0].camera
     pictures = [render(mesh, camera).color for mesh in (trained.mesh, moved)]

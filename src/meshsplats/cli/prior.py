@@ -43,6 +43,7 @@ from meshsplats.finetuning.memory import available_memory, check_memory, readabl
 from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train
+from meshsplats.prior.bind import LAYERS
 
 SUFFIXES = (".npz", ".glb")
 
@@ -60,11 +61,11 @@ class LayOptions:
     """Triangles on each face, in each layer: 1 to 256; square numbers fit without T-junctions."""
     by_area: bool = False
     """So many on average, more on larger faces."""
-    layers: int = 1
+    layers: int = LAYERS
     """Layers of triangles on each face: 1 to 16."""
-    spacing: float = 0.0
-    """Scene units from one layer to the next along the base's normals; below 0 inwards, as for a base that
-    encloses its subject. 0: all layers lie in the base."""
+    spacing: Number = None
+    """Scene units from one layer to the next along the base's normals; below 0 inwards. 0: all layers lie in
+    the base. Default: inwards, all together 1/30 of the diagonal of the base's box."""
     colors: Literal["auto", "texture", "vertices", "views", "grey"] = "auto"
     """Where colours begin: the base's texture, its vertex colours, the pictures that see a place most
     squarely; auto: the first of these that there is."""

@@ -23,7 +23,10 @@ MAX_TRIANGLES = 50_000_000
 LAYER_OPACITY = 0.1
 """Share of the base's opacity that coplanar layers above the lowest begin with."""
 SHELL_OPACITY = 0.3
-"""Share of the base's opacity that all layers begin with where they are spaced."""
+"""Share of the base's opacity that layers above the lowest begin with where they are spaced."""
+LAYERS = 6
+SHELLS_DEPTH = 1 / 30
+"""By default, depth of all shells together as a share of the diagonal of the base's box."""
 
 
 def bind(
@@ -31,8 +34,8 @@ def bind(
     *,
     triangles: int = 1,
     by_area: bool = False,
-    layers: int = 1,
-    spacing: float = 0.0,
+    layers: int = LAYERS,
+    spacing: float | None = None,
     colors: Source = "auto",
     views: Sequence[View] = (),
     threads: int | None = None,
@@ -40,14 +43,17 @@ def bind(
     """Lays ``triangles`` triangles a layer on every face of ``base``.
 
     Each layer covers each face exactly and begins with the base's colours. Its triangles on a face share
-    vertices; those of different faces do not, so each face has colours of its own. Without ``spacing`` all
-    layers lie in the base, and its picture is what training begins with: the lowest layer is as opaque as
-    the base, those above it are almost transparent. In each face those of higher layers come first, as what
-    is nearer does, and all share one depth group.
+    vertices; those of different faces do not, so each face has colours of its own. The picture that training
+    begins with is the base's: its own layer, the lowest, is as opaque as the base.
 
-    With ``spacing``, layers are shells: the base with its vertices moved along their normals. They begin
-    translucent, and together can show what lies in the depth between them, for a base that is not where the
-    surface is. The triangles of a face and shell share one depth group.
+    By default the layers above it are shells inside the base: the base with its vertices moved along their
+    normals, translucent and hidden at first. Where the base is not where the surface is, as with a visual
+    hull or a coarse scan, training makes the outer shells transparent, and all together show what lies in
+    the depth between them; where it is the surface, they stay hidden. The triangles of a face and shell share
+    one depth group.
+
+    With ``spacing`` 0 all layers lie in the base, those above the lowest almost transparent. In each face
+    those of higher layers come first, as what is nearer does, and all share one depth group.
 
     Faces without area carry no triangles, with a counted DataWarning.
 
@@ -57,7 +63,9 @@ def bind(
         by_area: that many on average, square numbers about in proportion to the faces' areas.
         layers: 1 to 16.
         spacing: scene units from one layer to the next along the base's normals; below 0 they go inwards,
-            as for a base that encloses its subject, a visual hull say.
+            above 0 outwards, where they show at first. By default all shells together are ``SHELLS_DEPTH`` of
+            the diagonal of the base's box deep, on the inner side where the base is closed (whichever way it
+            is wound), else behind.
         colors: where colours come from: 'texture', 'vertices' (vertex colours), 'views' (the views that see
             a place most squarely), 'grey'; 'auto': the first of these that there is. Where a textured base
             has faces without texture, they take vertex colours, if any.
@@ -69,7 +77,7 @@ def bind(
     """
     if not 1 <= layers <= MAX_LAYERS:
         raise ValueError(f"layers must be a number from 1 to {MAX_LAYERS}, got {layers}")
-    if not np.isfinite(spacing):
+    if spacing is not None and not np.isfinite(spacing):
         raise ValueError(f"spacing must be a finite length, got {spacing}")
     if not 1 <= triangles <= MOST:
         raise ValueError(f"triangles must be a number from 1 to {MOST}, got {triangles}")
@@ -95,17 +103,17 @@ def bind(
             f"{total:,} triangles are more than the {MAX_TRIANGLES:,} that fit: use fewer a face, or a"
             " coarser base"
         )
+    if spacing is None:
+        spacing = _inwards(corners[solid], layers)
     laid = _laid_out(solid, counts, layers)
     face = laid.vertex_face[laid.triangles[:, 0]]
     binding = Binding(base.vertices, base.faces, laid.vertex_face, laid.weights, laid.layers, spacing)
     rgba = _colors(base, binding, source, views, threads)
     depth_group = face
+    rgba[laid.layers > 0, 3] *= SHELL_OPACITY if spacing else LAYER_OPACITY
     if spacing and layers > 1:
-        rgba[:, 3] *= SHELL_OPACITY
         shells = face * np.int64(layers) + laid.layers[laid.triangles[:, 0]]
         depth_group = np.unique(shells, return_inverse=True)[1].reshape(-1).astype(np.int32)
-    else:
-        rgba[laid.layers > 0, 3] *= LAYER_OPACITY
     mesh = SplatMesh(
         binding.positions(),
         laid.triangles,
@@ -117,6 +125,18 @@ def bind(
         binding=binding,
     )
     return MeshPrior(mesh)
+
+
+def _inwards(corners: np.ndarray, layers: int) -> float:
+    """The default spacing of so many layers on the triangles ``corners`` (m, 3, 3)."""
+    if layers == 1:
+        return 0.0
+    points = corners.reshape(-1, 3)
+    a, b, c = (corners - points.mean(axis=0)).transpose(1, 0, 2)
+    # Six times the volume inside: below 0 where normals point inwards.
+    outwards = np.einsum("ij,ij->", a, np.cross(b, c)) >= 0
+    depth = SHELLS_DEPTH * float(np.linalg.norm(np.ptp(points, axis=0))) / (layers - 1)
+    return -depth if outwards else depth
 
 
 class _Laid(NamedTuple):

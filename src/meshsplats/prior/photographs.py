@@ -28,10 +28,10 @@ _ROUNDS = 64
 def colors_from_views(binding: Binding, views: Sequence[View], *, threads: int | None = None) -> np.ndarray:
     """(v, 3) float32 display RGB at the vertices of ``binding`` on its base, as the ``views`` show them.
 
-    A place counts as seen where the base itself does not hide it. Its colour is the mean over the ``BEST``
-    views with the largest cosine between the base's normal (either side) and the direction to the camera,
-    weighted by its square. Places that no view sees take the colours next to them on the base; mid grey where
-    no view sees anything.
+    A place counts as seen where the base itself does not hide it, or by no more than what lies above its
+    layer. Its colour is the mean over the ``BEST`` views with the largest cosine between the base's normal
+    (either side) and the direction to the camera, weighted by its square. Places that no view sees take the
+    colours next to them on the base; mid grey where no view sees anything.
     """
     base = SplatMesh(
         binding.base_vertices,
@@ -39,10 +39,11 @@ def colors_from_views(binding: Binding, views: Sequence[View], *, threads: int |
         np.tile(np.array([0.5, 0.5, 0.5, 1], np.float32), (len(binding.base_vertices), 1)),
     )
     points, normals = binding.positions().astype(np.float64), binding.normals()
+    depths = np.abs(binding.layers * binding.lift)
     scores = np.zeros((len(points), BEST), np.float32)
     colors = np.zeros((len(points), BEST, 3), np.float32)
     for view in views[:: max(1, -(-len(views) // MOST_VIEWS))]:
-        rows, score, color = _seen(base, points, normals, view, threads)
+        rows, score, color = _seen(base, points, normals, depths, view, threads)
         # In place of the least of the best so far, where it is better.
         least = scores[rows].argmin(axis=1)
         better = score > scores[rows, least]
@@ -57,9 +58,17 @@ def colors_from_views(binding: Binding, views: Sequence[View], *, threads: int |
 
 
 def _seen(
-    base: SplatMesh, points: np.ndarray, normals: np.ndarray, view: View, threads: int | None
+    base: SplatMesh,
+    points: np.ndarray,
+    normals: np.ndarray,
+    depths: np.ndarray,
+    view: View,
+    threads: int | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers of the points that ``view`` sees, the cosines at which it does, and their colours (k, 3)."""
+    """Numbers of the points that ``view`` sees, the cosines at which it does, and their colours (k, 3).
+
+    ``depths`` (n,) are how far from the base they lie.
+    """
     camera, picture = view.camera, view.picture
     x, y, z = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
     front = z > camera.near
@@ -76,7 +85,8 @@ def _seen(
     # Where nothing is drawn at the middle of its pixel, a point at an outline is in front of all there is.
     solid = drawn.alpha > 0.5
     surface = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)[place]
-    slack = _TOLERANCE * z[rows] / min(camera.fx, camera.fy) / np.maximum(cosine, 0.25)
+    slack = _TOLERANCE * z[rows] / min(camera.fx, camera.fy) + depths[rows]
+    slack /= np.maximum(cosine, 0.25)
     keep = (z[rows] <= surface + slack) & (cosine > _GRAZING)
     color = picture.over((0, 0, 0))
     if picture.alpha is not None:
