@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from conftest import shared_data
 
 from meshsplats import GaussianCloud, SplatMesh, load_gaussians, load_mesh, psnr, save_gaussians
 from meshsplats.cli import main
+from meshsplats.errors import MissingDependencyError
 from meshsplats.prior import bind
-from meshsplats.prior.surface import base_surface, surface_net
+from meshsplats.prior.surface import base_surface, isosurface
 
 
 def ball(radius=1.0, center=(0.0, 0, 0), n=40) -> SplatMesh:
@@ -34,22 +37,43 @@ def volume(vertices, faces) -> float:
     return float(np.linalg.det(vertices[faces].astype(float)).sum()) / 6
 
 
-def test_the_net_of_a_plane_and_of_a_ball():
+def test_the_surface_of_a_plane_and_of_a_ball():
     grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3, indexing="ij"), -1)
-    vertices, faces = surface_net(grid[..., 0] - 4.25)
+    vertices, faces = isosurface(grid[..., 0] - 4.25)
     np.testing.assert_allclose(vertices[:, 0], 4.25)
     normals = np.cross(
         vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
     )
     assert (normals[:, 0] > 0).all(), "faces look where the field is positive"
     distance = np.linalg.norm(grid - 5.4, axis=-1) - 4
-    vertices, faces = surface_net(distance)
+    vertices, faces = isosurface(distance)
     assert open_edges(faces) == 0
-    np.testing.assert_allclose(np.linalg.norm(vertices - 5.4, axis=1), 4, atol=0.15)
+    np.testing.assert_array_equal(np.unique(faces), np.arange(len(vertices)))
+    np.testing.assert_allclose(np.linalg.norm(vertices - 5.4, axis=1), 4, atol=0.05)
     # Of so few voxels it is a coarse ball, whose chords lie inside.
-    assert volume(vertices, faces) == pytest.approx(4 / 3 * np.pi * 64, rel=0.1)
+    assert volume(vertices, faces) == pytest.approx(4 / 3 * np.pi * 64, rel=0.05)
     for empty in (np.ones((4, 4, 4)), -np.ones((4, 4, 4))):
-        assert len(surface_net(empty)[1]) == 0
+        assert len(isosurface(empty)[1]) == 0
+
+
+def test_as_many_faces_as_asked_for():
+    grid = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), -1)
+    distance = np.linalg.norm(grid - 19.4, axis=-1) - 15
+    every = len(isosurface(distance)[1])
+    vertices, faces = isosurface(distance, faces=500)
+    assert every > 5000
+    assert len(faces) == pytest.approx(500, abs=2)
+    assert open_edges(faces) == 0
+    np.testing.assert_array_equal(np.unique(faces), np.arange(len(vertices)))
+    np.testing.assert_allclose(np.linalg.norm(vertices - 19.4, axis=1), 15, atol=0.3)
+    assert len(isosurface(distance, faces=10**6)[1]) == every
+
+
+def test_without_the_extra_it_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "skimage.measure", None)
+    monkeypatch.setattr("meshsplats.prior.surface.render", None)  # told before the work
+    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[base\]'"):
+        base_surface(ball(), resolution=8, cameras=4)
 
 
 def test_the_surface_of_a_ball():
@@ -82,6 +106,7 @@ def test_what_cannot_be_done():
     for options, message in [
         ({"resolution": 4}, "resolution must be"),
         ({"resolution": 600}, "resolution must be"),
+        ({"faces": 3}, "faces must be"),
         ({"cameras": 2}, "cameras must be"),
         ({"cameras": []}, "no cameras"),
     ]:
@@ -114,12 +139,13 @@ def discs(count=1500) -> GaussianCloud:
 def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     save_gaussians(discs(), tmp_path / "scene.ply")
     out = tmp_path / "base.obj"
-    options = ["--resolution", "24", "--views", "16"]
+    options = ["--resolution", "24", "--views", "16", "--faces", "600"]
     assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out), *options]) == 0
     assert "next: meshsplats prior" in capsys.readouterr().out
     base = load_mesh(out)
     assert np.abs(np.linalg.norm(base.vertices, axis=1) - 1).max() < 0.15
     assert open_edges(base.faces) == 0
+    assert len(base.faces) == pytest.approx(600, abs=2)
     assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out)]) == 1
     assert main(["base", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
 

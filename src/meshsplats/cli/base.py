@@ -27,7 +27,9 @@ class Base:
     output: Output
     """The mesh, coloured and opaque: .ply, .obj, .glb, .npz, .usdc."""
     resolution: int = 96
-    """Voxels along the longest side, 8 to 512: the more, the finer, and the more triangles."""
+    """Voxels along the longest side, 8 to 512: the more, the finer."""
+    faces: int = 20_000
+    """About so many triangles, where the voxels give more; 0: all of them."""
     views: int = 48
     """Number of places round the object from which it is looked at."""
     cameras: File = None
@@ -55,6 +57,7 @@ class Base:
         base = base_surface(
             scene,
             resolution=self.resolution,
+            faces=self.faces,
             cameras=self.views if self.cameras is None else load_cameras(self.cameras),
             threads=self.threads,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
 from meshsplats.camera import Camera, dome
 from meshsplats.dataset import Picture, View
+from meshsplats.errors import MissingDependencyError
 from meshsplats.framing import guess_up, scene_bounds, weighted_quantile
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -25,13 +27,14 @@ _COVERED = 0.002
 """Share of the opacity that may lie beyond each side of the box: strays must not make it large."""
 _MARGIN = 0.05
 _LEAST_PART = 0.01
-"""Separate parts with a smaller share of the largest part's triangles than this are left out."""
+"""Separate parts with a smaller share of the largest part's volume than this are left out."""
 
 
 def base_surface(
     scene: GaussianCloud | SplatMesh,
     *,
     resolution: int = 96,
+    faces: int = 20_000,
     cameras: Sequence[Camera] | int = 48,
     threads: int | None = None,
     progress: Callable[[], object] | None = None,
@@ -41,13 +44,13 @@ def base_surface(
     The scene is drawn from all round as a mesh, with depths. Each picture tells the voxels of a grid how far
     before or behind the surface they lie, up to ``TRUNCATION`` voxels, and the means make a signed distance
     (TSDF; Curless and Levoy 1996). What no picture sees is inside. The surface where it is 0 is found by
-    surface nets (Gibson 1998): a vertex in each voxel that it passes, at the mean of its crossings with the
-    voxel's edges. Small separate parts are left out.
+    marching cubes, and edges are collapsed where that changes its shape least (Garland and Heckbert 1997).
+    Small separate parts are left out. Needs the extra ``base``.
 
     Args:
         scene: splats, which are converted for the purpose, or a mesh, fine-tuned say.
-        resolution: voxels along the longest side of the box, 8 to 512: time and memory grow with its cube,
-            triangles with its square.
+        resolution: voxels along the longest side of the box, 8 to 512: time and memory grow with its cube.
+        faces: about so many triangles, at least 4, where the grid gives more; 0: all of them.
         cameras: to look from, with the whole object in their pictures; or a number to be placed all round.
         threads: at most this many; all processors by default.
         progress: called after each picture.
@@ -56,6 +59,8 @@ def base_surface(
     """
     if not 8 <= resolution <= MAX_RESOLUTION:
         raise ValueError(f"resolution must be 8 to {MAX_RESOLUTION} voxels, got {resolution}")
+    if faces < 0 or 0 < faces < 4:
+        raise ValueError(f"faces must be 4 or more, or 0 for all, got {faces}")
     if isinstance(cameras, int):
         if not 4 <= cameras <= 1000:
             raise ValueError(f"cameras must be 4 to 1000, got {cameras}")
@@ -67,6 +72,7 @@ def base_surface(
         placed = cameras
     if not placed:
         raise ValueError("there are no cameras to look from")
+    _libraries()  # before the work
     mesh = scene
     if isinstance(mesh, GaussianCloud):
         from meshsplats.conversion import convert
@@ -88,67 +94,47 @@ def base_surface(
     for axis in range(3):  # closed at the border
         sides = np.moveaxis(field, axis, 0)
         sides[0] = sides[-1] = 1
-    vertices, faces = surface_net(field)
-    vertices, faces = _large_parts(vertices, faces)
-    if not len(faces):
+    vertices, triangles = isosurface(field, faces)
+    if not len(triangles):
         raise ValueError("nothing solid is seen from all round: this makes bases of objects, not of haze")
     points = (low + voxel * vertices).astype(np.float32)
     colors = np.ones((len(points), 4), np.float32)
-    colors[:, :3] = colors_from_views(_at_vertices(points, faces), views, threads=threads)
-    return BaseMesh(points, faces, colors, up=guess_up(scene))
+    colors[:, :3] = colors_from_views(_at_vertices(points, triangles), views, threads=threads)
+    return BaseMesh(points, triangles, colors, up=guess_up(scene))
 
 
-def surface_net(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) float64 vertices, in steps of the grid, and (m, 3) int32 triangles of the surface where
-    ``field`` (x, y, z) passes 0, wound so that they face where it is positive."""
-    inside = field < 0
-    bits = [(i >> 2 & 1, i >> 1 & 1, i & 1) for i in range(8)]
-    counts = np.zeros(tuple(s - 1 for s in field.shape), np.int8)
-    for bit in bits:
-        counts += _corner(inside, bit)
-    active = (counts > 0) & (counts < 8)
-    cells = np.argwhere(active)
-    number = np.full(active.shape, -1, np.int32)
-    number[active] = np.arange(len(cells), dtype=np.int32)
-    values = np.stack([_corner(field, bit)[active] for bit in bits], axis=1).astype(np.float64)
-    sums, crossings = np.zeros((len(cells), 3)), np.zeros(len(cells))
-    for i in range(8):
-        for axis in range(3):
-            j = i | (4 >> axis)
-            if i == j:
-                continue
-            a, b = values[:, i], values[:, j]
-            crossed = (a < 0) != (b < 0)
-            share = np.where(crossed, a / np.where(crossed, a - b, 1), 0)
-            place = np.tile(np.array(bits[i], np.float64), (len(cells), 1))
-            place[:, axis] = share
-            sums += np.where(crossed[:, None], place, 0)
-            crossings += crossed
-    vertices = cells + sums / np.maximum(crossings, 1)[:, None]
-    faces = [np.empty((0, 3), np.int32)]
-    for axis in range(3):
-        before = tuple(slice(None, -1) if k == axis else slice(None) for k in range(3))
-        after = tuple(slice(1, None) if k == axis else slice(None) for k in range(3))
-        edges = np.argwhere(inside[before] != inside[after])
-        others = [(axis + 1) % 3, (axis + 2) % 3]
-        # An edge on the border of the grid has no four voxels round it.
-        deep = [(edges[:, k] > 0) & (edges[:, k] < field.shape[k] - 1) for k in others]
-        edges = edges[deep[0] & deep[1]]
-        quad = []
-        for first, second in ((1, 1), (0, 1), (0, 0), (1, 0)):
-            cell = edges.copy()
-            cell[:, others[0]] -= first
-            cell[:, others[1]] -= second
-            quad.append(number[tuple(cell.T)])
-        leaving = inside[tuple(edges.T)]
-        a, b, c, d = (np.where(leaving, quad[i], quad[j]) for i, j in ((0, 0), (1, 3), (2, 2), (3, 1)))
-        faces += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
-    return vertices, np.concatenate(faces)
+    ``field`` (x, y, z) passes 0, wound so that they face where it is positive; about ``faces`` of them where
+    there would be more, unless that is 0.
+
+    Parts of the inside with less than ``_LEAST_PART`` of the volume of the largest are left out.
+    """
+    label, marching_cubes, simplify = _libraries()
+    part = label(field < 0, connectivity=1)
+    sizes = np.bincount(part.ravel())
+    if len(sizes) == 1 or sizes[0] == 0:  # all outside, or all inside
+        return np.empty((0, 3)), np.empty((0, 3), np.int32)
+    small = sizes < _LEAST_PART * sizes[1:].max()
+    small[0] = False
+    vertices, triangles, _, _ = marching_cubes(
+        np.where(small[part], -field, field), 0.0, gradient_direction="descent", allow_degenerate=False
+    )
+    if 0 < faces < len(triangles):
+        vertices, triangles = simplify(vertices, triangles, target_count=faces)
+    return vertices.astype(np.float64), triangles.astype(np.int32)
 
 
-def _corner(grid: np.ndarray, bit: tuple[int, int, int]) -> np.ndarray:
-    """The values at one corner of every voxel."""
-    return grid[tuple(slice(1, None) if b else slice(None, -1) for b in bit)]
+def _libraries() -> tuple[Callable[..., Any], ...]:
+    """scikit-image's label and marching_cubes, and simplify. MissingDependencyError names the extra."""
+    try:
+        from fast_simplification import simplify
+        from skimage.measure import label, marching_cubes
+    except ImportError as error:
+        raise MissingDependencyError(
+            "a base from splats needs scikit-image and fast-simplification: pip install 'meshsplats[base]'"
+        ) from error
+    return label, marching_cubes, simplify
 
 
 def _grid(scene: GaussianCloud | SplatMesh, resolution: int) -> tuple[np.ndarray, float, tuple[int, ...]]:
@@ -189,28 +175,6 @@ def _add(
         told = seen & (distance >= -1)
         total[i] += np.where(told, np.minimum(distance, 1), 0)
         weight[i] += told
-
-
-def _large_parts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Without separate parts that are small beside the largest, and without vertices of no triangle."""
-    if not len(faces):
-        return vertices, faces
-    part = np.arange(len(vertices))
-    while True:  # each vertex takes the smallest number round it, until nothing changes
-        least = part[faces].min(axis=1)
-        found = part.copy()
-        for k in range(3):
-            np.minimum.at(found, faces[:, k], least)
-        found = found[found]
-        if (found == part).all():
-            break
-        part = found
-    sizes = np.bincount(part[faces[:, 0]], minlength=len(vertices))
-    faces = faces[sizes[part[faces[:, 0]]] >= max(_LEAST_PART * sizes.max(), 1)]
-    used = np.zeros(len(vertices), bool)
-    used[faces.ravel()] = True
-    renumber = np.cumsum(used, dtype=np.int32) - 1
-    return vertices[used], renumber[faces]
 
 
 def _at_vertices(points: np.ndarray, faces: np.ndarray) -> Binding:
