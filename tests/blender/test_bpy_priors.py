@@ -126,10 +126,13 @@ def test_handlers_follow_shape_keys_and_armatures(placed):
             group.remove(function)
 
 
-def test_a_simulated_base(placed):
-    """A cloth pinned nowhere falls, and takes its splats along."""
+@pytest.mark.parametrize("kind", ["CLOTH", "SOFT_BODY"])
+def test_a_simulated_base(placed, kind):
+    """A cloth or soft body pinned nowhere falls, and takes its splats along."""
     thing, base, prior = placed
-    base.modifiers.new("cloth", "CLOTH")
+    modifier = base.modifiers.new("simulation", kind)
+    if kind == "SOFT_BODY":
+        modifier.settings.use_goal = False
     scene = bpy.context.scene
     bpy.app.handlers.frame_change_post.append(priors.after_frame)
     try:
