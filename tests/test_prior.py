@@ -105,6 +105,32 @@ def test_identity_by_default_shells_are_hidden_in_the_base(inside_out):
         np.testing.assert_array_equal(render(mesh, camera).color, base_picture(base, camera))
 
 
+def test_shells_of_a_thin_base_do_not_stand_out():
+    base = replace(cube(), vertices=CUBE * np.float32([1, 1, 0.02]))
+    mesh = bind(base).mesh
+    layers, out = mesh.binding.layers, np.abs(mesh.vertices[:, 2]) > 0.012
+    assert out[layers == LAYERS - 1].all()
+    assert (mesh.colors[out, 3] == 0).all()
+    for camera in orbit(mesh, 3, width=96, height=96, elevation=40):
+        assert psnr(render(mesh, camera).color, base_picture(base, camera)) > 50
+
+
+def test_shells_lie_behind_what_the_views_see():
+    """A room: cameras inside it, and normals that point away from them."""
+    views = []
+    for turn in (np.eye(3), np.diag([-1.0, 1, -1])):
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn
+        views.append(
+            View(Camera(matrix, 16, 16, 16, 16, 32, 32), Picture(np.full((32, 32, 3), 0.5, np.float32)))
+        )
+    prior = bind(cube(), layers=2, views=views)
+    assert prior.lift > 0
+    for view in views:
+        drawn, wanted = render(prior.mesh, view.camera).color, base_picture(cube(), view.camera)
+        np.testing.assert_array_equal(drawn, wanted)
+
+
 def test_one_triangle_a_face_has_the_bases_corners_to_the_last_bit():
     base = bumpy()
     mesh = bind(base, layers=1).mesh

@@ -16,6 +16,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.prior.model import MeshPrior
 from meshsplats.prior.pattern import MOST, counts_by_area, face_pattern
 from meshsplats.prior.photographs import colors_from_views
+from meshsplats.prior.shells import Looks, look_at_base
 
 Source = Literal["auto", "texture", "vertices", "views", "grey"]
 MAX_LAYERS = 16
@@ -49,8 +50,9 @@ def bind(
     By default the layers above it are shells inside the base: the base with its vertices moved along their
     normals, translucent and hidden at first. Where the base is not where the surface is, as with a visual
     hull or a coarse scan, training makes the outer shells transparent, and all together show what lies in
-    the depth between them; where it is the surface, they stay hidden. The triangles of a face and shell share
-    one depth group.
+    the depth between them; where it is the surface, they stay hidden. Where the base is thinner than they are
+    deep and they would stand out, they are transparent. The triangles of a face and shell share one depth
+    group.
 
     With ``spacing`` 0 all layers lie in the base, those above the lowest almost transparent. In each face
     those of higher layers come first, as what is nearer does, and all share one depth group.
@@ -64,12 +66,12 @@ def bind(
         layers: 1 to 16.
         spacing: scene units from one layer to the next along the base's normals; below 0 they go inwards,
             above 0 outwards, where they show at first. By default all shells together are ``SHELLS_DEPTH`` of
-            the diagonal of the base's box deep, on the inner side where the base is closed (whichever way it
-            is wound), else behind.
+            the diagonal of the base's box deep, on the side away from the ``views``; without views, from
+            places all round.
         colors: where colours come from: 'texture', 'vertices' (vertex colours), 'views' (the views that see
             a place most squarely), 'grey'; 'auto': the first of these that there is. Where a textured base
             has faces without texture, they take vertex colours, if any.
-        views: pictures with cameras, for 'views'.
+        views: pictures with cameras: for 'views', and for where the shells go.
         threads: at most this many; all processors by default.
 
     Raises ValueError for a base without a face that has an area, options out of range, and colours that the
@@ -103,17 +105,26 @@ def bind(
             f"{total:,} triangles are more than the {MAX_TRIANGLES:,} that fit: use fewer a face, or a"
             " coarser base"
         )
-    if spacing is None:
-        spacing = _inwards(corners[solid], layers)
+    looks = None
+    if layers > 1 and spacing != 0:
+        faces = base.faces[solid]
+        looks = look_at_base(base.vertices, faces, [view.camera for view in views], threads=threads)
+    if looks is None:
+        spacing = spacing or 0.0
+    elif spacing is None:
+        depth = SHELLS_DEPTH * float(np.linalg.norm(np.ptp(corners[solid].reshape(-1, 3), axis=0)))
+        spacing = (-depth if looks.facing else depth) / (layers - 1)
     laid = _laid_out(solid, counts, layers)
     face = laid.vertex_face[laid.triangles[:, 0]]
     binding = Binding(base.vertices, base.faces, laid.vertex_face, laid.weights, laid.layers, spacing)
     rgba = _colors(base, binding, source, views, threads)
     depth_group = face
     rgba[laid.layers > 0, 3] *= SHELL_OPACITY if spacing else LAYER_OPACITY
-    if spacing and layers > 1:
+    if looks is not None:
         shells = face * np.int64(layers) + laid.layers[laid.triangles[:, 0]]
         depth_group = np.unique(shells, return_inverse=True)[1].reshape(-1).astype(np.int32)
+        if looks.facing == (spacing < 0):
+            rgba[_standing_out(binding, looks), 3] = 0
     mesh = SplatMesh(
         binding.positions(),
         laid.triangles,
@@ -127,16 +138,14 @@ def bind(
     return MeshPrior(mesh)
 
 
-def _inwards(corners: np.ndarray, layers: int) -> float:
-    """The default spacing of so many layers on the triangles ``corners`` (m, 3, 3)."""
-    if layers == 1:
-        return 0.0
-    points = corners.reshape(-1, 3)
-    a, b, c = (corners - points.mean(axis=0)).transpose(1, 0, 2)
-    # Six times the volume inside: below 0 where normals point inwards.
-    outwards = np.einsum("ij,ij->", a, np.cross(b, c)) >= 0
-    depth = SHELLS_DEPTH * float(np.linalg.norm(np.ptp(points, axis=0))) / (layers - 1)
-    return -depth if outwards else depth
+def _standing_out(binding: Binding, looks: Looks) -> np.ndarray:
+    """(v,) bool: the vertices of shells whose face at their layer has a corner outside the base."""
+    result = np.zeros(len(binding.layers), bool)
+    for layer in range(1, int(binding.layers.max()) + 1):
+        out = looks.standing_out(binding.base_vertices + layer * binding.lift * binding.base_normals)
+        own = binding.layers == layer
+        result[own] = out[binding.base_faces[binding.vertex_face[own]]].any(axis=1)
+    return result
 
 
 class _Laid(NamedTuple):
