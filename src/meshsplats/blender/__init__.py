@@ -58,7 +58,8 @@ def draw(
 
     Returns:
         ``{"blender": its version, "build_seconds": float, "picture_seconds": [float, ...], "layers": most
-        layers behind each other, "bounce_limit": int}``.
+        layers behind each other, "bounce_limit": int}``, and as ``build_processor_seconds`` and
+        ``picture_processor_seconds`` the processor time of all threads.
 
     Raises:
         ValueError: options out of range, another suffix, pictures that do not match the cameras, an empty

@@ -81,7 +81,8 @@ def run_job(
     """Has Blender build the scene, save ``blend`` and render ``pictures``, one a camera.
 
     ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called after each
-    picture. Returns ``{"blender": version, "build_seconds": s, "picture_seconds": [s, ...]}``.
+    picture. Returns ``{"blender": version, "build_seconds": s, "build_processor_seconds": s,
+    "picture_seconds": [s, ...], "picture_processor_seconds": [s, ...]}``.
 
     Raises BlenderError with Blender's own words if it fails, MissingDependencyError if the system lacks
     libraries that it needs, besides what ``command`` raises. Ctrl-C ends Blender too.
@@ -116,7 +117,7 @@ def _watch(
         # The worker must be this very package, wherever this process found it.
         places = [str(Path(worker.__file__).resolve().parents[3]), environment.get("PYTHONPATH", "")]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
-    result: dict[str, Any] = {"picture_seconds": []}
+    result: dict[str, Any] = {"picture_seconds": [], "picture_processor_seconds": []}
     said: deque[str] = deque(maxlen=40)
     finished, failure, unloadable = False, None, None
     process = subprocess.Popen(
@@ -137,8 +138,10 @@ def _watch(
             message = json.loads(line[len(worker.MARK) :])
             if "built" in message:
                 result |= {"blender": message["blender"], "build_seconds": message["built"]}
+                result["build_processor_seconds"] = message["processor"]
             elif "picture" in message:
                 result["picture_seconds"].append(message["seconds"])
+                result["picture_processor_seconds"].append(message["processor"])
                 if progress is not None:
                     progress()
             finished |= "done" in message

@@ -50,12 +50,16 @@ def main(job_path: str) -> None:
     cameras = [Camera(np.array(c.pop("world_to_camera")), **c) for c in job["cameras"]]
     blend, targets = job["blend"], [Path(target) for target in job["pictures"]]
 
-    start = time.perf_counter()
+    start, processor = time.perf_counter(), time.process_time()
     sort = options.engine == "eevee"
     if sort and cameras:
         subject = _for_painter(subject, cameras[0])
     built = build(subject, cameras, options, job["limit"], edges=bool(blend))
-    tell(built=round(time.perf_counter() - start, 3), blender=bpy.app.version_string)
+    tell(
+        built=round(time.perf_counter() - start, 3),
+        processor=round(time.process_time() - processor, 3),
+        blender=bpy.app.version_string,
+    )
     if blend:
         bpy.context.preferences.filepaths.save_version = 0
         with atomic_path(blend) as temporary:
@@ -71,10 +75,14 @@ def main(job_path: str) -> None:
             meshes.set_faces(built.thing.data, subject.faces[order])
         built.scene.frame_set(i)  # where the timeline puts camera i before the lens
         stage.aim(built.scene, camera, thing, factor)
-        start = time.perf_counter()
+        start, processor = time.perf_counter(), time.process_time()
         with atomic_path(target) as temporary:
             pictures.render_to(built.scene, temporary, factor)
-        tell(picture=str(target), seconds=round(time.perf_counter() - start, 3))
+        tell(
+            picture=str(target),
+            seconds=round(time.perf_counter() - start, 3),
+            processor=round(time.process_time() - processor, 3),
+        )
     tell(done=True)
 
 
