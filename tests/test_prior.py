@@ -110,7 +110,8 @@ def test_shells_of_a_thin_base_do_not_stand_out():
     mesh = bind(base).mesh
     layers, out = mesh.binding.layers, np.abs(mesh.vertices[:, 2]) > 0.012
     assert out[layers == LAYERS - 1].all()
-    assert (mesh.colors[out, 3] == 0).all()
+    assert (mesh.colors[out, 3] > 0).all()
+    assert (mesh.colors[out, 3] < 0.01).all()
     for camera in orbit(mesh, 3, width=96, height=96, elevation=40):
         assert psnr(render(mesh, camera).color, base_picture(base, camera)) > 50
 

@@ -25,6 +25,9 @@ LAYER_OPACITY = 0.1
 """Share of the base's opacity that coplanar layers above the lowest begin with."""
 SHELL_OPACITY = 0.3
 """Share of the base's opacity that layers above the lowest begin with where they are spaced."""
+FAINT = 0.005
+"""Most opacity that shells begin with where they stand out of the base: next to nothing shows, but training can
+make more of it, which it cannot of 0."""
 LAYERS = 6
 SHELLS_DEPTH = 1 / 30
 """By default, depth of all shells together as a share of the diagonal of the base's box."""
@@ -51,8 +54,8 @@ def bind(
     normals, translucent and hidden at first. Where the base is not where the surface is, as with a visual
     hull or a coarse scan, training makes the outer shells transparent, and all together show what lies in
     the depth between them; where it is the surface, they stay hidden. Where the base is thinner than they are
-    deep and they would stand out, they are transparent. The triangles of a face and shell share one depth
-    group.
+    deep and they would stand out, they are almost transparent. The triangles of a face and shell share one
+    depth group.
 
     With ``spacing`` 0 all layers lie in the base, those above the lowest almost transparent. In each face
     those of higher layers come first, as what is nearer does, and all share one depth group.
@@ -124,7 +127,8 @@ def bind(
         shells = face * np.int64(layers) + laid.layers[laid.triangles[:, 0]]
         depth_group = np.unique(shells, return_inverse=True)[1].reshape(-1).astype(np.int32)
         if looks.facing == (spacing < 0):
-            rgba[_standing_out(binding, looks), 3] = 0
+            out = _standing_out(binding, looks)
+            rgba[out, 3] = np.minimum(rgba[out, 3], np.float32(FAINT))
     mesh = SplatMesh(
         binding.positions(),
         laid.triangles,
