@@ -26,8 +26,8 @@ LAYER_OPACITY = 0.1
 SHELL_OPACITY = 0.3
 """Share of the base's opacity that layers above the lowest begin with where they are spaced."""
 FAINT = 0.005
-"""Most opacity that shells begin with where they stand out of the base: next to nothing shows, but training can
-make more of it, which it cannot of 0."""
+"""Most opacity that shells begin with where they stand out of the base: next to nothing shows, but training
+can make more of it, which it cannot of 0."""
 LAYERS = 6
 SHELLS_DEPTH = 1 / 30
 """By default, depth of all shells together as a share of the diagonal of the base's box."""
