@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
 
-Unit = Literal["splat", "scene"]
+Unit = Literal["picture", "splat", "scene"]
 Backdrop = Literal["random", "white", "black"]
 BACKDROPS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
@@ -33,10 +33,12 @@ class FinetuneConfig:
     whose result depends on the machine's speed."""
     color_rate: float = 0.02
     """Adam's rate of red, green, blue and opacity, which lie in [0, 1]: about how far one step moves them."""
-    position_rate: float = 0.02
+    position_rate: float = 0.012
     """Adam's rate of the positions, in ``position_unit``; 0: they stay."""
-    position_unit: Unit = "splat"
-    """splat: the size of the splat that a vertex belongs to. scene: scene units, as the paper has it."""
+    position_unit: Unit = "picture"
+    """splat: the size of the splat that a vertex belongs to, or the triangle's on a base mesh. picture: the
+    geometric mean of that size and 3 pixels of the training views that see it; on a base mesh as splat.
+    scene: scene units, as the paper has it."""
     soft_edges: bool = True
     """Opacities that are 0 at the mesh's open edges, as on the rims of fans, stay 0. An edge that shows has
     no gradient that would move it back, and opacities, which cannot fall below 0, would drift up there."""
