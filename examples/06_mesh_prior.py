@@ -1,6 +1,6 @@
 """A mesh prior: splats on a base mesh, trained, bent and lit anew. The picture of docs/mesh-prior.md.
 
-python examples/06_mesh_prior.py [steps]      Needs the extra finetune. Writes into example-output/.
+python examples/06_mesh_prior.py [steps]      Needs the extras finetune and base. Writes into example-output/.
 """
 
 import sys
@@ -18,11 +18,11 @@ out = Path("example-output")
 out.mkdir(exist_ok=True)
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 20
 
-# Train: a base of the surface, four shells of splats on it, and the splats' own pictures to learn from.
+# Train: a base of the surface, splats on it and on shells inside, and the splats' own pictures to learn from.
 cloud = make_scene()
-base = base_surface(cloud, resolution=64, cameras=32)
+base = base_surface(cloud, resolution=64, faces=10_000, cameras=32)
 data = ms.splat_dataset(cloud, train=30, test=4, width=160, sh_degree=0)
-start = bind(base, layers=4, spacing=-0.01)
+start = bind(base, views=data.train)
 prior = train(start, data, prior_config(steps=steps))
 before, after = (ms.evaluate(p.mesh, data).methods[0].mean("psnr") for p in (start, prior))
 ms.save_mesh(prior.mesh, out / "prior.npz")
@@ -44,7 +44,8 @@ bent = prior.pose(turned + height[:, None] * axis + lean)
 camera = ms.orbit(cloud, 1, elevation=22, azimuth=-10, width=300, height=340)[0]
 right, _, forward = camera.world_to_camera[:3, :3]
 lamp = 1.2 * right + 0.8 * axis - 0.6 * forward
-shade = 0.25 + 0.95 * np.clip(bent.normals @ (lamp / np.linalg.norm(lamp)), 0, 1)
+facing = np.sign(((camera.center - bent.vertices) * bent.normals).sum(axis=1, keepdims=True))  # two-sided
+shade = 0.25 + 0.95 * np.clip(facing * bent.normals @ (lamp / np.linalg.norm(lamp)), 0, 1)
 warm = bent.colors.copy()
 warm[:, :3] = np.clip(warm[:, :3] * shade[:, None] * [1.1, 1.0, 0.8], 0, 1)
 
