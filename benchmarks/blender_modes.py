@@ -3,8 +3,8 @@
     blender-env/bin/python benchmarks/blender_modes.py [--size 96] [--samples 32]
 
 A grey ball of 3000 splats, twice as long as wide and half as thick, tilted and moved at random, is lit by sun
-and sky. Prints a Markdown table: the light of the ball's middle, and how far it deviates from a smooth picture
-(a polynomial of degree 4), which is what looks mottled or speckled.
+and sky. Prints a Markdown table: the light of the ball's middle, and how far it deviates from a smooth
+picture (a polynomial of degree 4), which is what looks mottled or speckled.
 """
 
 from __future__ import annotations
