@@ -48,18 +48,16 @@ using PictureWorker = ms::MeshTile<ms::PictureTile>;
 
 int64_t draw_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera, const MsOptions &options,
                   const MsPicture &picture, ms::PictureLog *log) {
-    std::vector<ms::TileLog> logs(options.threads);
-    std::atomic<int> started{0};
     return draw_tiles(
         grid, scene.items, options.threads,
         [&] {
             auto worker = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, picture, camera));
-            if (log) worker->blend().record(&logs[started++]);
+            if (log) worker->blend().record();
             return worker;
         },
         [&](PictureWorker &worker, int64_t tile, const ms::Entry *list, int64_t length) {
             draw_tile(grid, worker, tile, list, length);
-            if (log) log->keep(tile, *worker.blend().log());
+            if (log) log->keep(tile, worker.blend().log(), *worker.blend().pieces());
         });
 }
 
@@ -80,7 +78,6 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
     struct Worker {
         ms::GradientTile back;
         std::unique_ptr<PictureWorker> again;
-        ms::TileLog log;
         ms::PackedLog packed;
     };
     std::vector<std::unique_ptr<Worker>> workers(threads);
@@ -91,17 +88,17 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
             ms::on_threads(threads, [&](int thread) {
                 auto &worker = workers[thread];
                 if (!worker)
-                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}, {}});
+                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}});
                 for (int i; (i = next.fetch_add(1)) < count;) {
                     const int64_t tile = wave + i;
                     const ms::PackedLog *entries = log.find(tile);
                     if (!entries) {
                         if (!worker->again) {
                             worker->again = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, nothing, camera));
-                            worker->again->blend().record(&worker->log);
+                            worker->again->blend().record();
                         }
                         draw_tile(grid, *worker->again, tile, lists->list(tile), lists->length(tile));
-                        worker->packed.pack(worker->log);
+                        worker->packed.pack(worker->again->blend().log(), *worker->again->blend().pieces());
                         entries = &worker->packed;
                     }
                     int x, y;

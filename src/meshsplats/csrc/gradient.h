@@ -38,16 +38,16 @@ class GradientTile {
         area_ = TileArea(grid_, tile_x, tile_y);
         out.count = 0;
         out.attributes.clear();
-        if (log.steps.empty() || !load_given()) return;
-        begin_triangles(log);
+        if (log.faces().empty() || !load_given()) return;
+        set_up(log.faces());
         for (int block = 0; block < BLOCKS; ++block) {
-            const TileLog::Step *begin = log.steps.data() + (block ? log.end[block - 1] : 0), *end = log.steps.data() + log.end[block];
+            log.unpack(block, entries_, pieces_, steps_);
             if (extra_)
-                block_back<true>(log, block, begin, end);
+                block_back<true>(block);
             else
-                block_back<false>(log, block, begin, end);
+                block_back<false>(block);
         }
-        finish(log.faces.size(), out);
+        finish(log.faces().size(), out);
     }
 
   private:
@@ -70,9 +70,13 @@ class GradientTile {
         Lanes apart[2][4];      // RGBA of the other two minus that of the first
         int32_t vertex[3][LANES];
     };
-    struct Fragment {
-        Lanes z, light;  // depth; the light that reaches it, times depth, 0 where there is none
-        uint32_t place, lanes;
+    // An entry of the log at the samples of its block.
+    struct Fragments {
+        Lanes rgba[4], z;  // where it has a piece
+        Lanes own;         // its colour, and what else is asked for, times the gradient of the sample's
+        Lanes light;       // that reaches it, times depth; 0 where there is none
+        Lanes contrast;    // own, less what is seen behind times that gradient
+        uint32_t entry;
     };
     struct Plane {
         float a, b, c, low, high, first;
@@ -109,44 +113,39 @@ class GradientTile {
         return any;
     }
 
-    // Triangles are made ready a few at a time, once one of them is needed: of many nothing was blended.
-    void begin_triangles(const PackedLog &log) {
-        const size_t n = log.faces.size(), batches = (n + LANES - 1) / LANES;
-        if (triangles_.size() < batches * LANES) {
+    // Makes the triangles ready.
+    void set_up(const std::vector<int32_t> &faces) {
+        const size_t n = faces.size(), batches = (n + LANES - 1) / LANES;
+        if (corners_.size() < batches) {
             triangles_.resize(batches * LANES);
             moments_.resize(batches * LANES);
             corners_.resize(batches);
         }
-        ready_.assign(batches, 0);
         planes_.resize(n * extra_);
         extra_sums_.assign(n * extra_ * 3, 0.0f);
+        for (size_t i = 0; i < std::min(n, CORNERS_AHEAD); ++i) ask_for_corners(faces[i]);
+        for (size_t begin = 0; begin < n; begin += LANES) set_up_batch(faces, begin);
     }
 
-    // Fetches what a batch will need, as far as it is known without waiting.
-    __attribute__((always_inline)) void ask_for_faces(const PackedLog &log, size_t batch) {
-        for (size_t i = batch * LANES; i < std::min(log.faces.size(), (batch + 1) * LANES); ++i)
-            __builtin_prefetch(mesh_.faces + 3 * (int64_t)log.faces[i]);
-    }
-    __attribute__((always_inline)) void ask_for_corners(const PackedLog &log, size_t batch) {
-        for (size_t i = batch * LANES; i < std::min(log.faces.size(), (batch + 1) * LANES); ++i) {
-            for (int k = 0; k < 3; ++k) {
-                const int64_t corner = mesh_.faces[3 * (int64_t)log.faces[i] + k];
-                __builtin_prefetch(&scene_.vertices[corner]);
-                __builtin_prefetch(mesh_.colors + 4 * corner);
-            }
+    static constexpr size_t FACES_AHEAD = 2 * LANES, CORNERS_AHEAD = LANES;
+
+    __attribute__((always_inline)) void ask_for_corners(int64_t face) {
+        for (int k = 0; k < 3; ++k) {
+            const int64_t corner = mesh_.faces[3 * face + k];
+            __builtin_prefetch(&scene_.vertices[corner]);
+            __builtin_prefetch(mesh_.colors + 4 * corner);
         }
     }
 
-    __attribute__((noinline)) void set_up_batch(const PackedLog &log, size_t batch) {
-        const size_t begin = batch * LANES;
-        const int held = (int)std::min<size_t>(LANES, log.faces.size() - begin);
-        ready_[batch] = 1;
-        // Batches are mostly needed one after the other.
-        ask_for_faces(log, batch + 2);
-        ask_for_corners(log, batch + 1);
+    void set_up_batch(const std::vector<int32_t> &faces, size_t begin) {
+        const int held = (int)std::min<size_t>(LANES, faces.size() - begin);
+        for (size_t i = begin; i < begin + held; ++i) {
+            if (i + FACES_AHEAD < faces.size()) __builtin_prefetch(mesh_.faces + 3 * (int64_t)faces[i + FACES_AHEAD]);
+            if (i + CORNERS_AHEAD < faces.size()) ask_for_corners(faces[i + CORNERS_AHEAD]);
+        }
         Triangles<LANES> &t = batch_;
-        Corners &corners = corners_[batch];
-        fill(&log.faces[begin], held, corners.vertex);
+        Corners &corners = corners_[begin / LANES];
+        fill(&faces[begin], held, corners.vertex);
         for (int i = 0; i < 3; ++i) {
             corners.s[i][0] = load_lanes(t.sa[i]);
             corners.s[i][1] = load_lanes(t.sb[i]);
@@ -231,83 +230,123 @@ class GradientTile {
         }
     }
 
-    static Lanes depth(const Prepared &t, const Lanes &x, const Lanes &y) {
-        const Lanes q = mul_add(lanes(t.qa), x, mul_add(lanes(t.qb), y, lanes(t.qc)));
-        return reciprocal(clamp(q, lanes(t.q_min), lanes(t.q_max)));
-    }
-    static Lanes value(const Prepared &t, int channel, const Lanes &x, const Lanes &y, const Lanes &z) {
-        const Lanes linear = mul_add(lanes(t.a[channel]), x, mul_add(lanes(t.b[channel]), y, lanes(t.c[channel])));
-        return clamp(linear * z, lanes(t.low[channel]), lanes(t.high[channel]));
+    // Fills in what does not depend on the order.
+    template <bool EXTRA>
+    void evaluate(int block, const Lanes &lane_x, const Lanes &lane_y, Fragments &f) {
+        const TileLog::Entry entry = entries_[f.entry];
+        const Piece *piece = pieces_.data() + entry.first;
+        Lanes q, linear[4];
+        const Prepared *t = &triangles_[piece->triangle];
+        f4 low = load4(t->low), high = load4(t->high);
+        float q_min = t->q_min, q_max = t->q_max;
+        for (uint32_t i = 0;;) {
+            const Lanes x = lane_x - lanes(t->x0), y = lane_y - lanes(t->y0);
+            const Lanes own_q = mul_add(lanes(t->qa), x, mul_add(lanes(t->qb), y, lanes(t->qc)));
+            q = i ? pick(piece[i].lanes, own_q, q) : own_q;
+            for (int c = 0; c < 4; ++c) {
+                const Lanes value = mul_add(lanes(t->a[c]), x, mul_add(lanes(t->b[c]), y, lanes(t->c[c])));
+                linear[c] = i ? pick(piece[i].lanes, value, linear[c]) : value;
+            }
+            if (++i == entry.count) break;
+            t = &triangles_[piece[i].triangle];
+            low = min4(low, load4(t->low));
+            high = max4(high, load4(t->high));
+            q_min = std::min(q_min, t->q_min);
+            q_max = std::max(q_max, t->q_max);
+        }
+        f.z = reciprocal(clamp(q, lanes(q_min), lanes(q_max)));
+        for (int c = 0; c < 4; ++c) f.rgba[c] = clamp(linear[c] * f.z, lanes(low[c]), lanes(high[c]));
+        const float *g = towards_[0] + block * LANES;
+        f.own = mul_add(f.rgba[0], load_lanes(g), mul_add(f.rgba[1], load_lanes(g + SAMPLES), f.rgba[2] * load_lanes(g + 2 * SAMPLES)));
+        f.light = f.contrast = lanes(0);
+        if (!EXTRA) return;
+        for (uint32_t i = 0; i < entry.count; ++i) {
+            t = &triangles_[piece[i].triangle];
+            const Lanes x = lane_x - lanes(t->x0), y = lane_y - lanes(t->y0);
+            for (int c = 0; c < extra_; ++c)
+                f.own = f.own + only(piece[i].lanes, extra_value(piece[i].triangle, c, x, y, f.z) * load_lanes(towards_extra(c, block)));
+        }
     }
 
-    // Takes the fragments of one block, in steps nearest first, from back to front. The light that reaches each is found
-    // before, from the front, and kept for a chunk of steps.
+    // Goes through the steps of one block. The light that reaches each fragment is found from the front, what is seen behind
+    // it from the back; then entries are taken whole. Of many steps, this is done a chunk at a time.
     template <bool EXTRA>
-    void block_back(const PackedLog &log, int block, const TileLog::Step *begin, const TileLog::Step *end) {
-        const int64_t chunks = (end - begin + CHUNK - 1) / CHUNK;
+    void block_back(int block) {
+        const int64_t chunks = ((int64_t)steps_.size() + CHUNK - 1) / CHUNK;
         const Lanes enough = lanes(options_.min_transmittance);
         const Lanes lane_x = TileArea::lane_x() + lanes(TileArea::block_x(block)), lane_y = TileArea::lane_y() + lanes(TileArea::block_y(block));
-        // Notes the light that reaches each fragment, as the picture was drawn; returns what goes on.
+        auto end = [&](int64_t chunk) { return std::min<int64_t>(steps_.size(), (chunk + 1) * CHUNK); };
+        // Entries get places in fragments_ chunk by chunk: what is below `used` is of an earlier one.
+        places_.assign(entries_.size(), 0);
+        int64_t used = 1, count = 0;
         auto forth = [&](int64_t chunk, Lanes through) {
-            found_.clear();
-            for (const TileLog::Step *step = begin + chunk * CHUNK; step < std::min(end, begin + (chunk + 1) * CHUNK); ++step) {
-                for (uint32_t i = step->first; i < step->first + step->count; ++i) {
-                    const uint32_t covered = log.pieces[i].lanes & step->lanes;
-                    if (!covered) continue;
-                    const uint32_t place = log.pieces[i].triangle;
-                    if (!ready_[place / LANES]) set_up_batch(log, place / LANES);
-                    const Prepared &t = triangles_[place];
-                    const Lanes x = lane_x - lanes(t.x0), y = lane_y - lanes(t.y0), z = depth(t, x, y);
-                    const Lanes alpha = only(covered, value(t, 3, x, y, z));
-                    found_.push_back({z, only(covered & at_least(through, enough), through * z), place, covered});
-                    through = through - through * alpha;
+            used += count;
+            count = 0;
+            for (int64_t i = chunk * CHUNK; i < end(chunk); ++i) {
+                const TileLog::Step step = steps_[i];
+                int64_t &place = places_[step.entry];
+                if (place < used) {
+                    place = used + count;
+                    if (count == (int64_t)fragments_.size()) fragments_.resize(std::max<size_t>(64, 2 * count));
+                    fragments_[count].entry = step.entry;
+                    evaluate<EXTRA>(block, lane_x, lane_y, fragments_[count++]);
                 }
+                Fragments &f = fragments_[place - used];
+                f.light = pick(step.lanes & at_least(through, enough), through * f.z, f.light);
+                through = through - only(step.lanes, through * f.rgba[3]);
             }
             return through;
         };
         starts_.resize(chunks + 1);
         starts_[0] = lanes(1);
         for (int64_t chunk = 0; chunk < chunks; ++chunk) starts_[chunk + 1] = forth(chunk, starts_[chunk]);
-
-        Lanes behind = load_lanes(behind_ + block * LANES), g[3];
-        for (int c = 0; c < 3; ++c) g[c] = load_lanes(towards_[c] + block * LANES);
+        Lanes behind = load_lanes(behind_ + block * LANES);
         for (int64_t chunk = chunks - 1; chunk >= 0; --chunk) {
             if (chunk < chunks - 1) forth(chunk, starts_[chunk]);
-            for (auto f = found_.rbegin(); f != found_.rend(); ++f) {
-                const Prepared &t = triangles_[f->place];
-                const Lanes x = lane_x - lanes(t.x0), y = lane_y - lanes(t.y0), z = f->z;
-                Lanes rgba[4];
-                for (int c = 0; c < 4; ++c) rgba[c] = value(t, c, x, y, z);
-                Lanes own = mul_add(rgba[0], g[0], mul_add(rgba[1], g[1], rgba[2] * g[2]));
-                if (EXTRA)
-                    for (int c = 0; c < extra_; ++c) own = own + extra_value(f->place, c, x, y, z) * load_lanes(towards_extra(c, block));
-                const Lanes contrast = own - behind, alpha = only(f->lanes, rgba[3]);
-                behind = mul_add(behind, lanes(1) - alpha, alpha * own);
-
-                const Lanes opaque = f->light * rgba[3];
-                Lanes sums[4], sums_y[4];
-                for (int c = 0; c < 3; ++c) sums[c] = opaque * g[c];
-                sums[3] = f->light * contrast;
-                Lanes v = sums[0] * (rgba[0] - lanes(t.first[0]));
-                for (int c = 1; c < 4; ++c) v = mul_add(sums[c], rgba[c] - lanes(t.first[c]), v);
-                if (EXTRA) {
-                    for (int c = 0; c < extra_; ++c) {
-                        const Lanes sum = opaque * load_lanes(towards_extra(c, block));
-                        v = v + sum * (extra_value(f->place, c, x, y, z) - lanes(planes_[(size_t)f->place * extra_ + c].first));
-                        float *to = &extra_sums_[((size_t)f->place * extra_ + c) * 3];
-                        to[0] += ::ms::sum(sum * x);
-                        to[1] += ::ms::sum(sum * y);
-                        to[2] += ::ms::sum(sum);
-                    }
-                }
-                for (int c = 0; c < 4; ++c) sums_y[c] = sums[c] * y;
-                const Lanes sums_v[4] = {v, v * x, v * y, lanes(0)};
-                // x is the same in every row.
-                Lanes columns[4] = {add_rows(sums), lanes(0), add_rows(sums_y), add_rows(sums_v)};
-                columns[1] = columns[0] * x;
-                float *to = moments_[f->place].sum[0];
-                store_lanes(to, load_lanes(to) + add_columns(columns));
+            for (int64_t i = end(chunk) - 1; i >= chunk * CHUNK; --i) {
+                const TileLog::Step step = steps_[i];
+                Fragments &f = fragments_[places_[step.entry] - used];
+                const Lanes contrast = f.own - behind;
+                f.contrast = pick(step.lanes, contrast, f.contrast);
+                behind = behind + only(step.lanes, f.rgba[3] * contrast);
             }
+            for (int64_t i = 0; i < count; ++i) add<EXTRA>(block, lane_x, lane_y, fragments_[i]);
+        }
+    }
+
+    // Adds an entry to the moments of its triangles.
+    template <bool EXTRA>
+    void add(int block, const Lanes &lane_x, const Lanes &lane_y, const Fragments &f) {
+        const TileLog::Entry entry = entries_[f.entry];
+        const Lanes opaque = f.light * f.rgba[3];
+        const float *g = towards_[0] + block * LANES;
+        const Lanes all[4] = {opaque * load_lanes(g), opaque * load_lanes(g + SAMPLES), opaque * load_lanes(g + 2 * SAMPLES), f.light * f.contrast};
+        for (uint32_t i = entry.first; i < entry.first + entry.count; ++i) {
+            const Piece piece = pieces_[i];
+            const Prepared &t = triangles_[piece.triangle];
+            const Lanes x = lane_x - lanes(t.x0), y = lane_y - lanes(t.y0);
+            Lanes sums[4], sums_y[4];
+            for (int c = 0; c < 4; ++c) sums[c] = only(piece.lanes, all[c]);
+            Lanes v = sums[0] * (f.rgba[0] - lanes(t.first[0]));
+            for (int c = 1; c < 4; ++c) v = mul_add(sums[c], f.rgba[c] - lanes(t.first[c]), v);
+            if (EXTRA) {
+                for (int c = 0; c < extra_; ++c) {
+                    const size_t place = (size_t)piece.triangle * extra_ + c;
+                    const Lanes sum = only(piece.lanes, opaque * load_lanes(towards_extra(c, block)));
+                    v = v + sum * (extra_value(piece.triangle, c, x, y, f.z) - lanes(planes_[place].first));
+                    float *to = &extra_sums_[place * 3];
+                    to[0] += ::ms::sum(sum * x);
+                    to[1] += ::ms::sum(sum * y);
+                    to[2] += ::ms::sum(sum);
+                }
+            }
+            for (int c = 0; c < 4; ++c) sums_y[c] = sums[c] * y;
+            const Lanes sums_v[4] = {v, v * x, v * y, lanes(0)};
+            // x is the same in every row.
+            Lanes columns[4] = {add_rows(sums), lanes(0), add_rows(sums_y), add_rows(sums_v)};
+            columns[1] = columns[0] * x;
+            float *to = moments_[piece.triangle].sum[0];
+            store_lanes(to, load_lanes(to) + add_columns(columns));
         }
     }
 
@@ -319,13 +358,12 @@ class GradientTile {
 
     // From sums over samples to the corners.
     void finish(size_t count, TileGradients &out) const {
+        out.count = count;
         if (out.corners.size() < count) out.corners.resize(count);
         out.attributes.resize(count * 3 * extra_);
         for (size_t begin = 0; begin < count; begin += LANES) {
-            if (!ready_[begin / LANES]) continue;
             const int held = (int)std::min<size_t>(LANES, count - begin);
             finish_batch(begin, held, out);
-            out.count += held;
         }
     }
 
@@ -353,7 +391,7 @@ class GradientTile {
                 alignas(64) float apart[LANES] = {};
                 for (int i = 0; i < held; ++i) {
                     apart[i] = mesh_.attributes[(int64_t)corners.vertex[k][i] * extra_ + c] - planes_[(begin + i) * extra_ + c].first;
-                    out.attributes[((out.count + i) * 3 + k) * extra_ + c] = lane_of(towards, i);
+                    out.attributes[((begin + i) * 3 + k) * extra_ + c] = lane_of(towards, i);
                 }
                 for (int j = 0; j < 3; ++j) g[k][j] = mul_add(load_lanes(apart), sums[j], g[k][j]);
             }
@@ -367,7 +405,7 @@ class GradientTile {
         }
         constexpr int stride = sizeof(CornerGradients) / sizeof(float);
         for (int k = 0; k < 3; ++k) {
-            CornerGradients &first = out.corners[out.count];
+            CornerGradients &first = out.corners[begin];
             for (int c = 0; c < 4; ++c) put_column(dot(s[k], of_rgba[c]), &first.rgba[k][c], held, stride);
             Lanes d[3] = {lanes(0), lanes(0), lanes(0)};
             for (int i = 0; i < 3; ++i) {
@@ -379,7 +417,7 @@ class GradientTile {
             for (int j = 0; j < 3; ++j)
                 put_column(mul_add(lanes((float)pr.m[j]), x, mul_add(lanes((float)pr.m[4 + j]), y, lanes((float)pr.m[8 + j]) * z)),
                            &first.position[k][j], held, stride);
-            for (int i = 0; i < held; ++i) out.corners[out.count + i].vertex[k] = corners.vertex[k][i];
+            for (int i = 0; i < held; ++i) out.corners[begin + i].vertex[k] = corners.vertex[k][i];
         }
     }
 
@@ -398,13 +436,16 @@ class GradientTile {
     std::vector<float> towards_extra_;
     Triangles<LANES> batch_;
     float origin_x_[LANES], origin_y_[LANES];
-    std::vector<uint8_t> ready_;    // by batch of LANES triangles of the log
     std::vector<Prepared> triangles_;
-    std::vector<Corners> corners_;  // by batch
+    std::vector<Corners> corners_;  // LANES triangles each
     std::vector<Moments> moments_;
     std::vector<Plane> planes_;
     std::vector<float> extra_sums_;
-    std::vector<Fragment> found_;
+    std::vector<TileLog::Entry> entries_;  // of a block
+    std::vector<Piece> pieces_;
+    std::vector<TileLog::Step> steps_;
+    std::vector<Fragments> fragments_;
+    std::vector<int64_t> places_;  // by entry of a block
     std::vector<Lanes> starts_;
 };
 

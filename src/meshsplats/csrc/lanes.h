@@ -171,14 +171,15 @@ inline Lanes add_columns(const Lanes terms[4]) {
 // Lane i: first[i * stride], for i < count; 0 beyond.
 inline Lanes column(const float *first, int count, int stride) {
     alignas(64) float v[LANES] = {};
-    for (int i = 0; i < count; ++i) v[i] = first[(long)i * stride];
+    for (int i = 0; i < count; ++i) v[i] = first[i * stride];
     return load_lanes(v);
 }
+
 // The way back.
 inline void put_column(const Lanes &a, float *first, int count, int stride) {
     alignas(64) float v[LANES];
     store_lanes(v, a);
-    for (int i = 0; i < count; ++i) first[(long)i * stride] = v[i];
+    for (int i = 0; i < count; ++i) first[i * stride] = v[i];
 }
 
 }  // namespace ms

@@ -146,13 +146,16 @@ class MeshTile {
     void add_run(int begin, int end, unsigned crossing) {
         const Triangles &t = triangles_;
         uint8_t touching[BLOCKS] = {};
-        TileLog *log = blend_.pieces();
+        TilePieces *found = blend_.pieces();
         uint32_t number[Triangles::N];
         unsigned blocks = 0;
         for (int k = begin; k < end; ++k) {
             unsigned touched = prepare(k);
             blocks |= touched;
-            number[k] = UINT32_MAX;
+            if (found && touched) {
+                number[k] = (uint32_t)found->triangles.size();
+                found->triangles.push_back({t.face[k], TilePieces::NONE});
+            }
             for (; touched; touched &= touched - 1) touching[__builtin_ctz(touched)] |= 1u << k;
         }
         for (; blocks; blocks &= blocks - 1) {
@@ -189,13 +192,9 @@ class MeshTile {
                 }
                 if (!covered) face = t.face[k];
                 covered |= inside;
-                if (log) {
-                    if (number[k] == UINT32_MAX) {
-                        number[k] = (uint32_t)log->faces.size();
-                        log->faces.push_back(t.face[k]);
-                    }
-                    if (!pieces) first_piece = (uint32_t)log->pieces.size();
-                    log->pieces.push_back({number[k], inside});
+                if (found) {
+                    if (!pieces) first_piece = (uint32_t)found->pieces.size();
+                    found->pieces.push_back({number[k], inside});
                     ++pieces;
                 }
                 if (GENERAL && blend_.needs_weights()) {

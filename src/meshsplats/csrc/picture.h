@@ -28,20 +28,21 @@ class PictureTile {
         : scene_(scene), grid_(scene.grid), options_(options), picture_(picture), camera_(camera),
           extras_(picture, scene.mesh), sums_((size_t)SAMPLES * extras_.channels) {}
 
-    // Writes what is blended to a log, or not (null). Then triangles without opacity count too, and what lies behind an
+    // From now on keeps a log of what is blended in the tile. Then triangles without opacity count too, and what lies behind an
     // opaque one is followed as if it let some light through: for gradients, that is what making it translucent shows.
-    void record(TileLog *log) { log_ = log; }
-    const TileLog *log() const { return log_; }
+    void record() { log_ = std::make_unique<TileLog>(); }
+    const TileLog &log() const { return *log_; }
     // Where to note which triangle covers what, or null.
-    TileLog *pieces() { return log_ ? log_ : extras_.any ? &own_pieces_ : nullptr; }
-    bool keeps_invisible() const { return log_; }
+    TilePieces *pieces() { return log_ || extras_.any ? &pieces_ : nullptr; }
+    bool keeps_invisible() const { return log_ != nullptr; }
     bool needs_weights() const { return extras_.any; }
     int64_t fragments() const { return fragments_; }
     unsigned open(int block) const { return open_[block]; }
 
     void begin(const TileArea &area) {
         area_ = area;
-        if (pieces()) pieces()->clear();
+        pieces_.clear();
+        if (log_) log_->clear();
         for (int i = 0; i < SAMPLES; ++i) {
             layers_[i] = 0;
             color_[0][i] = color_[1][i] = color_[2][i] = 0;
@@ -126,6 +127,8 @@ class PictureTile {
         for (int c = 0; c < 3; ++c) color[c] = load_lanes(color_[c] + block * LANES);
         const Lanes enough = lanes(options_.min_transmittance);
         uint32_t open = open_[block], lit = at_least(through, enough);
+        TileLog::Block *log = log_ ? &log_->blocks[block] : nullptr;
+        if (log) log->make_room(waiting.count());
         waiting.take(nearest_to_come, open, [&](int entry, uint32_t ready) {
             const Fragments &f = waiting.fragments(entry);
             const Lanes weight = only(ready & (GENERAL ? lit & open : open), through * f.rgba[3]);
@@ -138,9 +141,15 @@ class PictureTile {
                 return;
             }
             lit = at_least(through, enough);
-            if (log_) {
-                if (ready & open)
-                    log_->steps[block].push_back({waiting.first_piece(entry), (uint16_t)(ready & open), (uint16_t)waiting.pieces(entry)});
+            if (log) {
+                if (ready & open) {
+                    uint32_t &number = waiting.number(entry);
+                    if (number == Waiting::NO_NUMBER) {
+                        number = log->entry_count++;
+                        log->entries[number] = {waiting.first_piece(entry), waiting.pieces(entry)};
+                    }
+                    log->steps[log->step_count++] = {number, ready & open};
+                }
                 reach = reach - only(ready & open, reach * least(f.rgba[3], lanes(MOST_OPAQUE)));
                 open &= lit | at_least(reach, enough);
             } else {
@@ -149,12 +158,13 @@ class PictureTile {
             if (extras_.any) {
                 alignas(64) float weights[LANES];
                 store_lanes(weights, weight);
-                pieces()->for_pieces(waiting.first_piece(entry), waiting.pieces(entry), seen, [&](uint32_t triangle, uint32_t part) {
-                    for (; part; part &= part - 1) {
+                const Piece *piece = pieces_.pieces.data() + waiting.first_piece(entry);
+                for (uint32_t i = 0; i < waiting.pieces(entry); ++i) {
+                    for (uint32_t part = piece[i].lanes & seen; part; part &= part - 1) {
                         const int lane = __builtin_ctz(part);
-                        add_extras(block * LANES + lane, pieces()->faces[triangle], waiting.weights(entry), lane, weights[lane]);
+                        add_extras(block * LANES + lane, pieces_.triangles[piece[i].triangle].face, waiting.weights(entry), lane, weights[lane]);
                     }
-                });
+                }
             }
             if (options_.max_layers) {
                 for (uint32_t rest = seen; rest; rest &= rest - 1)
@@ -229,8 +239,8 @@ class PictureTile {
     alignas(64) float color_[3][SAMPLES];
     alignas(64) float through_[SAMPLES];
     alignas(64) float reach_[SAMPLES];  // the same if nothing were more opaque than MOST_OPAQUE
-    TileLog *log_ = nullptr;
-    TileLog own_pieces_;
+    std::unique_ptr<TileLog> log_;
+    TilePieces pieces_;
     int32_t layers_[SAMPLES];
     uint32_t open_[BLOCKS];  // per block, the samples that still take light
     std::vector<float> sums_;

@@ -32,9 +32,12 @@ class Waiting {
 
     uint32_t first_piece(int entry) const { return entries_[entry].first_piece; }
     uint32_t pieces(int entry) const { return entries_[entry].pieces; }
+    // Its number in the log.
+    static constexpr uint32_t NO_NUMBER = UINT32_MAX;
+    uint32_t &number(int entry) { return entries_[entry].number; }
 
     // `face` is the first face of the entry; entries of a run follow each other in the order of their faces. Weights may
-    // be null, and pieces [first_piece, first_piece + pieces) of the tile's log none.
+    // be null, and pieces [first_piece, first_piece + pieces) of those found in the tile none.
     void add(uint32_t covered, int32_t face, const Fragments &fragments, const FragmentWeights *weights, uint32_t first_piece,
              uint32_t pieces) {
         if (count_ == (int)entries_.size()) {
@@ -45,7 +48,7 @@ class Waiting {
             weights_.resize(entries_.size());
             weights_[count_] = *weights;
         }
-        entries_[count_] = {covered, face, first_piece, pieces};
+        entries_[count_] = {covered, face, first_piece, pieces, NO_NUMBER};
         fragments_[count_++] = fragments;
     }
 
@@ -94,7 +97,7 @@ class Waiting {
     struct Entry {
         uint32_t lanes;
         int32_t face;
-        uint32_t first_piece, pieces;
+        uint32_t first_piece, pieces, number;
     };
     struct Active {
         int entry;
