@@ -141,10 +141,10 @@ def test_obj_vertex_colours_serve_where_there_is_no_texture(tmp_path):
     colored = OBJ.replace("v 0 0 0", "v 0 0 0 1 0 0").replace("v 1 0 0", "v 1 0 0 1 0 0")
     colored = colored.replace("v 1 1 0", "v 1 1 0 1 0 0").replace("v 0 1 0", "v 0 1 0 1 0 0")
     base = load_base(write_obj(tmp_path, colored + "f 1 2 3\n"))
-    mesh = bind(base).mesh
+    mesh = bind(base, layers=1).mesh
     np.testing.assert_allclose(mesh.colors[6:], [[1, 0, 0, 1]] * 3)
-    np.testing.assert_allclose(bind(base, colors="vertices").mesh.colors, [[1, 0, 0, 1]] * 9)
-    assert (bind(base, colors="texture").mesh.colors[:6, 2] > 0).any()
+    np.testing.assert_allclose(bind(base, layers=1, colors="vertices").mesh.colors, [[1, 0, 0, 1]] * 9)
+    assert (bind(base, layers=1, colors="texture").mesh.colors[:6, 2] > 0).any()
 
 
 def test_missing_pictures_are_told(tmp_path):
