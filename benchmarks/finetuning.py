@@ -117,8 +117,7 @@ def by_processor_time(mesh, data, config: FinetuneConfig, options, seconds) -> t
     from meshsplats.finetuning.tuning import kept_faces, make_step
 
     torch.set_num_threads(1)
-    cameras = [view.camera for view in data.train]
-    state = State.begin(mesh, len(data.train), config, options.threads, cameras)
+    state = State.begin(mesh, len(data.train), config, options.threads)
     step, interval = 0, config.prune_interval(len(data.train))
     while (fraction := seconds() / (options.minutes * 60)) < 1:
         make_step(state, data.train, step, fraction)

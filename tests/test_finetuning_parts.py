@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from meshsplats.camera import Camera, look_at, orbit
+from meshsplats.camera import Camera, orbit
 from meshsplats.conversion import convert
 from meshsplats.dataset import Dataset, Picture, View
 from meshsplats.demo_scene import make_scene
@@ -23,7 +23,7 @@ from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, r
 from meshsplats.finetuning.edges import on_open_edges
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
-from meshsplats.finetuning.sizes import PICTURE_PIXELS, picture_units, vertex_sizes
+from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.finetuning.start import starting_mesh
 from meshsplats.mesh import SplatMesh
 
@@ -80,6 +80,16 @@ def test_rates_fall_over_the_length_and_by_step():
     assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
     assert rates(config, 0, 0.5) == pytest.approx((0.01, 0.02))
     assert rates(config, 3, 1) == pytest.approx((0.1 * 0.01 / 8, 0.002))
+
+
+def test_long_runs_move_positions_less():
+    config = make_config(steps=1000, position_rate=0.2, final_share=1.0, rate_steps=250)
+    assert rates(config, 0, 0)[1] == 0.2
+    for step in (1, 500, 999):
+        assert rates(config, step, step / 1000)[1] == pytest.approx(0.1)
+        assert rates(config, step, step / 200)[1] == 0.2
+        assert rates(replace(config, rate_steps=0), step, step / 1000)[1] == 0.2
+        assert rates(config, step, step / 1000)[0] == rates(config, step, step / 200)[0]
 
 
 @pytest.mark.parametrize(
@@ -140,23 +150,6 @@ def test_sizes_of_a_real_mesh_are_those_of_its_splats():
     first = mesh.faces[np.searchsorted(mesh.face_splat, np.arange(200)), 0]
     spread = np.log(sizes[first] / np.sort(cloud.scales, axis=1)[:, 1])
     assert spread.std() < 0.5
-
-
-def test_units_of_pictures_lie_between_the_size_and_so_many_pixels():
-    """A camera of 100 pixels focal length, 5 units away: a pixel is 0.05 units there."""
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    vertices = np.concatenate([corners * 0.01, corners - [0, 0, 90]])
-    mesh = SplatMesh(vertices, [[0, 1, 2], [3, 4, 5]], np.ones((6, 4)))
-    lens = {"width": 100, "height": 100, "fov": math.degrees(2 * math.atan(0.5))}
-    camera = look_at((0, 0, -5), (0, 0, 0), **lens)
-    sizes = vertex_sizes(mesh)
-    units = picture_units(mesh, sizes, [camera])
-    assert np.allclose(units[:3], np.sqrt(0.01 * PICTURE_PIXELS * 0.05), rtol=1e-3)
-    assert np.array_equal(units[3:], sizes[3:])  # behind the camera
-    larger = replace(mesh, vertices=mesh.vertices * 4)
-    away = look_at((0, 0, -20), (0, 0, 0), **lens)
-    assert np.allclose(picture_units(larger, vertex_sizes(larger), [away]), 4 * units, rtol=1e-4)
-    assert np.array_equal(picture_units(mesh, sizes, []), sizes)
 
 
 def test_open_edges_are_those_of_one_triangle():

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
 
-Unit = Literal["picture", "splat", "scene"]
+Unit = Literal["splat", "scene"]
 Backdrop = Literal["random", "white", "black"]
 BACKDROPS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
@@ -33,17 +33,18 @@ class FinetuneConfig:
     whose result depends on the machine's speed."""
     color_rate: float = 0.02
     """Adam's rate of red, green, blue and opacity, which lie in [0, 1]: about how far one step moves them."""
-    position_rate: float = 0.012
+    position_rate: float = 0.02
     """Adam's rate of the positions, in ``position_unit``; 0: they stay."""
-    position_unit: Unit = "picture"
-    """splat: the size of the splat that a vertex belongs to, or the triangle's on a base mesh. picture: the
-    geometric mean of that size and 3 pixels of the training views that see it; on a base mesh as splat.
-    scene: scene units, as the paper has it."""
+    position_unit: Unit = "splat"
+    """splat: the size of the splat that a vertex belongs to. scene: scene units, as the paper has it."""
     soft_edges: bool = True
     """Opacities that are 0 at the mesh's open edges, as on the rims of fans, stay 0. An edge that shows has
     no gradient that would move it back, and opacities, which cannot fall below 0, would drift up there."""
     final_share: float = 0.1
     """Both rates fall exponentially over the whole length, to this share of what they were."""
+    rate_steps: int = 250
+    """Runs of more steps than these move positions less in each, at ``sqrt(rate_steps / steps)`` of the rate:
+    what a short run needs to arrive is noise in a long one. 0: the rate does not depend on the length."""
     color_step_decay: float = 1.0
     """The colour rate is also multiplied by this after every step."""
     beta1: float = 0.5
@@ -126,6 +127,7 @@ _RANGES: list[tuple[str, float, float, bool]] = [
     ("color_rate", 1e-9, 1, False),
     ("position_rate", 0, 10, False),
     ("final_share", 1e-6, 1, False),
+    ("rate_steps", 0, 10**9, True),
     ("color_step_decay", 0.5, 1, False),
     ("beta1", 0, 0.99999, False),
     ("beta2", 0, 0.9999999, False),
@@ -149,6 +151,7 @@ _PAPER = FinetuneConfig(
     position_unit="scene",
     soft_edges=False,
     final_share=1.0,
+    rate_steps=0,
     color_step_decay=0.999,
     beta1=0.9,
     beta2=0.999,
@@ -191,8 +194,13 @@ def make_config(preset: str = "default", **changes: Any) -> FinetuneConfig:
 
 
 def rates(config: FinetuneConfig, step: int, fraction: float) -> tuple[float, float]:
-    """Rates of colours and of positions for step number ``step`` (from 0), ``fraction`` (0 to 1) of the
-    way."""
+    """Rates of colours and of positions for step number ``step`` (from 0), ``fraction`` (0 to 1) of the way.
+
+    The number of all steps is taken to be ``step / fraction``, which suits runs of a stated time, too.
+    """
     decay = config.final_share ** min(max(fraction, 0.0), 1.0)
     color = config.color_rate * decay * config.color_step_decay**step
-    return max(color, 1e-12), config.position_rate * decay
+    position = config.position_rate * decay
+    if config.rate_steps and step > config.rate_steps * fraction:
+        position *= math.sqrt(config.rate_steps * fraction / step)
+    return max(color, 1e-12), position

@@ -129,8 +129,7 @@ def finetune(
         state = State.resume(found.arrays, blending, views, config, run.threads)
         step, spent, losses = found.step, found.seconds, found.losses
     else:
-        cameras = [view.camera for view in dataset.train]
-        state = State.begin(mesh, views, config, run.threads, cameras)
+        state = State.begin(mesh, views, config, run.threads)
         step, spent, losses = 0, 0.0, ()
         if journal is not None:
             journal.begin(config.to_dict())

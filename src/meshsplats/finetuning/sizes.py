@@ -1,16 +1,10 @@
-"""The size of each vertex' splat, in the scene and on pictures: units in which positions are optimised."""
+"""The size of each vertex' splat: the unit in which positions are optimised."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.mesh import SplatMesh
-
-PICTURE_PIXELS = 3.0
-"""Splats that are so many pixels large move the same way in both units."""
 
 
 def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
@@ -36,16 +30,3 @@ def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
     if positive.any():
         result[~positive] = result[positive].min()
     return result.astype(np.float32)
-
-
-def picture_units(mesh: SplatMesh, sizes: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """(v,) float32, scene units: the geometric mean of each vertex' size (v,) and ``PICTURE_PIXELS`` pixels
-    of the cameras that see it; the size alone where none does.
-
-    A step of a share of the size is many pixels on a wall of few large splats, and nothing on a leaf of many
-    small ones.
-    """
-    from meshsplats.conversion.footprint import Views
-
-    pixels = Views(mesh.vertices, cameras).pixel_sizes() if cameras else np.zeros_like(sizes)
-    return np.where(pixels > 0, np.sqrt(sizes * np.float32(PICTURE_PIXELS) * pixels), sizes)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.finetuning.adam import RowAdam
@@ -16,7 +14,7 @@ from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.edges import on_open_edges
-from meshsplats.finetuning.sizes import picture_units, vertex_sizes
+from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.mesh import SplatMesh
 
 try:
@@ -60,7 +58,7 @@ class State:
         if self.bound is not None:
             self._positions = adam(self.bound.weights, lr=1.0, scale=sizes)
         else:
-            unit = None if config.position_unit == "scene" else sizes
+            unit = sizes if config.position_unit == "splat" else None
             self._positions = adam(self.vertices, lr=1.0, scale=unit)
         self._colors = adam(self.colors, lr=1.0, bounds=(0, 1))
         # Of the triangles alone, so that a resumed run has the same.
@@ -68,15 +66,8 @@ class State:
         self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
 
     @classmethod
-    def begin(
-        cls,
-        mesh: SplatMesh,
-        views: int,
-        config: FinetuneConfig,
-        threads: int | None,
-        cameras: Sequence[Camera] = (),
-    ) -> State:
-        """That of a mesh before the first step. ``cameras``: of the training views, for units of pictures."""
+    def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
+        """That of a mesh before the first step."""
         mesh = replace(mesh, normals=None)  # they would not follow the positions
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
@@ -95,8 +86,6 @@ class State:
             sizes = weight_units(mesh, config.position_unit == "scene")
         else:
             sizes = vertex_sizes(mesh)
-            if config.position_unit == "picture":
-                sizes = picture_units(mesh, sizes, cameras)
         return cls(mesh, sizes, exposures, config, threads)
 
     @classmethod

@@ -12,7 +12,13 @@ if TYPE_CHECKING:
     from meshsplats.finetuning import FinetuneConfig, Progress, RunOptions
 
 
-CHOICES = {"color_rate": 0.05, "position_rate": 0.05, "ssim_weight": 0.0, "l2_weight": 5.0}
+CHOICES = {
+    "color_rate": 0.05,
+    "position_rate": 0.05,
+    "rate_steps": 0,
+    "ssim_weight": 0.0,
+    "l2_weight": 5.0,
+}
 """Where training a prior differs from the preset 'default' of fine-tuning."""
 
 
