@@ -62,7 +62,7 @@ $(BLENDER_VENV)/wheel/made: $(BUILD_INPUTS) $(shell find src -name '*.py')
 	@$(BLENDER_PYTHON) -m venv $(BLENDER_VENV)/build
 	@rm -f $(@D)/*.whl
 	@$(BLENDER_VENV)/build/bin/python -m pip --disable-pip-version-check --quiet wheel --no-deps \
-	  -C build-dir=build/blender --wheel-dir $(@D) .
+	  --config-settings=build-dir=build/blender --wheel-dir $(@D) .
 	@touch $@
 
 $(BLENDER_VENV)/%/installed: $(BLENDER_VENV)/wheel/made
