@@ -115,7 +115,7 @@ def _watch(
     environment = dict(os.environ)
     if arguments[1] == "-m":
         # The worker must be this very package, wherever this process found it.
-        places = [str(Path(worker.__file__).resolve().parents[3]), environment.get("PYTHONPATH", "")]
+        places = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
     result: dict[str, Any] = {"picture_seconds": [], "picture_processor_seconds": []}
     said: deque[str] = deque(maxlen=40)
