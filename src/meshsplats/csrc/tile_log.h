@@ -4,7 +4,6 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
-#include <cstring>
 #include <memory>
 #include <vector>
 
@@ -142,13 +141,12 @@ class PictureLog {
   public:
     PictureLog(int64_t tiles, int64_t budget) : tiles_(tiles), left_(budget) {}
 
-    // Not for one tile by two threads. Once the budget is spent, nothing is kept any more.
+    // Not for one tile by two threads. After the first log that does not fit, nothing is kept any more.
     void keep(int64_t tile, const TileLog &log, TilePieces &found) {
-        if (left_ <= 0) return;
+        if (left_ < 0) return;
         auto packed = std::make_unique<PackedLog>();
         packed->pack(log, found);
-        left_ -= packed->bytes();
-        tiles_[tile] = std::move(packed);
+        if ((left_ -= packed->bytes()) >= 0) tiles_[tile] = std::move(packed);
     }
     const PackedLog *find(int64_t tile) const { return tiles_[tile].get(); }
     bool complete() const {
