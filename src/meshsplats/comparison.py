@@ -83,19 +83,15 @@ def compare_views(
         A mesh made for blending in linear light is drawn so, and encoded for display after.
     samples, max_layers: as in ``render``, for the mesh.
     """
-    from meshsplats.colors import linear_to_srgb, srgb_to_linear
+    from meshsplats.evaluation import mesh_picture
     from meshsplats.metrics import psnr, ssim
-    from meshsplats.rendering import render, render_splats
+    from meshsplats.rendering import render_splats
 
-    linear = mesh.blending == "linear"
-    behind = srgb_to_linear(np.asarray(background, np.float32)) if linear else background
     options: dict[str, Any] = {"samples": samples, "max_layers": max_layers, "threads": threads}
     for i, camera in enumerate(cameras):
         a = render_splats(cloud, camera, sh_degree=sh_degree, background=background, threads=threads).color
         a = np.clip(a, 0, 1)
-        b = np.clip(render(mesh, camera, background=behind, **options).color, 0, 1)
-        if linear:
-            b = linear_to_srgb(b)
+        b = np.clip(mesh_picture(mesh, camera, background, **options)[0], 0, 1)
         yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))
 
 

@@ -215,6 +215,7 @@ def mesh_picture(
     background: Sequence[float],
     *,
     samples: int = 1,
+    max_layers: int | None = None,
     threads: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(h, w, 3) display RGB over a display ``background`` and (h, w) alpha, blended in the space that the
@@ -223,7 +224,7 @@ def mesh_picture(
 
     linear = mesh.blending == "linear"
     behind = srgb_to_linear(np.asarray(background)) if linear else background
-    drawn = render(mesh, camera, background=behind, samples=samples, threads=threads)
+    drawn = render(mesh, camera, background=behind, samples=samples, max_layers=max_layers, threads=threads)
     return (linear_to_srgb(drawn.color) if linear else drawn.color), drawn.alpha
 
 
