@@ -11,7 +11,16 @@ from pathlib import Path
 import tyro
 
 from meshsplats.cli import UsageError
-from meshsplats.cli.common import Count, File, Output, SplatOptions, check_outputs, load_scene, size_of
+from meshsplats.cli.common import (
+    Count,
+    File,
+    Output,
+    SplatOptions,
+    check_mesh_suffix,
+    check_outputs,
+    load_scene,
+    size_of,
+)
 from meshsplats.mesh import SplatMesh
 
 
@@ -44,12 +53,11 @@ class Base:
 
     def run(self) -> None:
         from meshsplats.camera import load_cameras
-        from meshsplats.formats.meshes import MESH_SUFFIXES, save_mesh
+        from meshsplats.formats.meshes import save_mesh
         from meshsplats.prior.surface import base_surface
 
         start = time.perf_counter()
-        if self.output.suffix.lower() not in MESH_SUFFIXES:
-            raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
+        check_mesh_suffix(self.output)
         if self.cameras is not None and self.views != type(self).views:
             raise UsageError("--views has no effect with --cameras")
         check_outputs([self.output], self.force)

@@ -227,6 +227,14 @@ def _numbers(text: str) -> tuple[float, ...] | None:
     return numbers if len(numbers) == 3 and np.isfinite(numbers).all() else None
 
 
+def check_mesh_suffix(path: Path) -> None:
+    """Raises UsageError if no mesh can be written under this name."""
+    from meshsplats.formats.meshes import MESH_SUFFIXES
+
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {path.name!r}")
+
+
 def check_outputs(paths: Sequence[Path], force: bool, folder: Path | None = None) -> None:
     """Before the work: raises OSError if an output exists already (unless ``force``) or cannot be made.
 

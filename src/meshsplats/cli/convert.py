@@ -21,6 +21,7 @@ from meshsplats.cli.common import (
     SplatOptions,
     Text,
     cameras_beside,
+    check_mesh_suffix,
     check_outputs,
     configuration,
     data_cameras,
@@ -107,14 +108,13 @@ class Convert:
     """Overwrite existing outputs."""
 
     def run(self) -> None:
-        from meshsplats.formats.meshes import MESH_SUFFIXES, save_mesh
+        from meshsplats.formats.meshes import save_mesh
 
         suffix = self.output.suffix.lower()
         if self.as_splats:
             self._save_splats(suffix)
             return
-        if suffix not in MESH_SUFFIXES:
-            raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
+        check_mesh_suffix(self.output)
         if self.lit and suffix != ".glb" and not suffix.startswith(".usd"):
             raise UsageError(f"--lit is for .glb and .usd files: {suffix} has no material")
         glb_only = (self.color_type, self.alpha, self.compression)

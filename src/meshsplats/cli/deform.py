@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from meshsplats.cli import UsageError
-from meshsplats.cli.common import Number, Output, check_outputs, plural, size_of, track
+from meshsplats.cli.common import Number, Output, check_mesh_suffix, check_outputs, plural, size_of, track
 from meshsplats.mesh import SplatMesh
 
 
@@ -40,12 +40,10 @@ class Deform:
 
     def run(self) -> None:
         from meshsplats.formats.base_meshes import load_base
-        from meshsplats.formats.meshes import MESH_SUFFIXES
         from meshsplats.prior import load_prior
 
         start = time.perf_counter()
-        if self.output.suffix.lower() not in MESH_SUFFIXES:
-            raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
+        check_mesh_suffix(self.output)
         if not self.base:
             raise UsageError("give the edited base with --base")
         targets = self.targets()

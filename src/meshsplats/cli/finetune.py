@@ -26,6 +26,7 @@ from meshsplats.cli.common import (
     SplatOptions,
     Text,
     cameras_beside,
+    check_mesh_suffix,
     check_outputs,
     configuration,
     load_scene,
@@ -227,11 +228,10 @@ class Finetune:
     """Overwrite existing outputs."""
 
     def run(self) -> int:
-        from meshsplats.formats.meshes import MESH_SUFFIXES, save_mesh
+        from meshsplats.formats.meshes import save_mesh
 
         began = time.perf_counter() - STARTING_UP
-        if self.output.suffix.lower() not in MESH_SUFFIXES:
-            raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {self.output.name!r}")
+        check_mesh_suffix(self.output)
         config = self.configured()
         self.target.check()
         files = _Files(self.output)
