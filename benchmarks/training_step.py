@@ -16,13 +16,12 @@ blending. Needs torch.
 from __future__ import annotations
 
 import argparse
-import statistics
 import time
 from collections.abc import Callable
 
 import numpy as np
 import torch
-from rendering import SCENES, random_fans
+from rendering import SCENES, clocked, random_fans
 
 from meshsplats.camera import Camera
 from meshsplats.finetuning.adam import RowAdam
@@ -125,15 +124,6 @@ def growth(repeat: int) -> None:
         )
 
 
-def seconds(work: Callable[[], object], repeat: int) -> float:
-    taken = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        work()
-        taken.append(time.perf_counter() - start)
-    return statistics.median(taken)
-
-
 def mitsuba_picture(mesh: SplatMesh, camera: Camera) -> tuple[str, Callable[[], object]] | None:
     """Drawing with gradients of the colours by Mitsuba 3, and its variant; None where it is missing."""
     try:
@@ -203,15 +193,14 @@ def beside(fans: int, repeat: int) -> None:
     fragments = render(mesh, camera).fragments
     layers = fragments / side**2
     print(f"{len(mesh.faces):,} triangles, {side} x {side}, {layers:.1f} fragments a pixel, 2 threads.\n")
-    ours = seconds(lambda: draw().color.mean().backward(), 20 * repeat)
+    ours = clocked(lambda: draw().color.mean().backward(), 20 * repeat)
     found: dict[str, float] = {"meshsplats": ours}
     reference = reference_autograd.rasterize(vertices, mesh.faces, colors, camera).color.mean()
-    order = seconds(lambda: reference_autograd.rasterize(vertices, mesh.faces, colors, camera), 1)
-    found["torch, float64 reference"] = seconds(lambda: reference.backward(retain_graph=True), 1) + order
+    order = clocked(lambda: reference_autograd.rasterize(vertices, mesh.faces, colors, camera), 1)
+    found["torch, float64 reference"] = clocked(lambda: reference.backward(retain_graph=True), 1) + order
     other = mitsuba_picture(mesh, camera)
     if other:
-        other[1]()  # compiles its kernels
-        found[f"Mitsuba 3, {other[0]}"] = seconds(other[1], repeat)
+        found[f"Mitsuba 3, {other[0]}"] = clocked(other[1], repeat)
     table(["picture and gradients of colours", "ms", "of ours"])
     for name, taken in found.items():
         row(name, f"{1e3 * taken:.1f}", f"{taken / ours:.1f}")
