@@ -15,29 +15,35 @@
 
 namespace ms {
 
-// Gradients with respect to the corners of one triangle, from one tile.
-struct CornerGradients {
-    int32_t vertex[3];
-    float position[3][3];
-    float rgba[3][4];
-};
-
+// Gradients of some vertices, from one tile. A vertex comes once, or now and then a few times.
 struct TileGradients {
-    std::vector<CornerGradients> corners;  // of the first `count` triangles; what is beyond has no meaning
+    struct Sum {
+        alignas(32) float position[4];  // and nothing
+        float rgba[4];
+    };
+    // Of the first `count`; what is beyond has no meaning.
+    std::vector<int32_t> vertices;
+    std::vector<Sum> sums;
+    std::vector<float> attributes;  // attribute_count numbers each
     size_t count = 0;
-    std::vector<float> attributes;         // (3, attribute_count) numbers a triangle
+
+    void make_room(size_t more, int channels) {
+        if (vertices.size() >= count + more) return;
+        vertices.resize(2 * (count + more));
+        sums.resize(vertices.size());
+        attributes.resize(vertices.size() * channels);
+    }
 };
 
 class GradientTile {
   public:
     GradientTile(const Scene &scene, const MsOptions &options, const MsCamera &camera, const MsPictureGradient &given)
         : scene_(scene), mesh_(scene.mesh), grid_(scene.grid), options_(options), camera_(camera), given_(given),
-          extra_(given.attributes ? mesh_.attribute_count : 0), towards_extra_((size_t)extra_ * SAMPLES) {}
+          extra_(given.attributes ? mesh_.attribute_count : 0), towards_extra_((size_t)extra_ * SAMPLES), corner_extras_(3 * extra_) {}
 
     void run(int tile_x, int tile_y, const PackedLog &log, TileGradients &out) {
         area_ = TileArea(grid_, tile_x, tile_y);
         out.count = 0;
-        out.attributes.clear();
         if (log.faces().empty() || !load_given()) return;
         set_up(log.faces());
         for (int block = 0; block < BLOCKS; ++block) {
@@ -55,10 +61,9 @@ class GradientTile {
 
     // Positions count from a place of the triangle's own, close to it and to the tile: else small triangles would lose digits.
     struct Prepared {
-        alignas(16) float a[4], b[4], c[4];
-        alignas(16) float low[4], high[4], first[4];
-        float qa, qb, qc, q_min, q_max;
-        float x0, y0;
+        alignas(64) float a[4], b[4], c[4], low[4], high[4], first[4];  // of RGBA / depth; of RGBA
+        float qa, qb, qc, q_min;
+        float q_max, x0, y0, unused;
     };
     // Row c: sums of z g of channel c of RGBA, times 1, x and y; last column: the same of z g v.
     struct Moments {
@@ -72,11 +77,14 @@ class GradientTile {
     };
     // An entry of the log at the samples of its block.
     struct Fragments {
-        Lanes rgba[4], z;  // where it has a piece
-        Lanes own;         // its colour, and what else is asked for, times the gradient of the sample's
-        Lanes light;       // that reaches it, times depth; 0 where there is none
-        Lanes contrast;    // own, less what is seen behind times that gradient
-        uint32_t entry;
+        Lanes rgba[4];   // where it has a piece
+        Lanes light;     // depth; then times the light that reaches it
+        Lanes contrast;  // its colour, and what else is asked for, times the gradient of the sample's; then less the same of
+                         // what is seen behind
+    };
+    // The entry they belong to, and the samples where light reaches them.
+    struct Lit {
+        uint32_t entry, lanes;
     };
     struct Plane {
         float a, b, c, low, high, first;
@@ -151,30 +159,32 @@ class GradientTile {
             corners.s[i][1] = load_lanes(t.sb[i]);
             corners.s[i][2] = load_lanes(t.sc[i]);
         }
+        Lanes rgba[3][4];
+        for (int i = 0; i < 3; ++i) get_columns([&](int k) { return t.rgba[i][k < held ? k : 0]; }, rgba[i]);
+        for (int j = 0; j < 2; ++j)
+            for (int c = 0; c < 4; ++c) corners.apart[j][c] = rgba[j + 1][c] - rgba[0][c];
+        Prepared *const first = &triangles_[begin];
+        auto put = [&](const Lanes columns[4], float (Prepared::*row)[4]) {
+            put_columns(columns[0], columns[1], columns[2], columns[3], [&](int k) { return first[k].*row; });
+        };
+        Lanes mixed[4];
+        auto mix = [&](int j) {
+            for (int c = 0; c < 4; ++c)
+                mixed[c] = mul_add(corners.s[0][j], rgba[0][c], mul_add(corners.s[1][j], rgba[1][c], corners.s[2][j] * rgba[2][c]));
+            return mixed;
+        };
+        put(mix(0), &Prepared::a);
+        put(mix(1), &Prepared::b);
+        put(mix(2), &Prepared::c);
+        put(rgba[0], &Prepared::first);
+        for (int c = 0; c < 4; ++c) mixed[c] = least(least(rgba[0][c], rgba[1][c]), rgba[2][c]);
+        put(mixed, &Prepared::low);
+        for (int c = 0; c < 4; ++c) mixed[c] = most(most(rgba[0][c], rgba[1][c]), rgba[2][c]);
+        put(mixed, &Prepared::high);
+        put_columns(load_lanes(t.qa), load_lanes(t.qb), load_lanes(t.qc), load_lanes(t.q_min), [&](int k) { return &first[k].qa; });
+        put_columns(load_lanes(t.q_max), load_lanes(origin_x_), load_lanes(origin_y_), lanes(0), [&](int k) { return &first[k].q_max; });
+        std::fill(&moments_[begin], &moments_[begin] + held, Moments{});
         for (int k = 0; k < held; ++k) {
-            Prepared &p = triangles_[begin + k];
-            moments_[begin + k] = Moments{};
-            const f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
-            auto mix = [&](float *out, const float s[3][LANES]) {
-                store4(out, set4(s[0][k]) * c[0] + set4(s[1][k]) * c[1] + set4(s[2][k]) * c[2]);
-            };
-            mix(p.a, t.sa);
-            mix(p.b, t.sb);
-            mix(p.c, t.sc);
-            store4(p.low, min4(min4(c[0], c[1]), c[2]));
-            store4(p.high, max4(max4(c[0], c[1]), c[2]));
-            store4(p.first, c[0]);
-            for (int j = 0; j < 2; ++j) {
-                const f4 apart = c[j + 1] - c[0];
-                for (int i = 0; i < 4; ++i) ((float *)&corners.apart[j][i])[k] = apart[i];
-            }
-            p.qa = t.qa[k];
-            p.qb = t.qb[k];
-            p.qc = t.qc[k];
-            p.q_min = t.q_min[k];
-            p.q_max = t.q_max[k];
-            p.x0 = origin_x_[k];
-            p.y0 = origin_y_[k];
             for (int c = 0; c < extra_; ++c) {
                 Plane plane{0, 0, 0, 0, 0, 0};
                 for (int i = 0; i < 3; ++i) {
@@ -230,10 +240,9 @@ class GradientTile {
         }
     }
 
-    // Fills in what does not depend on the order.
+    // Fills in what does not depend on the order; returns the depth.
     template <bool EXTRA>
-    void evaluate(int block, const Lanes &lane_x, const Lanes &lane_y, Fragments &f) {
-        const TileLog::Entry entry = entries_[f.entry];
+    Lanes evaluate(int block, const Lanes &lane_x, const Lanes &lane_y, const TileLog::Entry entry, Fragments &f) {
         const Piece *piece = pieces_.data() + entry.first;
         Lanes q, linear[4];
         const Prepared *t = &triangles_[piece->triangle];
@@ -254,18 +263,18 @@ class GradientTile {
             q_min = std::min(q_min, t->q_min);
             q_max = std::max(q_max, t->q_max);
         }
-        f.z = reciprocal(clamp(q, lanes(q_min), lanes(q_max)));
-        for (int c = 0; c < 4; ++c) f.rgba[c] = clamp(linear[c] * f.z, lanes(low[c]), lanes(high[c]));
+        const Lanes z = f.light = reciprocal(clamp(q, lanes(q_min), lanes(q_max)));
+        for (int c = 0; c < 4; ++c) f.rgba[c] = clamp(linear[c] * z, lanes(low[c]), lanes(high[c]));
         const float *g = towards_[0] + block * LANES;
-        f.own = mul_add(f.rgba[0], load_lanes(g), mul_add(f.rgba[1], load_lanes(g + SAMPLES), f.rgba[2] * load_lanes(g + 2 * SAMPLES)));
-        f.light = f.contrast = lanes(0);
-        if (!EXTRA) return;
+        f.contrast = mul_add(f.rgba[0], load_lanes(g), mul_add(f.rgba[1], load_lanes(g + SAMPLES), f.rgba[2] * load_lanes(g + 2 * SAMPLES)));
+        if (!EXTRA) return z;
         for (uint32_t i = 0; i < entry.count; ++i) {
             t = &triangles_[piece[i].triangle];
             const Lanes x = lane_x - lanes(t->x0), y = lane_y - lanes(t->y0);
             for (int c = 0; c < extra_; ++c)
-                f.own = f.own + only(piece[i].lanes, extra_value(piece[i].triangle, c, x, y, f.z) * load_lanes(towards_extra(c, block)));
+                f.contrast = f.contrast + only(piece[i].lanes, extra_value(piece[i].triangle, c, x, y, z) * load_lanes(towards_extra(c, block)));
         }
+        return z;
     }
 
     // Goes through the steps of one block. The light that reaches each fragment is found from the front, what is seen behind
@@ -287,12 +296,19 @@ class GradientTile {
                 int64_t &place = places_[step.entry];
                 if (place < used) {
                     place = used + count;
-                    if (count == (int64_t)fragments_.size()) fragments_.resize(std::max<size_t>(64, 2 * count));
-                    fragments_[count].entry = step.entry;
-                    evaluate<EXTRA>(block, lane_x, lane_y, fragments_[count++]);
+                    if (count == (int64_t)fragments_.size()) {
+                        fragments_.resize(std::max<size_t>(64, 2 * count));
+                        lit_.resize(fragments_.size());
+                        if (EXTRA) depths_.resize(fragments_.size());
+                    }
+                    lit_[count] = {step.entry, 0};
+                    const Lanes depth = evaluate<EXTRA>(block, lane_x, lane_y, entries_[step.entry], fragments_[count]);
+                    if (EXTRA) depths_[count] = depth;
+                    ++count;
                 }
                 Fragments &f = fragments_[place - used];
-                f.light = pick(step.lanes & at_least(through, enough), through * f.z, f.light);
+                f.light = pick(step.lanes, through * f.light, f.light);
+                lit_[place - used].lanes |= step.lanes & at_least(through, enough);
                 through = through - only(step.lanes, through * f.rgba[3]);
             }
             return through;
@@ -306,21 +322,23 @@ class GradientTile {
             for (int64_t i = end(chunk) - 1; i >= chunk * CHUNK; --i) {
                 const TileLog::Step step = steps_[i];
                 Fragments &f = fragments_[places_[step.entry] - used];
-                const Lanes contrast = f.own - behind;
+                const Lanes contrast = f.contrast - behind;
                 f.contrast = pick(step.lanes, contrast, f.contrast);
                 behind = behind + only(step.lanes, f.rgba[3] * contrast);
             }
-            for (int64_t i = 0; i < count; ++i) add<EXTRA>(block, lane_x, lane_y, fragments_[i]);
+            for (int64_t i = 0; i < count; ++i) add<EXTRA>(block, lane_x, lane_y, i);
         }
     }
 
     // Adds an entry to the moments of its triangles.
     template <bool EXTRA>
-    void add(int block, const Lanes &lane_x, const Lanes &lane_y, const Fragments &f) {
-        const TileLog::Entry entry = entries_[f.entry];
-        const Lanes opaque = f.light * f.rgba[3];
+    void add(int block, const Lanes &lane_x, const Lanes &lane_y, int64_t place) {
+        const Fragments &f = fragments_[place];
+        const Lit lit = lit_[place];
+        const TileLog::Entry entry = entries_[lit.entry];
+        const Lanes light = only(lit.lanes, f.light), opaque = light * f.rgba[3];
         const float *g = towards_[0] + block * LANES;
-        const Lanes all[4] = {opaque * load_lanes(g), opaque * load_lanes(g + SAMPLES), opaque * load_lanes(g + 2 * SAMPLES), f.light * f.contrast};
+        const Lanes all[4] = {opaque * load_lanes(g), opaque * load_lanes(g + SAMPLES), opaque * load_lanes(g + 2 * SAMPLES), light * f.contrast};
         for (uint32_t i = entry.first; i < entry.first + entry.count; ++i) {
             const Piece piece = pieces_[i];
             const Prepared &t = triangles_[piece.triangle];
@@ -331,10 +349,10 @@ class GradientTile {
             for (int c = 1; c < 4; ++c) v = mul_add(sums[c], f.rgba[c] - lanes(t.first[c]), v);
             if (EXTRA) {
                 for (int c = 0; c < extra_; ++c) {
-                    const size_t place = (size_t)piece.triangle * extra_ + c;
+                    const size_t plane = (size_t)piece.triangle * extra_ + c;
                     const Lanes sum = only(piece.lanes, opaque * load_lanes(towards_extra(c, block)));
-                    v = v + sum * (extra_value(piece.triangle, c, x, y, f.z) - lanes(planes_[place].first));
-                    float *to = &extra_sums_[place * 3];
+                    v = v + sum * (extra_value(piece.triangle, c, x, y, depths_[place]) - lanes(planes_[plane].first));
+                    float *to = &extra_sums_[plane * 3];
                     to[0] += ::ms::sum(sum * x);
                     to[1] += ::ms::sum(sum * y);
                     to[2] += ::ms::sum(sum);
@@ -356,28 +374,23 @@ class GradientTile {
         return clamp(((lanes(p.a) * x + lanes(p.b) * y) + lanes(p.c)) * z, lanes(p.low), lanes(p.high));
     }
 
-    // From sums over samples to the corners.
-    void finish(size_t count, TileGradients &out) const {
-        out.count = count;
-        if (out.corners.size() < count) out.corners.resize(count);
-        out.attributes.resize(count * 3 * extra_);
-        for (size_t begin = 0; begin < count; begin += LANES) {
-            const int held = (int)std::min<size_t>(LANES, count - begin);
-            finish_batch(begin, held, out);
-        }
+    // From sums over samples to the corners, and from corners to vertices.
+    void finish(size_t count, TileGradients &out) {
+        for (size_t begin = 0; begin < count; begin += LANES) finish_batch(begin, (int)std::min<size_t>(LANES, count - begin), out);
     }
 
-    void finish_batch(size_t begin, int held, TileGradients &out) const {
+    void finish_batch(size_t begin, int held, TileGradients &out) {
         const Corners &corners = corners_[begin / LANES];
         const auto &s = corners.s;
-        const float *moments = moments_[begin].sum[0];
+        Lanes moments[4][4];
+        for (int c = 0; c < 4; ++c) get_columns([&](int i) { return moments_[begin + i].sum[c]; }, moments[c]);
         // Of x, y and 1, in this order.
         Lanes of_rgba[4][3], g[3][3];
         for (int c = 0; c < 4; ++c)
-            for (int j = 0; j < 3; ++j) of_rgba[c][j] = column(moments + 4 * c + (j + 1) % 3, held, sizeof(Moments) / sizeof(float));
+            for (int j = 0; j < 3; ++j) of_rgba[c][j] = moments[c][(j + 1) % 3];
         // G, a row a corner.
         for (int j = 0; j < 3; ++j) {
-            g[0][j] = lanes(0) - column(moments + 4 * ((j + 1) % 3) + 3, held, sizeof(Moments) / sizeof(float));
+            g[0][j] = lanes(0) - moments[(j + 1) % 3][3];
             for (int k = 1; k < 3; ++k) {
                 g[k][j] = g[0][j];
                 for (int c = 0; c < 4; ++c) g[k][j] = mul_add(corners.apart[k - 1][c], of_rgba[c][j], g[k][j]);
@@ -385,14 +398,16 @@ class GradientTile {
         }
         for (int c = 0; c < extra_; ++c) {
             Lanes sums[3];
-            for (int j = 0; j < 3; ++j) sums[j] = column(&extra_sums_[(begin * extra_ + c) * 3 + j], held, 3 * extra_);
+            for (int j = 0; j < 3; ++j) {
+                alignas(64) float column[LANES] = {};
+                for (int i = 0; i < held; ++i) column[i] = extra_sums_[((begin + i) * extra_ + c) * 3 + j];
+                sums[j] = load_lanes(column);
+            }
             for (int k = 0; k < 3; ++k) {
-                const Lanes towards = dot(s[k], sums);
+                corner_extras_[k * extra_ + c] = dot(s[k], sums);
                 alignas(64) float apart[LANES] = {};
-                for (int i = 0; i < held; ++i) {
+                for (int i = 0; i < held; ++i)
                     apart[i] = mesh_.attributes[(int64_t)corners.vertex[k][i] * extra_ + c] - planes_[(begin + i) * extra_ + c].first;
-                    out.attributes[((begin + i) * 3 + k) * extra_ + c] = lane_of(towards, i);
-                }
                 for (int j = 0; j < 3; ++j) g[k][j] = mul_add(load_lanes(apart), sums[j], g[k][j]);
             }
         }
@@ -403,10 +418,10 @@ class GradientTile {
             to_x[i] = (float)(pr.cx - area_.x0 - t.x0);
             to_y[i] = (float)(pr.cy - area_.y0 - t.y0);
         }
-        constexpr int stride = sizeof(CornerGradients) / sizeof(float);
+        TileGradients::Sum sums[3][LANES];
         for (int k = 0; k < 3; ++k) {
-            CornerGradients &first = out.corners[begin];
-            for (int c = 0; c < 4; ++c) put_column(dot(s[k], of_rgba[c]), &first.rgba[k][c], held, stride);
+            put_columns(dot(s[k], of_rgba[0]), dot(s[k], of_rgba[1]), dot(s[k], of_rgba[2]), dot(s[k], of_rgba[3]),
+                        [&](int i) { return sums[k][i].rgba; });
             Lanes d[3] = {lanes(0), lanes(0), lanes(0)};
             for (int i = 0; i < 3; ++i) {
                 const Lanes h = dot(g[i], s[k]);
@@ -414,10 +429,30 @@ class GradientTile {
             }
             const Lanes z = mul_add(load_lanes(to_x), d[0], mul_add(load_lanes(to_y), d[1], d[2]));
             const Lanes x = d[0] * lanes((float)pr.fx), y = d[1] * lanes((float)pr.fy);
+            Lanes world[3];
             for (int j = 0; j < 3; ++j)
-                put_column(mul_add(lanes((float)pr.m[j]), x, mul_add(lanes((float)pr.m[4 + j]), y, lanes((float)pr.m[8 + j]) * z)),
-                           &first.position[k][j], held, stride);
-            for (int i = 0; i < held; ++i) out.corners[begin + i].vertex[k] = corners.vertex[k][i];
+                world[j] = mul_add(lanes((float)pr.m[j]), x, mul_add(lanes((float)pr.m[4 + j]), y, lanes((float)pr.m[8 + j]) * z));
+            put_columns(world[0], world[1], world[2], lanes(0), [&](int i) { return sums[k][i].position; });
+        }
+        out.make_room(3 * LANES, extra_);
+        for (int i = 0; i < held; ++i)
+            for (int k = 0; k < 3; ++k) add_corner(corners.vertex[k][i], sums[k][i], k, i, out);
+    }
+
+    // Triangles of a fan come close together, so that a corner is mostly a vertex that was just met.
+    void add_corner(int32_t vertex, const TileGradients::Sum &sum, int corner, int lane, TileGradients &out) {
+        uint32_t &place = met_[(uint32_t)vertex % MET];
+        const bool again = place < out.count && out.vertices[place] == vertex;
+        if (!again) {
+            place = (uint32_t)out.count++;
+            out.vertices[place] = vertex;
+        }
+        TileGradients::Sum &to = out.sums[place];
+        store4(to.position, again ? load4(to.position) + load4(sum.position) : load4(sum.position));
+        store4(to.rgba, again ? load4(to.rgba) + load4(sum.rgba) : load4(sum.rgba));
+        for (int c = 0; c < extra_; ++c) {
+            float &extra = out.attributes[(size_t)place * extra_ + c];
+            extra = (again ? extra : 0) + lane_of(corner_extras_[corner * extra_ + c], lane);
         }
     }
 
@@ -445,8 +480,13 @@ class GradientTile {
     std::vector<Piece> pieces_;
     std::vector<TileLog::Step> steps_;
     std::vector<Fragments> fragments_;
+    std::vector<Lit> lit_;
+    std::vector<Lanes> depths_;
     std::vector<int64_t> places_;  // by entry of a block
     std::vector<Lanes> starts_;
+    std::vector<Lanes> corner_extras_;  // of a few triangles: (corner, channel)
+    static constexpr uint32_t MET = 2048;
+    uint32_t met_[MET] = {};  // where in the sums of a tile a vertex may be; its number is looked at there
 };
 
 // Adds the gradients of all tiles to those of the vertices, always in the order of the tiles: the result does not depend on
@@ -460,29 +500,27 @@ class VertexGradients {
         on_threads(threads_, [&](int thread) {
             const int64_t begin = mesh_.vertex_count * thread / threads_, end = mesh_.vertex_count * (thread + 1) / threads_;
             for (int i = 0; i < count; ++i) {
-                const float *extra = tiles[i].attributes.data();
-                const size_t n = tiles[i].count;
-                for (size_t number = 0; number < n; ++number) {
-                    const CornerGradients &g = tiles[i].corners[number];
-                    if (number + 8 < n) {
-                        for (int64_t v : tiles[i].corners[number + 8].vertex) {
-                            __builtin_prefetch(out_.vertices + 3 * v, 1);
-                            __builtin_prefetch(out_.colors + 4 * v, 1);
-                        }
+                const TileGradients &tile = tiles[i];
+                for (size_t place = 0; place < tile.count; ++place) {
+                    if (place + AHEAD < tile.count) {
+                        const int64_t v = tile.vertices[place + AHEAD];
+                        __builtin_prefetch(out_.vertices + 3 * v, 1);
+                        __builtin_prefetch(out_.colors + 4 * v, 1);
                     }
-                    for (int k = 0; k < 3; ++k, extra += attributes_) {
-                        const int64_t v = g.vertex[k];
-                        if (v < begin || v >= end) continue;
-                        for (int j = 0; j < 3; ++j) out_.vertices[3 * v + j] += g.position[k][j];
-                        store4(out_.colors + 4 * v, load4(out_.colors + 4 * v) + load4(g.rgba[k]));
-                        for (int c = 0; c < attributes_; ++c) out_.attributes[v * attributes_ + c] += extra[c];
-                    }
+                    const int64_t v = tile.vertices[place];
+                    if (v < begin || v >= end) continue;
+                    const TileGradients::Sum &sum = tile.sums[place];
+                    for (int j = 0; j < 3; ++j) out_.vertices[3 * v + j] += sum.position[j];
+                    store4(out_.colors + 4 * v, load4(out_.colors + 4 * v) + load4(sum.rgba));
+                    for (int c = 0; c < attributes_; ++c) out_.attributes[v * attributes_ + c] += tile.attributes[place * attributes_ + c];
                 }
             }
         });
     }
 
   private:
+    static constexpr size_t AHEAD = 24;
+
     const MsMesh &mesh_;
     const MsVertexGradients &out_;
     int attributes_, threads_;

@@ -25,6 +25,10 @@ struct Grid {
           side(TILE / samples * samples), tiles_x((width + side - 1) / side), tiles_y((height + side - 1) / side) {}
     int64_t tiles() const { return (int64_t)tiles_x * tiles_y; }
 
+    // The column or row of tiles of a sample: its place / side, without the division, which takes longer than all else that
+    // is asked of a small triangle.
+    int tile_of(int place) const { return (int)((uint64_t)place * share_ >> 32); }
+
     // Tiles are numbered down and then across strips of a few rows, so that what one tile reads is still at hand for its
     // neighbours in both directions.
     static constexpr int STRIP = 4;
@@ -38,6 +42,9 @@ struct Grid {
         x = (int)(rest / rows);
         y = first + (int)(rest % rows);
     }
+
+  private:
+    uint64_t share_ = (UINT64_C(1) << 32) / side + 1;  // exact for places below 2^28 and sides up to 16
 };
 
 // Something to draw: a run of triangles, or a splat.
@@ -64,25 +71,32 @@ inline bool sample_range(double lo, double hi, int count, int &first, int &last)
 
 // Orders items nearest first (stable radix sort by key, which is >= 0).
 inline void sort_items(std::vector<Item> &items) {
-    std::vector<Item> other(items.size());
-    auto digit = [](const Item &item, int pass) {
-        uint32_t bits;
-        std::memcpy(&bits, &item.entry.key, 4);
-        return (~bits >> (11 * pass)) & 2047u;
+    struct Place {
+        uint32_t key, item;
     };
-    std::vector<size_t> start(2048);
-    for (int pass = 0; pass < 3; ++pass) {
-        std::fill(start.begin(), start.end(), 0);
-        for (auto &item : items) ++start[digit(item, pass)];
-        size_t sum = 0;
-        for (auto &s : start) {
-            size_t n = s;
-            s = sum;
+    std::vector<Place> places(items.size()), other(items.size());
+    constexpr int PASSES = 3, BITS = 11, DIGITS = 1 << BITS;
+    std::vector<uint32_t> start(PASSES * DIGITS);
+    auto digit = [](uint32_t key, int pass) { return key >> (BITS * pass) & (DIGITS - 1); };
+    for (size_t i = 0; i < items.size(); ++i) {
+        uint32_t bits;
+        std::memcpy(&bits, &items[i].entry.key, 4);
+        places[i] = {~bits, (uint32_t)i};
+        for (int pass = 0; pass < PASSES; ++pass) ++start[pass * DIGITS + digit(~bits, pass)];
+    }
+    for (int pass = 0; pass < PASSES; ++pass) {
+        uint32_t sum = 0, *of = &start[pass * DIGITS];
+        for (int i = 0; i < DIGITS; ++i) {
+            const uint32_t n = of[i];
+            of[i] = sum;
             sum += n;
         }
-        for (auto &item : items) other[start[digit(item, pass)]++] = item;
-        items.swap(other);
+        for (const Place &place : places) other[of[digit(place.key, pass)]++] = place;
+        places.swap(other);
     }
+    std::vector<Item> sorted(items.size());
+    for (size_t i = 0; i < items.size(); ++i) sorted[i] = items[places[i].item];
+    items.swap(sorted);
 }
 
 // Tile lists for a run of consecutive tiles, in the order of the items. Long lists are made a run of tiles at a

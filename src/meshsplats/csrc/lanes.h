@@ -168,18 +168,54 @@ inline Lanes add_columns(const Lanes terms[4]) {
     return r;
 }
 
-// Lane i: first[i * stride], for i < count; 0 beyond.
-inline Lanes column(const float *first, int count, int stride) {
-    alignas(64) float v[LANES] = {};
-    for (int i = 0; i < count; ++i) v[i] = first[i * stride];
-    return load_lanes(v);
+#if defined(__AVX512F__)
+// Turns each group of four lanes, a square of four rows and four columns, over.
+inline void turn(__m512 a[4]) {
+    const __m512 low01 = _mm512_unpacklo_ps(a[0], a[1]), high01 = _mm512_unpackhi_ps(a[0], a[1]);
+    const __m512 low23 = _mm512_unpacklo_ps(a[2], a[3]), high23 = _mm512_unpackhi_ps(a[2], a[3]);
+    a[0] = _mm512_shuffle_ps(low01, low23, 0x44);
+    a[1] = _mm512_shuffle_ps(low01, low23, 0xEE);
+    a[2] = _mm512_shuffle_ps(high01, high23, 0x44);
+    a[3] = _mm512_shuffle_ps(high01, high23, 0xEE);
+}
+#endif
+
+// From rows of four numbers to columns of 16: lane i of out[j] is row(i)[j].
+template <class Row>
+inline void get_columns(Row &&row, Lanes out[4]) {
+#if defined(__AVX512F__)
+    __m512 a[4];
+    for (int j = 0; j < 4; ++j) {
+        a[j] = _mm512_castps128_ps512(load4(row(j)));
+        a[j] = _mm512_insertf32x4(a[j], load4(row(4 + j)), 1);
+        a[j] = _mm512_insertf32x4(a[j], load4(row(8 + j)), 2);
+        a[j] = _mm512_insertf32x4(a[j], load4(row(12 + j)), 3);
+    }
+    turn(a);
+    for (int j = 0; j < 4; ++j) out[j].part[0] = a[j];
+#else
+    for (int i = 0; i < LANES; ++i)
+        for (int j = 0; j < 4; ++j) ((float *)&out[j])[i] = row(i)[j];
+#endif
 }
 
-// The way back.
-inline void put_column(const Lanes &a, float *first, int count, int stride) {
-    alignas(64) float v[LANES];
-    store_lanes(v, a);
-    for (int i = 0; i < count; ++i) first[i * stride] = v[i];
+// The way back: to rows of four numbers, 16 of them.
+template <class Row>
+inline void put_columns(const Lanes &a, const Lanes &b, const Lanes &c, const Lanes &d, Row &&row) {
+    const Lanes columns[4] = {a, b, c, d};
+#if defined(__AVX512F__)
+    __m512 rows[4] = {columns[0].part[0], columns[1].part[0], columns[2].part[0], columns[3].part[0]};
+    turn(rows);
+    for (int j = 0; j < 4; ++j) {
+        store4(row(j), _mm512_extractf32x4_ps(rows[j], 0));
+        store4(row(4 + j), _mm512_extractf32x4_ps(rows[j], 1));
+        store4(row(8 + j), _mm512_extractf32x4_ps(rows[j], 2));
+        store4(row(12 + j), _mm512_extractf32x4_ps(rows[j], 3));
+    }
+#else
+    for (int i = 0; i < LANES; ++i)
+        for (int j = 0; j < 4; ++j) row(i)[j] = ((const float *)&columns[j])[i];
+#endif
 }
 
 }  // namespace ms

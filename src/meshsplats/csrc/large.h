@@ -4,6 +4,7 @@
 #include <cstddef>
 #include <cstdlib>
 #include <new>
+#include <utility>
 #include <vector>
 
 #if defined(__linux__)
@@ -33,6 +34,11 @@ struct LargePages {
     void deallocate(T *p, std::size_t n) {
         ::operator delete(p, std::align_val_t(n * sizeof(T) < PAGE ? 64 : PAGE));
     }
+    // Numbers that are about to be written are not written as zeros first, by one thread.
+    template <class U>
+    void construct(U *p) { ::new ((void *)p) U; }
+    template <class U, class... Given>
+    void construct(U *p, Given &&...given) { ::new ((void *)p) U(std::forward<Given>(given)...); }
     template <class U>
     bool operator==(const LargePages<U> &) const { return true; }
     template <class U>

@@ -184,8 +184,8 @@ struct Scene {
             int x0, x1, y0, y1;
             if (!sample_range(lo[0], hi[0], grid.width, x0, x1) || !sample_range(lo[1], hi[1], grid.height, y0, y1))
                 continue;
-            const TileBox box{(uint16_t)(x0 / grid.side), (uint16_t)(x1 / grid.side), (uint16_t)(y0 / grid.side),
-                              (uint16_t)(y1 / grid.side)};
+            const TileBox box{(uint16_t)grid.tile_of(x0), (uint16_t)grid.tile_of(x1), (uint16_t)grid.tile_of(y0),
+                              (uint16_t)grid.tile_of(y1)};
             boxes[i] = box;
             all = {std::min(all.x0, box.x0), std::max(all.x1, box.x1), std::min(all.y0, box.y0), std::max(all.y1, box.y1)};
             if (mesh.depth_group && mesh.depth_group[i] >= 0)

@@ -172,8 +172,8 @@ class SplatScene {
         for (double &d : direction) d /= length;
         sh_color(cloud_.sh + 3 * (int64_t)cloud_.sh_stored * i, cloud_.sh_used, direction, out.rgb);
         item = {{(float)(1 / c.z), 0, 1},
-                (uint16_t)(x0 / grid_.side), (uint16_t)(x1 / grid_.side),
-                (uint16_t)(y0 / grid_.side), (uint16_t)(y1 / grid_.side)};
+                (uint16_t)grid_.tile_of(x0), (uint16_t)grid_.tile_of(x1),
+                (uint16_t)grid_.tile_of(y0), (uint16_t)grid_.tile_of(y1)};
         return true;
     }
 
