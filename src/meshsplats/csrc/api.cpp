@@ -72,8 +72,10 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
     const MsPicture nothing{};  // what is drawn once more is only logged
     ms::VertexGradients sum(mesh, out, channels, threads);
 
-    // Gradients of a few tiles at a time wait to be added in order.
+    // Gradients of a few tiles at a time wait to be added in order: of so few that they need little memory, but enough for
+    // threads not to wait for each other.
     constexpr int WAVE = 256;
+    const int64_t wave_triangles = (int64_t)threads << 17;
     std::vector<ms::TileGradients> waiting(WAVE);
     struct Worker {
         ms::GradientTile back;
@@ -82,8 +84,12 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
     };
     std::vector<std::unique_ptr<Worker>> workers(threads);
     auto run = [&](int64_t begin, int64_t end, ms::TileLists *lists) {
-        for (int64_t wave = begin; wave < end; wave += WAVE) {
-            const int count = (int)std::min<int64_t>(WAVE, end - wave);
+        for (int64_t wave = begin; wave < end;) {
+            int count = 0;
+            for (int64_t triangles = 0; count < WAVE && wave + count < end && (count < threads || triangles < wave_triangles); ++count) {
+                const ms::PackedLog *entries = log.find(wave + count);
+                triangles += entries ? (int64_t)entries->faces().size() : lists->length(wave + count);
+            }
             std::atomic<int> next{0};
             ms::on_threads(threads, [&](int thread) {
                 auto &worker = workers[thread];
@@ -107,6 +113,7 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
                 }
             });
             sum.add(waiting.data(), count);
+            wave += count;
         }
     };
     if (!redraws) return run(0, grid.tiles(), nullptr);

@@ -22,14 +22,14 @@ struct TileGradients {
         float rgba[4];
     };
     // Of the first `count`; what is beyond has no meaning.
-    std::vector<int32_t> vertices;
-    std::vector<Sum> sums;
-    std::vector<float> attributes;  // attribute_count numbers each
+    Large<int32_t> vertices;
+    Large<Sum> sums;
+    Large<float> attributes;  // attribute_count numbers each
     size_t count = 0;
 
     void make_room(size_t more, int channels) {
         if (vertices.size() >= count + more) return;
-        vertices.resize(2 * (count + more));
+        vertices.resize(std::max(count + more, 2 * vertices.size()));
         sums.resize(vertices.size());
         attributes.resize(vertices.size() * channels);
     }
@@ -376,6 +376,7 @@ class GradientTile {
 
     // From sums over samples to the corners, and from corners to vertices.
     void finish(size_t count, TileGradients &out) {
+        out.make_room(count + count / 2, extra_);  // of a mesh of fans; else it will grow
         for (size_t begin = 0; begin < count; begin += LANES) finish_batch(begin, (int)std::min<size_t>(LANES, count - begin), out);
     }
 

@@ -90,7 +90,7 @@ class Waiting {
 
   private:
     static constexpr int ENTRIES = 8;  // a list is blended as far as possible once it is so long
-    static constexpr int MANY_ENTRIES = 64;
+    static constexpr int MANY_ENTRIES = 256;
     // Where a block takes many vectors, longer code to rank costs more than it gains.
     static constexpr int MOST_TO_RANK = PARTS <= 2 ? 16 : 8, MOST_TO_SEARCH = 512;
 
@@ -206,11 +206,11 @@ class Waiting {
 
     // For longer lists, of which mostly only the nearest matter: finds those of every lane, again and again.
     template <class Blend>
-    void nearest_first(const int n, const uint32_t &open, Blend &blend) {
+    void nearest_first(int n, const uint32_t &open, Blend &blend) {
         constexpr float NONE = -1, DONE = -2;
         if (left_.size() < (size_t)n) left_.resize(n);
         for (int i = 0; i < n; ++i) left_[i] = pick(active_[i].lanes, fragments_[active_[i].entry].key, lanes(DONE));
-        for (;;) {
+        for (int round = 1;; ++round) {
             Lanes nearest = lanes(NONE), which = lanes(0);
             for (int i = 0; i < n; ++i) {
                 const uint32_t ties = equal(left_[i], nearest);
@@ -225,9 +225,19 @@ class Waiting {
                 const float place = places[__builtin_ctz(rest)];
                 const uint32_t due = rest & equal(which, lanes(place));
                 left_[(int)place] = pick(due, lanes(DONE), left_[(int)place]);
+                active_[(int)place].lanes &= ~due;
                 blend(active_[(int)place].entry, due);
                 rest &= ~due;
             }
+            if (round % 8) continue;
+            // What is done is not looked at any more.
+            int kept = 0;
+            for (int i = 0; i < n; ++i) {
+                active_[kept] = active_[i];
+                left_[kept] = left_[i];
+                kept += (active_[i].lanes & open) != 0;
+            }
+            n = kept;
         }
     }
 
