@@ -31,6 +31,7 @@ from meshsplats.finetuning.tuning import (  # noqa: E402
     in_view,
     kept_faces,
     make_step,
+    relocate,
     target_of,
     view_of_step,
 )
@@ -177,9 +178,16 @@ def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads(scene):
 
 
 def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path):
-    """Pruned by opacity and importance on the way, and stopped three times."""
+    """Pruned by opacity and importance and relocated on the way, and stopped three times."""
     _, dataset, mesh = scene
-    config = make_config(epochs=4, prune_epochs=1, prune_opacity=0.05, prune_importance=0.3, exposure=True)
+    config = make_config(
+        epochs=4,
+        prune_epochs=2,
+        prune_opacity=0.05,
+        prune_importance=0.3,
+        relocate_share=0.1,
+        exposure=True,
+    )
     unstopped = tmp_path / "unstopped"
     whole = finetune(mesh, dataset, config, run=RunOptions(unstopped))
     assert len(whole.faces) < len(mesh.faces)
@@ -361,6 +369,37 @@ def test_faint_triangles_are_dropped_with_their_vertices_and_moments(scene):
         for key in ("mean", "square"):
             assert np.array_equal(smaller.arrays()[f"{name}.{key}"], state.arrays()[f"{name}.{key}"][used])
     assert np.array_equal(smaller.sizes, state.sizes[used])
+
+
+def test_relocated_splats_begin_anew_where_they_are_needed(scene):
+    _, dataset, mesh = scene
+    config = make_config(relocate_share=0.1)
+    state = State.begin(mesh, len(dataset.train), config, None)
+    for step in range(len(dataset.train)):
+        make_step(state, dataset.train, step, 0.0)
+    before, sizes = state.arrays(), state.sizes.copy()
+    assert state.relocate(np.zeros(len(mesh.vertices), bool)) == 0
+    assert not state.arrays()["usage.color"].any()
+    state = State.resume(before, "display", len(dataset.train), config, None)
+    tuned = state.result()
+    moved = relocate(state, dataset.train)
+    after = state.arrays()
+    assert 0 < moved <= 0.1 * len(np.unique(mesh.face_splat))
+    changed = (state.result().vertices != tuned.vertices).any(axis=1)
+    splats = np.unique(mesh.face_splat[changed[mesh.faces].any(axis=1)])
+    assert len(splats) == 2 * moved
+    taken = np.zeros(len(changed), bool)
+    taken[mesh.faces[np.isin(mesh.face_splat, splats)]] = True
+    assert not changed[~taken].any()
+    assert np.array_equal(state.sizes[~taken], sizes[~taken])
+    assert (state.sizes[taken] != sizes[taken]).all()
+    for name in ("positions", "colors"):
+        assert not after[f"{name}.mean"][taken].any()
+        assert np.array_equal(after[f"{name}.mean"][~taken], before[f"{name}.mean"][~taken])
+    assert not after["usage.color"].any()
+    assert not after["usage.position"].any()
+    kept = make_config(relocate_share=0)
+    assert relocate(State.begin(mesh, len(dataset.train), kept, None), dataset.train) == 0
 
 
 # ---- Runs

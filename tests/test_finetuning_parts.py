@@ -23,6 +23,7 @@ from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, r
 from meshsplats.finetuning.edges import on_open_edges
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
+from meshsplats.finetuning.relocation import Usage, find_moves, halves
 from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.finetuning.start import starting_mesh
 from meshsplats.mesh import SplatMesh
@@ -162,6 +163,72 @@ def test_open_edges_are_those_of_one_triangle():
     assert np.array_equal(np.flatnonzero(~rims), np.arange(200) * 9)  # all but the centres
     shuffled = np.roll(mesh.faces[::-1], 1, axis=1)
     assert np.array_equal(on_open_edges(shuffled, len(mesh.vertices)), rims)
+
+
+# ---- Relocation
+
+
+def fans(count: int, sides: int = 4) -> SplatMesh:
+    """Fans side by side, twice as long as wide."""
+    angles = np.arange(sides) * 2 * np.pi / sides
+    fan = np.concatenate([[[0, 0, 0]], np.stack([2 * np.cos(angles), np.sin(angles), 0 * angles], 1)])
+    ring = 1 + np.arange(sides)
+    faces = np.stack([0 * ring, ring, np.roll(ring, -1)], 1)
+    numbers = np.arange(count)
+    return SplatMesh(
+        (fan[None] + 10 * numbers[:, None, None]).reshape(-1, 3),
+        (faces[None] + (sides + 1) * numbers[:, None, None]).reshape(-1, 3),
+        np.full((count * (sides + 1), 4), 0.5),
+        face_splat=np.repeat(numbers, sides),
+    )
+
+
+def usage(color: list[float], position: list[float], corners: int) -> Usage:
+    return Usage(*(np.repeat(np.array(values, np.float32), corners) for values in (color, position)))
+
+
+def test_the_idlest_splats_go_to_those_that_are_pushed_most():
+    mesh = fans(6)
+    seen = np.ones(30, bool)
+    # Splat 2 is idle, 4 idler; 5 is pushed most, then 0; 3 shows too little to be halved.
+    of = usage([10, 10, 1.2, 3, 1, 20], [4, 1, 9, 9, 9, 5], 5)
+    idle, needed = find_moves(mesh, of, seen, 0.5)
+    assert (idle[:, 0] // 5).tolist() == [4, 2]
+    assert (needed[:, 0] // 5).tolist() == [5, 0]
+    assert np.array_equal(idle - idle[:, :1], np.tile(np.arange(5), (2, 1)))
+    assert (find_moves(mesh, of, seen, 0.2).idle[:, 0] // 5).tolist() == [4]
+    # What no view looks at may be all there is of its place.
+    seen[20:25] = False
+    assert (find_moves(mesh, of, seen, 0.5).idle[:, 0] // 5).tolist() == [2]
+
+
+def test_only_splats_of_the_commonest_form_with_vertices_of_their_own_move():
+    mesh = fans(6)
+    of = usage([10, 10, 1, 10, 1, 20], [1, 1, 1, 1, 1, 1], 5)
+    seen = np.ones(30, bool)
+    assert len(find_moves(mesh, of, seen, 0.5).idle) == 2
+    cut = replace(mesh, faces=np.delete(mesh.faces, 8, 0), face_splat=np.delete(mesh.face_splat, 8))
+    assert (find_moves(cut, of, seen, 0.5).idle[:, 0] // 5).tolist() == [4]
+    faces = mesh.faces.copy()
+    faces[16] = [10, 21, 22]  # a triangle of splat 4 hangs on splat 2
+    assert len(find_moves(replace(mesh, faces=faces), of, seen, 0.5).idle) == 0
+    assert len(find_moves(replace(mesh, face_splat=None), of, seen, 0.5).idle) == 0
+    still = usage([10, 10, 1, 10, 1, 20], [0, 0, 1, 0, 1, 0], 5)
+    assert len(find_moves(mesh, still, seen, 0.5).idle) == 0
+
+
+def test_halves_lie_side_by_side_along_the_longest_axis():
+    fan = fans(1).vertices[None] + np.float32([3, 1, 2])
+    right, left, share = halves(fan)
+    if right[0, :, 0].mean() < left[0, :, 0].mean():
+        right, left = left, right
+    reach = lambda half, axis: (half[0, :, axis].min(), half[0, :, axis].max())  # noqa: E731
+    assert reach(right, 0) == pytest.approx((3 - 0.4, 5), abs=1e-5)
+    assert reach(left, 0) == pytest.approx((1, 3 + 0.4), abs=1e-5)
+    for half in (right, left):
+        assert reach(half, 1) == pytest.approx((0, 2), abs=1e-5)
+        assert half[0, :, 2] == pytest.approx(2, abs=1e-5)
+    assert share == pytest.approx([0.6])
 
 
 def test_each_preset_begins_with_its_conversion():

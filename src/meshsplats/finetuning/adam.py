@@ -179,6 +179,14 @@ class RowAdam:
         result.mean, result.square, result.steps = self.mean[index], self.square[index], self.steps
         return result
 
+    def restart(self, rows: np.ndarray, like: np.ndarray, scale: np.ndarray | None = None) -> None:
+        """Rows whose values were set anew forget where they were going; how far they go in a step they take
+        from the rows ``like``. Row numbers have any one shape; ``scale`` are new factors of the rate."""
+        self.mean[rows] = 0
+        self.square[rows] = self.square[like]
+        if scale is not None and self.scale is not None:
+            self.scale[rows] = scale
+
 
 def _array(given: Any) -> Any:
     """The NumPy array that shares the memory of a torch tensor; anything else as it is."""

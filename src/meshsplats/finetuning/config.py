@@ -73,6 +73,12 @@ class FinetuneConfig:
     prune_importance: float = 0.0
     """Of those, also the splats that training views have before them, but that all together show less of
     them than this, in pixels: hidden inside, or too faint."""
+    relocate_share: float = 0.0
+    """At most this share of the splats is moved at a time: those that show next to nothing take over halves
+    of those that are needed most; 0: none, and none on a base mesh. For long runs: what was halved has to
+    settle again."""
+    relocate_epochs: float = 1.0
+    """They are moved each time so many epochs have passed, in the first half of the run."""
     blending: Literal["mesh", "display", "linear"] = "mesh"
     """Space in which the triangles are blended: as the mesh says; display values; or linear light, for
     exports that will be lit or blended by engines that work in linear light."""
@@ -115,6 +121,10 @@ class FinetuneConfig:
         """Number of steps from one pruning to the next; 0: never."""
         return max(1, round(self.prune_epochs * views)) if self.prune_epochs else 0
 
+    def relocate_interval(self, views: int) -> int:
+        """Number of steps from one relocation to the next; 0: never."""
+        return max(1, round(self.relocate_epochs * views)) if self.relocate_share else 0
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return asdict(self)
@@ -138,6 +148,8 @@ _RANGES: list[tuple[str, float, float, bool]] = [
     ("prune_epochs", 0, 1e6, False),
     ("prune_opacity", 0, 1, False),
     ("prune_importance", 0, 1e6, False),
+    ("relocate_share", 0, 0.5, False),
+    ("relocate_epochs", 1e-3, 1e6, False),
     ("samples", 1, 16, True),
     ("seed", 0, 2**63 - 1, True),
 ]

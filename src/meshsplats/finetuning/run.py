@@ -28,6 +28,9 @@ from meshsplats.metrics import psnr
 if TYPE_CHECKING:
     from meshsplats.finetuning.state import State
 
+RELOCATED = 0.5
+"""Splats are moved in this share of the run: those moved later would not settle any more."""
+
 WATCHED_VIEWS = 8
 """Most held-out views that are scored while a run goes on."""
 
@@ -190,10 +193,11 @@ class _Run:
         return self.step / self.steps if self.steps else 1.0
 
     def go(self) -> SplatMesh:
-        from meshsplats.finetuning.tuning import kept_faces, make_step
+        from meshsplats.finetuning.tuning import kept_faces, make_step, relocate
 
         views = self.dataset.train
         interval = self.config.prune_interval(len(views))
+        moves = self.config.relocate_interval(len(views))
         with StopSignals() as signals:
             if self.step == 0:
                 self._report()
@@ -209,6 +213,8 @@ class _Run:
                     self.last_loss = loss
                 if interval and self.step % interval == 0 and not self._done():
                     self.state = self.state.prune(kept_faces(self.state, views))
+                if moves and self.step % moves == 0 and self.fraction <= RELOCATED:
+                    relocate(self.state, views)
                 every, previews = self.run.report_every, self.run.preview_every
                 if every and self.step % every == 0 and not self._done():
                     self._report()

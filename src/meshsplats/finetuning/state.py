@@ -14,6 +14,7 @@ from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.edges import on_open_edges
+from meshsplats.finetuning.relocation import Usage, find_moves, halves
 from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.mesh import SplatMesh
 
@@ -64,6 +65,7 @@ class State:
         # Of the triangles alone, so that a resumed run has the same.
         self._edges = on_open_edges(mesh.faces, len(mesh.vertices)) if config.soft_edges else None
         self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
+        self._usage = Usage.none(len(mesh.vertices)) if config.relocate_share and self.bound is None else None
 
     @classmethod
     def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
@@ -100,12 +102,15 @@ class State:
         """That of a checkpoint. FileFormatError if its arrays do not fit each other."""
         mesh = stored_mesh(arrays, blending)
         try:
-            sizes = _of_shape(arrays["sizes"], (len(mesh.vertices),))
+            sizes = _of_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
             exposures = _of_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
             state = cls(mesh, sizes, exposures, config, threads)
             for name, adam in state._optimisers().items():
                 part = {key: arrays[f"{name}.{key}"] for key in ("mean", "square", "steps")}
                 adam.load_state(part)
+            if state._usage is not None:
+                parts = (_of_shape(arrays[name], (len(mesh.vertices),)) for name in state._usage.arrays())
+                state._usage = Usage(*(part.copy() for part in parts))
         except KeyError as error:
             raise FileFormatError(f"the checkpoint lacks {error}") from None
         except (ValueError, TypeError) as error:
@@ -119,6 +124,8 @@ class State:
             arrays["exposure.values"] = self.exposures.detach().numpy()
         for name, adam in self._optimisers().items():
             arrays |= {f"{name}.{key}": value for key, value in adam.state().items()}
+        if self._usage is not None:
+            arrays |= self._usage.arrays()
         return arrays
 
     def result(self) -> SplatMesh:
@@ -149,6 +156,8 @@ class State:
         reached = self.colors.grad[:, 3].numpy() != 0
         opacity = self.colors.detach().numpy()[:, 3]
         clear = None if self._edges is None else self._edges & (opacity == 0)
+        if self._usage is not None:
+            self._usage.add(self.colors.grad.numpy(), self.vertices.grad.numpy(), self.sizes, reached)
         self._colors.lr = color_rate
         self._colors.step(self.colors.grad, reached)
         if clear is not None:
@@ -176,6 +185,26 @@ class State:
         if self.exposures is not None:
             self.exposures.grad = None
 
+    def relocate(self, looked_at: np.ndarray) -> int:
+        """Lets splats that show next to nothing though they are ``looked_at``, (v,) bool, take over halves of
+        those that are needed most, as far as the configuration allows; returns how many. What was seen of
+        them so far is forgotten."""
+        if self._usage is None:
+            return 0
+        idle, needed = find_moves(self.mesh, self._usage, looked_at, self.config.relocate_share)
+        if len(idle):
+            positions, colors = self.vertices.detach().numpy(), self.colors.detach().numpy()
+            positions[needed], positions[idle], share = halves(positions[needed])
+            colors[idle] = colors[needed]
+            # Sizes are the sides of squares.
+            self.sizes[needed] *= np.sqrt(share, dtype=np.float32)[:, None]
+            self.sizes[idle] = self.sizes[needed]
+            for rows in (idle, needed):
+                self._positions.restart(rows, needed, self.sizes[rows])
+                self._colors.restart(rows, needed)
+        self._usage.clear()
+        return len(idle)
+
     def prune(self, keep: np.ndarray) -> State:
         """Only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
         if keep.all():
@@ -192,6 +221,8 @@ class State:
         if self._exposures is not None:
             every = np.arange(len(self._exposures.mean))
             smaller._exposures = self._exposures.select(smaller.exposures, every)
+        if self._usage is not None:
+            smaller._usage = Usage(self._usage.color[used], self._usage.position[used])
         return smaller
 
     def _optimisers(self) -> dict[str, RowAdam]:

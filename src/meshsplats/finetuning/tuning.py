@@ -145,6 +145,17 @@ def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
     return keep if keep.any() else np.ones(len(keep), bool)
 
 
+def relocate(state: State, views: Sequence[View]) -> int:
+    """Moves splats to where they are needed (see ``relocation``); returns how many."""
+    if not state.config.relocate_share or state.bound is not None:
+        return 0
+    positions = state.vertices.detach().numpy()
+    looked_at = np.zeros(len(positions), bool)
+    for view in views[:: max(1, -(-len(views) // IMPORTANCE_VIEWS))]:
+        looked_at |= in_view(positions, view)
+    return state.relocate(looked_at)
+
+
 def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """What ``views`` show of each vertex: (v,) float32 pixels, (v,) bool whether any has it before it.
 
