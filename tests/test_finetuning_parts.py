@@ -77,20 +77,23 @@ def test_a_length_takes_the_place_of_the_presets():
 
 
 def test_rates_fall_over_the_length_and_by_step():
-    config = make_config(color_rate=0.1, position_rate=0.2, final_share=0.01, color_step_decay=0.5)
+    config = make_config(
+        color_rate=0.1, position_rate=0.2, final_share=0.01, color_step_decay=0.5, rate_steps=0
+    )
     assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
     assert rates(config, 0, 0.5) == pytest.approx((0.01, 0.02))
     assert rates(config, 3, 1) == pytest.approx((0.1 * 0.01 / 8, 0.002))
 
 
-def test_long_runs_move_positions_less():
-    config = make_config(steps=1000, position_rate=0.2, final_share=1.0, rate_steps=250)
-    assert rates(config, 0, 0)[1] == 0.2
-    for step in (1, 500, 999):
-        assert rates(config, step, step / 1000)[1] == pytest.approx(0.1)
-        assert rates(config, step, step / 200)[1] == 0.2
-        assert rates(replace(config, rate_steps=0), step, step / 1000)[1] == 0.2
-        assert rates(config, step, step / 1000)[0] == rates(config, step, step / 200)[0]
+def test_long_runs_move_positions_less_and_end_lower():
+    config = make_config(steps=1000, color_rate=0.1, position_rate=0.2, final_share=0.04, rate_steps=250)
+    assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
+    # Four times as many steps: half the rate, and half the share at the end.
+    assert rates(config, 500, 0.5) == pytest.approx((0.1 * 0.02**0.5, 0.1 * 0.02**0.5))
+    assert rates(config, 999, 0.999) == pytest.approx((0.1 * 0.02, 0.1 * 0.02), rel=0.01)
+    for step in (100, 250):  # short runs, and those that do not care
+        assert rates(config, step, 1) == pytest.approx((0.1 * 0.04, 0.2 * 0.04))
+        assert rates(replace(config, rate_steps=0), 4 * step, 1) == pytest.approx((0.1 * 0.04, 0.2 * 0.04))
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,9 @@ class FinetuneConfig:
     final_share: float = 0.1
     """Both rates fall exponentially over the whole length, to this share of what they were."""
     rate_steps: int = 250
-    """Runs of more steps than these move positions less in each, at ``sqrt(rate_steps / steps)`` of the rate:
-    what a short run needs to arrive is noise in a long one. 0: the rate does not depend on the length."""
+    """Runs of more steps than these move positions less in each, at ``sqrt(rate_steps / steps)`` of the rate,
+    and both rates fall that much further: what a short run needs to arrive is noise in a long one. 0: rates
+    do not depend on the length."""
     color_step_decay: float = 1.0
     """The colour rate is also multiplied by this after every step."""
     beta1: float = 0.5
@@ -55,7 +56,7 @@ class FinetuneConfig:
     """Adam's smallest divisor."""
     ssim_weight: float = 0.4
     """Share of SSIM, 0 to 1."""
-    l2_weight: float = 0.0
+    l2_weight: float = 10.0
     """Weight of the mean square difference, added to the others."""
     background: Backdrop = "random"
     """Behind pictures that have alpha; random: another colour in every step, so that what should be empty
@@ -168,6 +169,7 @@ _PAPER = FinetuneConfig(
     beta1=0.9,
     beta2=0.999,
     ssim_weight=0.4,
+    l2_weight=0.0,
     background="white",
     prune_epochs=10,
     epsilon=1e-8,
@@ -210,9 +212,9 @@ def rates(config: FinetuneConfig, step: int, fraction: float) -> tuple[float, fl
 
     The number of all steps is taken to be ``step / fraction``, which suits runs of a stated time, too.
     """
-    decay = config.final_share ** min(max(fraction, 0.0), 1.0)
-    color = config.color_rate * decay * config.color_step_decay**step
-    position = config.position_rate * decay
+    slowed = 1.0
     if config.rate_steps and step > config.rate_steps * fraction:
-        position *= math.sqrt(config.rate_steps * fraction / step)
-    return max(color, 1e-12), position
+        slowed = math.sqrt(config.rate_steps * fraction / step)
+    decay = (config.final_share * slowed) ** min(max(fraction, 0.0), 1.0)
+    color = config.color_rate * decay * config.color_step_decay**step
+    return max(color, 1e-12), config.position_rate * decay * slowed
