@@ -100,9 +100,9 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
     used = seconds()
 
     def psnr(**what) -> float:
-        return (
-            evaluate(what.pop("mesh", None), judged, threads=options.threads, **what).methods[0].mean("psnr")
-        )
+        # Of splats, the last is with all their spherical harmonics.
+        scores = evaluate(what.pop("mesh", None), judged, threads=options.threads, **what)
+        return scores.methods[-1].mean("psnr")
 
     splats = f"{psnr(splats=cloud):.2f}" if scene.photographs else ""
     scores = f"{psnr(mesh=mesh):.2f} | {psnr(mesh=tuned):.2f}"
