@@ -182,7 +182,7 @@ def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path):
     _, dataset, mesh = scene
     config = make_config(
         epochs=4,
-        prune_epochs=2,
+        prune_epochs=1,
         prune_opacity=0.05,
         prune_importance=0.3,
         relocate_share=0.1,

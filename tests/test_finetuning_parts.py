@@ -23,7 +23,7 @@ from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, r
 from meshsplats.finetuning.edges import on_open_edges
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
-from meshsplats.finetuning.relocation import Usage, find_moves, halves
+from meshsplats.finetuning.relocation import HALF, Usage, find_moves, halves
 from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.finetuning.start import starting_mesh
 from meshsplats.mesh import SplatMesh
@@ -222,7 +222,7 @@ def test_only_splats_of_the_commonest_form_with_vertices_of_their_own_move():
 
 def test_halves_lie_side_by_side_along_the_longest_axis():
     fan = fans(1).vertices[None] + np.float32([3, 1, 2])
-    right, left, share = halves(fan)
+    right, left = halves(fan)
     if right[0, :, 0].mean() < left[0, :, 0].mean():
         right, left = left, right
     reach = lambda half, axis: (half[0, :, axis].min(), half[0, :, axis].max())  # noqa: E731
@@ -231,7 +231,7 @@ def test_halves_lie_side_by_side_along_the_longest_axis():
     for half in (right, left):
         assert reach(half, 1) == pytest.approx((0, 2), abs=1e-5)
         assert half[0, :, 2] == pytest.approx(2, abs=1e-5)
-    assert share == pytest.approx([0.6])
+    assert pytest.approx(0.6) == HALF
 
 
 def test_each_preset_begins_with_its_conversion():

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats.finetuning.sizes import splat_starts
 from meshsplats.mesh import SplatMesh
 
 IDLE = 0.2
@@ -20,6 +21,9 @@ IDLE = 0.2
 
 OVERLAP = 0.2
 """The halves of a splat of length 2 along its longest axis reach from -OVERLAP to 1, and back."""
+
+HALF = (1 + OVERLAP) / 2
+"""Share of its area that each of them fills."""
 
 
 class Usage:
@@ -71,7 +75,7 @@ def find_moves(mesh: SplatMesh, usage: Usage, looked_at: np.ndarray, share: floa
     none = np.zeros((0, 0), np.int64)
     if mesh.face_splat is None or not len(mesh.faces):
         return Moves(none, none)
-    starts = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) > 0]))
+    starts = splat_starts(mesh.face_splat)
     ends = np.append(starts[1:], len(mesh.faces))
     low = np.minimum.reduceat(mesh.faces.min(axis=1), starts)
     high = np.maximum.reduceat(mesh.faces.max(axis=1), starts)
@@ -99,14 +103,13 @@ def find_moves(mesh: SplatMesh, usage: Usage, looked_at: np.ndarray, share: floa
     return Moves(rows[idle[: len(needed)]], rows[needed])
 
 
-def halves(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def halves(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two sets of vertices (n, k, 3) float32 in place of each of ``positions`` (n, k, 3), side by side along
-    its longest axis and overlapping a little, and (n,) the share of its area that each fills."""
+    its longest axis and overlapping a little."""
     exact = positions.astype(np.float64)
     away = exact - exact.mean(axis=1, keepdims=True)
     axis = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away))[1][:, :, 2]
     along = np.einsum("nki,ni->nk", away, axis)
-    narrower = exact - (1 - OVERLAP) / 2 * along[..., None] * axis[:, None]
-    apart = (1 - OVERLAP) / 2 * np.abs(along).max(axis=1)[:, None, None] * axis[:, None]
-    share = np.full(len(exact), (1 + OVERLAP) / 2)
-    return (narrower + apart).astype(np.float32), (narrower - apart).astype(np.float32), share
+    narrower = exact - (1 - HALF) * along[..., None] * axis[:, None]
+    apart = (1 - HALF) * np.abs(along).max(axis=1)[:, None, None] * axis[:, None]
+    return (narrower + apart).astype(np.float32), (narrower - apart).astype(np.float32)

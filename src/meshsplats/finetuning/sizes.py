@@ -7,6 +7,11 @@ import numpy as np
 from meshsplats.mesh import SplatMesh
 
 
+def splat_starts(face_splat: np.ndarray) -> np.ndarray:
+    """Numbers of the first triangles of each splat, of ``face_splat`` (f,), f > 0."""
+    return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))
+
+
 def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
     """(v,) float32 sizes in scene units: the side of a square with twice the area of a vertex' typical
     triangle.
@@ -20,7 +25,7 @@ def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.sqrt(np.linalg.norm(normals, axis=1))
     if mesh.face_splat is not None and len(size):
-        starts = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) > 0]))
+        starts = splat_starts(mesh.face_splat)
         counts = np.diff(np.append(starts, len(size)))
         size = np.repeat(np.add.reduceat(size, starts) / counts, counts)
     total = np.bincount(mesh.faces.ravel(), np.repeat(size, 3), v)

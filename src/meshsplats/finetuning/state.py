@@ -14,7 +14,7 @@ from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.edges import on_open_edges
-from meshsplats.finetuning.relocation import Usage, find_moves, halves
+from meshsplats.finetuning.relocation import HALF, Usage, find_moves, halves
 from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.mesh import SplatMesh
 
@@ -194,10 +194,10 @@ class State:
         idle, needed = find_moves(self.mesh, self._usage, looked_at, self.config.relocate_share)
         if len(idle):
             positions, colors = self.vertices.detach().numpy(), self.colors.detach().numpy()
-            positions[needed], positions[idle], share = halves(positions[needed])
+            positions[needed], positions[idle] = halves(positions[needed])
             colors[idle] = colors[needed]
             # Sizes are the sides of squares.
-            self.sizes[needed] *= np.sqrt(share, dtype=np.float32)[:, None]
+            self.sizes[needed] *= np.sqrt(np.float32(HALF))
             self.sizes[idle] = self.sizes[needed]
             for rows in (idle, needed):
                 self._positions.restart(rows, needed, self.sizes[rows])

@@ -13,6 +13,7 @@ from meshsplats.dataset import View
 from meshsplats.errors import DivergenceError, MissingDependencyError
 from meshsplats.finetuning.config import BACKDROPS, FinetuneConfig, rates
 from meshsplats.finetuning.losses import photometric_loss
+from meshsplats.finetuning.sizes import splat_starts
 from meshsplats.finetuning.state import GAIN, OFFSET, State
 from meshsplats.rendering.autograd import rasterize
 
@@ -136,7 +137,7 @@ def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
         shown *= every  # as if all had been looked at
         corners_shown, corners_before = shown[mesh.faces].sum(axis=1), before[mesh.faces].any(axis=1)
         if mesh.face_splat is not None and len(mesh.faces):
-            starts = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) > 0]))
+            starts = splat_starts(mesh.face_splat)
             counts = np.diff(np.append(starts, len(mesh.faces)))
             # A corner that several triangles share counts once for each, the same in all splats.
             corners_shown = np.repeat(np.add.reduceat(corners_shown, starts), counts)
