@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import meshsplats as ms
-from meshsplats.cli.finetune import TargetOptions
+from meshsplats.cli.finetune import TargetOptions, worthwhile_views
 from meshsplats.evaluation import evaluate
 from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config, starting_mesh
 
@@ -73,6 +73,8 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
     def seconds() -> float:
         return (clock() - start) / share
 
+    length = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
+    config = make_config(preset, **length)
     start = clock()
     cloud = ms.load_gaussians(options.data / scene.splats)
     if scene.photographs:
@@ -83,13 +85,11 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
     else:
         source = options.data / scene.splats
         data = TargetOptions(sh_degree=options.sh_degree, held_out=1).make(
-            cloud, source, (1, 1, 1), options.threads
+            cloud, source, (1, 1, 1), options.threads, worthwhile_views(config)
         )
         cameras = ms.load_cameras(options.data / scene.cameras)
         judged = ms.Dataset((), ms.splat_views(cloud, cameras, sh_degree=options.sh_degree))
     mesh = starting_mesh(cloud, [view.camera for view in data.train], preset=preset)
-    length = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
-    config = make_config(preset, **length)
     told = []
     run = RunOptions(threads=options.threads, report_every=0, spent=seconds())
     if options.clock == "wall" or options.steps:

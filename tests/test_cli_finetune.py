@@ -18,7 +18,7 @@ from _photographs import write_photographs
 
 from meshsplats.camera import orbit, save_cameras
 from meshsplats.cli import main
-from meshsplats.cli.finetune import Finetune, TargetOptions
+from meshsplats.cli.finetune import Finetune, TargetOptions, worthwhile_views
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config
 from meshsplats.formats.meshes import load_mesh
@@ -26,6 +26,15 @@ from meshsplats.formats.splats import save_gaussians
 from meshsplats.rendering import render_splats
 
 SMALL = ("--views", "4", "--held-out", "2", "--width", "32")
+
+
+@pytest.mark.parametrize(
+    ("length", "views"),
+    [({"steps": 100}, 200), ({"steps": 1200}, 600), ({"steps": 10**6}, 1000), ({"epochs": 15}, 200),
+     ({"minutes": 2}, 200), ({"minutes": 15}, 900), ({"minutes": 600}, 1000)],
+)  # fmt: skip
+def test_long_runs_have_more_views(length, views):
+    assert worthwhile_views(make_config(**length)) == views
 
 
 @pytest.fixture(scope="module")

@@ -322,6 +322,24 @@ def test_inside_cameras_stand_in_free_space_and_look_all_round():
     assert np.mean([view.alpha.mean() for view in dataset.views]) > 0.95
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_the_first_views_held_out_are_the_same_for_any_number_of_others(cloud, known):
+    """What was trained on can be measured later without knowing on how many views it was."""
+    cameras = ms.orbit(cloud, 60, width=64, height=48) if known else None
+    held = [
+        {v.name for v in splat_dataset(cloud, cameras=cameras, train=train, test=8, width=32).test}
+        for train in (3, 20, 500)
+    ]
+    assert len(held[0]) == 8
+    assert held[0] == held[1] == held[2]
+    trained = {v.name for v in splat_dataset(cloud, cameras=cameras, train=500, test=8, width=32).train}
+    assert trained.isdisjoint(held[0])
+    assert len(trained) == (52 if known else 500)
+    if not known:  # nor are they trained on where fewer are held out
+        few = splat_dataset(cloud, train=20, test=1, width=32)
+        assert held[0].isdisjoint(v.name for v in few.train)
+
+
 def test_no_free_space_is_an_error():
     ball = np.random.default_rng(0).normal(size=(500, 3)) * 0.1
     with pytest.raises(ValueError, match="no free place was found inside the scene"):

@@ -83,6 +83,10 @@ else:
     _Tuning = _described(FinetuneConfig)
 
 
+FEWEST_VIEWS, MOST_VIEWS = 200, 1000
+"""Pictures of splats to learn from: in a short run, and in the longest."""
+
+
 @dataclass(frozen=True)
 class TargetOptions:
     """What the pictures should look like: photographs (--data), or else the splats' own pictures."""
@@ -93,8 +97,9 @@ class TargetOptions:
     """With --data: pictures this many times smaller."""
     test_every: int = 8
     """With --data: every n-th view is held out, where the data set has no split of its own; 0: none."""
-    views: int = 200
-    """Without --data: number of pictures of the splats to learn from."""
+    views: Count = None
+    """Without --data: number of pictures of the splats to learn from. Default: 200, and more in a long run:
+    one for each second, or for two --steps, up to 1000."""
     held_out: int = 8
     """Without --data: number of further pictures to measure with."""
     width: int = 400
@@ -136,8 +141,9 @@ class TargetOptions:
         source: Path,
         background: Sequence[float],
         threads: int | None,
+        worthwhile: int = FEWEST_VIEWS,
     ) -> Dataset:
-        """The data set."""
+        """The data set; of so many views as are ``worthwhile`` where nothing else was said."""
         if self.data is not None:
             return load_dataset(
                 self.data,
@@ -155,7 +161,7 @@ class TargetOptions:
             scene,
             placement=self.placement,
             cameras=cameras,
-            train=self.views,
+            train=self.views or worthwhile,
             test=self.held_out,
             width=self.width,
             distance=self.distance,
@@ -165,6 +171,13 @@ class TargetOptions:
             threads=threads,
             cache_bytes=self.cache_bytes,
         )
+
+
+def worthwhile_views(config: FinetuneConfig) -> int:
+    """Number of pictures of splats for so long a run: few are drawn sooner and seen more often, but a long
+    run learns them by heart."""
+    wanted = 60 * config.minutes if config.minutes is not None else (config.steps or 0) / 2
+    return round(min(max(wanted, FEWEST_VIEWS), MOST_VIEWS))
 
 
 @dataclass(frozen=True)
@@ -239,7 +252,8 @@ class Finetune:
         _need_torch()
         scene = load_scene(self.input, self.reading)
         background = (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
-        dataset = self.target.make(scene, self.input, background, self.threads)
+        worthwhile = worthwhile_views(config)
+        dataset = self.target.make(scene, self.input, background, self.threads, worthwhile)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
         from meshsplats.finetuning.memory import available_memory, check_memory, readable
 

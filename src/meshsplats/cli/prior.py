@@ -36,6 +36,7 @@ from meshsplats.cli.finetune import (
     _say,
     _shown,
     check_run_files,
+    worthwhile_views,
 )
 from meshsplats.dataset import Dataset
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
@@ -189,7 +190,8 @@ class Prior:
         if self.splats is None:
             mesh = SplatMesh(base.vertices, base.faces, _grey(base))
             return self.target.make(mesh, self.input, background, self.threads)
-        return self.target.make(self.reading.load(self.splats), self.splats, background, self.threads)
+        cloud, worthwhile = self.reading.load(self.splats), worthwhile_views(config)
+        return self.target.make(cloud, self.splats, background, self.threads, worthwhile)
 
     def _tell(self, files: _Files, trained: MeshPrior, seconds: float) -> None:
         from meshsplats.finetuning.journal import Journal

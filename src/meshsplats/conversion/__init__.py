@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.conversion.detail import LEVELS, choose_levels, shown_pixels
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import FILTER_PX2, Views, pixel_sizes, widen
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
@@ -62,6 +63,11 @@ def convert(
         ValueError: an option out of range, options that contradict each other, or nothing left to draw.
     """
     chosen = make_options(options).resolved(preset, has_cameras=bool(cameras))
+    shown = None
+    if chosen.detail == "cameras":
+        options |= {"mode": "flat", "detail": "even"}
+        even = convert(cloud, preset=preset, cameras=cameras, up=up, **options)
+        shown = shown_pixels(even, len(cloud), cameras or ())
     direction = guess_up(None, cameras) if up is None else unit_up(up)
     rows = _worth_drawing(cloud, chosen)
     part = cloud
@@ -79,7 +85,7 @@ def convert(
     areas = disc_areas(sigma)
     shadow = mean_shadow(areas)
     shapes, choice = _shapes(sigma, chosen)
-    triangles = len(shapes[0].pattern.faces)  # a splat, whatever its shape
+    triangles = len(shapes[0].pattern.faces)  # a splat, whatever its shape, or in the mean
 
     keep = areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(part), bool)
     if not keep.any():
@@ -91,6 +97,9 @@ def convert(
         # Splats without area last of all.
         importance[~keep] = -1
         keep &= most_important(importance, triangles, chosen.max_splats, chosen.max_triangles)
+    if shown is not None:
+        choice[keep] = choose_levels(shown[rows[keep]], int(keep.sum()) * triangles)
+        shapes = [_ellipse(sides, rings, chosen) for sides, rings in LEVELS]
     if chosen.compensation:
         opacity = opacity * _missing(areas, shadow, shapes, choice) ** np.float32(chosen.compensation)
 
@@ -100,6 +109,7 @@ def convert(
     everything = bool(keep.all())
     chosen_rows = np.flatnonzero(keep)
     pick = (lambda array: array) if everything else (lambda array: np.take(array, chosen_rows, axis=0))
+    counts = np.array([len(shape.pattern.faces) for shape in shapes])
     vertices, faces, rgba = build(
         shapes,
         pick(choice),
@@ -110,7 +120,8 @@ def convert(
         pick(colors),
         pick(opacity),
     )
-    return SplatMesh(vertices, faces, rgba, face_splat=np.repeat(pick(rows), triangles), up=direction)
+    owners = np.repeat(pick(rows), counts[pick(choice)])
+    return SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction)
 
 
 def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:
@@ -181,31 +192,37 @@ _ORDERS = np.array(
 def _shapes(sigma: np.ndarray, options: ConversionOptions) -> tuple[list[Shape], np.ndarray]:
     """The shapes in use and (n,) which of them each splat takes."""
 
-    def shape(sides: int, mode: str) -> Shape:
-        fit = partial(
-            fit_profile,
-            sides,
-            options.rings,
-            rim_opacity=options.opac_mul,
-            center_opacity=options.center_mul,
-            conserve=True,
-        )
-        profile = fit(rim_radius=options.scale_mul)
-        if mode == "crossed" and options.scale_mul is None:
-            profile = fit(rim_radius=CROSSED_REACH * profile.radii[-1])
-        return Shape(pattern(sides, options.rings, mode), profile)
-
     sides = int(options.no_triag)  # type: ignore[arg-type]
     choice = np.zeros(len(sigma), np.int8)
     if options.mode != "crossed":
-        return [shape(sides, options.mode)], choice  # type: ignore[arg-type]
+        return [_ellipse(sides, options.rings, options, options.mode)], choice  # type: ignore[arg-type]
     choice[sigma[:, 2] <= options.flat_below * sigma[:, 1]] = 1
-    return [shape(sides, "crossed"), shape(2 * sides, "flat")], choice
+    crossed, flat = ((sides, "crossed"), (2 * sides, "flat"))
+    return [_ellipse(n, options.rings, options, mode) for n, mode in (crossed, flat)], choice  # type: ignore[arg-type]
+
+
+def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "flat") -> Shape:
+    """That of so many sides and rings with the profile that ``options`` ask for."""
+    fit = partial(
+        fit_profile,
+        sides,
+        rings,
+        rim_opacity=options.opac_mul,
+        center_opacity=options.center_mul,
+        conserve=True,
+    )
+    profile = fit(rim_radius=options.scale_mul)
+    if mode == "crossed" and options.scale_mul is None:
+        profile = fit(rim_radius=CROSSED_REACH * profile.radii[-1])
+    return Shape(pattern(sides, rings, mode), profile)
 
 
 def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
     """(n,) mean area of a splat's projection over all directions, over that of its ellipses: |cos| is 1/2 on
     average."""
-    sums = [0.5 * areas[:, : shape.pattern.ellipses].sum(axis=1) for shape in shapes]
-    drawn = sums[0] if len(sums) == 1 else np.where(choice == 0, *sums)
+    ellipses = np.array([shape.pattern.ellipses for shape in shapes])
+    sums = {count: 0.5 * areas[:, :count].sum(axis=1) for count in set(ellipses)}
+    drawn = np.zeros_like(shadow)
+    for count, area in sums.items():
+        drawn = np.where(ellipses[choice] == count, area, drawn)
     return np.divide(shadow, drawn, out=np.ones_like(shadow), where=drawn > 0)

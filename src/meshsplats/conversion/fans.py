@@ -127,33 +127,29 @@ def build(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (v, 3), faces (f, 3) and colours (v, 4), splat after splat.
 
-    All ``shapes`` have the same number of faces; ``choice`` (n,) numbers each splat's. ``order`` (n, 3) and
+    ``choice`` (n,) numbers each splat's of the ``shapes``. ``order`` (n, 3) and
     ``sigma`` (n, 3) give its axes as in ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the
     product is clamped to 1.
     """
     n = len(centers)
-    corners = np.stack([shape.pattern.faces.ravel() for shape in shapes])
-    count = np.array([len(shape.pattern.level) for shape in shapes], np.int64)[choice]
-    ends = np.cumsum(count)
-    v, f = int(ends[-1]) if n else 0, n * corners.shape[1] // 3
+    corners = [shape.pattern.faces.ravel() for shape in shapes]
+    first, v = _firsts(np.array([len(shape.pattern.level) for shape in shapes])[choice])
+    first_face, f = _firsts(np.array([len(shape.pattern.faces) for shape in shapes])[choice])
     if max(v, f) > np.iinfo(np.int32).max:
         raise ValueError(f"the mesh would have {v} vertices and {f} triangles, too many: use max_triangles")
-    first = np.subtract(ends, count, out=ends)
     vertices = np.empty((v, 3), np.float32)
     colors = np.empty((v, 4), np.float32)
-    faces = np.empty((n, corners.shape[1]), np.int32)
+    faces = np.empty((f, 3), np.int32)
     recipes = [_recipe(shape) for shape in shapes]
 
     for part in chunks(n, CHUNK):
-        np.take(corners, choice[part], axis=0, out=faces[part], mode="clip")
-        faces[part] += first[part].astype(np.int32)[:, None]
         for number, (shape, (place, tint)) in enumerate(zip(shapes, recipes, strict=True)):
             rows = np.flatnonzero(choice[part] == number)
             if not len(rows):
                 continue
             own = [
                 np.take(array[part], rows, axis=0)
-                for array in (first, centers, quaternions, order, sigma, rgb, opacity)
+                for array in (first, centers, quaternions, order, sigma, rgb, opacity, first_face)
             ]
             levels = np.array(shape.profile.opacities, np.float32)
             used = shape.pattern.directions.shape[1]
@@ -162,7 +158,14 @@ def build(
             paint = np.concatenate([own[5].T, np.minimum(levels[:, None] * own[6], np.float32(1))])
             _put(vertices, own[0], thin_product(parts.T, place))
             _put(colors, own[0], thin_product(paint.T, tint))
-    return vertices, faces.reshape(-1, 3), colors
+            _put(faces, own[7], own[0].astype(np.int32)[:, None] + corners[number])
+    return vertices, faces, colors
+
+
+def _firsts(counts: np.ndarray) -> tuple[np.ndarray, int]:
+    """Numbers of the first of ``counts`` (n,) things each, one after the other, and that of all."""
+    ends = np.cumsum(counts, dtype=np.int64)
+    return ends - counts, int(ends[-1]) if len(ends) else 0
 
 
 def _put(out: np.ndarray, first: np.ndarray, blocks: np.ndarray) -> None:

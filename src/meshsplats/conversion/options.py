@@ -11,6 +11,7 @@ import numpy as np
 Mode = Literal["crossed", "flat", "3d"]
 Footprint = Literal["cameras", "framing", "distance", "density", "none"]
 Colors = Literal["degree0", "cameras"]
+Detail = Literal["even", "cameras"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,10 @@ class ConversionOptions:
     rings: int | None = None
     """Rings of vertices in an ellipse, 1 to 4; the last is the rim. More follow the Gaussian closer: 2 rings
     draw 3 * no_triag triangles an ellipse. Default and paper: 1."""
+    detail: Detail | None = None
+    """even: as many triangles for every splat. cameras, for mode 'flat', which it implies, with one ring:
+    from 4 to 80, in the mean ``no_triag``; more for splats that show large from the cameras given, fewer for
+    those that show little. Fine-tuning does so. Default and paper: even."""
     flat_below: float | None = None
     """crossed: a splat whose smallest standard deviation (with its footprint) is less than this fraction of
     the middle one is drawn as one ellipse of twice as many triangles, 0 to 1."""
@@ -83,6 +88,8 @@ class ConversionOptions:
             raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
         defaults = PRESETS[preset]
         given = {f.name for f in fields(self) if getattr(self, f.name) is not None}
+        if self.detail == "cameras" and self.mode is None:
+            defaults = replace(defaults, mode="flat")
         full = replace(
             self, **{f.name: getattr(defaults, f.name) for f in fields(self) if f.name not in given}
         )
@@ -95,7 +102,7 @@ class ConversionOptions:
         return full
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
-        for name, kind in [("mode", Mode), ("footprint", Footprint), ("colors", Colors)]:
+        for name, kind in [("mode", Mode), ("footprint", Footprint), ("colors", Colors), ("detail", Detail)]:
             if getattr(self, name) not in get_args(kind):
                 raise ValueError(
                     f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}"
@@ -116,6 +123,14 @@ class ConversionOptions:
             raise ValueError(f"no_triag must be even in mode 'crossed', got {self.no_triag}")
         if "flat_below" in given and self.mode != "crossed":
             raise ValueError(f"flat_below is for mode 'crossed', got mode {self.mode!r}")
+        if self.detail == "cameras":
+            if not has_cameras:
+                raise ValueError("detail='cameras' needs cameras: give some, or choose even")
+            if self.mode != "flat" or self.rings != 1 or self.no_triag < 4:  # type: ignore[operator]
+                raise ValueError(
+                    "detail='cameras' needs mode 'flat', rings 1 and no_triag of at least 4, got mode"
+                    f" {self.mode!r}, rings {self.rings} and no_triag {self.no_triag}"
+                )
         if self.footprint == "cameras" and not has_cameras:
             raise ValueError(
                 "footprint='cameras' needs cameras: give some, or choose framing, distance, density or none"
@@ -158,6 +173,7 @@ PRESETS = {
         mode="crossed",
         opac_mul=0.0,
         rings=1,
+        detail="even",
         flat_below=0.15,
         compensation=1.0,
         focal=1000.0,
@@ -172,6 +188,7 @@ PRESETS = {
         opac_mul=0.2,
         center_mul=1.0,
         rings=1,
+        detail="even",
         flat_below=0.0,
         compensation=0.0,
         footprint="none",

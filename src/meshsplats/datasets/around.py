@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from meshsplats.camera import MAX_SIDE, NEAR_SHARE, Camera, look_at
-from meshsplats.dataset import CACHE_BYTES, WHITE, Dataset, View, splat_views
+from meshsplats.dataset import CACHE_BYTES, WHITE, Dataset, splat_views
 from meshsplats.framing import (
     SAMPLE,
     SURROUNDINGS,
@@ -38,6 +38,9 @@ SURROUNDINGS_SHARE = 0.01
 """More of the opacity than this beyond the subject, and it stands in surroundings."""
 STANDS = 12
 """Most places from which a scene is seen from inside."""
+HELD_OUT = 8
+"""Views that are held out at the least, asked for or not: a mesh can be measured on them later
+without knowing what it was trained on."""
 CANDIDATES = 512
 """Points tried as such a place."""
 ROOMY = 0.4
@@ -74,8 +77,9 @@ def splat_dataset(
     cameras: where the scene was trained from, as in a model folder's cameras.json. They are used in place of
         a placement: as many as are asked for, spread over all, those held out between the others, scaled to
         ``width``. ``height``, ``fov``, ``distance`` and ``up`` then have no part.
-    train, test: numbers of views. The views held out go on with the sequence of the others, so both are
-        spread evenly and none lies on another.
+    train, test: numbers of views. Those held out are the first of a sequence with which the others go on, so
+        both are spread evenly, none lies on another, and the first ``HELD_OUT`` are never trained on,
+        however many views are.
     width, height: size in pixels; height: as width.
     fov: degrees that the shorter side spans; 50, or 75 inside.
     distance: nearest and farthest camera of 'object' and 'surrounded', as multiples of the distance from
@@ -94,18 +98,19 @@ def splat_dataset(
         raise ValueError(f"width and height must lie between 1 and {MAX_SIDE} pixels")
     if not (len(distance) == 2 and 0 < distance[0] <= distance[1] < np.inf):
         raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
+    first = max(test, HELD_OUT)  # of the training views
     if cameras is not None:
-        placed = _given(cameras, train + test, width)
+        placed, first = _given(cameras, train, test, width)
     elif placement == "inside":
         placed = inside_cameras(
-            cloud, train + test, up=up, width=width, height=height or width, fov=75.0 if fov is None else fov
+            cloud, first + train, up=up, width=width, height=height or width, fov=75.0 if fov is None else fov
         )
     else:
         if placement == "auto":
             placement = "surrounded" if has_surroundings(cloud) else "object"
         placed = outside_cameras(
             cloud,
-            train + test,
+            first + train,
             elevations=SURROUNDED_ELEVATIONS if placement == "surrounded" else OBJECT_ELEVATIONS,
             distance=distance,
             up=up,
@@ -122,13 +127,7 @@ def splat_dataset(
         threads=threads,
         cache_bytes=cache_bytes,
     )
-    if cameras is None:
-        return Dataset(views[:train], views[train:], "splats")
-    held = set(_spread(len(views), min(test, len(views) - 1)))
-    part: tuple[list[View], list[View]] = ([], [])
-    for i, view in enumerate(views):
-        part[i in held].append(view)
-    return Dataset(tuple(part[0]), tuple(part[1]), "splats")
+    return Dataset(views[first:], views[:test], "splats")
 
 
 def has_surroundings(cloud: GaussianCloud) -> bool:
@@ -265,12 +264,15 @@ def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np
     return tried[chosen], clearance[chosen]
 
 
-def _given(cameras: Sequence[Camera], most: int, width: int) -> list[Camera]:
-    """Up to ``most`` of the cameras, spread over them, with pictures ``width`` pixels wide."""
+def _given(cameras: Sequence[Camera], train: int, test: int, width: int) -> tuple[list[Camera], int]:
+    """Up to ``test`` of the cameras, spread over them, then up to ``train`` of the others; with pictures
+    ``width`` pixels wide. And the number of the first of those."""
     if len(cameras) < 1:
         raise ValueError("cameras is empty; leave it out to have cameras placed")
-    chosen = _spread(len(cameras), min(most, len(cameras)))
-    return [cameras[i].scaled(width / cameras[i].width) for i in chosen]
+    held = _spread(len(cameras), min(test, len(cameras) - 1))
+    rest = np.delete(np.arange(len(cameras)), held)
+    chosen = [*held, *rest[_spread(len(rest), min(train, len(rest)))]]
+    return [cameras[i].scaled(width / cameras[i].width) for i in chosen], len(held)
 
 
 def _spread(count: int, some: int) -> list[int]:

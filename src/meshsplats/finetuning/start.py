@@ -15,14 +15,19 @@ def starting_mesh(
 ) -> SplatMesh:
     """``cloud`` converted for the fine-tuning of that ``preset``, to be seen from ``cameras``.
 
-    For 'paper' and 'published' that is the paper's conversion. For 'default' it is ours with one ellipse of 8
-    triangles a splat (``mode='flat'``) where ``options``, those of ``convert``, do not say otherwise: two
-    crossed ones look better as they are converted, but cost twice the time in a step and end lower.
+    For 'paper' and 'published' that is the paper's conversion. For 'default' it is ours, where ``options``,
+    those of ``convert``, do not say otherwise, with one ellipse a splat (``mode='flat'``) of 8 triangles in
+    the mean, more where much shows (``detail='cameras'``): two crossed ellipses look better as they are
+    converted, but cost more time in a step and end lower.
     """
     from meshsplats.conversion import convert
+    from meshsplats.conversion.detail import LEAST
 
     if preset != "default":
         return convert(cloud, preset="paper", cameras=cameras, **options)
     if options.get("mode") is None and options.get("flat_below") is None:
         options["mode"] = "flat"
+    one_ring = options.get("mode") == "flat" and options.get("rings") in (None, 1)
+    if options.get("detail") is None and one_ring and (options.get("no_triag") or 8) >= LEAST:
+        options["detail"] = "cameras"
     return convert(cloud, preset="default", cameras=cameras, **options)

@@ -1,0 +1,126 @@
+"""Triangles by what cameras show: as many in all, more where more shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from meshsplats import GaussianCloud, convert, render
+from meshsplats.camera import look_at
+from meshsplats.conversion.detail import LEAST, LEVELS, TRIANGLES, choose_levels, shown_pixels
+
+shares = st.lists(st.floats(0, 1e4), min_size=1, max_size=40).map(np.array)
+
+
+def scene(seed: int, n: int = 80) -> GaussianCloud:
+    rng = np.random.default_rng(seed)
+    turns = rng.normal(size=(n, 4))
+    return GaussianCloud(
+        rng.normal(size=(n, 3)),
+        turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        np.exp(rng.normal(size=(n, 3)) - 2),
+        rng.uniform(0.1, 1, n),
+        rng.normal(size=(n, 1, 3)),
+    )
+
+
+def cameras(count: int = 3) -> list:
+    return [
+        look_at((6 * np.sin(a), 0.5, -6 * np.cos(a)), (0, 0, 0), up=(0, -1, 0), width=64, height=48, fov=50)
+        for a in range(count)
+    ]
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(shares, st.integers(4, 90), st.floats(1e-3, 1e3))
+def test_levels(shown, mean, factor):
+    """Within the budget, and not wasteful; who shows more has no less; only ratios count."""
+    budget = mean * len(shown)
+    levels = choose_levels(shown, budget)
+    assert TRIANGLES[levels].sum() <= budget
+    order = np.argsort(shown, kind="stable")
+    # Of splats that show the same, the first may be one step ahead when the budget ends between them.
+    strict = np.diff(shown[order]) > 1e-9 * shown[order][1:]
+    assert (np.diff(levels[order])[strict] >= 0).all()
+    assert (levels[shown == 0] == 0).all()
+    could_rise = (shown > 0) & (levels < len(LEVELS) - 1)
+    if could_rise.any():
+        assert budget - TRIANGLES[levels].sum() < np.diff(TRIANGLES).max()
+    if len(set(shown)) == len(shown) and shown.min() > 1e-3:
+        np.testing.assert_allclose(levels, choose_levels(shown * factor, budget), atol=1)
+
+
+def test_levels_of_a_hand_worked_case():
+    """Of 1 and 100 pixels, 16 triangles: 4 and 8 (the step to 24 is too dear); 28: 4 and 24."""
+    shown = np.array([1.0, 100.0])
+    assert TRIANGLES[choose_levels(shown, 16)].tolist() == [4, 8]
+    assert TRIANGLES[choose_levels(shown, 28)].tolist() == [4, 24]
+    assert TRIANGLES[choose_levels(shown, 8)].tolist() == [4, 4]
+    with pytest.raises(ValueError, match="2 splats need at least 8 triangles, not 7"):
+        choose_levels(shown, 7)
+
+
+def test_shown_pixels_are_the_opacity_of_the_picture():
+    """What all splats show adds up to the opacity of the pictures; one before the other hides it."""
+    cloud = scene(0)
+    mesh = convert(cloud, mode="flat", footprint="none")
+    views = cameras()
+    shown = shown_pixels(mesh, len(cloud), views)
+    alpha = np.mean([render(mesh, view, background=(0, 0, 0)).alpha.sum(dtype=np.float64) for view in views])
+    np.testing.assert_allclose(shown.sum(), alpha, rtol=1e-4)
+    one = mesh.keep_faces(mesh.face_splat == 7)
+    alone = render(one, views[0], background=(0, 0, 0)).alpha.sum(dtype=np.float64)
+    np.testing.assert_allclose(shown_pixels(one, len(cloud), views[:1])[7], alone, rtol=1e-4)
+    assert (np.delete(shown_pixels(one, len(cloud), views[:1]), 7) == 0).all()
+
+
+def test_only_ratios_of_pictures_count():
+    """Cameras of twelve times the size: their pictures are looked at smaller."""
+    cloud = scene(1)
+    mesh = convert(cloud, mode="flat", footprint="none")
+    small = [replace(view) for view in cameras()]
+    large = [view.scaled(12) for view in small]
+    a, b = (shown_pixels(mesh, len(cloud), views) for views in (small, large))
+    assert 0.5 * (400 / 64) ** 2 < b.sum() / a.sum() < 2 * (400 / 64) ** 2
+
+
+@pytest.mark.parametrize("mean", [4, 8, 20])
+def test_as_many_triangles_in_all(mean):
+    cloud, views = scene(2), cameras()
+    mesh = convert(cloud, cameras=views, detail="cameras", no_triag=mean)
+    even = convert(cloud, cameras=views, mode="flat", no_triag=mean)
+    assert len(mesh.faces) <= len(even.faces)
+    assert len(mesh.faces) > 0.9 * len(even.faces)
+    counts = np.bincount(mesh.face_splat, minlength=len(cloud))
+    assert set(counts) <= set(TRIANGLES.tolist())
+    if mean == 4:
+        assert (counts == LEAST).all()
+        return
+    shown = shown_pixels(even, len(cloud), views)
+    assert (np.diff(counts[np.argsort(shown)]) >= 0).all()
+
+
+def test_a_splat_has_the_fan_of_its_level():
+    """Each splat is what an even conversion to its own number of triangles makes of it."""
+    cloud, views = scene(3), cameras()
+    mesh = convert(cloud, cameras=views, detail="cameras")
+    counts = np.bincount(mesh.face_splat, minlength=len(cloud))
+    assert len(set(counts)) >= 4
+    for (sides, rings), triangles in zip(LEVELS, TRIANGLES, strict=True):
+        even = convert(cloud, cameras=views, mode="flat", no_triag=sides, rings=rings)
+        for splat in np.flatnonzero(counts == triangles):
+            a, b = (m.keep_faces(m.face_splat == splat) for m in (mesh, even))
+            assert (a.faces == b.faces).all()
+            np.testing.assert_array_equal(a.vertices, b.vertices)
+            np.testing.assert_array_equal(a.colors, b.colors)
+
+
+def test_max_triangles_is_kept():
+    cloud, views = scene(4), cameras()
+    mesh = convert(cloud, cameras=views, detail="cameras", max_triangles=200)
+    assert 150 < len(mesh.faces) <= 200
+    assert mesh.splat_count == 25
