@@ -1,8 +1,13 @@
-"""Checks shared by the data classes."""
+"""What all parts do with arrays: checks of the data classes, a few out of many."""
 
 from __future__ import annotations
 
 import numpy as np
+
+
+def evenly(items, most: int):
+    """Every k-th of ``items``, a sequence or array, with the least k that leaves at most ``most``."""
+    return items[:: max(1, -(-len(items) // most))]
 
 
 def checked_array(name: str, value, dtype, shape: tuple[int | None, ...]) -> np.ndarray:

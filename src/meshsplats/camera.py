@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import checked_array, evenly
 from meshsplats.errors import FileFormatError
 from meshsplats.framing import (
     DEFAULT_UP,
@@ -106,6 +106,12 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y
         )
+
+
+def a_few(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:
+    """Every k-th of ``cameras``, at most ``most``, with pictures of at most ``side`` pixels: enough to learn
+    what they see."""
+    return [c.scaled(min(1.0, side / max(c.width, c.height))) for c in evenly(cameras, most)]
 
 
 def look_at(

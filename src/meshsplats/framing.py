@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from meshsplats._arrays import evenly
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -147,7 +148,7 @@ def fit_pictures(
     """
     # What is near looks larger: the middle of the box is not the middle of a picture. Two steps of least
     # squares over the views bring it there within a few pixels; a dozen of the views are enough to know.
-    some = rotations[:: -(-len(rotations) // 12)]
+    some = evenly(rotations, 12)
     across = np.concatenate([rotation[:2] for rotation in some])
     for _ in range(2):
         away = max(_fitting_distance(bounds, target, rotation, slopes) for rotation in some)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.camera import Camera, look_at
+from meshsplats.camera import Camera, a_few, look_at
 from meshsplats.framing import front_axes, scene_bounds
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
@@ -45,8 +45,7 @@ def most_layers(
     """
     if len(mesh.faces) == 0:
         return 0
-    some = list(cameras[:: -(-len(cameras) // 8)]) if cameras else []
-    probes = [camera.scaled(min(1.0, _PROBE_SIDE / max(camera.width, camera.height))) for camera in some]
+    probes = a_few(cameras or (), 8, _PROBE_SIDE)
     bounds = scene_bounds(mesh)
     reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max()) or bounds.radius
     axes = front_axes(mesh.up.astype(np.float64))

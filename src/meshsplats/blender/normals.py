@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera, dome
+from meshsplats.camera import Camera, a_few, dome
 from meshsplats.conversion.footprint import spacing
 from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh
@@ -174,8 +174,7 @@ def _seen_from(
 ) -> np.ndarray:
     """(n, 3) sum of the unit directions from each centre to the cameras that see it; zero where none does."""
     views = dome(mesh, VIEWS, whole=True, up=guess_up(mesh), width=_SIDE, height=_SIDE)
-    some = cameras[:: -(-len(cameras) // 16)] if cameras else ()
-    views += [camera.scaled(min(1.0, _SIDE / max(camera.width, camera.height))) for camera in some]
+    views += a_few(cameras or (), 16, _SIDE)
     seen = np.zeros_like(centers)
     for camera in views:
         picture = render(mesh, camera, depth=True, threads=threads)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, a_few
 from meshsplats.mesh import SplatMesh
 
 LEVELS = ((4, 1), (6, 1), (8, 1), (8, 2), (12, 2), (12, 3), (16, 3))
@@ -44,11 +44,10 @@ def shown_pixels(mesh: SplatMesh, splats: int, cameras: Sequence[Camera]) -> np.
     attribute = np.zeros((len(mesh.vertices), 1), np.float32)
     weights = np.zeros_like(attribute)
     positions, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-    chosen = cameras[:: -(-len(cameras) // PICTURES)]
+    chosen = a_few(cameras, PICTURES, SIDE)
     for camera in chosen:
-        smaller = camera.scaled(min(1.0, SIDE / max(camera.width, camera.height)))
         picture = RecordedPicture(
-            mesh.vertices, mesh.faces, mesh.colors, attribute, smaller, face_splat=mesh.face_splat
+            mesh.vertices, mesh.faces, mesh.colors, attribute, camera, face_splat=mesh.face_splat
         )
         h, w = picture.alpha.shape
         picture.back(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from meshsplats._arrays import evenly
 from meshsplats.dataset import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation import mesh_picture
 from meshsplats.finetuning.checkpoint import (
@@ -171,7 +172,7 @@ class _Run:
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = 0.0
-        watched = dataset.test[:: max(1, -(-len(dataset.test) // WATCHED_VIEWS))]
+        watched = evenly(dataset.test, WATCHED_VIEWS)
         self.watched: tuple[View, ...] = watched
 
     @property

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import evenly
 from meshsplats.colors import srgb_to_linear
 from meshsplats.dataset import View
 from meshsplats.errors import DivergenceError, MissingDependencyError
@@ -132,9 +133,9 @@ def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
     config, mesh = state.config, state.result()
     keep = (mesh.colors[mesh.faces, 3] >= config.prune_opacity).any(axis=1)
     if config.prune_importance > 0:
-        every = max(1, -(-len(views) // IMPORTANCE_VIEWS))
-        shown, before = importance(state, views[::every])
-        shown *= every  # as if all had been looked at
+        some = evenly(views, IMPORTANCE_VIEWS)
+        shown, before = importance(state, some)
+        shown *= len(views) / len(some)  # as if all had been looked at
         corners_shown, corners_before = shown[mesh.faces].sum(axis=1), before[mesh.faces].any(axis=1)
         if mesh.face_splat is not None and len(mesh.faces):
             starts = splat_starts(mesh.face_splat)
@@ -152,7 +153,7 @@ def relocate(state: State, views: Sequence[View]) -> int:
         return 0
     positions = state.vertices.detach().numpy()
     looked_at = np.zeros(len(positions), bool)
-    for view in views[:: max(1, -(-len(views) // IMPORTANCE_VIEWS))]:
+    for view in evenly(views, IMPORTANCE_VIEWS):
         looked_at |= in_view(positions, view)
     return state.relocate(looked_at)
 
