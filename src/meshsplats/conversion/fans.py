@@ -169,8 +169,12 @@ def _firsts(counts: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _put(out: np.ndarray, first: np.ndarray, blocks: np.ndarray) -> None:
-    """Writes each row of ``blocks`` (k, m * c) as m rows of ``out`` (v, c), from row ``first`` on."""
+    """Writes each row of ``blocks`` (k, m * c) as m rows of ``out`` (v, c), from row ``first`` on; ascending."""
     width = out.shape[1]
+    rows = blocks.size // width
+    if first[-1] - first[0] == rows - blocks.shape[1] // width:  # one after the other
+        out[first[0] : first[0] + rows] = blocks.reshape(-1, width)
+        return
     # Every run of m rows as one item: written whole, much quicker than row by row.
     runs = sliding_window_view(out.reshape(-1), blocks.shape[1], writeable=True)
     runs[first * width] = blocks
