@@ -169,7 +169,8 @@ def _firsts(counts: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _put(out: np.ndarray, first: np.ndarray, blocks: np.ndarray) -> None:
-    """Writes each row of ``blocks`` (k, m * c) as m rows of ``out`` (v, c), from row ``first`` on; ascending."""
+    """Writes each row of ``blocks`` (k, m * c) as m rows of ``out`` (v, c), from row ``first`` on, (k,)
+    ascending."""
     width = out.shape[1]
     rows = blocks.size // width
     if first[-1] - first[0] == rows - blocks.shape[1] // width:  # one after the other
