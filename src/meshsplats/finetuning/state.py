@@ -145,7 +145,7 @@ class State:
             if t is not None and t.grad is not None
         ]
         # A sum of finite numbers may overflow, but then training has failed, too.
-        return all(bool(torch.isfinite(gradient.sum(dtype=torch.float64))) for gradient in gradients)
+        return all(bool(torch.isfinite(gradient.sum())) for gradient in gradients)
 
     def step(self, color_rate: float, position_rate: float, view: int) -> None:
         """One step of Adam on what training view number ``view`` reached, with the gradients that are
