@@ -56,7 +56,7 @@ class FinetuneConfig:
     """Adam's smallest divisor."""
     ssim_weight: float = 0.4
     """Share of SSIM, 0 to 1."""
-    l2_weight: float = 10.0
+    l2_weight: float = 50.0
     """Weight of the mean square difference, added to the others."""
     background: Backdrop = "random"
     """Behind pictures that have alpha; random: another colour in every step, so that what should be empty

@@ -30,8 +30,8 @@ IMPORTANCE_VIEWS = 64
 
 LEAST_LIGHT = {"display": 1e-3, "linear": 1e-4}
 """A pixel is finished when less of its light than this is left to what comes next; that is the background's.
-It saves a tenth to a sixth of the time, and pictures change by 0.0002 (rms). Encoding lifts dark linear light,
-so there it is less."""
+It saves a tenth to a sixth of the time, and pictures change by 0.0002 (rms). Less in linear light, which is
+lifted where it is dark."""
 
 
 class Target(NamedTuple):
