@@ -107,11 +107,15 @@ class Camera:
             self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y
         )
 
+    def within(self, side: int) -> Camera:
+        """The same view on a picture no side of which is longer than ``side`` pixels; never a larger one."""
+        return self.scaled(min(1.0, side / max(self.width, self.height)))
+
 
 def a_few(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:
     """Every k-th of ``cameras``, at most ``most``, with pictures of at most ``side`` pixels: enough to learn
     what they see."""
-    return [c.scaled(min(1.0, side / max(c.width, c.height))) for c in evenly(cameras, most)]
+    return [camera.within(side) for camera in evenly(cameras, most)]
 
 
 def look_at(

@@ -130,3 +130,8 @@ class SplatMesh:
         """Without the triangles all of whose corners are below ``min_opacity``, and without orphaned
         vertices."""
         return self.keep_faces((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
+
+
+def splat_starts(face_splat: np.ndarray) -> np.ndarray:
+    """Numbers of the first triangles of each splat, of ``face_splat`` (f,), f > 0."""
+    return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))

@@ -79,7 +79,7 @@ def hidden_by_limit(
 ) -> float:
     """Share of the pixels (0 to 1) that change by more than half a step of 8 bits if only ``limit`` layers
     count."""
-    probe = camera.scaled(min(1.0, 2 * _PROBE_SIDE / max(camera.width, camera.height)))
+    probe = camera.within(2 * _PROBE_SIDE)
     whole = render(mesh, probe, threads=threads).alpha
     cut = render(mesh, probe, max_layers=limit, threads=threads).alpha
     return float(np.mean(np.abs(whole - cut) > 0.5 / 255))

@@ -16,7 +16,7 @@ import numpy as np
 from meshsplats.camera import Camera, a_few, dome
 from meshsplats.conversion.footprint import spacing
 from meshsplats.framing import guess_up
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.rendering import render
 
 CELL = 2.5
@@ -107,10 +107,7 @@ def _unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
 def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Number of the splat that each face belongs to (f,), and of the n splats: centres (n, 3), weights
     (n,), area times opacity, and (n, 3, 3) sums of weight times normal times normal over their triangles."""
-    if mesh.face_splat is None:
-        starts = np.arange(len(mesh.faces))
-    else:
-        starts = np.flatnonzero(np.concatenate([[True], np.diff(mesh.face_splat) != 0]))
+    starts = np.arange(len(mesh.faces)) if mesh.face_splat is None else splat_starts(mesh.face_splat)
     owner = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(mesh.faces))))
     weights = np.empty(len(starts))
     centers = np.empty((len(starts), 3))

@@ -191,14 +191,12 @@ _ORDERS = np.array(
 
 def _shapes(sigma: np.ndarray, options: ConversionOptions) -> tuple[list[Shape], np.ndarray]:
     """The shapes in use and (n,) which of them each splat takes."""
-
-    sides = int(options.no_triag)  # type: ignore[arg-type]
+    sides, rings = int(options.no_triag), int(options.rings)  # type: ignore[arg-type]
     choice = np.zeros(len(sigma), np.int8)
     if options.mode != "crossed":
-        return [_ellipse(sides, options.rings, options, options.mode)], choice  # type: ignore[arg-type]
+        return [_ellipse(sides, rings, options, options.mode)], choice  # type: ignore[arg-type]
     choice[sigma[:, 2] <= options.flat_below * sigma[:, 1]] = 1
-    crossed, flat = ((sides, "crossed"), (2 * sides, "flat"))
-    return [_ellipse(n, options.rings, options, mode) for n, mode in (crossed, flat)], choice  # type: ignore[arg-type]
+    return [_ellipse(sides, rings, options, "crossed"), _ellipse(2 * sides, rings, options)], choice
 
 
 def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "flat") -> Shape:
@@ -220,9 +218,6 @@ def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "fl
 def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
     """(n,) mean area of a splat's projection over all directions, over that of its ellipses: |cos| is 1/2 on
     average."""
-    ellipses = np.array([shape.pattern.ellipses for shape in shapes])
-    sums = {count: 0.5 * areas[:, :count].sum(axis=1) for count in set(ellipses)}
-    drawn = np.zeros_like(shadow)
-    for count, area in sums.items():
-        drawn = np.where(ellipses[choice] == count, area, drawn)
+    last = np.array([shape.pattern.ellipses - 1 for shape in shapes])[choice]
+    drawn = 0.5 * np.take_along_axis(np.cumsum(areas, axis=1), last[:, None], axis=1)[:, 0]
     return np.divide(shadow, drawn, out=np.ones_like(shadow), where=drawn > 0)

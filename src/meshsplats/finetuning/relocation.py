@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats.finetuning.sizes import splat_starts
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, splat_starts
 
 IDLE = 0.2
 """A splat whose sum over its colours is below this share of the median counts as showing next to nothing."""

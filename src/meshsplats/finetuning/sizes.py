@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats.mesh import SplatMesh
-
-
-def splat_starts(face_splat: np.ndarray) -> np.ndarray:
-    """Numbers of the first triangles of each splat, of ``face_splat`` (f,), f > 0."""
-    return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))
+from meshsplats.mesh import SplatMesh, splat_starts
 
 
 def vertex_sizes(mesh: SplatMesh) -> np.ndarray:

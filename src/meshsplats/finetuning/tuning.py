@@ -14,8 +14,8 @@ from meshsplats.dataset import View
 from meshsplats.errors import DivergenceError, MissingDependencyError
 from meshsplats.finetuning.config import BACKDROPS, FinetuneConfig, rates
 from meshsplats.finetuning.losses import photometric_loss
-from meshsplats.finetuning.sizes import splat_starts
 from meshsplats.finetuning.state import GAIN, OFFSET, State
+from meshsplats.mesh import splat_starts
 from meshsplats.rendering.autograd import rasterize
 
 try:

@@ -56,7 +56,7 @@ def look_at_base(
     base = SplatMesh(vertices, faces, colors, attributes={"normal": normals})
     if cameras:
         chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, LOOKS).round().astype(int)]
-        chosen = [c.scaled(min(1.0, SIDE / max(c.width, c.height))) for c in dict.fromkeys(chosen)]
+        chosen = [camera.within(SIDE) for camera in dict.fromkeys(chosen)]
     else:
         chosen = dome(base, LOOKS, whole=True, width=SIDE, height=SIDE)
     nearest, front = [], 0.0
