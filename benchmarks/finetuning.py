@@ -17,9 +17,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import meshsplats as ms
-from meshsplats.cli.finetune import TargetOptions, worthwhile_views
+from meshsplats.cli.finetune import TargetOptions
 from meshsplats.evaluation import evaluate
-from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config, starting_mesh
+from meshsplats.finetuning import (
+    FinetuneConfig,
+    RunOptions,
+    finetune,
+    make_config,
+    starting_mesh,
+    worthwhile_views,
+)
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from _photographs import write_photographs
 
 from meshsplats.camera import orbit, save_cameras
 from meshsplats.cli import main
-from meshsplats.cli.finetune import Finetune, TargetOptions, worthwhile_views
+from meshsplats.cli.finetune import Finetune, TargetOptions
 from meshsplats.demo_scene import make_scene
-from meshsplats.finetuning import make_config
+from meshsplats.finetuning import make_config, worthwhile_views
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.splats import save_gaussians
 from meshsplats.rendering import render_splats

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from meshsplats import GaussianCloud, convert, render
 from meshsplats.camera import look_at
-from meshsplats.conversion.detail import LEAST, LEVELS, TRIANGLES, choose_levels, shown_pixels
+from meshsplats.conversion.detail import LEAST, LEVELS, TRIANGLES, choose_levels, splat_pixels
 
 shares = st.lists(st.floats(0, 1e4), min_size=1, max_size=40).map(np.array)
 
@@ -69,13 +69,13 @@ def test_shown_pixels_are_the_opacity_of_the_picture():
     cloud = scene(0)
     mesh = convert(cloud, mode="flat", footprint="none")
     views = cameras()
-    shown = shown_pixels(mesh, len(cloud), views)
+    shown = splat_pixels(mesh, len(cloud), views)
     alpha = np.mean([render(mesh, view, background=(0, 0, 0)).alpha.sum(dtype=np.float64) for view in views])
     np.testing.assert_allclose(shown.sum(), alpha, rtol=1e-4)
     one = mesh.keep_faces(mesh.face_splat == 7)
     alone = render(one, views[0], background=(0, 0, 0)).alpha.sum(dtype=np.float64)
-    np.testing.assert_allclose(shown_pixels(one, len(cloud), views[:1])[7], alone, rtol=1e-4)
-    assert (np.delete(shown_pixels(one, len(cloud), views[:1]), 7) == 0).all()
+    np.testing.assert_allclose(splat_pixels(one, len(cloud), views[:1])[7], alone, rtol=1e-4)
+    assert (np.delete(splat_pixels(one, len(cloud), views[:1]), 7) == 0).all()
 
 
 def test_only_ratios_of_pictures_count():
@@ -84,7 +84,7 @@ def test_only_ratios_of_pictures_count():
     mesh = convert(cloud, mode="flat", footprint="none")
     small = [replace(view) for view in cameras()]
     large = [view.scaled(12) for view in small]
-    a, b = (shown_pixels(mesh, len(cloud), views) for views in (small, large))
+    a, b = (splat_pixels(mesh, len(cloud), views) for views in (small, large))
     assert 0.5 * (400 / 64) ** 2 < b.sum() / a.sum() < 2 * (400 / 64) ** 2
 
 
@@ -100,7 +100,7 @@ def test_as_many_triangles_in_all(mean):
     if mean == 4:
         assert (counts == LEAST).all()
         return
-    shown = shown_pixels(even, len(cloud), views)
+    shown = splat_pixels(even, len(cloud), views)
     assert (np.diff(counts[np.argsort(shown)]) >= 0).all()
 
 

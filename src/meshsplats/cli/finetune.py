@@ -38,6 +38,7 @@ from meshsplats.cli.convert import _Options as ConversionOptions
 from meshsplats.dataset import Dataset, load_dataset
 from meshsplats.errors import MissingDependencyError
 from meshsplats.finetuning import (
+    FEWEST_VIEWS,
     FinetuneConfig,
     Interrupted,
     Progress,
@@ -45,6 +46,7 @@ from meshsplats.finetuning import (
     finetune,
     make_config,
     starting_mesh,
+    worthwhile_views,
 )
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -81,10 +83,6 @@ if TYPE_CHECKING:
     _Tuning = FinetuneConfig
 else:
     _Tuning = _described(FinetuneConfig)
-
-
-FEWEST_VIEWS, MOST_VIEWS = 200, 1000
-"""Pictures of splats to learn from: in a short run, and in the longest."""
 
 
 @dataclass(frozen=True)
@@ -171,13 +169,6 @@ class TargetOptions:
             threads=threads,
             cache_bytes=self.cache_bytes,
         )
-
-
-def worthwhile_views(config: FinetuneConfig) -> int:
-    """Number of pictures of splats for so long a run: few are drawn sooner and seen more often, but a long
-    run learns them by heart."""
-    wanted = 60 * config.minutes if config.minutes is not None else (config.steps or 0) / 2
-    return round(min(max(wanted, FEWEST_VIEWS), MOST_VIEWS))
 
 
 @dataclass(frozen=True)

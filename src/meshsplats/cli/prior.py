@@ -36,10 +36,9 @@ from meshsplats.cli.finetune import (
     _say,
     _shown,
     check_run_files,
-    worthwhile_views,
 )
 from meshsplats.dataset import Dataset
-from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
+from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, worthwhile_views
 from meshsplats.finetuning.memory import available_memory, check_memory, readable
 from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh

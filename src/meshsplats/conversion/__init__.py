@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.conversion.detail import LEVELS, choose_levels, shown_pixels
+from meshsplats.conversion.detail import LEVELS, choose_levels, splat_pixels
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import FILTER_PX2, Views, pixel_sizes, widen
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
@@ -63,11 +63,6 @@ def convert(
         ValueError: an option out of range, options that contradict each other, or nothing left to draw.
     """
     chosen = make_options(options).resolved(preset, has_cameras=bool(cameras))
-    shown = None
-    if chosen.detail == "cameras":
-        options |= {"mode": "flat", "detail": "even"}
-        even = convert(cloud, preset=preset, cameras=cameras, up=up, **options)
-        shown = shown_pixels(even, len(cloud), cameras or ())
     direction = guess_up(None, cameras) if up is None else unit_up(up)
     rows = _worth_drawing(cloud, chosen)
     part = cloud
@@ -97,31 +92,38 @@ def convert(
         # Splats without area last of all.
         importance[~keep] = -1
         keep &= most_important(importance, triangles, chosen.max_splats, chosen.max_triangles)
-    if shown is not None:
-        choice[keep] = choose_levels(shown[rows[keep]], int(keep.sum()) * triangles)
-        shapes = [_ellipse(sides, rings, chosen) for sides, rings in LEVELS]
-    if chosen.compensation:
-        opacity = opacity * _missing(areas, shadow, shapes, choice) ** np.float32(chosen.compensation)
 
     colors = part.colors
     if chosen.colors == "cameras" and part.sh_degree > 0 and views is not None:
         colors = views.mean_colors(part.sh)
-    everything = bool(keep.all())
-    chosen_rows = np.flatnonzero(keep)
-    pick = (lambda array: array) if everything else (lambda array: np.take(array, chosen_rows, axis=0))
-    counts = np.array([len(shape.pattern.faces) for shape in shapes])
-    vertices, faces, rgba = build(
-        shapes,
-        pick(choice),
-        pick(part.means),
-        pick(part.quaternions),
-        pick(axes),
-        pick(sigma),
-        pick(colors),
-        pick(opacity),
-    )
-    owners = np.repeat(pick(rows), counts[pick(choice)])
-    return SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction)
+
+    def assembled(shapes: list[Shape], choice: np.ndarray, keep: np.ndarray) -> SplatMesh:
+        drawn = opacity
+        if chosen.compensation:
+            drawn = drawn * _missing(areas, shadow, shapes, choice) ** np.float32(chosen.compensation)
+        everything = bool(keep.all())
+        kept = np.flatnonzero(keep)
+        pick = (lambda array: array) if everything else (lambda array: np.take(array, kept, axis=0))
+        counts = np.array([len(shape.pattern.faces) for shape in shapes])
+        vertices, faces, rgba = build(
+            shapes,
+            pick(choice),
+            pick(part.means),
+            pick(part.quaternions),
+            pick(axes),
+            pick(sigma),
+            pick(colors),
+            pick(drawn),
+        )
+        owners = np.repeat(pick(rows), counts[pick(choice)])
+        return SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction)
+
+    mesh = assembled(shapes, choice, keep)
+    if chosen.detail == "cameras":
+        shown = splat_pixels(mesh, len(cloud), cameras or ())[rows[keep]]
+        choice[keep] = choose_levels(shown, len(mesh.faces))
+        mesh = assembled([_ellipse(sides, rings, chosen) for sides, rings in LEVELS], choice, keep)
+    return mesh
 
 
 def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:

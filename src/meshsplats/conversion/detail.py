@@ -12,6 +12,7 @@ import numpy as np
 
 from meshsplats.camera import Camera, a_few
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.recorded import shown_pixels
 
 LEVELS = ((4, 1), (6, 1), (8, 1), (8, 2), (12, 2), (12, 3), (16, 3))
 """Sides and rings of the ellipses to choose from, by their number of triangles."""
@@ -33,34 +34,17 @@ SIDE = 400
 """Greatest side of these pictures: it is ratios that count."""
 
 
-def shown_pixels(mesh: SplatMesh, splats: int, cameras: Sequence[Camera]) -> np.ndarray:
-    """(splats,) float64 pixels that ``cameras`` show of each splat, a picture: sums of blending weights.
-
-    A weight is the derivative of a picture of an attribute by that attribute.
-    """
-    from meshsplats.rendering.recorded import RecordedPicture
-
+def splat_pixels(mesh: SplatMesh, splats: int, cameras: Sequence[Camera]) -> np.ndarray:
+    """(splats,) float64 pixels that ``cameras`` show of each splat, a picture."""
     assert mesh.face_splat is not None
-    attribute = np.zeros((len(mesh.vertices), 1), np.float32)
-    weights = np.zeros_like(attribute)
-    positions, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
+    owner = np.zeros(len(mesh.vertices), np.int64)
+    owner[mesh.faces.ravel()] = np.repeat(mesh.face_splat, 3)
+    shown = np.zeros(splats)
     chosen = a_few(cameras, PICTURES, SIDE)
     for camera in chosen:
-        picture = RecordedPicture(
-            mesh.vertices, mesh.faces, mesh.colors, attribute, camera, face_splat=mesh.face_splat
-        )
-        h, w = picture.alpha.shape
-        picture.back(
-            np.zeros((h, w, 3), np.float32),
-            None,
-            np.ones((h, w, 1), np.float32),
-            vertices=positions,
-            colors=colors,
-            vertex_attributes=weights,
-        )
-    owner = np.zeros(len(weights), np.int64)
-    owner[mesh.faces.ravel()] = np.repeat(mesh.face_splat, 3)
-    return np.bincount(owner, weights[:, 0], splats) / len(chosen)
+        pixels = shown_pixels(mesh.vertices, mesh.faces, mesh.colors, camera, face_splat=mesh.face_splat)
+        shown += np.bincount(owner, pixels, splats)
+    return shown / len(chosen)
 
 
 def choose_levels(shown: np.ndarray, budget: int) -> np.ndarray:

@@ -3,12 +3,19 @@
 Running needs the extra ``finetune``; importing this package does not.
 """
 
-from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config
+from meshsplats.finetuning.config import (
+    FEWEST_VIEWS,
+    PRESETS,
+    FinetuneConfig,
+    make_config,
+    worthwhile_views,
+)
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.run import Progress, RunOptions, finetune
 from meshsplats.finetuning.start import starting_mesh
 
 __all__ = [
+    "FEWEST_VIEWS",
     "PRESETS",
     "FinetuneConfig",
     "Interrupted",
@@ -17,4 +24,5 @@ __all__ = [
     "finetune",
     "make_config",
     "starting_mesh",
+    "worthwhile_views",
 ]

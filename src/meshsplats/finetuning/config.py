@@ -13,6 +13,9 @@ Backdrop = Literal["random", "white", "black"]
 BACKDROPS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
 
+FEWEST_VIEWS, MOST_VIEWS = 200, 1000
+"""Pictures of splats to learn from: in a short run, and in the longest."""
+
 
 @dataclass(frozen=True)
 class FinetuneConfig:
@@ -205,6 +208,13 @@ def make_config(preset: str = "default", **changes: Any) -> FinetuneConfig:
     if any(changes.get(name) is not None for name in LENGTHS):
         changes = {name: None for name in LENGTHS} | changes
     return replace(PRESETS[preset], **changes)
+
+
+def worthwhile_views(config: FinetuneConfig) -> int:
+    """Number of pictures of splats for so long a run: few are drawn sooner and seen more often, but a long
+    run learns them by heart."""
+    wanted = 60 * config.minutes if config.minutes is not None else (config.steps or 0) / 2
+    return round(min(max(wanted, FEWEST_VIEWS), MOST_VIEWS))
 
 
 def rates(config: FinetuneConfig, step: int, fraction: float) -> tuple[float, float]:

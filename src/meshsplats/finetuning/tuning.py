@@ -17,6 +17,7 @@ from meshsplats.finetuning.losses import photometric_loss
 from meshsplats.finetuning.state import GAIN, OFFSET, State
 from meshsplats.mesh import splat_starts
 from meshsplats.rendering.autograd import rasterize
+from meshsplats.rendering.recorded import shown_pixels
 
 try:
     import torch
@@ -166,32 +167,23 @@ def relocate(state: State, views: Sequence[View]) -> int:
 
 
 def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """What ``views`` show of each vertex: (v,) float32 pixels, (v,) bool whether any has it before it.
-
-    Pixels are sums of blending weights: the derivative of a picture of an attribute by that attribute.
-    """
-    shown = np.zeros(len(state.mesh.vertices), np.float32)
+    """What ``views`` show of each vertex: (v,) float32 pixels, (v,) bool whether any has it before it."""
+    vertices, colors = state.vertices.detach().numpy(), state.colors.detach().numpy()
+    shown = np.zeros(len(vertices), np.float32)
     before = np.zeros(len(shown), bool)
-    vertices, colors = state.vertices.detach(), state.colors.detach()
     for view in views:
-        columns = torch.cat([colors, torch.zeros(len(colors), 1)], 1).requires_grad_(True)
-        raster = rasterize(
+        shown += shown_pixels(
             vertices,
             state.mesh.faces,
-            columns,
+            colors,
             view.camera,
+            mask=view.mask,
             samples=state.config.samples,
             face_splat=state.mesh.face_splat,
             depth_group=state.mesh.depth_group,
             threads=state.threads,
         )
-        weight = raster.attributes[..., 0]
-        if view.mask is not None:
-            weight = weight[torch.from_numpy(view.mask)]
-        weight.sum().backward()
-        assert columns.grad is not None
-        shown += columns.grad[:, 4].numpy()
-        before |= in_view(vertices.numpy(), view)
+        before |= in_view(vertices, view)
     return shown, before
 
 

@@ -114,3 +114,44 @@ class RecordedPicture:
             None if attributes is None else core.pointer(vertex_attributes),
         )
         core.call("ms_rasterize_back", self._mesh, self._camera, self._options, self._log, given, out)
+
+
+def shown_pixels(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    camera: Camera,
+    *,
+    mask: np.ndarray | None = None,
+    samples: int = 1,
+    face_splat: np.ndarray | None = None,
+    depth_group: np.ndarray | None = None,
+    threads: int | None = None,
+) -> np.ndarray:
+    """(v,) float32 pixels that a picture shows of each vertex: sums of its blending weights, of pixels where
+    ``mask``, (h, w) bool.
+
+    A weight is the derivative of a picture of an attribute by that attribute.
+    """
+    weights = np.zeros((len(vertices), 1), np.float32)
+    picture = RecordedPicture(
+        vertices,
+        faces,
+        colors,
+        np.zeros_like(weights),
+        camera,
+        face_splat=face_splat,
+        depth_group=depth_group,
+        samples=samples,
+        threads=threads,
+    )
+    counted = np.ones_like(picture.attributes) if mask is None else mask[..., None].astype(np.float32)
+    picture.back(
+        np.zeros_like(picture.color),
+        None,
+        counted,
+        vertices=np.zeros_like(vertices),
+        colors=np.zeros_like(colors),
+        vertex_attributes=weights,
+    )
+    return weights[:, 0]
