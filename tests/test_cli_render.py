@@ -59,10 +59,18 @@ def test_one_picture_of_a_mesh(triangle, tmp_path, capsys):
     assert run(triangle, "-o", out, "--cameras", tmp_path / "one.json", "--background", "0,0,1") == 0
     np.testing.assert_array_equal(picture(out), np.full((8, 12, 3), (128, 0, 128)))
     assert "1 picture of 12 x 8" in capsys.readouterr().out
-    config = json.loads((tmp_path / "a.config.json").read_text())
+    config = json.loads((tmp_path / "a.png.config.json").read_text())
     assert config["command"] == "render"
     assert config["options"]["background"] == "0,0,1"
-    assert len(load_cameras(tmp_path / "a.cameras.json")) == 1
+    assert len(load_cameras(tmp_path / "a.png.cameras.json")) == 1
+
+
+def test_a_picture_beside_the_files_of_its_mesh(triangle, tmp_path):
+    """A mesh has its own configuration beside it, which is neither in the way nor lost."""
+    ours = tmp_path / "triangle.config.json"
+    ours.write_text("{}")
+    assert run(triangle, "-o", tmp_path / "triangle.png", "--cameras", tmp_path / "one.json") == 0
+    assert ours.read_text() == "{}"
 
 
 def test_linear_meshes_are_blended_in_linear_light_and_encoded(triangle, tmp_path):
@@ -85,7 +93,7 @@ def test_transparent_and_depth(triangle, tmp_path):
     depth = np.load(tmp_path / "a.depth.npy", allow_pickle=False)
     np.testing.assert_allclose(depth, np.full((16, 24), 4.0), rtol=1e-5)
     assert run(triangle, "-o", out, *cameras, "--transparent", "--depth", "png", "--force") == 0
-    unit = json.loads((tmp_path / "a.config.json").read_text())["depth_unit"]
+    unit = json.loads((tmp_path / "a.png.config.json").read_text())["depth_unit"]
     np.testing.assert_allclose(picture(tmp_path / "a.depth.png") * unit, np.full((16, 24), 4.0), atol=unit)
 
 
@@ -117,7 +125,7 @@ def test_splats_become_a_mesh_unless_asked(splats, tmp_path):
     from meshsplats.conversion import convert
 
     assert run(splats, "-o", tmp_path / "a.png", "--width", "20", "--samples", "1") == 0
-    (camera,) = load_cameras(tmp_path / "a.cameras.json")
+    (camera,) = load_cameras(tmp_path / "a.png.cameras.json")
     drawn = render(convert(load_gaussians(splats)), camera)
     np.testing.assert_array_equal(picture(tmp_path / "a.png"), to_bytes(drawn.color))
 

@@ -26,6 +26,7 @@ from meshsplats.cli.common import (
     load_scene,
     parse_color,
     plural,
+    record_beside,
     size_of,
     view_names,
     write_json,
@@ -101,8 +102,10 @@ class Blender:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
         pictures = self._pictures(suffix, len(cameras))
         blend = self.output if suffix == ".blend" else None
-        beside = self.output.with_suffix if suffix else lambda name: self.output / name.lstrip(".")
-        records = [beside(".cameras.json"), beside(".config.json")]
+        records = [
+            record_beside(self.output, kind) if suffix else self.output / f"{kind}.json"
+            for kind in ("cameras", "config")
+        ]
         check_outputs(
             [*pictures, *([blend] if blend else []), *records], self.force, None if suffix else self.output
         )

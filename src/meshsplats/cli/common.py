@@ -255,6 +255,12 @@ def check_outputs(paths: Sequence[Path], force: bool, folder: Path | None = None
             raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
 
 
+def record_beside(output: Path, kind: str) -> Path:
+    """Name of the record ``kind`` of a single picture or scene: with all of its own name, so that
+    ``mesh.png`` and ``mesh.glb`` can lie side by side."""
+    return output.with_name(f"{output.name}.{kind}.json")
+
+
 def write_json(path: Path, content: Any) -> None:
     """Writes ``content`` whole or not at all; infinities and NaN, which JSON lacks, are a ValueError."""
     from meshsplats.formats.atomic import atomic_path

@@ -24,6 +24,7 @@ from meshsplats.cli.common import (
     load_scene,
     parse_color,
     plural,
+    record_beside,
     size_of,
     track,
     view_names,
@@ -127,9 +128,7 @@ class Render:
         out = self.output
         if single:
             depths = [out.with_suffix(f".depth.{self.depth}")] if self.depth != "none" else []
-            return _Files(
-                [out], depths, None, out.with_suffix(".cameras.json"), out.with_suffix(".config.json")
-            )
+            return _Files([out], depths, None, record_beside(out, "cameras"), record_beside(out, "config"))
         pictures = [out / name for name in view_names(count)]
         depths = (
             [out / name for name in view_names(count, "depth", f".{self.depth}")]
