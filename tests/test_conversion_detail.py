@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from meshsplats import GaussianCloud, convert, render
 from meshsplats.camera import look_at
-from meshsplats.conversion.detail import LEAST, LEVELS, TRIANGLES, choose_levels, splat_pixels
+from meshsplats.conversion.detail import HIDDEN, LEAST, LEVELS, LOOKED_AT, TRIANGLES, choose_levels, look
 
 shares = st.lists(st.floats(0, 1e4), min_size=1, max_size=40).map(np.array)
 
@@ -36,7 +36,7 @@ def cameras(count: int = 3) -> list:
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
-@given(shares, st.integers(4, 90), st.floats(1e-3, 1e3))
+@given(shares, st.integers(3, 90), st.floats(1e-3, 1e3))
 def test_levels(shown, mean, factor):
     """Within the budget, and not wasteful; who shows more has no less; only ratios count."""
     budget = mean * len(shown)
@@ -55,13 +55,15 @@ def test_levels(shown, mean, factor):
 
 
 def test_levels_of_a_hand_worked_case():
-    """Of 1 and 100 pixels, 16 triangles: 4 and 8 (the step to 24 is too dear); 28: 4 and 24."""
+    """Of 1 and 100 pixels, the second climbs to 8 (5 more), 24 (16 more) and 36, before the first has 4."""
     shown = np.array([1.0, 100.0])
-    assert TRIANGLES[choose_levels(shown, 16)].tolist() == [4, 8]
-    assert TRIANGLES[choose_levels(shown, 28)].tolist() == [4, 24]
-    assert TRIANGLES[choose_levels(shown, 8)].tolist() == [4, 4]
-    with pytest.raises(ValueError, match="2 splats need at least 8 triangles, not 7"):
-        choose_levels(shown, 7)
+    assert TRIANGLES[choose_levels(shown, 26)].tolist() == [3, 8]
+    assert TRIANGLES[choose_levels(shown, 27)].tolist() == [3, 24]
+    assert TRIANGLES[choose_levels(shown, 39)].tolist() == [3, 36]
+    assert TRIANGLES[choose_levels(shown, 40)].tolist() == [4, 36]
+    assert TRIANGLES[choose_levels(shown, 6)].tolist() == [3, 3]
+    with pytest.raises(ValueError, match="2 splats need at least 6 triangles, not 5"):
+        choose_levels(shown, 5)
 
 
 def test_shown_pixels_are_the_opacity_of_the_picture():
@@ -69,26 +71,53 @@ def test_shown_pixels_are_the_opacity_of_the_picture():
     cloud = scene(0)
     mesh = convert(cloud, mode="flat", footprint="none")
     views = cameras()
-    shown = splat_pixels(mesh, len(cloud), views)
+    shown = look(mesh, cloud.means, views).pixels
     alpha = np.mean([render(mesh, view, background=(0, 0, 0)).alpha.sum(dtype=np.float64) for view in views])
     np.testing.assert_allclose(shown.sum(), alpha, rtol=1e-4)
     one = mesh.keep_faces(mesh.face_splat == 7)
     alone = render(one, views[0], background=(0, 0, 0)).alpha.sum(dtype=np.float64)
-    np.testing.assert_allclose(splat_pixels(one, len(cloud), views[:1])[7], alone, rtol=1e-4)
-    assert (np.delete(splat_pixels(one, len(cloud), views[:1]), 7) == 0).all()
+    only = look(one, cloud.means, views[:1]).pixels
+    np.testing.assert_allclose(only[7], alone, rtol=1e-4)
+    assert (np.delete(only, 7) == 0).all()
 
 
-def test_only_ratios_of_pictures_count():
-    """Cameras of twelve times the size: their pictures are looked at smaller."""
+def test_pixels_are_those_of_the_camera():
+    """Cameras of twelve times the size: their pictures are looked at smaller, and show 144 times as many
+    pixels."""
     cloud = scene(1)
     mesh = convert(cloud, mode="flat", footprint="none")
     small = [replace(view) for view in cameras()]
     large = [view.scaled(12) for view in small]
-    a, b = (splat_pixels(mesh, len(cloud), views) for views in (small, large))
-    assert 0.5 * (400 / 64) ** 2 < b.sum() / a.sum() < 2 * (400 / 64) ** 2
+    a, b = (look(mesh, cloud.means, views).pixels for views in (small, large))
+    np.testing.assert_allclose(b.sum() / a.sum(), 144, rtol=0.02)
 
 
-@pytest.mark.parametrize("mean", [4, 8, 20])
+def test_what_is_hidden_gets_no_triangles():
+    """Behind an opaque wall, out of all pictures, and before too few cameras to tell."""
+    wall = GaussianCloud(
+        np.array([[0, 0, 0], [0, 0, 3.0], [0, 40, 0], [0.3, 0, -1]]),
+        np.array([[1.0, 0, 0, 0]] * 4),
+        np.array([[9, 9, 0.01], [0.1, 0.1, 0.1], [0.1, 0.1, 0.1], [0.1, 0.1, 0.1]]),
+        np.array([1, 1, 1, 0.5]),
+        np.zeros((4, 1, 3)),
+    )
+    views = [
+        look_at((x, 0, -6), (x, 0, 0), up=(0, -1, 0), width=40, height=40, fov=40)
+        for x in np.linspace(-0.5, 0.5, LOOKED_AT)
+    ]
+    mesh = convert(wall, cameras=views, detail="cameras", footprint="none")
+    assert np.unique(mesh.face_splat).tolist() == [0, 2, 3]
+    assert len(mesh.faces) <= 8 * 4
+    assert (mesh.face_splat == 0).sum() > 8
+    assert (mesh.face_splat == 2).sum() == LEAST
+    even = convert(wall, mode="flat", footprint="none")
+    assert look(even, wall.means, views).hidden.tolist() == [False, True, False, False]
+    assert look(even, wall.means, views[1:]).hidden.tolist() == [False] * 4
+    pixels = look(even, wall.means, views).pixels
+    assert pixels[1] < HIDDEN < pixels[3]
+
+
+@pytest.mark.parametrize("mean", [3, 8, 20])
 def test_as_many_triangles_in_all(mean):
     cloud, views = scene(2), cameras()
     mesh = convert(cloud, cameras=views, detail="cameras", no_triag=mean)
@@ -97,10 +126,10 @@ def test_as_many_triangles_in_all(mean):
     assert len(mesh.faces) > 0.9 * len(even.faces)
     counts = np.bincount(mesh.face_splat, minlength=len(cloud))
     assert set(counts) <= set(TRIANGLES.tolist())
-    if mean == 4:
+    if mean == LEAST:
         assert (counts == LEAST).all()
         return
-    shown = splat_pixels(even, len(cloud), views)
+    shown = look(even, cloud.means, views).pixels
     assert (np.diff(counts[np.argsort(shown)]) >= 0).all()
 
 

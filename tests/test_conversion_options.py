@@ -154,7 +154,6 @@ REFUSED = [
     (dict(detail="finest"), "detail must be one of even, cameras"),
     (dict(detail="cameras", mode="3d", cameras=[CAMERA]), "mode '3d'"),
     (dict(detail="cameras", rings=2, cameras=[CAMERA]), "rings 2"),
-    (dict(detail="cameras", no_triag=3, cameras=[CAMERA]), "no_triag of at least 4"),
     (dict(min_opacity=2), "min_opacity"),
     (dict(crop=(0, 0, 0, 1, 1)), "crop"),
     (dict(crop=(0, 0, 0, -1, 1, 1)), "each minimum <= its maximum"),

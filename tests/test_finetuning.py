@@ -28,7 +28,6 @@ from meshsplats.finetuning.state import State  # noqa: E402
 from meshsplats.finetuning.tuning import (  # noqa: E402
     encoded,
     importance,
-    in_view,
     kept_faces,
     make_step,
     relocate,
@@ -276,9 +275,9 @@ def test_a_step_changes_only_what_its_view_shows(scene):
     make_step(state, dataset.train, 0, 0.0)
     moved = (state.result().colors != mesh.colors).any(axis=1)
     assert 0.05 < moved.mean() < 1
-    assert in_view(mesh.vertices[moved], near).mean() > 0.8
+    assert near.camera.sees(mesh.vertices[moved]).mean() > 0.8
     far = np.full((1, 3), 1e3, np.float32)
-    assert not in_view(far, near).any()
+    assert not near.camera.sees(far).any()
 
 
 def test_positions_move_by_the_size_of_their_splats(scene):

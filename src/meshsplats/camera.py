@@ -111,6 +111,15 @@ class Camera:
         """The same view on a picture no side of which is longer than ``side`` pixels; never a larger one."""
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        """(n,) bool: points (n, 3) in front of the camera that project into the picture."""
+        matrix = self.world_to_camera.astype(np.float32)
+        x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).T
+        front = z > self.near
+        depth = np.where(front, z, 1)
+        u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
+        return front & (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
+
 
 def a_few(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:
     """Every k-th of ``cameras``, at most ``most``, with pictures of at most ``side`` pixels: enough to learn

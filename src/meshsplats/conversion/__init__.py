@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.conversion.detail import LEVELS, choose_levels, splat_pixels
+from meshsplats.conversion.detail import LEVELS, choose_levels, look
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import FILTER_PX2, Views, pixel_sizes, widen
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
@@ -120,8 +120,10 @@ def convert(
 
     mesh = assembled(shapes, choice, keep)
     if chosen.detail == "cameras":
-        shown = splat_pixels(mesh, len(cloud), cameras or ())[rows[keep]]
-        choice[keep] = choose_levels(shown, len(mesh.faces))
+        shown = look(mesh, cloud.means, cameras or ())
+        visible = keep & ~shown.hidden[rows]
+        keep = visible if visible.any() else keep
+        choice[keep] = choose_levels(shown.pixels[rows[keep]], len(mesh.faces))
         mesh = assembled([_ellipse(sides, rings, chosen) for sides, rings in LEVELS], choice, keep)
     return mesh
 

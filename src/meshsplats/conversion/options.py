@@ -38,8 +38,9 @@ class ConversionOptions:
     draw 3 * no_triag triangles an ellipse. Default and paper: 1."""
     detail: Detail | None = None
     """even: as many triangles for every splat. cameras, for mode 'flat', which it implies, with one ring:
-    from 4 to 80, in the mean ``no_triag``; more for splats that show large from the cameras given, fewer for
-    those that show little. Fine-tuning does so. Default and paper: even."""
+    from 3 to 80, in the mean ``no_triag``; more for splats that show large from the cameras given, fewer for
+    those that show little, none for those that hide inside a solid. Fine-tuning does so. Default and paper:
+    even."""
     flat_below: float | None = None
     """crossed: a splat whose smallest standard deviation (with its footprint) is less than this fraction of
     the middle one is drawn as one ellipse of twice as many triangles, 0 to 1."""
@@ -126,10 +127,10 @@ class ConversionOptions:
         if self.detail == "cameras":
             if not has_cameras:
                 raise ValueError("detail='cameras' needs cameras: give some, or choose even")
-            if self.mode != "flat" or self.rings != 1 or self.no_triag < 4:  # type: ignore[operator]
+            if self.mode != "flat" or self.rings != 1:
                 raise ValueError(
-                    "detail='cameras' needs mode 'flat', rings 1 and no_triag of at least 4, got mode"
-                    f" {self.mode!r}, rings {self.rings} and no_triag {self.no_triag}"
+                    f"detail='cameras' needs mode 'flat' and rings 1, got mode {self.mode!r} and"
+                    f" rings {self.rings}"
                 )
         if self.footprint == "cameras" and not has_cameras:
             raise ValueError(

@@ -21,13 +21,12 @@ def starting_mesh(
     converted, but cost more time in a step and end lower.
     """
     from meshsplats.conversion import convert
-    from meshsplats.conversion.detail import LEAST
 
     if preset != "default":
         return convert(cloud, preset="paper", cameras=cameras, **options)
     if options.get("mode") is None and options.get("flat_below") is None:
         options["mode"] = "flat"
     one_ring = options.get("mode") == "flat" and options.get("rings") in (None, 1)
-    if options.get("detail") is None and one_ring and (options.get("no_triag") or 8) >= LEAST:
+    if options.get("detail") is None and one_ring:
         options["detail"] = "cameras"
     return convert(cloud, preset="default", cameras=cameras, **options)

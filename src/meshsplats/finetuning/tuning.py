@@ -162,7 +162,7 @@ def relocate(state: State, views: Sequence[View]) -> int:
     positions = state.vertices.detach().numpy()
     looked_at = np.zeros(len(positions), bool)
     for view in evenly(views, IMPORTANCE_VIEWS):
-        looked_at |= in_view(positions, view)
+        looked_at |= view.camera.sees(positions)
     return state.relocate(looked_at)
 
 
@@ -183,16 +183,5 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
             depth_group=state.mesh.depth_group,
             threads=state.threads,
         )
-        before |= in_view(vertices, view)
+        before |= view.camera.sees(vertices)
     return shown, before
-
-
-def in_view(points: np.ndarray, view: View) -> np.ndarray:
-    """(v,) bool: points (v, 3) that project into the view's picture."""
-    camera = view.camera
-    matrix = camera.world_to_camera.astype(np.float32)
-    x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).T
-    front = z > camera.near
-    depth = np.where(front, z, 1)
-    u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-    return front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
