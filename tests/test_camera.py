@@ -352,3 +352,13 @@ def test_standard_cameras():
     assert len(cameras) == 8
     np.testing.assert_allclose(distance, 2.3 * bounds.radius, rtol=0.03)
     np.testing.assert_allclose(guess_up(None, cameras), (0, -1, 0), atol=1e-6)
+
+
+def test_sees_what_projects_into_the_picture():
+    """Focal length 10, 40 x 20 pixels, principal point (15, 10), near 1: at depth 2, x from -3 to 5 and y
+    from -2 to 2."""
+    camera = Camera(np.eye(4), 10, 10, 15, 10, 40, 20, near=1)
+    inside = [[-2.99, 0, 2], [4.99, 0, 2], [0, -1.99, 2], [0, 1.99, 2], [0, 0, 1.01]]
+    outside = [[-3.01, 0, 2], [5.01, 0, 2], [0, -2.01, 2], [0, 2.01, 2], [0, 0, 0.99], [0, 0, -2], [0, 0, 0]]
+    assert camera.sees(np.array(inside)).all()
+    assert not camera.sees(np.array(outside)).any()

@@ -258,12 +258,16 @@ def test_every_epoch_shows_every_view_once_in_another_order():
 def test_backgrounds_are_random_only_where_alpha_is_known(scene):
     _, dataset, _ = scene
     drawn, photo = dataset.train[0], View(dataset.train[0].camera, Picture(dataset.train[0].image))
-    random, white = make_config(), make_config(background="white")
+    random, mixed, white = (make_config(background=name) for name in ("random", "mixed", "white"))
     colors = {target_of(drawn, random, step).background for step in range(5)}
     assert len(colors) == 5
     assert target_of(drawn, random, 3).background == target_of(drawn, random, 3).background
     assert target_of(photo, random, 3).background == (1, 1, 1)
     assert target_of(drawn, white, 3).background == (1, 1, 1)
+    on_black = View(drawn.camera, drawn.picture, (0, 0, 0))
+    for step in range(6):
+        wanted = target_of(drawn, random, step).background if step % 2 else (0, 0, 0)
+        assert target_of(on_black, mixed, step).background == wanted
     target = target_of(drawn, random, 3)
     assert np.allclose(target.color.numpy(), drawn.picture.over(target.background))
 

@@ -104,7 +104,7 @@ def test_long_runs_move_positions_less_and_end_lower():
         ({"beta2": 1.0}, "beta2"),
         ({"steps": 2.5}, "steps must be a whole number"),
         ({"steps": 3, "minutes": 1}, "steps and minutes"),
-        ({"background": "grey"}, "background must be one of random, white, black"),
+        ({"background": "grey"}, "background must be one of mixed, random, white, black"),
         ({"blending": "srgb"}, "blending must be one of"),
         ({"position_unit": "pixel"}, "position_unit must be one of"),
         ({"exposure": 1}, "exposure must be True or False"),

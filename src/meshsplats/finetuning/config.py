@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
 
 Unit = Literal["splat", "scene"]
-Backdrop = Literal["random", "white", "black"]
+Backdrop = Literal["mixed", "random", "white", "black"]
 BACKDROPS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
 
@@ -61,9 +61,10 @@ class FinetuneConfig:
     """Share of SSIM, 0 to 1."""
     l2_weight: float = 50.0
     """Weight of the mean square difference, added to the others."""
-    background: Backdrop = "random"
+    background: Backdrop = "mixed"
     """Behind pictures that have alpha; random: another colour in every step, so that what should be empty
-    becomes so. Photographs without alpha are drawn on the data set's own background."""
+    becomes so; mixed: that in every second step, and in the others the data set's own background, on which
+    pictures are shown and compared. Photographs without alpha are drawn on the latter."""
     exposure: bool = False
     """Photographs: fit a gain and an offset a channel for each training picture, so that changes of light
     between them are not painted into the mesh. Their means stay 1 and 0."""

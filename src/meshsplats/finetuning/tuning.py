@@ -57,9 +57,10 @@ def target_of(view: View, config: FinetuneConfig, step: int) -> Target:
     picture = view.picture
     background = view.background
     if picture.alpha is not None:
-        background = BACKDROPS.get(config.background) or tuple(
-            np.random.default_rng([config.seed, step, 1]).random(3).astype(np.float32).tolist()
-        )
+        background = BACKDROPS.get(config.background, background)
+        if config.background == "random" or (config.background == "mixed" and step % 2):
+            drawn = np.random.default_rng([config.seed, step, 1]).random(3)
+            background = tuple(drawn.astype(np.float32).tolist())
     mask = None if picture.mask is None else torch.from_numpy(picture.mask)
     return Target(torch.from_numpy(picture.over(background)), mask, background)
 
