@@ -1,4 +1,4 @@
-"""Triangles by what cameras show: as many in all, more where more shows."""
+"""Triangles by what cameras show: as many in all, more where more shows and is wrong."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshsplats import GaussianCloud, convert, render
+from meshsplats import GaussianCloud, SplatMesh, convert, render, render_splats
 from meshsplats.camera import look_at
 from meshsplats.conversion.detail import HIDDEN, LEAST, LEVELS, LOOKED_AT, TRIANGLES, choose_levels, look
 
@@ -71,14 +71,33 @@ def test_shown_pixels_are_the_opacity_of_the_picture():
     cloud = scene(0)
     mesh = convert(cloud, mode="flat", footprint="none")
     views = cameras()
-    shown = look(mesh, cloud.means, views).pixels
+    shown = look(mesh, cloud.means, cloud, views).pixels
     alpha = np.mean([render(mesh, view, background=(0, 0, 0)).alpha.sum(dtype=np.float64) for view in views])
     np.testing.assert_allclose(shown.sum(), alpha, rtol=1e-4)
     one = mesh.keep_faces(mesh.face_splat == 7)
     alone = render(one, views[0], background=(0, 0, 0)).alpha.sum(dtype=np.float64)
-    only = look(one, cloud.means, views[:1]).pixels
+    only = look(one, cloud.means, cloud, views[:1]).pixels
     np.testing.assert_allclose(only[7], alone, rtol=1e-4)
     assert (np.delete(only, 7) == 0).all()
+
+
+def test_error_is_that_of_the_picture():
+    """Of a mesh that fills every pixel, the squared differences of colour and opacity add up; a mesh that is
+    right has none, and where nothing is drawn there is nothing to refine."""
+    cloud = scene(5, 1)
+    sheet = SplatMesh(
+        np.array([[-90, -90, 0], [90, -90, 0], [0, 90, 0.0]]),
+        np.array([[0, 1, 2]]),
+        np.array([[0.2, 0.5, 0.4, 1]] * 3),
+        face_splat=np.zeros(1, np.int32),
+    )
+    (view,) = cameras(1)
+    truth = render_splats(cloud, view, background=(0, 0, 0))
+    square = np.square(truth.color - [0.2, 0.5, 0.4]).sum() + np.square(1 - truth.alpha).sum()
+    seen = look(sheet, cloud.means, cloud, [view])
+    np.testing.assert_allclose(seen.error, square, rtol=1e-4)
+    np.testing.assert_allclose(seen.pixels, 64 * 48, rtol=1e-4)
+    np.testing.assert_allclose(seen.need, np.sqrt(square * 64 * 48), rtol=1e-4)
 
 
 def test_pixels_are_those_of_the_camera():
@@ -88,7 +107,7 @@ def test_pixels_are_those_of_the_camera():
     mesh = convert(cloud, mode="flat", footprint="none")
     small = [replace(view) for view in cameras()]
     large = [view.scaled(12) for view in small]
-    a, b = (look(mesh, cloud.means, views).pixels for views in (small, large))
+    a, b = (look(mesh, cloud.means, cloud, views).pixels for views in (small, large))
     np.testing.assert_allclose(b.sum() / a.sum(), 144, rtol=0.02)
 
 
@@ -111,9 +130,9 @@ def test_what_is_hidden_gets_no_triangles():
     assert (mesh.face_splat == 0).sum() > 8
     assert (mesh.face_splat == 2).sum() == LEAST
     even = convert(wall, mode="flat", footprint="none")
-    assert look(even, wall.means, views).hidden.tolist() == [False, True, False, False]
-    assert look(even, wall.means, views[1:]).hidden.tolist() == [False] * 4
-    pixels = look(even, wall.means, views).pixels
+    assert look(even, wall.means, wall, views).hidden.tolist() == [False, True, False, False]
+    assert look(even, wall.means, wall, views[1:]).hidden.tolist() == [False] * 4
+    pixels = look(even, wall.means, wall, views).pixels
     assert pixels[1] < HIDDEN < pixels[3]
 
 
@@ -129,8 +148,8 @@ def test_as_many_triangles_in_all(mean):
     if mean == LEAST:
         assert (counts == LEAST).all()
         return
-    shown = look(even, cloud.means, views).pixels
-    assert (np.diff(counts[np.argsort(shown)]) >= 0).all()
+    need = look(even, cloud.means, cloud, views).need
+    assert (np.diff(counts[np.argsort(need)]) >= 0).all()
 
 
 def test_a_splat_has_the_fan_of_its_level():

@@ -120,10 +120,10 @@ def convert(
 
     mesh = assembled(shapes, choice, keep)
     if chosen.detail == "cameras":
-        shown = look(mesh, cloud.means, cameras or ())
-        visible = keep & ~shown.hidden[rows]
+        seen = look(mesh, cloud.means, part, cameras or ())
+        visible = keep & ~seen.hidden[rows]
         keep = visible if visible.any() else keep
-        choice[keep] = choose_levels(shown.pixels[rows[keep]], len(mesh.faces))
+        choice[keep] = choose_levels(seen.need[rows[keep]], len(mesh.faces))
         mesh = assembled([_ellipse(sides, rings, chosen) for sides, rings in LEVELS], choice, keep)
     return mesh
 

@@ -38,9 +38,9 @@ class ConversionOptions:
     draw 3 * no_triag triangles an ellipse. Default and paper: 1."""
     detail: Detail | None = None
     """even: as many triangles for every splat. cameras, for mode 'flat', which it implies, with one ring:
-    from 3 to 80, in the mean ``no_triag``; more for splats that show large from the cameras given, fewer for
-    those that show little, none for those that hide inside a solid. Fine-tuning does so. Default and paper:
-    even."""
+    from 3 to 80, in the mean ``no_triag``; more for splats that show large and wrong from the cameras given,
+    fewer for those that show little, none for those that hide inside a solid. Fine-tuning does so. Default
+    and paper: even."""
     flat_below: float | None = None
     """crossed: a splat whose smallest standard deviation (with its footprint) is less than this fraction of
     the middle one is drawn as one ellipse of twice as many triangles, 0 to 1."""

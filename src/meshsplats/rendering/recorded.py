@@ -115,6 +115,22 @@ class RecordedPicture:
         )
         core.call("ms_rasterize_back", self._mesh, self._camera, self._options, self._log, given, out)
 
+    def spread(self, values: np.ndarray) -> np.ndarray:
+        """(v, k) float32: for each vertex the sum of ``values`` (h, w, k) by the weights with which it is
+        blended into the pixels. A picture made with k attributes, of any values: a weight is the derivative
+        of the picture of an attribute by that attribute."""
+        mesh = self._mesh
+        sums = np.zeros((mesh.vertex_count, mesh.attribute_count), np.float32)
+        self.back(
+            np.zeros_like(self.color),
+            None,
+            np.ascontiguousarray(values, np.float32),
+            vertices=np.zeros((mesh.vertex_count, 3), np.float32),
+            colors=np.zeros((mesh.vertex_count, 4), np.float32),
+            vertex_attributes=sums,
+        )
+        return sums
+
 
 def shown_pixels(
     vertices: np.ndarray,
@@ -129,29 +145,16 @@ def shown_pixels(
     threads: int | None = None,
 ) -> np.ndarray:
     """(v,) float32 pixels that a picture shows of each vertex: sums of its blending weights, of pixels where
-    ``mask``, (h, w) bool.
-
-    A weight is the derivative of a picture of an attribute by that attribute.
-    """
-    weights = np.zeros((len(vertices), 1), np.float32)
+    ``mask``, (h, w) bool."""
     picture = RecordedPicture(
         vertices,
         faces,
         colors,
-        np.zeros_like(weights),
+        np.zeros((len(vertices), 1), np.float32),
         camera,
         face_splat=face_splat,
         depth_group=depth_group,
         samples=samples,
         threads=threads,
     )
-    counted = np.ones_like(picture.attributes) if mask is None else mask[..., None].astype(np.float32)
-    picture.back(
-        np.zeros_like(picture.color),
-        None,
-        counted,
-        vertices=np.zeros_like(vertices),
-        colors=np.zeros_like(colors),
-        vertex_attributes=weights,
-    )
-    return weights[:, 0]
+    return picture.spread(np.ones_like(picture.attributes) if mask is None else mask[..., None])[:, 0]
