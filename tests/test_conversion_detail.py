@@ -82,8 +82,7 @@ def test_shown_pixels_are_the_opacity_of_the_picture():
 
 
 def test_error_is_that_of_the_picture():
-    """Of a mesh that fills every pixel, the squared differences of colour and opacity add up; a mesh that is
-    right has none, and where nothing is drawn there is nothing to refine."""
+    """Of a mesh that fills every pixel, the squared differences of colour and opacity add up."""
     cloud = scene(5, 1)
     sheet = SplatMesh(
         np.array([[-90, -90, 0], [90, -90, 0], [0, 90, 0.0]]),
