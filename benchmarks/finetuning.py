@@ -4,7 +4,9 @@
     python benchmarks/finetuning.py --data ../shared/data --scenes lego --presets default --minutes 5
 
 Splat files are judged at the cameras `DATA/cameras/*_mid.json` on white at degree 0, at one sample a pixel;
-drawing the targets counts towards the time, judging does not. Photographs are judged on their held-out views.
+drawing the targets counts towards the time, judging does not. Photographs are judged on their held-out views:
+mean (median), then the same after a gain and an offset a channel are fitted to each picture. `--exposure` fits
+such to the training pictures, too.
 `--clock processor` counts the processor time of all threads, divided by --processors, instead of the clock on
 the wall: for machines that do other work at the same time.
 """
@@ -63,6 +65,7 @@ def main() -> None:
     parser.add_argument("--processors", type=int, default=2, help="that processor time is divided by")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--sh-degree", type=int, default=0, help="of targets drawn from splats")
+    parser.add_argument("--exposure", action="store_true", help="fit gains and offsets of the photographs")
     parser.add_argument("--test-views", type=int, default=40, help="at most so many views to judge by")
     options = parser.parse_args()
     print("| scene | preset | triangles | steps | seconds | splats | converted | tuned |")
@@ -81,7 +84,7 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
         return (clock() - start) / share
 
     length = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
-    config = make_config(preset, **length)
+    config = make_config(preset, **length, exposure=bool(scene.photographs and options.exposure))
     start = clock()
     cloud = ms.load_gaussians(options.data / scene.splats)
     if scene.photographs:
@@ -106,14 +109,20 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
         tuned, steps = by_processor_time(mesh, data, config, options, seconds)
     used = seconds()
 
-    def psnr(**what) -> float:
-        # Of splats, the last is with all their spherical harmonics.
-        scores = evaluate(what.pop("mesh", None), judged, threads=options.threads, **what)
-        return scores.methods[-1].mean("psnr")
+    def psnr(mesh: ms.SplatMesh | None, splats: ms.GaussianCloud | None = None) -> str:
+        scores = evaluate(
+            mesh, judged, splats=splats, fit_exposure=bool(scene.photographs), threads=options.threads
+        )
+        method = scores.methods[-1]  # of splats, with all their spherical harmonics
+        if not scene.photographs:
+            return f"{method.mean('psnr'):.2f}"
+        columns = ("psnr", "psnr_exposure")
+        return ", ".join(f"{method.mean(column):.2f} ({method.median(column):.2f})" for column in columns)
 
-    splats = f"{psnr(splats=cloud):.2f}" if scene.photographs else ""
-    scores = f"{psnr(mesh=mesh):.2f} | {psnr(mesh=tuned):.2f}"
-    return f"| {name} | {preset} | {len(tuned.faces):,} | {steps} | {used:.0f} | {splats} | {scores} |"
+    splats = psnr(None, cloud) if scene.photographs else ""
+    label = f"{preset}, exposure" if config.exposure else preset
+    cells = (name, label, f"{len(tuned.faces):,}", steps, f"{used:.0f}", splats, psnr(mesh), psnr(tuned))
+    return f"| {' | '.join(map(str, cells))} |"
 
 
 def by_processor_time(mesh, data, config: FinetuneConfig, options, seconds) -> tuple[ms.SplatMesh, int]:
