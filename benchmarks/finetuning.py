@@ -5,8 +5,8 @@
 
 Splat files are judged at the cameras `DATA/cameras/*_mid.json` on white at degree 0, at one sample a pixel;
 drawing the targets counts towards the time, judging does not. Photographs are judged on their held-out views:
-mean (median), then the same after a gain and an offset a channel are fitted to each picture. `--exposure` fits
-such to the training pictures, too.
+mean (median), then the same after a gain and an offset a channel are fitted to each picture. `--exposure`
+fits such to the training pictures, too.
 `--clock processor` counts the processor time of all threads, divided by --processors, instead of the clock on
 the wall: for machines that do other work at the same time.
 """

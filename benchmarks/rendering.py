@@ -1,12 +1,15 @@
 """Speed and memory of the renderer, and of its way back, on random fans of 8 triangles.
 
     python benchmarks/rendering.py [--repeat 5] [--threads 1 2] [--scenes 160k 1M 4M]
+    python benchmarks/rendering.py --growth --threads 1
 
 Prints a Markdown table. render: a picture, exact at every pixel. log: the same, with a log to go back by.
 back: gradients of positions and colours from that of the picture. Medians of the clock in milliseconds;
 fragments blended a pixel, and a second by render; nanoseconds of log and back together for each fragment; the
 peak of the process's memory beyond what it held before, of render, and of log and back without the gradients
-(Linux). Each row runs in a process of its own.
+(Linux). Each row runs in a process of its own. --growth: one scene, then four times as many triangles of a
+quarter of the size, four times as many pixels, and four times as many layers (triangles of a quarter of the
+opacity).
 """
 
 from __future__ import annotations
@@ -33,6 +36,13 @@ SCENES = {
     "4M": (500_000, 0.006, 0.06, 800),
 }
 """Fans, their radius at depth 1, opacity, side of the picture in pixels."""
+
+GROWTH = {
+    "one": (31_250, 0.029, 0.05, 400),
+    "triangles": (125_000, 0.0145, 0.05, 400),
+    "pixels": (31_250, 0.029, 0.05, 800),
+    "layers": (125_000, 0.029, 0.0125, 400),
+}
 
 
 def random_fans(fans: int, radius: float, opacity: float, side: int) -> tuple[SplatMesh, Camera]:
@@ -80,7 +90,7 @@ def clocked(work: Callable[[], object], repeat: int) -> float:
 
 
 def run(name: str, threads: int, repeat: int) -> None:
-    mesh, camera = random_fans(*SCENES[name])
+    mesh, camera = random_fans(*(SCENES | GROWTH)[name])
     towards = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
 
@@ -122,6 +132,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--growth", action="store_true", help="how time grows, in place of --scenes")
     parser.add_argument("--row", nargs=2, metavar=("SCENE", "THREADS"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.row:
@@ -131,7 +142,7 @@ def main() -> None:
     heads = ["triangles", "picture", "threads", "fragments a pixel", "render", "log", "back", "log + back"]
     heads += ["M fragments a second", "ns a fragment", "MB, render", "MB, log + back"]
     print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
-    for name in args.scenes:
+    for name in GROWTH if args.growth else args.scenes:
         for threads in args.threads:
             call = [sys.executable, __file__, "--repeat", str(args.repeat), "--row", name, str(threads)]
             subprocess.run(call, check=True)

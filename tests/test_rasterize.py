@@ -6,6 +6,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -256,6 +257,25 @@ def test_same_bits_whatever_the_threads_and_the_log():
     assert digest(threads=1, seed=1) != expected
     for options in ({"threads": 2}, {"threads": 5}, {"log_bytes": 0}, {"log_bytes": 3000, "threads": 3}):
         assert digest(**options) == expected, options
+
+
+def test_calls_at_the_same_time_do_not_disturb_each_other():
+    """Meshes whose arrays are large enough to be kept for the next call, of several sizes."""
+
+    def digest_of(number: int) -> bytes:
+        rng = np.random.default_rng(number)
+        points = rng.normal(size=(3 * (1500 + 900 * number), 3)) * [1, 1, 0.5] + [0, 0, 2.5]
+        mesh = SplatMesh(points, np.arange(len(points)).reshape(-1, 3), rng.random((len(points), 4)) * 0.2)
+        total = hashlib.sha256()
+        for part in gradients(rasterize, torch.float32, mesh, [camera(64, 48)], extra=0, threads=2):
+            total.update(part.numpy().tobytes())
+        return total.digest()
+
+    numbers = list(range(5)) * 4
+    alone = [digest_of(number) for number in range(5)]
+    assert len(set(alone)) == 5
+    with ThreadPoolExecutor(5) as pool:
+        assert list(pool.map(digest_of, numbers)) == [alone[number] for number in numbers]
 
 
 @pytest.mark.parametrize("variant", core.VARIANTS)

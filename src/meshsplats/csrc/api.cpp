@@ -81,6 +81,7 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
         ms::GradientTile back;
         std::unique_ptr<PictureWorker> again;
         ms::PackedLog packed;
+        ms::Large<unsigned char> memory;  // of that
     };
     std::vector<std::unique_ptr<Worker>> workers(threads);
     auto run = [&](int64_t begin, int64_t end, ms::TileLists *lists) {
@@ -88,13 +89,13 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
             int count = 0;
             for (int64_t triangles = 0; count < WAVE && wave + count < end && (count < threads || triangles < wave_triangles); ++count) {
                 const ms::PackedLog *entries = log.find(wave + count);
-                triangles += entries ? (int64_t)entries->faces().size() : lists->length(wave + count);
+                triangles += entries ? (int64_t)entries->face_count() : lists->length(wave + count);
             }
             std::atomic<int> next{0};
             ms::on_threads(threads, [&](int thread) {
                 auto &worker = workers[thread];
                 if (!worker)
-                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}});
+                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}, {}});
                 for (int i; (i = next.fetch_add(1)) < count;) {
                     const int64_t tile = wave + i;
                     const ms::PackedLog *entries = log.find(tile);
@@ -104,7 +105,11 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
                             worker->again->blend().record();
                         }
                         draw_tile(grid, *worker->again, tile, lists->list(tile), lists->length(tile));
-                        worker->packed.pack(worker->again->blend().log(), *worker->again->blend().pieces());
+                        const ms::TileLog &drawn = worker->again->blend().log();
+                        ms::TilePieces &found = *worker->again->blend().pieces();
+                        worker->packed = ms::PackedLog(drawn, found);
+                        worker->memory.resize(worker->packed.bytes());
+                        worker->packed.pack(drawn, found, worker->memory.data());
                         entries = &worker->packed;
                     }
                     int x, y;

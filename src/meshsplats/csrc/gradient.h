@@ -39,21 +39,25 @@ class GradientTile {
   public:
     GradientTile(const Scene &scene, const MsOptions &options, const MsCamera &camera, const MsPictureGradient &given)
         : scene_(scene), mesh_(scene.mesh), grid_(scene.grid), options_(options), camera_(camera), given_(given),
-          extra_(given.attributes ? mesh_.attribute_count : 0), towards_extra_((size_t)extra_ * SAMPLES), corner_extras_(3 * extra_) {}
+          extra_(given.attributes ? mesh_.attribute_count : 0), towards_extra_((size_t)extra_ * SAMPLES), fragments_(CHUNK), lit_(CHUNK),
+          depths_(extra_ ? CHUNK : 0), at_(CHUNK), corner_extras_(3 * extra_) {}
 
     void run(int tile_x, int tile_y, const PackedLog &log, TileGradients &out) {
         area_ = TileArea(grid_, tile_x, tile_y);
         out.count = 0;
-        if (log.faces().empty() || !load_given()) return;
-        set_up(log.faces());
+        if (!log.face_count() || !load_given()) return;
+        set_up(log.faces(), log.face_count());
         for (int block = 0; block < BLOCKS; ++block) {
-            log.unpack(block, entries_, pieces_, steps_);
+            log.entries(block, entries_);
+            pieces_ = log.pieces(block);
+            steps_ = log.steps(block);
+            step_count_ = log.step_count(block);
             if (extra_)
                 block_back<true>(block);
             else
                 block_back<false>(block);
         }
-        finish(log.faces().size(), out);
+        finish(log.face_count(), out);
     }
 
   private:
@@ -122,8 +126,8 @@ class GradientTile {
     }
 
     // Makes the triangles ready.
-    void set_up(const std::vector<int32_t> &faces) {
-        const size_t n = faces.size(), batches = (n + LANES - 1) / LANES;
+    void set_up(const int32_t *faces, size_t n) {
+        const size_t batches = (n + LANES - 1) / LANES;
         if (corners_.size() < batches) {
             triangles_.resize(batches * LANES);
             moments_.resize(batches * LANES);
@@ -132,7 +136,7 @@ class GradientTile {
         planes_.resize(n * extra_);
         extra_sums_.assign(n * extra_ * 3, 0.0f);
         for (size_t i = 0; i < std::min(n, CORNERS_AHEAD); ++i) ask_for_corners(faces[i]);
-        for (size_t begin = 0; begin < n; begin += LANES) set_up_batch(faces, begin);
+        for (size_t begin = 0; begin < n; begin += LANES) set_up_batch(faces, n, begin);
     }
 
     static constexpr size_t FACES_AHEAD = 2 * LANES, CORNERS_AHEAD = LANES;
@@ -145,11 +149,11 @@ class GradientTile {
         }
     }
 
-    void set_up_batch(const std::vector<int32_t> &faces, size_t begin) {
-        const int held = (int)std::min<size_t>(LANES, faces.size() - begin);
+    void set_up_batch(const int32_t *faces, size_t n, size_t begin) {
+        const int held = (int)std::min<size_t>(LANES, n - begin);
         for (size_t i = begin; i < begin + held; ++i) {
-            if (i + FACES_AHEAD < faces.size()) __builtin_prefetch(mesh_.faces + 3 * (int64_t)faces[i + FACES_AHEAD]);
-            if (i + CORNERS_AHEAD < faces.size()) ask_for_corners(faces[i + CORNERS_AHEAD]);
+            if (i + FACES_AHEAD < n) __builtin_prefetch(mesh_.faces + 3 * (int64_t)faces[i + FACES_AHEAD]);
+            if (i + CORNERS_AHEAD < n) ask_for_corners(faces[i + CORNERS_AHEAD]);
         }
         Triangles<LANES> &t = batch_;
         Corners &corners = corners_[begin / LANES];
@@ -243,9 +247,9 @@ class GradientTile {
     // Fills in what does not depend on the order; returns the depth.
     template <bool EXTRA>
     Lanes evaluate(int block, const Lanes &lane_x, const Lanes &lane_y, const TileLog::Entry entry, Fragments &f) {
-        const Piece *piece = pieces_.data() + entry.first;
+        const PackedLog::Numbered *piece = pieces_ + entry.first;
         Lanes q, linear[4];
-        const Prepared *t = &triangles_[piece->triangle];
+        const Prepared *t = &triangles_[piece->number()];
         f4 low = load4(t->low), high = load4(t->high);
         float q_min = t->q_min, q_max = t->q_max;
         for (uint32_t i = 0;;) {
@@ -257,7 +261,7 @@ class GradientTile {
                 linear[c] = i ? pick(piece[i].lanes, value, linear[c]) : value;
             }
             if (++i == entry.count) break;
-            t = &triangles_[piece[i].triangle];
+            t = &triangles_[piece[i].number()];
             low = min4(low, load4(t->low));
             high = max4(high, load4(t->high));
             q_min = std::min(q_min, t->q_min);
@@ -269,10 +273,10 @@ class GradientTile {
         f.contrast = mul_add(f.rgba[0], load_lanes(g), mul_add(f.rgba[1], load_lanes(g + SAMPLES), f.rgba[2] * load_lanes(g + 2 * SAMPLES)));
         if (!EXTRA) return z;
         for (uint32_t i = 0; i < entry.count; ++i) {
-            t = &triangles_[piece[i].triangle];
+            t = &triangles_[piece[i].number()];
             const Lanes x = lane_x - lanes(t->x0), y = lane_y - lanes(t->y0);
             for (int c = 0; c < extra_; ++c)
-                f.contrast = f.contrast + only(piece[i].lanes, extra_value(piece[i].triangle, c, x, y, z) * load_lanes(towards_extra(c, block)));
+                f.contrast = f.contrast + only(piece[i].lanes, extra_value(piece[i].number(), c, x, y, z) * load_lanes(towards_extra(c, block)));
         }
         return z;
     }
@@ -281,35 +285,37 @@ class GradientTile {
     // it from the back; then entries are taken whole. Of many steps, this is done a chunk at a time.
     template <bool EXTRA>
     void block_back(int block) {
-        const int64_t chunks = ((int64_t)steps_.size() + CHUNK - 1) / CHUNK;
+        const int64_t chunks = (step_count_ + CHUNK - 1) / CHUNK;
         const Lanes enough = lanes(options_.min_transmittance);
         const Lanes lane_x = TileArea::lane_x() + lanes(TileArea::block_x(block)), lane_y = TileArea::lane_y() + lanes(TileArea::block_y(block));
-        auto end = [&](int64_t chunk) { return std::min<int64_t>(steps_.size(), (chunk + 1) * CHUNK); };
+        auto end = [&](int64_t chunk) { return std::min(step_count_, (chunk + 1) * CHUNK); };
         // Entries get places in fragments_ chunk by chunk: what is below `used` is of an earlier one.
         places_.assign(entries_.size(), 0);
-        int64_t used = 1, count = 0;
+        uint32_t used = 1, count = 0;
         auto forth = [&](int64_t chunk, Lanes through) {
             used += count;
             count = 0;
-            for (int64_t i = chunk * CHUNK; i < end(chunk); ++i) {
-                const TileLog::Step step = steps_[i];
-                int64_t &place = places_[step.entry];
-                if (place < used) {
-                    place = used + count;
-                    if (count == (int64_t)fragments_.size()) {
-                        fragments_.resize(std::max<size_t>(64, 2 * count));
-                        lit_.resize(fragments_.size());
-                        if (EXTRA) depths_.resize(fragments_.size());
-                    }
-                    lit_[count] = {step.entry, 0};
-                    const Lanes depth = evaluate<EXTRA>(block, lane_x, lane_y, entries_[step.entry], fragments_[count]);
-                    if (EXTRA) depths_[count] = depth;
-                    ++count;
-                }
-                Fragments &f = fragments_[place - used];
-                f.light = pick(step.lanes, through * f.light, f.light);
-                lit_[place - used].lanes |= step.lanes & at_least(through, enough);
-                through = through - only(step.lanes, through * f.rgba[3]);
+            const PackedLog::Numbered *steps = steps_ + chunk * CHUNK;
+            const int64_t n = end(chunk) - chunk * CHUNK;
+            // Whether an entry comes for the first time is hard to predict: no branch.
+            for (int64_t i = 0; i < n; ++i) {
+                uint32_t &place = places_[steps[i].number()];
+                lit_[count] = {steps[i].number(), 0};
+                const bool fresh = place < used;
+                place = fresh ? used + count : place;
+                at_[i] = (uint16_t)(place - used);
+                count += fresh;
+            }
+            for (uint32_t i = 0; i < count; ++i) {
+                const Lanes depth = evaluate<EXTRA>(block, lane_x, lane_y, entries_[lit_[i].entry], fragments_[i]);
+                if (EXTRA) depths_[i] = depth;
+            }
+            for (int64_t i = 0; i < n; ++i) {
+                const unsigned lanes = steps[i].lanes;
+                Fragments &f = fragments_[at_[i]];
+                f.light = pick(lanes, through * f.light, f.light);
+                lit_[at_[i]].lanes |= lanes & at_least(through, enough);
+                through = through - only(lanes, through * f.rgba[3]);
             }
             return through;
         };
@@ -319,14 +325,14 @@ class GradientTile {
         Lanes behind = load_lanes(behind_ + block * LANES);
         for (int64_t chunk = chunks - 1; chunk >= 0; --chunk) {
             if (chunk < chunks - 1) forth(chunk, starts_[chunk]);
-            for (int64_t i = end(chunk) - 1; i >= chunk * CHUNK; --i) {
-                const TileLog::Step step = steps_[i];
-                Fragments &f = fragments_[places_[step.entry] - used];
+            const PackedLog::Numbered *steps = steps_ + chunk * CHUNK;
+            for (int64_t i = end(chunk) - chunk * CHUNK; i-- > 0;) {
+                Fragments &f = fragments_[at_[i]];
                 const Lanes contrast = f.contrast - behind;
-                f.contrast = pick(step.lanes, contrast, f.contrast);
-                behind = behind + only(step.lanes, f.rgba[3] * contrast);
+                f.contrast = pick(steps[i].lanes, contrast, f.contrast);
+                behind = behind + only(steps[i].lanes, f.rgba[3] * contrast);
             }
-            for (int64_t i = 0; i < count; ++i) add<EXTRA>(block, lane_x, lane_y, i);
+            for (uint32_t i = 0; i < count; ++i) add<EXTRA>(block, lane_x, lane_y, i);
         }
     }
 
@@ -340,8 +346,9 @@ class GradientTile {
         const float *g = towards_[0] + block * LANES;
         const Lanes all[4] = {opaque * load_lanes(g), opaque * load_lanes(g + SAMPLES), opaque * load_lanes(g + 2 * SAMPLES), light * f.contrast};
         for (uint32_t i = entry.first; i < entry.first + entry.count; ++i) {
-            const Piece piece = pieces_[i];
-            const Prepared &t = triangles_[piece.triangle];
+            const PackedLog::Numbered piece = pieces_[i];
+            const uint32_t triangle = piece.number();
+            const Prepared &t = triangles_[triangle];
             const Lanes x = lane_x - lanes(t.x0), y = lane_y - lanes(t.y0);
             Lanes sums[4], sums_y[4];
             for (int c = 0; c < 4; ++c) sums[c] = only(piece.lanes, all[c]);
@@ -349,9 +356,9 @@ class GradientTile {
             for (int c = 1; c < 4; ++c) v = mul_add(sums[c], f.rgba[c] - lanes(t.first[c]), v);
             if (EXTRA) {
                 for (int c = 0; c < extra_; ++c) {
-                    const size_t plane = (size_t)piece.triangle * extra_ + c;
+                    const size_t plane = (size_t)triangle * extra_ + c;
                     const Lanes sum = only(piece.lanes, opaque * load_lanes(towards_extra(c, block)));
-                    v = v + sum * (extra_value(piece.triangle, c, x, y, depths_[place]) - lanes(planes_[plane].first));
+                    v = v + sum * (extra_value(triangle, c, x, y, depths_[place]) - lanes(planes_[plane].first));
                     float *to = &extra_sums_[plane * 3];
                     to[0] += ::ms::sum(sum * x);
                     to[1] += ::ms::sum(sum * y);
@@ -363,7 +370,7 @@ class GradientTile {
             // x is the same in every row.
             Lanes columns[4] = {add_rows(sums), lanes(0), add_rows(sums_y), add_rows(sums_v)};
             columns[1] = columns[0] * x;
-            float *to = moments_[piece.triangle].sum[0];
+            float *to = moments_[triangle].sum[0];
             store_lanes(to, load_lanes(to) + add_columns(columns));
         }
     }
@@ -442,15 +449,16 @@ class GradientTile {
 
     // Triangles of a fan come close together, so that a corner is mostly a vertex that was just met.
     void add_corner(int32_t vertex, const TileGradients::Sum &sum, int corner, int lane, TileGradients &out) {
-        uint32_t &place = met_[(uint32_t)vertex % MET];
-        const bool again = place < out.count && out.vertices[place] == vertex;
-        if (!again) {
-            place = (uint32_t)out.count++;
-            out.vertices[place] = vertex;
-        }
+        uint32_t &met = met_[(uint32_t)vertex % MET];
+        // Whether it was is hard to predict: no branch. What is read where it was not need not be a number, and counts as 0.
+        const uint32_t known = met < out.count ? met : 0, next = (uint32_t)out.count;
+        const bool again = (met < out.count) & (out.vertices[known] == vertex);
+        const uint32_t place = met = again ? known : next;
+        out.count += !again;
+        out.vertices[place] = vertex;
         TileGradients::Sum &to = out.sums[place];
-        store4(to.position, again ? load4(to.position) + load4(sum.position) : load4(sum.position));
-        store4(to.rgba, again ? load4(to.rgba) + load4(sum.rgba) : load4(sum.rgba));
+        store4(to.position, only4(again, load4(to.position)) + load4(sum.position));
+        store4(to.rgba, only4(again, load4(to.rgba)) + load4(sum.rgba));
         for (int c = 0; c < extra_; ++c) {
             float &extra = out.attributes[(size_t)place * extra_ + c];
             extra = (again ? extra : 0) + lane_of(corner_extras_[corner * extra_ + c], lane);
@@ -478,12 +486,14 @@ class GradientTile {
     std::vector<Plane> planes_;
     std::vector<float> extra_sums_;
     std::vector<TileLog::Entry> entries_;  // of a block
-    std::vector<Piece> pieces_;
-    std::vector<TileLog::Step> steps_;
+    const PackedLog::Numbered *pieces_, *steps_;
+    int64_t step_count_;
+    std::vector<uint32_t> places_;  // by entry
+    // Of what a chunk of its steps refers to:
     std::vector<Fragments> fragments_;
     std::vector<Lit> lit_;
     std::vector<Lanes> depths_;
-    std::vector<int64_t> places_;  // by entry of a block
+    std::vector<uint16_t> at_;  // by step
     std::vector<Lanes> starts_;
     std::vector<Lanes> corner_extras_;  // of a few triangles: (corner, channel)
     static constexpr uint32_t MET = 2048;

@@ -7,6 +7,7 @@
 #include <cstring>
 #include <vector>
 
+#include "large.h"
 #include "parallel.h"
 #include "types.h"
 
@@ -172,7 +173,7 @@ class TileLists {
     int threads_;
     std::vector<int32_t> count_;
     std::vector<int64_t> start_;
-    std::vector<Entry> entries_;
+    Large<Entry> entries_;
     int64_t begin_ = 0, end_ = 0;
 };
 

@@ -49,9 +49,9 @@ class MeshTile {
     // Which triangles of a run may touch the tile: a bit each.
     uint64_t touching(const Entry &run) const {
         const TileBox *box = scene_.boxes.data() + run.first;
+        const TileNumber tile(tile_x_, tile_y_);
         uint64_t bits = 0;
-        for (int i = 0; i < run.length; ++i)
-            bits |= (uint64_t)((box[i].x0 <= tile_x_) & (tile_x_ <= box[i].x1) & (box[i].y0 <= tile_y_) & (tile_y_ <= box[i].y1)) << i;
+        for (int i = 0; i < run.length; ++i) bits |= (uint64_t)box[i].has(tile) << i;
         return bits;
     }
     void ask_for_faces(const Entry *list, int64_t i) {
@@ -147,14 +147,15 @@ class MeshTile {
         const Triangles &t = triangles_;
         uint8_t touching[BLOCKS] = {};
         TilePieces *found = blend_.pieces();
+        if (found) found->make_room(Triangles::N, Triangles::N * BLOCKS);
         uint32_t number[Triangles::N];
         unsigned blocks = 0;
         for (int k = begin; k < end; ++k) {
             unsigned touched = prepare(k);
             blocks |= touched;
             if (found && touched) {
-                number[k] = (uint32_t)found->triangles.size();
-                found->triangles.push_back({t.face[k], TilePieces::NONE});
+                number[k] = found->triangle_count;
+                found->triangles[found->triangle_count++] = {t.face[k], TilePieces::NONE};
             }
             for (; touched; touched &= touched - 1) touching[__builtin_ctz(touched)] |= 1u << k;
         }
@@ -162,13 +163,14 @@ class MeshTile {
             const int block = __builtin_ctz(blocks);
             const unsigned open = blend_.open(block);
             Waiting &waiting = waiting_[block];
-            Fragments f{};
+            Fragments *f = &waiting.next();
             FragmentWeights weights{};
             unsigned covered = 0;
             int32_t face = 0;
-            uint32_t first_piece = 0, pieces = 0;
+            uint32_t first_piece = found ? found->piece_count : 0, pieces = 0;
             auto add = [&] {
-                waiting.add(covered, face, f, GENERAL && blend_.needs_weights() ? &weights : nullptr, first_piece, pieces);
+                waiting.add(covered, face, GENERAL && blend_.needs_weights() ? &weights : nullptr, first_piece, pieces);
+                first_piece += pieces;
             };
             for (unsigned rest = touching[block]; rest; rest &= rest - 1) {
                 const int k = __builtin_ctz(rest);
@@ -181,20 +183,21 @@ class MeshTile {
                 if (covered & inside) {
                     add();
                     covered = pieces = 0;
-                    f = {};
+                    f = &waiting.next();
                 }
+                // What the first triangle of an entry has outside of itself is finite, too.
+                const unsigned put = covered ? inside : (1u << LANES) - 1;
                 q = clamp(q, lanes(t.q_min[k]), lanes(t.q_max[k]));
                 const Lanes z = lanes(1) / q;
-                f.key = pick(inside, GENERAL ? key(k, block, q) : q, f.key);
+                f->key = pick(put, GENERAL ? key(k, block, q) : q, f->key);
                 for (int c = 0; c < 4; ++c) {
                     const Lanes value = (of.inside[4 + c] + corner(of, 4 + c, block)) * z;
-                    f.rgba[c] = pick(inside, clamp(value, lanes(of.low[c]), lanes(of.high[c])), f.rgba[c]);
+                    f->rgba[c] = pick(put, clamp(value, lanes(of.low[c]), lanes(of.high[c])), f->rgba[c]);
                 }
                 if (!covered) face = t.face[k];
                 covered |= inside;
                 if (found) {
-                    if (!pieces) first_piece = (uint32_t)found->pieces.size();
-                    found->pieces.push_back({number[k], inside});
+                    found->pieces[found->piece_count++] = {number[k], inside};
                     ++pieces;
                 }
                 if (GENERAL && blend_.needs_weights()) {

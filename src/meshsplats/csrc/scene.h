@@ -1,6 +1,7 @@
 // A mesh made ready for one camera: projected vertices, groups of triangles, depth groups.
 #pragma once
 
+#include <climits>
 #include <vector>
 
 #include "grid.h"
@@ -15,9 +16,29 @@ struct DepthPlane {
     float q_min, q_max;
 };
 
-// The tiles that one triangle may touch, inclusive; none where x0 > x1.
-struct TileBox {
-    uint16_t x0, x1, y0, y1;
+// A tile's column and row (below 2^15) in a form that TileBox understands.
+class TileNumber {
+  public:
+    TileNumber(int x, int y) : bits_(four(x, HALF - x, y, HALF - y)) {}
+
+  private:
+    friend class TileBox;
+    static constexpr uint64_t HALF = 0x8000;
+    static uint64_t four(uint64_t a, uint64_t b, uint64_t c, uint64_t d) { return a | b << 16 | c << 32 | d << 48; }
+    uint64_t bits_;
+};
+
+// The tiles that one triangle may touch, inclusive; none where x0 > x1. Four comparisons are one addition: each of its
+// quarters reaches HALF where x0 <= x, x <= x1, y0 <= y and y <= y1.
+class TileBox {
+  public:
+    TileBox() = default;
+    TileBox(int x0, int x1, int y0, int y1) : bits_(TileNumber::four(HALF - x0, x1, HALF - y0, y1)) {}
+    bool has(const TileNumber &tile) const { return ((bits_ + tile.bits_) & ALL) == ALL; }
+
+  private:
+    static constexpr uint64_t HALF = TileNumber::HALF, ALL = 0x8000800080008000;
+    uint64_t bits_;
 };
 
 struct Scene {
@@ -148,9 +169,9 @@ struct Scene {
     bool bound(int64_t group, Item &item) {
         constexpr double inf = std::numeric_limits<double>::infinity();
         double key = 0;
-        TileBox all{UINT16_MAX, 0, UINT16_MAX, 0};
+        int left = INT_MAX, right = -1, top = INT_MAX, bottom = -1;
         for (int64_t i = group_start[group]; i < group_start[group + 1]; ++i) {
-            boxes[i] = {1, 0, 1, 0};
+            boxes[i] = TileBox(1, 0, 1, 0);
             double lo[2] = {inf, inf}, hi[2] = {-inf, -inf};
             auto include = [&](double x, double y) {
                 lo[0] = std::min(lo[0], x);
@@ -184,16 +205,17 @@ struct Scene {
             int x0, x1, y0, y1;
             if (!sample_range(lo[0], hi[0], grid.width, x0, x1) || !sample_range(lo[1], hi[1], grid.height, y0, y1))
                 continue;
-            const TileBox box{(uint16_t)grid.tile_of(x0), (uint16_t)grid.tile_of(x1), (uint16_t)grid.tile_of(y0),
-                              (uint16_t)grid.tile_of(y1)};
-            boxes[i] = box;
-            all = {std::min(all.x0, box.x0), std::max(all.x1, box.x1), std::min(all.y0, box.y0), std::max(all.y1, box.y1)};
+            x0 = grid.tile_of(x0), x1 = grid.tile_of(x1), y0 = grid.tile_of(y0), y1 = grid.tile_of(y1);
+            boxes[i] = TileBox(x0, x1, y0, y1);
+            left = std::min(left, x0), right = std::max(right, x1);
+            top = std::min(top, y0), bottom = std::max(bottom, y1);
             if (mesh.depth_group && mesh.depth_group[i] >= 0)
                 nearest = std::max(nearest, (double)planes[mesh.depth_group[i]].q_max);
             key = std::max(key, nearest);
         }
-        if (all.x0 > all.x1) return false;
-        item = {{(float)key, group_start[group], group_start[group + 1] - group_start[group]}, all.x0, all.x1, all.y0, all.y1};
+        if (left > right) return false;
+        item = {{(float)key, group_start[group], group_start[group + 1] - group_start[group]},
+                (uint16_t)left, (uint16_t)right, (uint16_t)top, (uint16_t)bottom};
         return true;
     }
 };

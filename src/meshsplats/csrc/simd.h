@@ -35,6 +35,13 @@ inline f4 load4(const float *p) {
 }
 inline void store4(float *p, f4 v) { __builtin_memcpy(p, &v, sizeof v); }
 
+// 0 where not `chosen`, whatever v is.
+inline f4 only4(bool chosen, f4 v) {
+    typedef int i4 __attribute__((vector_size(16)));
+    const int mask = -(int)chosen;
+    return (f4)((i4)v & i4{mask, mask, mask, mask});
+}
+
 #if defined(__SSE2__)
 inline f4 min4(f4 a, f4 b) { return _mm_min_ps(a, b); }
 inline f4 max4(f4 a, f4 b) { return _mm_max_ps(a, b); }

@@ -2,11 +2,12 @@
 #pragma once
 
 #include <algorithm>
-#include <atomic>
 #include <cstdint>
 #include <memory>
+#include <mutex>
 #include <vector>
 
+#include "large.h"
 #include "tile_area.h"
 
 namespace ms {
@@ -24,13 +25,16 @@ struct TilePieces {
         int32_t face;
         uint32_t place;  // in the packed log, or none
     };
+    // Vectors are longer than what is in use, so that adding to them needs no check.
     std::vector<Triangle> triangles;
     std::vector<Piece> pieces;
+    uint32_t triangle_count = 0, piece_count = 0;
 
-    void clear() {
-        triangles.clear();
-        pieces.clear();
+    void make_room(size_t new_triangles, size_t new_pieces) {
+        if (triangles.size() < triangle_count + new_triangles) triangles.resize(2 * (triangle_count + new_triangles));
+        if (pieces.size() < piece_count + new_pieces) pieces.resize(2 * (piece_count + new_pieces));
     }
+    void clear() { triangle_count = piece_count = 0; }
 };
 
 struct TileLog {
@@ -41,7 +45,7 @@ struct TileLog {
     struct Step {
         uint32_t entry, lanes;
     };
-    // Vectors are longer than what is in use, so that adding to them needs no check.
+    // Vectors are longer than what is in use, as above.
     struct Block {
         std::vector<Entry> entries;  // of which anything was blended
         std::vector<Step> steps;     // at every sample nearest first
@@ -62,23 +66,41 @@ struct TileLog {
 // The same with the pieces it refers to, in as little memory as possible.
 class PackedLog {
   public:
-    // Pieces of entries of which nothing was blended are left out.
-    void pack(const TileLog &log, TilePieces &found) {
-        size_t entry_count = 0, step_count = 0, piece_count = 0;
+    // A piece or a step.
+    struct Numbered {
+        uint16_t low, high, lanes;
+
+        Numbered() = default;
+        Numbered(uint32_t number, uint32_t lanes) : low((uint16_t)number), high((uint16_t)(number >> 16)), lanes((uint16_t)lanes) {}
+        uint32_t number() const { return low | (uint32_t)high << 16; }
+    };
+
+    // Sizes of a log, known before it is packed.
+    PackedLog(const TileLog &log, const TilePieces &found) {
         for (int i = 0; i < BLOCKS; ++i) {
             const TileLog::Block &block = log.blocks[i];
-            entry_count += block.entry_count;
-            step_count += block.step_count;
-            for (uint32_t j = 0; j < block.entry_count; ++j) piece_count += block.entries[j].count;
-            ends_[i] = {(uint32_t)entry_count, (uint32_t)step_count, (uint32_t)piece_count};
+            Ends &end = ends_[i] = i ? ends_[i - 1] : Ends{};
+            end.entries += block.entry_count;
+            end.steps += block.step_count;
+            for (uint32_t j = 0; j < block.entry_count; ++j) end.pieces += block.entries[j].count;
         }
-        counts_.reset(new uint8_t[entry_count]);
-        pieces_.reset(new Numbered[piece_count]);
-        steps_.reset(new Numbered[step_count]);
-        faces_.resize(std::min(piece_count, found.triangles.size()) + 1);
-        uint32_t face_count = 0;
-        uint8_t *count = counts_.get();
-        Numbered *piece = pieces_.get(), *step = steps_.get();
+        face_count_ = std::min<size_t>(all().pieces, found.triangle_count) + 1;
+    }
+    PackedLog() = default;
+
+    size_t bytes() const {
+        return face_count_ * sizeof(int32_t) + ((size_t)all().pieces + all().steps) * sizeof(Numbered) + all().entries;
+    }
+
+    // Into so many bytes, which stay the caller's. Pieces of entries of which nothing was blended are left out.
+    void pack(const TileLog &log, TilePieces &found, void *memory) {
+        faces_ = (int32_t *)memory;
+        pieces_ = (Numbered *)(faces_ + face_count_);
+        steps_ = pieces_ + all().pieces;
+        counts_ = (uint8_t *)(steps_ + all().steps);
+        face_count_ = 0;
+        uint8_t *count = counts_;
+        Numbered *piece = pieces_, *step = steps_;
         for (const TileLog::Block &block : log.blocks) {
             for (uint32_t j = 0; j < block.entry_count; ++j) {
                 const TileLog::Entry entry = block.entries[j];
@@ -87,53 +109,45 @@ class PackedLog {
                     // Whether a triangle comes for the first time is hard to predict: no branch.
                     TilePieces::Triangle &triangle = found.triangles[found.pieces[k].triangle];
                     const bool fresh = triangle.place == TilePieces::NONE;
-                    triangle.place = fresh ? face_count : triangle.place;
-                    faces_[face_count] = triangle.face;
-                    face_count += fresh;
+                    triangle.place = fresh ? face_count_ : triangle.place;
+                    faces_[face_count_] = triangle.face;
+                    face_count_ += fresh;
                     *piece++ = Numbered(triangle.place, found.pieces[k].lanes);
                 }
             }
             for (uint32_t j = 0; j < block.step_count; ++j) *step++ = Numbered(block.steps[j].entry, block.steps[j].lanes);
         }
-        faces_.resize(face_count);
     }
 
-    const std::vector<int32_t> &faces() const { return faces_; }
-    // What is known of a block; of pieces, `triangle` is a place in faces().
-    void unpack(int i, std::vector<TileLog::Entry> &entries, std::vector<Piece> &pieces, std::vector<TileLog::Step> &steps) const {
-        const Ends begin = i ? ends_[i - 1] : Ends{}, end = ends_[i];
-        entries.resize(end.entries - begin.entries);
+    // Of the packed log, each once.
+    const int32_t *faces() const { return faces_; }
+    size_t face_count() const { return face_count_; }
+    // What is known of a block. Entries are numbered in the order in which they come first in the steps.
+    void entries(int block, std::vector<TileLog::Entry> &out) const {
+        const Ends begin = before(block);
+        out.resize(ends_[block].entries - begin.entries);
         uint32_t first = 0;
-        for (size_t j = 0; j < entries.size(); ++j) {
-            entries[j] = {first, counts_[begin.entries + j]};
-            first += entries[j].count;
+        for (size_t j = 0; j < out.size(); ++j) {
+            out[j] = {first, counts_[begin.entries + j]};
+            first += out[j].count;
         }
-        pieces.resize(end.pieces - begin.pieces);
-        for (size_t j = 0; j < pieces.size(); ++j) pieces[j] = {pieces_[begin.pieces + j].number(), pieces_[begin.pieces + j].lanes};
-        steps.resize(end.steps - begin.steps);
-        for (size_t j = 0; j < steps.size(); ++j) steps[j] = {steps_[begin.steps + j].number(), steps_[begin.steps + j].lanes};
     }
-
-    int64_t bytes() const {
-        const Ends &all = ends_[BLOCKS - 1];
-        return (int64_t)(faces_.capacity() * sizeof(int32_t) + all.entries + (all.pieces + (size_t)all.steps) * sizeof(Numbered));
-    }
+    const Numbered *pieces(int block) const { return pieces_ + before(block).pieces; }  // number: a place in faces()
+    const Numbered *steps(int block) const { return steps_ + before(block).steps; }     // number: an entry's
+    int64_t step_count(int block) const { return ends_[block].steps - before(block).steps; }
 
   private:
-    struct Numbered {
-        uint16_t low, high, lanes;
-
-        Numbered() = default;
-        Numbered(uint32_t number, uint32_t lanes) : low((uint16_t)number), high((uint16_t)(number >> 16)), lanes((uint16_t)lanes) {}
-        uint32_t number() const { return low | (uint32_t)high << 16; }
-    };
     struct Ends {
-        uint32_t entries, steps, pieces;  // of this block and those before
+        uint32_t entries = 0, steps = 0, pieces = 0;  // of this block and those before
     };
-    std::vector<int32_t> faces_;
-    std::unique_ptr<uint8_t[]> counts_;  // pieces of each entry
-    std::unique_ptr<Numbered[]> pieces_, steps_;
+    const Ends &all() const { return ends_[BLOCKS - 1]; }
+    Ends before(int block) const { return block ? ends_[block - 1] : Ends{}; }
+
     Ends ends_[BLOCKS];
+    uint32_t face_count_ = 0;  // before it is packed, one more than the most there can be
+    int32_t *faces_ = nullptr;
+    Numbered *pieces_ = nullptr, *steps_ = nullptr;
+    uint8_t *counts_ = nullptr;  // pieces of each entry
 };
 
 // The logs of a picture's tiles, as far as they fit a budget of memory; other tiles have to be drawn again.
@@ -143,10 +157,11 @@ class PictureLog {
 
     // Not for one tile by two threads. After the first log that does not fit, nothing is kept any more.
     void keep(int64_t tile, const TileLog &log, TilePieces &found) {
-        if (left_ < 0) return;
-        auto packed = std::make_unique<PackedLog>();
-        packed->pack(log, found);
-        if ((left_ -= packed->bytes()) >= 0) tiles_[tile] = std::move(packed);
+        auto packed = std::make_unique<PackedLog>(log, found);
+        unsigned char *memory = reserve(packed->bytes());
+        if (!memory) return;
+        packed->pack(log, found, memory);
+        tiles_[tile] = std::move(packed);
     }
     const PackedLog *find(int64_t tile) const { return tiles_[tile].get(); }
     bool complete() const {
@@ -156,8 +171,29 @@ class PictureLog {
     }
 
   private:
+    static constexpr size_t CHUNK = (size_t)2 << 20, ALIGNMENT = 64;
+
+    // Null when the budget is spent.
+    unsigned char *reserve(size_t bytes) {
+        bytes = (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
+        std::lock_guard<std::mutex> lock(guard_);
+        if ((left_ -= bytes) < 0) {
+            left_ = -1;
+            return nullptr;
+        }
+        if (chunks_.empty() || chunks_.back().size() - used_ < bytes) {
+            chunks_.emplace_back(std::max(CHUNK, bytes));
+            used_ = 0;
+        }
+        used_ += bytes;
+        return chunks_.back().data() + (used_ - bytes);
+    }
+
     std::vector<std::unique_ptr<PackedLog>> tiles_;
-    std::atomic<int64_t> left_;
+    std::mutex guard_;
+    int64_t left_;
+    std::vector<Large<unsigned char>> chunks_;
+    size_t used_ = 0;  // of the last one
 };
 
 }  // namespace ms

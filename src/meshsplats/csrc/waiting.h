@@ -36,20 +36,22 @@ class Waiting {
     static constexpr uint32_t NO_NUMBER = UINT32_MAX;
     uint32_t &number(int entry) { return entries_[entry].number; }
 
-    // `face` is the first face of the entry; entries of a run follow each other in the order of their faces. Weights may
-    // be null, and pieces [first_piece, first_piece + pieces) of those found in the tile none.
-    void add(uint32_t covered, int32_t face, const Fragments &fragments, const FragmentWeights *weights, uint32_t first_piece,
-             uint32_t pieces) {
+    // Where the fragments of the next entry are to be put.
+    Fragments &next() {
         if (count_ == (int)entries_.size()) {
             entries_.resize(std::max(32, 2 * count_));
             fragments_.resize(entries_.size());
         }
+        return fragments_[count_];
+    }
+    // Adds that entry. `face` is its first face; entries of a run follow each other in the order of their faces. Weights may
+    // be null, and pieces [first_piece, first_piece + pieces) of those found in the tile none.
+    void add(uint32_t covered, int32_t face, const FragmentWeights *weights, uint32_t first_piece, uint32_t pieces) {
         if (weights) {
             weights_.resize(entries_.size());
             weights_[count_] = *weights;
         }
-        entries_[count_] = {covered, face, first_piece, pieces, NO_NUMBER};
-        fragments_[count_++] = fragments;
+        entries_[count_++] = {covered, face, first_piece, pieces, NO_NUMBER};
     }
 
     void clear() {
@@ -93,6 +95,7 @@ class Waiting {
     static constexpr int MANY_ENTRIES = 256;
     // Where a block takes many vectors, longer code to rank costs more than it gains.
     static constexpr int MOST_TO_RANK = PARTS <= 2 ? 16 : 8, MOST_TO_SEARCH = 512;
+    static_assert(MOST_TO_RANK <= LANES);
 
     struct Entry {
         uint32_t lanes;
@@ -164,15 +167,16 @@ class Waiting {
                         rank[j] = rank[j] + only(tie, lanes(1));
                     }
         }
-        float mean[MOST_TO_RANK];
+        alignas(64) float mean[LANES];
+        std::fill(mean, mean + LANES, std::numeric_limits<float>::max());
         for (int i = 0; i < n; ++i) {
             order.rank[i] = rank[i];
             mean[i] = sum(only(active_[i].lanes, rank[i])) / __builtin_popcount(active_[i].lanes);
         }
+        const Lanes means = load_lanes(mean);
         for (int i = 0; i < n; ++i) {
-            int place = 0;
-            for (int j = 0; j < n; ++j) place += (mean[j] < mean[i]) | ((mean[j] == mean[i]) & (j < i));
-            order.entry[place] = i;
+            const unsigned before = greater(lanes(mean[i]), means) | (equal(lanes(mean[i]), means) & ((1u << i) - 1));
+            order.entry[__builtin_popcount(before)] = i;
         }
     }
 
@@ -190,16 +194,15 @@ class Waiting {
         else if constexpr (MOST_TO_RANK > 8)
             n <= 12 ? rank<12>(n, order) : rank<16>(n, order);
         Lanes done = lanes(0);
-        for (bool more = true; more;) {
-            more = false;
-            for (int place = 0; place < n; ++place) {
-                const int i = order.entry[place];
+        for (uint32_t left = (1u << n) - 1; left;) {
+            for (uint32_t rest = left; rest; rest &= rest - 1) {
+                const int place = __builtin_ctz(rest), i = order.entry[place];
                 Active &a = active_[i];
                 const uint32_t due = a.lanes & equal(order.rank[i], done);
                 if (due) blend(a.entry, due);
                 done = done + only(due, lanes(1));
                 a.lanes &= ~due;
-                more |= a.lanes != 0;
+                left &= ~((uint32_t)!a.lanes << place);
             }
         }
     }
