@@ -311,11 +311,11 @@ class GradientTile {
                 if (EXTRA) depths_[i] = depth;
             }
             for (int64_t i = 0; i < n; ++i) {
-                const unsigned lanes = steps[i].lanes;
+                const unsigned due = steps[i].lanes;
                 Fragments &f = fragments_[at_[i]];
-                f.light = pick(lanes, through * f.light, f.light);
-                lit_[at_[i]].lanes |= lanes & at_least(through, enough);
-                through = through - only(lanes, through * f.rgba[3]);
+                f.light = pick(due, through * f.light, f.light);
+                lit_[at_[i]].lanes |= due & at_least(through, enough);
+                through = through - only(due, through * f.rgba[3]);
             }
             return through;
         };
