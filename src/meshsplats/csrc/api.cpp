@@ -105,11 +105,10 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
                             worker->again->blend().record();
                         }
                         draw_tile(grid, *worker->again, tile, lists->list(tile), lists->length(tile));
-                        const ms::TileLog &drawn = worker->again->blend().log();
-                        ms::TilePieces &found = *worker->again->blend().pieces();
-                        worker->packed = ms::PackedLog(drawn, found);
-                        worker->memory.resize(worker->packed.bytes());
-                        worker->packed.pack(drawn, found, worker->memory.data());
+                        worker->packed.pack(worker->again->blend().log(), *worker->again->blend().pieces(), [&](size_t bytes) {
+                            worker->memory.resize(bytes);
+                            return worker->memory.data();
+                        });
                         entries = &worker->packed;
                     }
                     int x, y;

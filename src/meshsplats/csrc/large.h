@@ -49,12 +49,12 @@ class Blocks {
     static void give(void *p, std::size_t bytes) noexcept {
         if (bytes < SMALLEST) return ::operator delete(p, std::align_val_t(64));
         const std::size_t size = rounded(bytes);
+        if (size > MOST) return release(p, size);
         Blocks &all = kept();
         std::lock_guard<std::mutex> lock(all.guard_);
         // What no longer fits makes room for what is in use now.
         if (all.bytes_ + size > MOST) all.drop();
         try {
-            if (size > MOST) throw std::bad_alloc();
             all.blocks_.push_back({p, size});
             all.bytes_ += size;
         } catch (const std::bad_alloc &) {

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <atomic>
 #include <cstdint>
 #include <memory>
 #include <mutex>
@@ -75,8 +76,10 @@ class PackedLog {
         uint32_t number() const { return low | (uint32_t)high << 16; }
     };
 
-    // Sizes of a log, known before it is packed.
-    PackedLog(const TileLog &log, const TilePieces &found) {
+    // Into memory that reserve(bytes) gives and that stays the caller's; false where it gives none. Pieces of entries of which
+    // nothing was blended are left out.
+    template <class Reserve>
+    bool pack(const TileLog &log, TilePieces &found, Reserve &&reserve) {
         for (int i = 0; i < BLOCKS; ++i) {
             const TileLog::Block &block = log.blocks[i];
             Ends &end = ends_[i] = i ? ends_[i - 1] : Ends{};
@@ -84,20 +87,14 @@ class PackedLog {
             end.steps += block.step_count;
             for (uint32_t j = 0; j < block.entry_count; ++j) end.pieces += block.entries[j].count;
         }
-        face_count_ = std::min<size_t>(all().pieces, found.triangle_count) + 1;
-    }
-    PackedLog() = default;
-
-    size_t bytes() const {
-        return face_count_ * sizeof(int32_t) + ((size_t)all().pieces + all().steps) * sizeof(Numbered) + all().entries;
-    }
-
-    // Into so many bytes, which stay the caller's. Pieces of entries of which nothing was blended are left out.
-    void pack(const TileLog &log, TilePieces &found, void *memory) {
-        faces_ = (int32_t *)memory;
-        pieces_ = (Numbered *)(faces_ + face_count_);
-        steps_ = pieces_ + all().pieces;
-        counts_ = (uint8_t *)(steps_ + all().steps);
+        const Ends &all = ends_[BLOCKS - 1];
+        // One more than there can be: each is written before it is known to be another one.
+        const size_t most_faces = (size_t)std::min(all.pieces, found.triangle_count) + 1;
+        faces_ = (int32_t *)reserve(most_faces * sizeof(int32_t) + ((size_t)all.pieces + all.steps) * sizeof(Numbered) + all.entries);
+        if (!faces_) return false;
+        pieces_ = (Numbered *)(faces_ + most_faces);
+        steps_ = pieces_ + all.pieces;
+        counts_ = (uint8_t *)(steps_ + all.steps);
         face_count_ = 0;
         uint8_t *count = counts_;
         Numbered *piece = pieces_, *step = steps_;
@@ -117,6 +114,7 @@ class PackedLog {
             }
             for (uint32_t j = 0; j < block.step_count; ++j) *step++ = Numbered(block.steps[j].entry, block.steps[j].lanes);
         }
+        return true;
     }
 
     // Of the packed log, each once.
@@ -140,11 +138,10 @@ class PackedLog {
     struct Ends {
         uint32_t entries = 0, steps = 0, pieces = 0;  // of this block and those before
     };
-    const Ends &all() const { return ends_[BLOCKS - 1]; }
     Ends before(int block) const { return block ? ends_[block - 1] : Ends{}; }
 
     Ends ends_[BLOCKS];
-    uint32_t face_count_ = 0;  // before it is packed, one more than the most there can be
+    uint32_t face_count_ = 0;
     int32_t *faces_ = nullptr;
     Numbered *pieces_ = nullptr, *steps_ = nullptr;
     uint8_t *counts_ = nullptr;  // pieces of each entry
@@ -157,11 +154,9 @@ class PictureLog {
 
     // Not for one tile by two threads. After the first log that does not fit, nothing is kept any more.
     void keep(int64_t tile, const TileLog &log, TilePieces &found) {
-        auto packed = std::make_unique<PackedLog>(log, found);
-        unsigned char *memory = reserve(packed->bytes());
-        if (!memory) return;
-        packed->pack(log, found, memory);
-        tiles_[tile] = std::move(packed);
+        if (left_ < 0) return;
+        auto packed = std::make_unique<PackedLog>();
+        if (packed->pack(log, found, [&](size_t bytes) { return reserve(bytes); })) tiles_[tile] = std::move(packed);
     }
     const PackedLog *find(int64_t tile) const { return tiles_[tile].get(); }
     bool complete() const {
@@ -176,11 +171,8 @@ class PictureLog {
     // Null when the budget is spent.
     unsigned char *reserve(size_t bytes) {
         bytes = (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
+        if ((left_ -= (int64_t)bytes) < 0) return nullptr;
         std::lock_guard<std::mutex> lock(guard_);
-        if ((left_ -= bytes) < 0) {
-            left_ = -1;
-            return nullptr;
-        }
         if (chunks_.empty() || chunks_.back().size() - used_ < bytes) {
             chunks_.emplace_back(std::max(CHUNK, bytes));
             used_ = 0;
@@ -190,8 +182,8 @@ class PictureLog {
     }
 
     std::vector<std::unique_ptr<PackedLog>> tiles_;
-    std::mutex guard_;
-    int64_t left_;
+    std::atomic<int64_t> left_;
+    std::mutex guard_;  // of what follows
     std::vector<Large<unsigned char>> chunks_;
     size_t used_ = 0;  // of the last one
 };
