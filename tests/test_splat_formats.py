@@ -299,6 +299,15 @@ def test_sog_pictures_may_be_png(tmp_path):
     assert len(load_gaussians(put(tmp_path / "s", files), strict=True)) == 9
 
 
+def test_a_sog_folder_that_names_its_generator_is_no_gltf(tmp_path):
+    # As PlayCanvas' splat-transform writes it since version 0.16.
+    files = encode.sog(some_splats(9), extra={"asset": {"generator": "splat-transform v0.16.0"}})
+    folder = put(tmp_path / "s", files)
+    for path in (folder, folder / "meta.json"):
+        assert splat_format(path) == "sog"
+        assert len(load_gaussians(path, strict=True)) == 9
+
+
 def test_sog_quaternions_without_a_tag_are_dropped(tmp_path):
     files = encode.sog(some_splats(9, degree=0))
     files["quats.webp"] = encode.webp(np.array([[128, 128, 128, 252 if i else 7] for i in range(9)]))

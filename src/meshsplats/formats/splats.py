@@ -25,6 +25,7 @@ Axes = Literal["auto", "y-down", "y-up"]
 SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "gltf"]
 
 _CONVERT = "convert it first: npx @playcanvas/splat-transform {name} {stem}.ply"
+_SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
 _EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
 
 
@@ -148,6 +149,8 @@ def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
     """What a JSON file is, by the words in it; its reader parses it."""
     file.seek(0)
     text = file.read(8 << 20)
+    if all(name in text for name in _SOG_SECTIONS):  # some name their generator in an asset, as glTF does
+        return "sog"
     if b'"asset"' in text and b'"lodLevels"' not in text:
         return "gltf"
     if b'"lodLevels"' in text:
