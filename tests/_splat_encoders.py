@@ -262,6 +262,26 @@ def sog(values, version=2, extra=None):
     return files
 
 
+def streamed_sog(parts, leaves, **index):
+    """Files of a streamed SOG folder. ``parts``: values of splats by name of their folder; ``leaves``: for
+    each place, by level, name, first splat and number of splats."""
+    files = {f"{name}/{key}": data for name, values in parts.items() for key, data in sog(values).items()}
+    names = list(parts)
+
+    def level(name, offset, count):
+        return {"file": names.index(name), "offset": offset, "count": count}
+
+    nodes = [{"lods": {str(k): level(*entry) for k, entry in leaf.items()}} for leaf in leaves]
+    document = {
+        "version": 1,
+        "asset": {"generator": "splat-transform v2.7.1"},
+        "lodLevels": 1 + max(k for leaf in leaves for k in leaf),
+        "filenames": [f"{name}/meta.json" for name in names],
+        "tree": {"children": [nodes[0], {"children": nodes[1:]}]},
+    }
+    return {"lod-meta.json": json.dumps(document | index).encode(), **files}
+
+
 def bundle(files, folder="", compression=zipfile.ZIP_STORED):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", compression) as archive:

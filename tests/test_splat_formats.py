@@ -11,6 +11,7 @@ import pytest
 from _splat_files import assert_same_cloud, expected_cloud, random_splats, splat_table, write_ply
 
 from meshsplats import DataWarning, FileFormatError, load_gaussians
+from meshsplats.formats.recognition import identify
 from meshsplats.formats.splats import splat_format
 
 DEGREES = [0, 1, 2, 3]
@@ -219,8 +220,8 @@ def test_spz_version_4_without_zstandard(tmp_path, monkeypatch):
 
 
 def put(folder, files):
-    folder.mkdir(exist_ok=True)
     for name, data in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
     return folder
 
@@ -308,6 +309,36 @@ def test_a_sog_folder_that_names_its_generator_is_no_gltf(tmp_path):
         assert len(load_gaussians(path, strict=True)) == 9
 
 
+def test_streamed_sog_is_read_place_by_place_in_the_finest_level(tmp_path):
+    fine, coarse, sky = (random_splats(n, degree=d, seed=n) for n, d in ((9, 1), (4, 0), (3, 1)))
+    leaves = [
+        {0: ("0_0", 5, 4), 1: ("1_0", 0, 1)},
+        {1: ("1_0", 1, 2)},  # a place without level 0; the first and the last of 1_0 are not needed
+        {1: ("1_0", 3, 1), 0: ("0_0", 0, 3)},
+    ]
+    files = encode.streamed_sog({"0_0": fine, "1_0": coarse, "env": sky}, leaves, environment="env/meta.json")
+    folder = put(tmp_path / "scene", files)
+    parts = [load_gaussians(folder / name) for name in ("0_0", "1_0", "env")]
+    for path in (folder, folder / "lod-meta.json"):
+        cloud = load_gaussians(path, strict=True)
+        for name in ("means", "quaternions", "scales", "opacities"):
+            a, b, c = (getattr(part, name) for part in parts)
+            assert np.array_equal(getattr(cloud, name), np.concatenate([a[:3], a[5:], b[1:3], c]))
+        assert cloud.sh.shape == (12, 4, 3)
+        assert np.array_equal(cloud.sh[:3], parts[0].sh[:3])
+        assert np.array_equal(cloud.sh[7:9, :1], parts[1].sh[1:3])
+        assert (cloud.sh[7:9, 1:] == 0).all()
+    assert splat_format(folder) == "streamed sog"
+    assert identify(folder / "lod-meta.json") == "splats"
+
+
+def test_streamed_sog_may_be_zipped_in_parts_and_have_empty_places(tmp_path):
+    part = some_splats(9)
+    files = encode.streamed_sog({"a": part}, [{0: ("a", 0, 9)}, {0: ("a", 9, 0)}], filenames=["a.sog"])
+    folder = put(tmp_path / "scene", files | {"a.sog": encode.bundle(encode.sog(part))})
+    assert len(load_gaussians(folder)) == 9
+
+
 def test_sog_quaternions_without_a_tag_are_dropped(tmp_path):
     files = encode.sog(some_splats(9, degree=0))
     files["quats.webp"] = encode.webp(np.array([[128, 128, 128, 252 if i else 7] for i in range(9)]))
@@ -384,7 +415,6 @@ def test_other_tools_are_named(tmp_path):
     for name, data in [
         ("a.ksplat", b"\0\1" + bytes(5000)),
         ("a.lcc", b'{"version": "5.0", "splats": 10, "totalLevel": 3}'),
-        ("lod-meta.json", b'{"version": 1, "lodLevels": 2, "asset": {}, "filenames": []}'),
     ]:
         (tmp_path / name).write_bytes(data)
         with pytest.raises(FileFormatError, match=rf"splat-transform {name}"):

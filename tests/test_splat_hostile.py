@@ -53,6 +53,15 @@ def meta(**changes):
     return SOG | {"meta.json": json.dumps(parsed).encode()}
 
 
+def streamed(**index):
+    """A streamed SOG folder of one part with entries of its index replaced."""
+    return encode.streamed_sog({"a": VALUES}, [{0: ("a", 0, 9)}, {0: ("a", 0, 9)}], **index)
+
+
+def tree(file=0, offset=0, count=9):
+    return {"lods": {"0": {"file": file, "offset": offset, "count": count}}}
+
+
 def bomb_picture():
     """A picture of 4000 x 4000 equal pixels in a few kilobytes."""
     return encode.picture(np.zeros((4000, 4000, 4), np.uint8), "PNG")
@@ -167,6 +176,7 @@ FILES = {
     "other.json": (b'{"hello": "world"}', "neither SOG nor glTF"),
 }
 
+DEEP = b'{"children":[' * 70 + b"]}" * 70
 FOLDERS = {
     "not JSON": (SOG | {"meta.json": b'{"means": '}, "cannot be read"),
     "an array": (
@@ -207,6 +217,43 @@ FOLDERS = {
     ),
 }
 
+STREAMED = {
+    "not JSON": (streamed() | {"lod-meta.json": b'{"lodLevels": '}, "cannot be read"),
+    "deep": (streamed() | {"lod-meta.json": b'{"lodLevels": ' + b"[" * 200_000}, "cannot be read"),
+    "deep tree": (
+        streamed() | {"lod-meta.json": b'{"lodLevels":1,"filenames":["a/meta.json"],"tree":%s}' % DEEP},
+        "neither 'lods' nor 'children'",
+    ),
+    "version 2": (streamed(version=2), "streamed SOG of version 2"),
+    "no parts": (streamed(filenames=[]), "its tree names part 0, but there are 0"),
+    "parts of text": (streamed(filenames="a"), "'filenames' must be a list"),
+    "no tree": (streamed(tree=None), "neither 'lods' nor 'children'"),
+    "empty tree": (streamed(tree={"children": []}), "its tree has none"),
+    "no level": (streamed(tree={"lods": {}}), "neither 'lods' nor 'children'"),
+    "level of text": (streamed(tree={"lods": {"a": 0}}), "levels must be numbers, got a"),
+    "level of list": (streamed(tree={"lods": {"0": [0, 0, 9]}}), "a level must be an object"),
+    "negative offset": (streamed(tree=tree(offset=-1)), "'offset' of a level must be a whole number, got -1"),
+    "count of truth": (
+        streamed(tree=tree(count=True)),
+        "'count' of a level must be a whole number, got True",
+    ),
+    "huge count": (streamed(tree=tree(count=10**30)), "'count' of a level must be a whole number"),
+    "beyond its part": (streamed(tree=tree(offset=1)), "splats 1 to 10 are asked for, but it has 9"),
+    "missing part": (streamed(filenames=["b/meta.json"]), "the part 'b/meta.json' that it names is missing"),
+    "missing environment": (streamed(environment="env/meta.json"), "the part 'env/meta.json' that"),
+    "parent folder": (streamed(filenames=["../secret/meta.json"]), "no path below its folder; refused"),
+    "dots within": (streamed(filenames=["a/../../secret/meta.json"]), "no path below its folder; refused"),
+    "absolute path": (streamed(filenames=["/etc/meta.json"]), "no path below its folder; refused"),
+    "windows path": (streamed(environment="C:\\meta.json"), "no path below its folder; refused"),
+    "environment of number": (streamed(environment=3), "no path below its folder; refused"),
+    "a part that is the index": (streamed(filenames=["lod-meta.json"]), "SOG version 1; known are 2"),
+    "two kinds": (
+        encode.streamed_sog({"a": VALUES, "b": VALUES}, [{0: ("a", 0, 9)}, {0: ("b", 0, 9)}])
+        | {"b/meta.json": meta(model="2dgs")["meta.json"]},
+        "of several kinds of splats: 2dgs, 3dgs",
+    ),
+}
+
 
 def check(path, message):
     refused(path, message, 90e6)
@@ -228,6 +275,25 @@ def test_sog_folders(tmp_path, name):
     for file_name, data in files.items():
         (tmp_path / "scene" / file_name).write_bytes(data)
     check(tmp_path / "scene", message)
+
+
+@pytest.mark.parametrize("name", STREAMED)
+def test_streamed_sog(tmp_path, name):
+    files, message = STREAMED[name]
+    for file_name, data in (files | {"../secret/meta.json": SOG["meta.json"]}).items():
+        path = tmp_path / "scene" / file_name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    check(tmp_path / "scene", message)
+
+
+def test_many_names_of_one_part_do_not_multiply_its_splats(tmp_path):
+    index = {"tree": {"children": [tree()] * 100_000}}
+    for file_name, data in streamed(**index).items():
+        path = tmp_path / file_name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(data)
+    assert len(load_gaussians(tmp_path)) == 9
 
 
 def test_frames_that_unpack_to_more(tmp_path):

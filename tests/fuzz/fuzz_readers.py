@@ -104,6 +104,12 @@ def mutated_files(seed: Seed, rng: np.random.Generator) -> dict[str, bytes]:
     return files
 
 
+def put(folder: Path, files: dict[str, bytes]) -> None:
+    for name, data in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+
+
 def fuzz(seed: Seed, count: int, number: int, keep: Path) -> tuple[Counter[str], float]:
     """Outcomes of ``count`` mutations, and the seconds that the slowest file took."""
     outcomes: Counter[str] = Counter()
@@ -112,8 +118,7 @@ def fuzz(seed: Seed, count: int, number: int, keep: Path) -> tuple[Counter[str],
         rng = np.random.default_rng([number, i, sum(seed.name.encode())])
         with tempfile.TemporaryDirectory() as folder:
             files = mutated_files(seed, rng)
-            for name, data in files.items():
-                (Path(folder) / name).write_bytes(data)
+            put(Path(folder), files)
             start = time.perf_counter()
             signal.alarm(SECONDS)
             try:
@@ -130,9 +135,7 @@ def fuzz(seed: Seed, count: int, number: int, keep: Path) -> tuple[Counter[str],
                     raise
                 outcome = "FAILED"
                 kept = keep / f"{seed.name}-{number}-{i}"
-                kept.mkdir(parents=True, exist_ok=True)
-                for name, data in files.items():
-                    (kept / name).write_bytes(data)
+                put(kept, files)
                 print(f"{kept}: {type(error).__name__}: {error}")
                 traceback.print_tb(error.__traceback__, limit=-3)
             finally:
@@ -167,8 +170,7 @@ def main() -> int:
     # Everything that is imported late is loaded before memory is limited.
     for seed in SEEDS:
         with tempfile.TemporaryDirectory() as folder:
-            for name, data in seed.files.items():
-                (Path(folder) / name).write_bytes(data)
+            put(Path(folder), seed.files)
             seed.load(Path(folder) / seed.opened)
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     limit = pages * resource.getpagesize() + MEMORY

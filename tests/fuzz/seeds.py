@@ -76,6 +76,9 @@ def _zstandard_seeds() -> list[Seed]:
 _VALUES = random_splats(9, degree=1)
 _SPZ = {version: encode.spz(_VALUES, version, extensions=bytes(8), flags=2) for version in (1, 2, 3)}
 _GLB = encode.gltf(encode.splat_accessors(_VALUES), nodes=[{"mesh": 0, "scale": [1, 2, 3]}])
+_STREAMED = encode.streamed_sog(
+    {"a": _VALUES}, [{0: ("a", 0, 4)}, {0: ("a", 5, 4)}], environment="a/meta.json"
+)
 
 SEEDS = [
     _ply("ply", "binary_little_endian", 1, False),
@@ -88,6 +91,7 @@ SEEDS = [
     Seed("sog", {"a.sog": encode.bundle(encode.sog(_VALUES))}, "a.sog", _in_archive),
     Seed("sog-folder", encode.sog(_VALUES), "."),
     Seed("sog-folder-1", encode.sog(_VALUES, version=1), "meta.json"),
+    Seed("sog-streamed", _STREAMED, "."),
     Seed("splat-glb", {"a.glb": _GLB}, "a.glb"),
     Seed("splat-gltf", {"a.gltf": encode.gltf(encode.splat_accessors(_VALUES), kind="gltf")}, "a.gltf"),
     Seed("spz-glb", {"a.glb": encode.gltf(spz_data=_SPZ[3])}, "a.glb"),

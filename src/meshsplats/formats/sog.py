@@ -14,6 +14,7 @@ import re
 import warnings
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,18 +33,20 @@ _PALETTE_COLUMNS = 64
 """Entries of the palette of harmonics in a row of its picture."""
 
 
-def read_sog(path: Path, *, strict: bool) -> GaussianCloud:
+def read_sog(
+    path: Path, budget: Budget, *, strict: bool, ranges: Sequence[tuple[int, int]] | None = None
+) -> GaussianCloud:
     """The splats of a `.sog` archive, or of the folder that holds the meta.json ``path``; errors as
-    ``load_gaussians``.
+    ``load_gaussians``. ``ranges``: first and end of the splats that are wanted, any number of times; None:
+    all.
     """
-    budget = Budget(path)
     with open(path, "rb") as file:
         zipped = file.read(2) == b"PK"
     if not zipped:
-        return _Reader(_Folder(path.parent, path, budget), path, budget).read(strict=strict)
+        return _Reader(_Folder(path.parent, path, budget), path, budget).read(ranges, strict=strict)
     try:
         with zipfile.ZipFile(path) as archive:
-            return _Reader(_Archive(archive, path), path, budget).read(strict=strict)
+            return _Reader(_Archive(archive, path), path, budget).read(ranges, strict=strict)
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
 
@@ -120,11 +123,11 @@ class _Reader:
     def _error(self, message: str) -> FileFormatError:
         return FileFormatError(f"{self._where}: {message}")
 
-    def read(self, *, strict: bool) -> GaussianCloud:
+    def read(self, ranges: Sequence[tuple[int, int]] | None, *, strict: bool) -> GaussianCloud:
         version = self._meta.get("version")
         if version not in (None, 2):
-            raise self._error(f"SOG version {str(version)[:20]}, known are 1 and 2")
-        count = self._count(version)
+            raise self._error(f"SOG version {str(version)[:20]}; known are 2, and 1, which has no number")
+        stored = self._count(version)
         rest = self._section("shN") if "shN" in self._meta else None
         files = {
             name: self._files_of(name, n)
@@ -134,16 +137,21 @@ class _Reader:
         if rest is not None:
             files["shN"] = self._files_of("shN", 2)
         data = {name: [self._files.read(n) for n in names] for name, names in files.items()}
-        self._budget.spend(64 * count, f"its {count:,} splats")
+        self._budget.spend(64 * stored, f"its {stored:,} splats")
+        chosen, count = self._chosen(ranges, stored)
         if rest is not None:
             palette = self._palette(data["shN"][0], rest, version)
-            labels = self._pixels(data["shN"][1], "shN labels", count)
+            labels = self._pixels(data["shN"][1], "shN labels", stored)[chosen]
             self._budget.spend(24 * palette.shape[1] * count, "its spherical harmonics")
         builder = CloudBuilder(count, 1 + palette.shape[1], self._where)
         rows = builder.next(count)
         self._fill(
             rows,
-            {name: [self._pixels(d, name, count) for d in data[name]] for name in data if name != "shN"},
+            {
+                name: [self._pixels(d, name, stored)[chosen] for d in data[name]]
+                for name in data
+                if name != "shN"
+            },
             version,
         )
         if labels is not None:
@@ -178,6 +186,19 @@ class _Reader:
         # The fourth byte is 252 + the index of the largest component; other values leave the quaternion zero.
         rows.quaternions[:] = 0
         fill_smallest_three(rows.quaternions, small, turns[:, 3].astype(np.int32) - 252)
+
+    def _chosen(
+        self, ranges: Sequence[tuple[int, int]] | None, stored: int
+    ) -> tuple[np.ndarray | slice, int]:
+        """What picks the splats of ``ranges`` from the rows of all, and their number."""
+        if ranges is None:
+            return slice(None), stored
+        chosen = np.zeros(stored, bool)
+        for first, end in ranges:
+            if end > stored:
+                raise self._error(f"the splats {first:,} to {end:,} are asked for, but it has {stored:,}")
+            chosen[first:end] = True
+        return chosen, int(np.count_nonzero(chosen))
 
     # -- meta.json
 

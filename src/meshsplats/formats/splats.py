@@ -19,10 +19,11 @@ from meshsplats.formats.sog import read_sog
 from meshsplats.formats.splat_gltf import read_splat_gltf
 from meshsplats.formats.splat_ply import read_float_ply, write_float_ply
 from meshsplats.formats.spz import is_spz, read_spz
+from meshsplats.formats.streamed_sog import read_streamed_sog
 from meshsplats.gaussians import GaussianCloud
 
 Axes = Literal["auto", "y-down", "y-up"]
-SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "gltf"]
+SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "streamed sog", "gltf"]
 
 _CONVERT = "convert it first: npx @playcanvas/splat-transform {name} {stem}.ply"
 _SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
@@ -34,10 +35,12 @@ def load_gaussians(
 ) -> GaussianCloud:
     """Splats of a file or folder, after activation. The content decides which format it is, not the name:
     `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json),
-    glTF and GLB with KHR_gaussian_splatting.
+    streamed SOG (folder or its lod-meta.json), glTF and GLB with KHR_gaussian_splatting.
 
     A folder is a model of the 3D Gaussian Splatting code, of which the
-    ``point_cloud/iteration_*/point_cloud.ply`` of the highest iteration is read, or an unpacked SOG file.
+    ``point_cloud/iteration_*/point_cloud.ply`` of the highest iteration is read, or an unpacked SOG file. A
+    streamed SOG scene is read in the finest level that each of its places has; its coarser levels are folders
+    in it that can be read by themselves.
 
     The cloud has y down and z forward, as float .ply files have it. ``axes`` says what the file has: 'auto'
     is what its format prescribes ('y-up' for SPZ and glTF, 'y-down' for the others), so that files of one
@@ -67,7 +70,9 @@ def load_gaussians(
         elif kind == "spz":
             cloud, to_y_down = read_spz(file.read(), found, Budget(found), strict=strict)
         elif kind == "sog":
-            cloud = read_sog(found, strict=strict)
+            cloud = read_sog(found, Budget(found), strict=strict)
+        elif kind == "streamed sog":
+            cloud = read_streamed_sog(found, strict=strict)
         else:
             cloud, to_y_down, turn = read_splat_gltf(found, strict=strict), HALF_TURN_Z, HALF_TURN_Z
     if axes != "auto":
@@ -151,12 +156,10 @@ def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
     text = file.read(8 << 20)
     if all(name in text for name in _SOG_SECTIONS):  # some name their generator in an asset, as glTF does
         return "sog"
-    if b'"asset"' in text and b'"lodLevels"' not in text:
-        return "gltf"
     if b'"lodLevels"' in text:
-        raise FileFormatError(
-            f"{path}: the index of a streamed SOG scene; give the meta.json of one of its parts, or {convert}"
-        )
+        return "streamed sog"
+    if b'"asset"' in text:
+        return "gltf"
     if path.suffix.lower() in (".lcc", ".lcc2") or (b'"splats"' in text and b'"totalLevel"' in text):
         raise FileFormatError(f"{path}: .lcc scenes are not read here; {convert}")
     if b'"means"' in text:
