@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import meshsplats as ms
-from meshsplats.cli.finetune import TargetOptions
+from meshsplats.cli.targets import TargetOptions
 from meshsplats.evaluation import evaluate
 from meshsplats.finetuning import (
     FinetuneConfig,

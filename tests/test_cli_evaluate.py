@@ -146,7 +146,7 @@ def test_existing_results_stay(scene, tmp_path, capsys):
 
 
 def test_default_views_are_those_that_finetune_holds_out(scene, tmp_path):
-    from meshsplats.cli.finetune import TargetOptions
+    from meshsplats.cli.targets import TargetOptions
 
     out = tmp_path / "out"
     assert run(scene / "mesh.npz", "--splats", scene / "scene.ply", "-o", out, "--strips", "0") == 0

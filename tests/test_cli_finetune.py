@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +21,8 @@ from _photographs import write_photographs
 
 from meshsplats.camera import orbit, save_cameras
 from meshsplats.cli import main
-from meshsplats.cli.finetune import Finetune, TargetOptions
+from meshsplats.cli.finetune import Finetune
+from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config, worthwhile_views
 from meshsplats.formats.meshes import load_mesh
@@ -70,6 +74,38 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     assert run(splats, "-o", out, *SMALL, "--steps", "12", "--force") == 0
     assert np.array_equal(load_mesh(out).vertices, mesh.vertices)
     assert "next: meshsplats evaluate" in capsys.readouterr().out
+
+
+def told_score(out: str, capsys) -> tuple[float, float]:
+    """Of what was held out, as ``finetune`` told it and as the command scores that it names."""
+    told = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
+    command = shlex.split(re.search(r"next: meshsplats (.*)", out)[1])
+    assert main([*command, "--strips", "0", "--json"]) == 0
+    (method,) = json.loads(capsys.readouterr().out)["scenes"][0]["methods"].values()
+    return told, method["mean"]["psnr"]
+
+
+@pytest.mark.parametrize("options", [["--downscale", "2", "--background", "black"], ["--test-every", "3"]])
+def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_path, capsys, options):
+    cloud = make_scene(300)
+    cameras = orbit(cloud, 9, width=64, height=64)
+    pictures = [render_splats(cloud, c, background=(0.2, 0.5, 0.7)).color for c in cameras]
+    data = write_photographs(tmp_path / "photos here", cameras, pictures)
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "--data", data, "-o", out, "--steps", "4", *options) == 0
+    told, scored = told_score(capsys.readouterr().out, capsys)
+    assert told == pytest.approx(scored, abs=0.005)
+
+
+def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys):
+    cloud = make_scene(300)
+    sh = np.zeros((len(cloud), 4, 3), np.float32)
+    sh[:, 0], sh[:, 2] = cloud.sh[:, 0], 1
+    save_gaussians(replace(cloud, sh=sh), tmp_path / "scene.ply")
+    options = ["--views", "4", "--sh-degree", "0", "--steps", "2"]
+    assert run(tmp_path / "scene.ply", "-o", tmp_path / "tuned.npz", *options) == 0
+    told, scored = told_score(capsys.readouterr().out, capsys)
+    assert told == pytest.approx(scored, abs=0.005)
 
 
 def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):

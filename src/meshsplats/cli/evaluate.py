@@ -30,7 +30,7 @@ from meshsplats.cli.common import (
     view_names,
     write_json,
 )
-from meshsplats.cli.finetune import TargetOptions
+from meshsplats.cli.targets import TargetOptions
 from meshsplats.dataset import Dataset, load_dataset, splat_views
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation import SSIM_CONVENTION, Report, ScoredView, evaluate

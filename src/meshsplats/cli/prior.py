@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shlex
-import signal
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,30 +14,24 @@ import tyro
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
 from meshsplats.cli import UsageError
-from meshsplats.cli.common import (
-    Count,
-    File,
-    Number,
-    Output,
-    SplatOptions,
-    configuration,
-    size_of,
-    write_json,
-)
-from meshsplats.cli.finetune import (
+from meshsplats.cli.common import Count, File, Number, Output, SplatOptions, configuration, write_json
+from meshsplats.cli.targets import TargetOptions
+from meshsplats.cli.training import (
     STARTING_UP,
-    TargetOptions,
-    _described,
-    _draw_preview,
-    _Files,
-    _need_torch,
-    _say,
-    _shown,
-    check_run_files,
+    RunFiles,
+    announce,
+    background_of,
+    described,
+    draw_preview,
+    given,
+    need_torch,
+    run_options,
+    shown,
+    stopped,
+    tell,
 )
 from meshsplats.dataset import Dataset
-from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, worthwhile_views
-from meshsplats.finetuning.memory import available_memory, check_memory, readable
+from meshsplats.finetuning import FinetuneConfig, Interrupted, worthwhile_views
 from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train
@@ -50,7 +42,7 @@ SUFFIXES = (".npz", ".glb")
 if TYPE_CHECKING:
     _Training = FinetuneConfig
 else:
-    _Training = _described(FinetuneConfig, prior_config())
+    _Training = described(FinetuneConfig, prior_config())
 
 
 @dataclass(frozen=True)
@@ -118,9 +110,9 @@ class Prior:
         began = time.perf_counter() - STARTING_UP
         config = self.configured()
         self._check()
-        files = _Files(self.output)
-        check_run_files(files, resume=self.resume, force=self.force)
-        _need_torch()
+        files = RunFiles(self.output)
+        files.check(resume=self.resume, force=self.force)
+        need_torch()
         wants_texture = self.laying.colors in ("auto", "texture")
         base = load_base(self.input, texture=self.laying.texture, textures=wants_texture)
         dataset = self._dataset(base, config)
@@ -133,43 +125,28 @@ class Prior:
             views=dataset.train,
             threads=self.threads,
         )
-        needed = check_memory(prior.mesh, dataset, cache_bytes=self.target.cache_bytes)
-        free = available_memory()
-        _say(
-            f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles;"
-            f" {len(dataset.train)} training views, {len(dataset.test)} held out; memory: about"
-            f" {readable(needed)}" + (f" of {readable(free)} free" if free else "")
-        )
-        options = RunOptions(
-            folder=files.run,
-            resume=self.resume,
-            report_every=self.report_every,
-            preview_every=self.preview_every,
-            threads=self.threads,
-            spent=time.perf_counter() - began,
-            cache_bytes=self.target.cache_bytes,
-        )
+        what = f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles"
+        announce(what, prior.mesh, dataset, self.target.cache_bytes)
+        options = run_options(self, files, began)
         try:
-            with _shown() as show:
+            with shown() as show:
                 trained = train(prior, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
-            _say(f"stopped after step {stop.step:,}; the checkpoint is in {files.run}: the same command with")
-            _say("  --resume goes on from there")
-            return 128 + (stop.signal or signal.SIGINT)
+            return stopped(stop, files)
         save_mesh(exported(trained, files.mesh), files.mesh)
         write_json(files.config, configuration("prior", self) | {"tuning": config.to_dict()})
-        _draw_preview(trained.mesh, files.preview)
-        self._tell(files, trained, time.perf_counter() - began)
+        draw_preview(trained.mesh, files.preview)
+        counts = {"base_faces": len(trained.base_faces), "triangles": len(trained.mesh.faces)}
+        made = f"{counts['triangles']:,} triangles on {counts['base_faces']:,} faces"
+        tell(self, files, time.perf_counter() - began, counts, made)
+        if not self.json:
+            print(f"next: edit {self.input}, moving its vertices, and")
+            print(f"  meshsplats deform {shlex.quote(str(files.mesh))} --base edited.obj -o edited.glb")
         return 0
 
     def configured(self) -> FinetuneConfig:
         """The configuration with what was given."""
-        given = {k: v for k, v in asdict(self.tuning).items() if v is not None}
-        lengths = {name: getattr(self, name) for name in ("epochs", "steps", "minutes")}
-        lengths = {name: value for name, value in lengths.items() if value is not None}
-        if len(lengths) > 1:
-            raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
-        return prior_config(**given, **lengths)
+        return prior_config(**given(self))
 
     def _check(self) -> None:
         """UsageError for options that contradict each other or would do nothing."""
@@ -185,38 +162,12 @@ class Prior:
         self.target.check()
 
     def _dataset(self, base: BaseMesh, config: FinetuneConfig) -> Dataset:
-        background = (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
+        background = background_of(config)
         if self.splats is None:
             mesh = SplatMesh(base.vertices, base.faces, _grey(base))
             return self.target.make(mesh, self.input, background, self.threads)
         cloud, worthwhile = self.reading.load(self.splats), worthwhile_views(config)
         return self.target.make(cloud, self.splats, background, self.threads, worthwhile)
-
-    def _tell(self, files: _Files, trained: MeshPrior, seconds: float) -> None:
-        from meshsplats.finetuning.journal import Journal
-
-        lines = Journal(files.run).metrics()
-        scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
-        result = {
-            "mesh": str(files.mesh),
-            "steps": lines[-1]["step"] if lines else 0,
-            "seconds": round(seconds, 2),
-            "base_faces": len(trained.base_faces),
-            "triangles": len(trained.mesh.faces),
-            "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
-            "run": str(files.run),
-        }
-        if self.json:
-            print(json.dumps(result, indent=1))
-            return
-        size = f"{size_of(files.mesh)}, {result['triangles']:,} triangles on {result['base_faces']:,} faces"
-        print(
-            f"{files.mesh} ({size}): {result['steps']:,} steps in {seconds:.1f} s"
-            + (f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else "")
-        )
-        print(f"preview: {files.preview}; metrics: {files.run}/metrics.jsonl")
-        print(f"next: edit {self.input}, moving its vertices, and")
-        print(f"  meshsplats deform {shlex.quote(str(files.mesh))} --base edited.obj -o edited.glb")
 
 
 def exported(prior: MeshPrior, path: Path) -> SplatMesh:

@@ -1,0 +1,102 @@
+"""Options of the commands that compare pictures with a truth: photographs, or the splats' own pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+from meshsplats.camera import load_cameras
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import Count, File, Folder, Text, cameras_beside, parse_up
+from meshsplats.dataset import Dataset, load_dataset
+from meshsplats.finetuning import FEWEST_VIEWS
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+
+@dataclass(frozen=True)
+class TargetOptions:
+    """What the pictures should look like: photographs (--data), or else the splats' own pictures."""
+
+    data: Folder = None
+    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio)."""
+    downscale: int = 1
+    """With --data: pictures this many times smaller."""
+    test_every: int = 8
+    """With --data: every n-th view is held out, where the data set has no split of its own; 0: none."""
+    views: Count = None
+    """Without --data: number of pictures of the splats to learn from. Default: 200, and more in a long run:
+    one for each second, or for two --steps, up to 1000."""
+    held_out: int = 8
+    """Without --data: number of further pictures to measure with."""
+    width: int = 400
+    """Without --data: side of these pictures in pixels."""
+    distance: tuple[float, float] = (0.9, 1.1)
+    """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
+    sphere with 90 % of the splats' opacity just fits the picture. The mesh looks best from there."""
+    placement: Literal["auto", "object", "surrounded", "inside"] = "auto"
+    """Without --data: cameras all round an object, above the ground round an object in its surroundings, or
+    inside a room."""
+    cameras: File = None
+    """Without --data: cameras to draw from, a JSON list or a cameras.json of a 3DGS trainer. Default: those
+    of a model folder, else cameras are placed."""
+    up: Text = None
+    """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
+    sh_degree: Count = None
+    """Without --data: draw the splats with spherical harmonics up to this degree. Default: all that are
+    stored."""
+    cache: float = 2.0
+    """Gigabytes of pictures kept in memory; the others are read or drawn again when they are needed."""
+
+    def check(self) -> None:
+        """UsageError for options that would do nothing."""
+        idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "sh_degree")
+        names, source = (idle, "--data") if self.data is not None else (("downscale", "test_every"), "splats")
+        for name in names:
+            if getattr(self, name) != next(f.default for f in fields(self) if f.name == name):
+                raise UsageError(f"--{name.replace('_', '-')} has no effect with {source}")
+        if not self.cache >= 0:
+            raise ValueError(f"--cache must be a number of gigabytes, >= 0, got {self.cache}")
+
+    @property
+    def cache_bytes(self) -> int:
+        return int(self.cache * 1e9)
+
+    def make(
+        self,
+        scene: GaussianCloud | SplatMesh,
+        source: Path,
+        background: Sequence[float],
+        threads: int | None,
+        worthwhile: int = FEWEST_VIEWS,
+    ) -> Dataset:
+        """The data set; of so many views as are ``worthwhile`` where nothing else was said."""
+        if self.data is not None:
+            return load_dataset(
+                self.data,
+                downscale=self.downscale,
+                test_every=self.test_every,
+                background=background,
+                cache_bytes=self.cache_bytes,
+            )
+        if not isinstance(scene, GaussianCloud):
+            raise UsageError(f"{source} is a mesh: give its photographs with --data, or splats in its place")
+        from meshsplats.datasets.around import splat_dataset
+
+        cameras = load_cameras(self.cameras) if self.cameras is not None else cameras_beside(source)
+        return splat_dataset(
+            scene,
+            placement=self.placement,
+            cameras=cameras,
+            train=self.views or worthwhile,
+            test=self.held_out,
+            width=self.width,
+            distance=self.distance,
+            up=None if self.up is None else parse_up(self.up),
+            sh_degree=self.sh_degree,
+            background=background,
+            threads=threads,
+            cache_bytes=self.cache_bytes,
+        )

@@ -1,0 +1,229 @@
+"""What ``finetune`` and ``prior`` share: options of an optimisation, its files, how it is shown and told."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+
+import tyro
+
+from meshsplats.camera import orbit
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import check_outputs, size_of
+from meshsplats.dataset import Dataset
+from meshsplats.errors import MissingDependencyError
+from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+
+    from meshsplats.cli.finetune import Finetune
+    from meshsplats.cli.prior import Prior
+
+STARTING_UP = 1.0
+"""Seconds that Python and the libraries take before the command's own clock begins."""
+
+
+def described(config: type[FinetuneConfig], standard: FinetuneConfig | None = None) -> type[FinetuneConfig]:
+    """The choices of a configuration as options that may be left out; their docstrings are the help. Values
+    that they have then are those of ``standard``, or the preset default's."""
+    typed: dict[str, Any] = {}
+    values: dict[str, Any] = {"__post_init__": lambda self: None}
+    for name, hint in get_type_hints(config).items():
+        if name in ("preset", "epochs", "steps", "minutes"):
+            typed[name] = tyro.conf.Suppress[object]  # type: ignore[misc]
+        else:
+            choices = "{" + ",".join(map(str, get_args(hint))) + "}"
+            metavar = {int: "N", float: "X", bool: "{True,False}"}.get(hint, choices)
+            told = f"(default preset: {getattr(FinetuneConfig, name)})"
+            if standard is not None:
+                told = f"(default: {getattr(standard, name)})"
+            typed[name] = Annotated[hint | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=told)]
+        values[name] = None
+    about = "What is not given is left to the preset."
+    made = type("TuningOptions", (config,), {"__annotations__": typed, "__doc__": about, **values})
+    return dataclass(frozen=True)(made)
+
+
+@dataclass(frozen=True)
+class RunFiles:
+    """Where the results of a run go."""
+
+    mesh: Path
+
+    @property
+    def config(self) -> Path:
+        return self.mesh.with_suffix(".config.json")
+
+    @property
+    def preview(self) -> Path:
+        return self.mesh.with_suffix(".preview.png")
+
+    @property
+    def run(self) -> Path:
+        return self.mesh.with_suffix(".run")
+
+    def check(self, *, resume: bool, force: bool) -> None:
+        """Before the work: OSError if something would be overwritten, cannot be written, or is missing to go
+        on from."""
+        from meshsplats.finetuning.journal import CHECKPOINT
+
+        checkpoint = self.run / CHECKPOINT
+        if resume and not checkpoint.is_file():
+            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to begin anew")
+        if checkpoint.exists() and not (resume or force):
+            raise FileExistsError(
+                f"{checkpoint} is left from an earlier run: --resume goes on with it, --force begins anew"
+            )
+        check_outputs([self.mesh, self.config, self.preview], force)
+
+
+def given(command: Finetune | Prior) -> dict[str, Any]:
+    """What of the configuration was given, its length with it."""
+    tuning = {k: v for k, v in asdict(command.tuning).items() if v is not None}
+    lengths = {name: getattr(command, name) for name in ("epochs", "steps", "minutes")}
+    lengths = {name: value for name, value in lengths.items() if value is not None}
+    if len(lengths) > 1:
+        raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
+    return tuning | lengths
+
+
+def background_of(config: FinetuneConfig) -> tuple[float, float, float]:
+    """Behind pictures where the configuration names none of its own."""
+    return (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
+
+
+def announce(what: str, mesh: SplatMesh, dataset: Dataset, cache_bytes: int) -> None:
+    """Says what is ahead. MemoryError if it would not fit."""
+    from meshsplats.finetuning.memory import available_memory, check_memory, readable
+
+    needed, free = check_memory(mesh, dataset, cache_bytes=cache_bytes), available_memory()
+    views = f"{len(dataset.train)} training views, {len(dataset.test)} held out"
+    say(f"{what}; {views}; memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else ""))
+
+
+def run_options(command: Finetune | Prior, files: RunFiles, began: float) -> RunOptions:
+    """Those of a command that began at ``began`` by the performance counter."""
+    return RunOptions(
+        folder=files.run,
+        resume=command.resume,
+        report_every=command.report_every,
+        preview_every=command.preview_every,
+        threads=command.threads,
+        spent=time.perf_counter() - began,
+        cache_bytes=command.target.cache_bytes,
+    )
+
+
+def stopped(stop: Interrupted, files: RunFiles) -> int:
+    """Says how to go on; returns the exit status."""
+    say(f"stopped after step {stop.step:,}; the checkpoint is in {files.run}: the same command with")
+    say("  --resume goes on from there")
+    return 128 + (stop.signal or signal.SIGINT)
+
+
+def tell(
+    command: Finetune | Prior, files: RunFiles, seconds: float, counts: dict[str, int], made: str
+) -> None:
+    """Prints what came of it: JSON with ``counts``, or text in which ``made`` stands for them."""
+    from meshsplats.finetuning.journal import Journal
+
+    lines = Journal(files.run).metrics()
+    scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
+    steps = lines[-1]["step"] if lines else 0
+    if command.json:
+        result = {
+            "mesh": str(files.mesh),
+            "steps": steps,
+            "seconds": round(seconds, 2),
+            **counts,
+            "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
+            "run": str(files.run),
+        }
+        print(json.dumps(result, indent=1))
+        return
+    print(
+        f"{files.mesh} ({size_of(files.mesh)}, {made}): {steps:,} steps in {seconds:.1f} s"
+        + (f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else "")
+    )
+    print(f"preview: {files.preview}; metrics: {files.run}/metrics.jsonl")
+
+
+@contextmanager
+def shown() -> Iterator[Any]:
+    """A function that shows a ``Progress``: as a bar where stderr is a terminal, else a line a score."""
+    if not sys.stderr.isatty():
+        yield _Lines()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        yield _InBar(bar)
+
+
+class _InBar:
+    def __init__(self, bar: Bar) -> None:
+        self._bar, self._task = bar, bar.add_task("fine-tuning", total=1.0, text="")
+        self._loss: float | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.loss is not None:  # one view's loss jumps about
+            self._loss = progress.loss if self._loss is None else 0.95 * self._loss + 0.05 * progress.loss
+        self._bar.update(self._task, completed=progress.fraction, text=_text(progress, self._loss))
+
+
+class _Lines:
+    def __init__(self) -> None:
+        self._last: float | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        if progress.held_out != self._last:
+            self._last = progress.held_out
+            say(_text(progress, progress.loss))
+
+
+def _text(progress: Progress, loss: float | None) -> str:
+    parts = [f"step {progress.step:,}" + (f"/{progress.steps:,}" if progress.steps else "")]
+    if loss is not None:
+        parts.append(f"loss {loss:.4f}")
+    if progress.held_out is not None:
+        parts.append(f"held out {progress.held_out:.2f} dB")
+    if progress.seconds_left is not None:
+        left = int(progress.seconds_left)
+        parts.append(f"{left // 60}:{left % 60:02d} left")
+    return ", ".join(parts)
+
+
+def draw_preview(mesh: SplatMesh, path: Path) -> None:
+    from meshsplats.evaluation import mesh_picture
+    from meshsplats.pictures import save_png
+
+    camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
+    save_png(path, mesh_picture(mesh, camera, (1, 1, 1), samples=2)[0])
+
+
+def need_torch() -> None:
+    """Before any work: MissingDependencyError without the extra."""
+    try:
+        import safetensors
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"fine-tuning needs {error.name}: pip install 'meshsplats[finetune]'"
+        ) from error
+    del safetensors
+
+
+def say(text: str) -> None:
+    print(f"meshsplats: {text}", file=sys.stderr, flush=True)
