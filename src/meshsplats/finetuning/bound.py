@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from meshsplats.binding import Binding
+from meshsplats.finetuning.sizes import means_at_vertices
 from meshsplats.mesh import SplatMesh
 
 _ROWS = 1 << 15
@@ -104,11 +105,4 @@ def weight_units(mesh: SplatMesh, per_scene_unit: bool) -> np.ndarray:
         return unit[binding.vertex_face].astype(np.float32)
     # Of a triangle with weights a, b, c in its corners, |det (a b c)| is the share of its face that it fills.
     share = np.sqrt(np.abs(np.linalg.det(binding.weights[mesh.faces].astype(np.float64))))
-    v = len(mesh.vertices)
-    total = np.bincount(mesh.faces.ravel(), np.repeat(share, 3), v)
-    uses = np.bincount(mesh.faces.ravel(), minlength=v)
-    result = np.divide(total, uses, out=np.zeros(v), where=uses > 0)
-    positive = result > 0
-    if positive.any():
-        result[~positive] = result[positive].min()
-    return result.astype(np.float32)
+    return means_at_vertices(mesh, share)

@@ -15,7 +15,6 @@ def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
     that several share takes the mean of theirs. Vertices without area take the smallest size that there is,
     so that they hardly move; all sizes are 0 if no triangle has an area.
     """
-    v = len(mesh.vertices)
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.sqrt(np.linalg.norm(normals, axis=1))
@@ -23,7 +22,14 @@ def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
         starts = splat_starts(mesh.face_splat)
         counts = np.diff(np.append(starts, len(size)))
         size = np.repeat(np.add.reduceat(size, starts) / counts, counts)
-    total = np.bincount(mesh.faces.ravel(), np.repeat(size, 3), v)
+    return means_at_vertices(mesh, size)
+
+
+def means_at_vertices(mesh: SplatMesh, values: np.ndarray) -> np.ndarray:
+    """(v,) float32: for each vertex the mean of its triangles' ``values`` (f,) >= 0. Vertices for which that
+    is 0 take the smallest of the others; all are 0 if all values are."""
+    v = len(mesh.vertices)
+    total = np.bincount(mesh.faces.ravel(), np.repeat(values, 3), v)
     uses = np.bincount(mesh.faces.ravel(), minlength=v)
     result = np.divide(total, uses, out=np.zeros(v), where=uses > 0)
     positive = result > 0
