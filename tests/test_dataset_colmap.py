@@ -33,7 +33,7 @@ def test_poses_intrinsics_and_pictures(tmp_path, text):
         assert view.mask is None
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse"])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "sparse/2", "."])
 def test_places_of_the_model(tmp_path, place):
     assert len(load_dataset(simple_colmap(tmp_path, place=place)).views) == 3
 
@@ -270,6 +270,11 @@ def test_names_that_are_not_text_and_names_twice_are_refused(tmp_path):
         ("images", "1 1 0 0 0 0 0 0 1\n\n", "line 1: a picture is"),
         ("images", "# x\n1 1 0 0 0 0 0 y 1 a.png\n\n", "line 2: expected numbers"),
         ("images", "\n", "names no pictures"),
+        (
+            "images",
+            "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b 7.png\n",
+            "line 2: a picture, where the points of the one before it are expected",
+        ),
     ],
 )
 def test_broken_text_is_refused(tmp_path, name, text, message):
@@ -337,6 +342,10 @@ def test_a_larger_second_model_is_told(tmp_path):
     [
         (lambda f: None, "it holds nothing"),
         (lambda f: (f / "sparse").mkdir(), "sparse/ holds no cameras"),
+        (
+            lambda f: [simple_colmap(f, place=f"sparse/{k}") for k in (1, 2)],
+            "holds the models 1, 2 but none named 0: rename",
+        ),
         (lambda f: (f / "database.db").touch(), "without a sparse model"),
         (lambda f: (f / "point_cloud").mkdir(), "a trained model"),
         (lambda f: (f / "cameras.bin").touch(), "a sparse model by itself"),

@@ -184,6 +184,8 @@ def test_brown_distortion_is_taken_out(tmp_path):
 
 def test_fisheye_by_model_and_by_flag(tmp_path):
     by_model = load_dataset(studio(tmp_path / "a", camera_model="OPENCV_FISHEYE", k1=0.1))
+    by_name = load_dataset(studio(tmp_path / "c", camera_model="opencv_fisheye", k1=0.1))
+    assert by_name.views[0].source.lens == by_model.views[0].source.lens
     by_flag = load_dataset(studio(tmp_path / "b", camera_model=None, is_fisheye=True, k1=0.1))
     assert by_model.views[0].source.lens == by_flag.views[0].source.lens
     assert by_model.views[0].source.lens.model == "OPENCV_FISHEYE"
@@ -209,7 +211,8 @@ def test_smaller_copies_of_nested_folders(tmp_path):
 def test_masks_by_name_and_by_folder(tmp_path):
     mask = np.zeros((8, 12), np.uint8)
     mask[:, :5] = 255
-    frames = [frame("images/f0.png", mask_path="m/x.png"), frame("images/f1.png"), frame("images/f2.png")]
+    frames = [frame("images/f0.png", mask_path="m/x.png"), frame("images/f1.png", mask_path="")]
+    frames.append(frame("images/f2.png", mask_path=None))
     save(tmp_path / "m/x.png", mask)
     save(tmp_path / "masks/f1.png.png", 255 - mask)
     folder = studio(tmp_path, frames=frames)

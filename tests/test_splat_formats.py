@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zipfile
 
@@ -287,6 +288,35 @@ def test_sog_labels_beyond_the_palette_have_no_harmonics(tmp_path):
     assert (cloud.sh[4, 1:] != 0).any()
 
 
+def changed_meta(files, change):
+    meta = json.loads(files["meta.json"])
+    change(meta)
+    return files | {"meta.json": json.dumps(meta).encode()}
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_sog_of_the_first_days_of_version_2_states_neither_bands_nor_count(tmp_path, degree):
+    files = encode.sog(some_splats(9, degree))
+
+    def forget(meta):
+        del meta["shN"]["bands"], meta["shN"]["count"]
+
+    cloud = load_gaussians(put(tmp_path / "old", changed_meta(files, forget)), strict=True)
+    assert np.array_equal(cloud.sh, load_gaussians(put(tmp_path / "new", files)).sh)
+
+
+def test_sog_codebooks_may_lack_their_first_entry(tmp_path):
+    """As PlayCanvas' engine mends it: as far below the second as all others are apart in the mean."""
+    files = encode.sog(some_splats(9, degree=1))
+    files["sh0.webp"] = encode.webp(np.tile([0, 1, 255, 255], (9, 1)))
+
+    def empty(meta):
+        meta["sh0"]["codebook"] = [None, *np.linspace(1.0, 52.0, 255)]
+
+    cloud = load_gaussians(put(tmp_path / "s", changed_meta(files, empty)), strict=True)
+    np.testing.assert_allclose(cloud.sh[:, 0], np.tile([0.8, 1, 52], (9, 1)), rtol=1e-6)
+
+
 def test_sog_pictures_may_be_png(tmp_path):
     values = some_splats(9, degree=0)
     files = encode.sog(values)
@@ -411,15 +441,23 @@ def test_gltf_in_linear_colours_says_so(tmp_path):
 # -- what is not read
 
 
-def test_other_tools_are_named(tmp_path):
-    for name, data in [
-        ("a.ksplat", b"\0\1" + bytes(5000)),
-        ("a.lcc", b'{"version": "5.0", "splats": 10, "totalLevel": 3}'),
-    ]:
-        (tmp_path / name).write_bytes(data)
-        with pytest.raises(FileFormatError, match=rf"splat-transform {name}"):
-            load_gaussians(tmp_path / name)
-        assert splat_format(tmp_path / name) is None
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("a.ksplat", b"\0\1" + bytes(5000), "splat-transform a.ksplat a.ply"),
+        ("a.lcc", b'{"version": "5.0", "splats": 10, "totalLevel": 3}', "splat-transform a.lcc a.ply"),
+        ("cut.splat", bytes(33), "not records of 32 bytes"),
+        ("a.ply.gz", b"\x1f\x8b\x08" + bytes(40), "a gzip file, but not SPZ; unpack it first"),
+        ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "git lfs pull"),
+        ("a.spz", b"\n<!DOCTYPE html><html>", "a web page, not the file itself"),
+    ],
+)
+def test_what_is_not_read_is_named_by_all_who_meet_it(tmp_path, name, data, message):
+    path = tmp_path / name
+    path.write_bytes(data)
+    for ask in (load_gaussians, identify, splat_format):
+        with pytest.raises(FileFormatError, match=message):
+            ask(path)
 
 
 def test_axes_must_be_known(tmp_path):

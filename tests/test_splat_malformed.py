@@ -208,6 +208,13 @@ def test_paths(tmp_path):
         load_gaussians(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json", "sparse"])
+def test_folders_of_photographs_are_told(tmp_path, name):
+    (tmp_path / name).mkdir()
+    with pytest.raises(FileFormatError, match=rf"photographs, not splats \({name} is there\).*--data"):
+        load_gaussians(tmp_path)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
 def test_special_files_are_not_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")

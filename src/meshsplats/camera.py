@@ -312,8 +312,10 @@ def load_cameras(path: str | Path) -> list[Camera]:
         path = path / "cameras.json"
     entries = read_json(path)
     if not isinstance(entries, list):
+        other = isinstance(entries, dict) and "frames" in entries
+        what = " with 'frames': of a data set, which load_dataset and --data read" if other else ""
         raise FileFormatError(
-            f"{path}: a camera file is a JSON list of cameras, this is a JSON {_kind(entries)}"
+            f"{path}: a camera file is a JSON list of cameras, this is a JSON {_kind(entries)}{what}"
         )
     if not entries:
         raise FileFormatError(f"{path}: holds no camera")

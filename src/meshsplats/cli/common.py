@@ -45,7 +45,8 @@ class SplatOptions:
     """How splat files are read."""
 
     axes: Literal["auto", "y-down", "y-up"] = "auto"
-    """What points up in the file; auto: as its format prescribes. The scene has y down after reading."""
+    """What points up in the file; auto: as its format prescribes. The scene has y down after reading. Some
+    programs write SPZ as if its y pointed down: if the picture is upside down, give y-down."""
     strict: bool = False
     """Splats with values that are not finite are an error, not left out with a warning."""
 

@@ -190,8 +190,23 @@ def _text_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame
             frames.append(_frame(name, pose, _whole(words[8], where), lenses, images, where))
             if len(frames) > MAX_FRAMES:
                 raise FileFormatError(f"{path}: more than {MAX_FRAMES:,} pictures")
-            next(lines, None)  # the picture's points, on a line that may be empty
+            points = next(lines, None)  # on a line that may be empty
+            if points is not None and _looks_like_a_picture(points[1]):
+                raise FileFormatError(
+                    f"{path}: line {points[0]}: a picture, where the points of the one before it are"
+                    " expected; a line for them must be there, if empty"
+                )
     return frames
+
+
+def _looks_like_a_picture(line: bytes) -> bool:
+    """Points are numbers throughout; a picture's line ends in a name."""
+    words = line.split(None, 9)
+    try:
+        float(words[9].split()[0] if len(words) == 10 else 0)
+    except ValueError:
+        return True
+    return False
 
 
 def _decoded(raw: bytes, path: Path, what: str) -> str:

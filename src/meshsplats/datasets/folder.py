@@ -33,10 +33,24 @@ def read_folder(path: Path, downscale: int, test_every: int, store: PictureStore
     model = find_model(path, ("sparse/0", "sparse"))
     if model is None and (path / "transforms.json").is_file():
         return _nerfstudio(path / "transforms.json", album, test_every)
-    model = model or find_model(path, ("colmap/sparse/0", "colmap/sparse"))
+    model = model or find_model(path, ("colmap/sparse/0", "colmap/sparse")) or _other_model(path)
     if model is None:
         raise FileFormatError(f"{path}: {_what_is_there(path)}")
     return _colmap(model, album, test_every)
+
+
+def _other_model(path: Path) -> Path | None:
+    """The only numbered model in sparse/, or one that lies beside the folder of its pictures."""
+    if (path / "sparse").is_dir():
+        numbers = [name for name in os.listdir(path / "sparse") if name.isdecimal()]
+        found = [model for name in numbers if (model := find_model(path / "sparse", (name,)))]
+        if len(found) > 1:
+            raise FileFormatError(
+                f"{path}: sparse/ holds the models {', '.join(sorted(m.name for m in found))} but none named"
+                " 0: rename the one to use"
+            )
+        return found[0] if found else None
+    return find_model(path, (".",)) if (path / "images").is_dir() else None
 
 
 def _colmap(model: Path, album: Album, test_every: int) -> Views:

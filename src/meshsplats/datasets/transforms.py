@@ -71,7 +71,7 @@ def _frame(path: Path, common: dict, frame: object, i: int) -> Frame:
     where = f"{path}: frame {i}"
     if not isinstance(frame, dict):
         raise FileFormatError(f"{where}: must be a JSON object")
-    file, mask = frame.get("file_path"), frame.get("mask_path")
+    file, mask = frame.get("file_path"), frame.get("mask_path") or None
     if not isinstance(file, str) or not file:
         raise FileFormatError(f"{where}: needs a 'file_path'")
     if mask is not None and not isinstance(mask, str):
@@ -87,7 +87,8 @@ def _lens(folder: Path, values: dict, file: str, where: str) -> Lens | None:
     if size is None:
         return None
     width, height = size
-    model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    model = values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    model = model.upper() if isinstance(model, str) else model
     if model == "EQUIRECTANGULAR":
         return Lens(model, 1, 1, width / 2, height / 2, width, height)
     if model not in (*_PERSPECTIVE, *_FISHEYE):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.mesh_checks import Budget
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 
@@ -93,6 +95,29 @@ class CloudBuilder:
                 array.resize((self._kept, *array.shape[1:]), refcheck=False)  # shrinks in place
         means, quaternions, scales, opacities, sh = self._arrays
         return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
+
+
+def joined(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCloud:
+    """All clouds in one, of at least one; missing harmonics are zero, and the kernel is that of all or
+    '3dgs'."""
+    if len(clouds) == 1:
+        return clouds[0]
+    count, width = sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds)
+    budget.spend(4 * (11 + 3 * width) * count, f"its {count:,} splats together")
+    sh = np.zeros((count, width, 3), np.float32)
+    start = 0
+    for cloud in clouds:
+        sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
+        start += len(cloud)
+    kernels = {cloud.kernel for cloud in clouds}
+    return GaussianCloud(
+        means=np.concatenate([cloud.means for cloud in clouds]),
+        quaternions=np.concatenate([cloud.quaternions for cloud in clouds]),
+        scales=np.concatenate([cloud.scales for cloud in clouds]),
+        opacities=np.concatenate([cloud.opacities for cloud in clouds]),
+        sh=sh,
+        kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
+    )
 
 
 def fill_smallest_three(out: np.ndarray, small: np.ndarray, largest: np.ndarray) -> None:

@@ -102,13 +102,12 @@ def read_mesh_ply(path: Path) -> SplatMesh:
     with open(path, "rb") as file:
         header = read_header(file, path)
         vertex, face = header.element("vertex"), header.element("face")
-        if vertex is None or any(n not in vertex.names for n in "xyz"):
+        names = () if vertex is None else vertex.names
+        if face is None and any(n.startswith(("f_dc_", "packed_")) for n in names):
+            raise FileFormatError(f"{path}: holds Gaussian splats, not a mesh; read it with load_gaussians")
+        if vertex is None or any(n not in names for n in "xyz"):
             raise FileFormatError(f"{path}: not a mesh: no element 'vertex' with x, y and z")
         if face is None:
-            if any(n.startswith("f_dc_") or n.startswith("packed_") for n in vertex.names):
-                raise FileFormatError(
-                    f"{path}: holds Gaussian splats, not a mesh; read it with load_gaussians"
-                )
             raise FileFormatError(f"{path}: not a mesh but points: it has no element 'face'")
         return _read(file, header, vertex, face, path)
 
@@ -138,6 +137,8 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
     for i, name in enumerate(groups["colors"]):
         if types[name].kind == "u":
             arrays["colors"][:, i] /= np.float32(np.iinfo(types[name]).max)
+        elif types[name].kind == "i":  # bytes in a wider type: no number of a signed one is white
+            arrays["colors"][:, i] /= np.float32(255)
     faces, numbers = read_faces(file, header, face, ("face_splat", "depth_group"), budget, path)
     return checked_mesh(
         path,

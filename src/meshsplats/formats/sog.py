@@ -244,7 +244,9 @@ class _Reader:
         return names
 
     def _numbers(self, section: str, key: str, lengths: tuple[int, ...]) -> np.ndarray:
-        value = self._section(section).get(key)
+        return self._checked(self._section(section).get(key), section, key, lengths)
+
+    def _checked(self, value: Any, section: str, key: str, lengths: tuple[int, ...]) -> np.ndarray:
         listed = value if isinstance(value, list) else [value]
         if len(listed) in lengths and all(isinstance(x, (int, float)) and abs(x) < 1e300 for x in listed):
             return np.array(listed, np.float64)
@@ -259,7 +261,14 @@ class _Reader:
         return (least + (most - least) * (pixels / np.float64(255))).astype(np.float32)
 
     def _codebook(self, section: str) -> np.ndarray:
-        return self._numbers(section, "codebook", (256,)).astype(np.float32)
+        book = self._section(section).get("codebook")
+        if isinstance(book, list) and len(book) == 256 and book[0] is None:
+            # Some writers left the first entry empty; it follows from the others as PlayCanvas has it.
+            rest = self._checked(book[1:], section, "codebook", (255,))
+            numbers = np.concatenate([rest[:1] + (rest[0] - rest[-1]) / 255, rest])
+        else:
+            numbers = self._checked(book, section, "codebook", (256,))
+        return numbers.astype(np.float32)
 
     def _kernel(self) -> Kernel:
         known: dict[str, Kernel] = {"antialiased": "antialiased", "2dgs": "2dgs"}
@@ -273,8 +282,9 @@ class _Reader:
         """(p, k - 1, 3) harmonics that labels refer to."""
         picture = self._picture(data, "shN centroids", 1 << 24)
         n = next((c for c in _COEFFICIENTS.values() if c * _PALETTE_COLUMNS == picture.shape[1]), 0)
-        bands = section.get("bands")
-        if not n or (version == 2 and (not isinstance(bands, int) or _COEFFICIENTS.get(bands) != n)):
+        bands = section.get("bands")  # neither they nor the count are in files of the first days of version 2
+        stated = version == 2 and bands is not None
+        if not n or (stated and (not isinstance(bands, int) or _COEFFICIENTS.get(bands) != n)):
             raise self._error(
                 f"the picture of harmonics is {picture.shape[1]} pixels wide, which does not fit"
                 f" {str(bands)[:20]} bands (192, 512, 960 pixels for 1, 2, 3)"
@@ -283,7 +293,7 @@ class _Reader:
         if version is None:
             least, most = self._range("shN", 1)
             return (least + (most - least) * (entries / np.float64(255))).astype(np.float32)
-        size = section.get("count")
+        size = section.get("count", len(entries))
         if not isinstance(size, int) or not 0 <= size <= len(entries):
             raise self._error(f"a palette of {str(size)[:20]} harmonics in a picture of {len(entries):,}")
         return self._codebook("shN")[entries[:size]]

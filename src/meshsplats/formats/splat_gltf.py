@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.errors import DataWarning
-from meshsplats.formats._cloud_builder import CloudBuilder
+from meshsplats.formats._cloud_builder import CloudBuilder, joined
 from meshsplats.formats._orientation import transformed
 from meshsplats.formats.gltf_document import GltfDocument
 from meshsplats.formats.gltf_reader import placed_meshes
@@ -48,7 +48,7 @@ def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
         raise document.error(
             f"a glTF file without splats (no primitive has {EXTENSION}); load_mesh reads meshes"
         )
-    return _joined(clouds, document)
+    return joined(clouds, document.budget)
 
 
 def has_splats(path: Path) -> bool:
@@ -130,20 +130,3 @@ def _object(document: GltfDocument, owner: dict[str, Any], key: str) -> dict[str
     if not isinstance(value, dict):
         raise document.error(f"{key} must be an object, got {str(value)[:40]}")
     return value
-
-
-def _joined(clouds: list[GaussianCloud], document: GltfDocument) -> GaussianCloud:
-    """All clouds in one; missing harmonics are zero, and the kernel is that of all or '3dgs'."""
-    if len(clouds) == 1:
-        return clouds[0]
-    k = max(c.sh.shape[1] for c in clouds)
-    document.budget.spend(4 * (11 + 3 * k) * sum(map(len, clouds)), "all splats together")
-    kernels = {c.kernel for c in clouds}
-    return GaussianCloud(
-        means=np.concatenate([c.means for c in clouds]),
-        quaternions=np.concatenate([c.quaternions for c in clouds]),
-        scales=np.concatenate([c.scales for c in clouds]),
-        opacities=np.concatenate([c.opacities for c in clouds]),
-        sh=np.concatenate([np.pad(c.sh, ((0, 0), (0, k - c.sh.shape[1]), (0, 0))) for c in clouds]),
-        kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
-    )

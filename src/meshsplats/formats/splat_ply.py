@@ -88,8 +88,11 @@ class _Columns:
 
 def is_float_splat(header: PlyHeader) -> bool:
     """Whether the vertex element looks like float splats rather than points of a mesh."""
-    element = header.element("vertex")
-    return element is not None and bool({"opacity", "scale_0", "rot_0"} & set(element.names))
+    element, face = header.element("vertex"), header.element("face")
+    if element is None:
+        return False
+    marks = {"scale_0", "rot_0"} if face is not None and face.count else {"opacity", "scale_0", "rot_0"}
+    return bool(marks & set(element.names))
 
 
 def read_float_ply(file: BinaryIO, header: PlyHeader, where: object, *, strict: bool) -> GaussianCloud:

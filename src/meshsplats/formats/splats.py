@@ -30,6 +30,10 @@ _SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
 _EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
 
 
+class UnreadSplats(FileFormatError):
+    """Splats, or what should be some, of a kind that is known and not read."""
+
+
 def load_gaussians(
     path: str | os.PathLike[str], *, strict: bool = False, axes: Axes = "auto"
 ) -> GaussianCloud:
@@ -44,7 +48,8 @@ def load_gaussians(
 
     The cloud has y down and z forward, as float .ply files have it. ``axes`` says what the file has: 'auto'
     is what its format prescribes ('y-up' for SPZ and glTF, 'y-down' for the others), so that files of one
-    model agree. A 'y-up' file is turned by half a turn, about z if it is glTF, about x otherwise.
+    model agree; but some programs write SPZ with y down, which nothing in the file tells. A 'y-up' file is
+    turned by half a turn, about z if it is glTF, about x otherwise.
 
     Splats with values that are not finite after activation (an infinite opacity logit is finite: 0 or 1), or
     with a zero quaternion, are left out with a DataWarning that counts them; with ``strict`` they are an
@@ -84,13 +89,15 @@ def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
     """The splat format that a file or folder has by its beginning, None if it has none.
 
     Some containers serve meshes too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to hold one, and any
-    file may be broken. Raises FileNotFoundError.
+    file may be broken. Raises FileNotFoundError, and UnreadSplats for a kind that is known and not read.
     """
     source = Path(path)
     try:
         found = _splat_file(source)
         with found.open("rb") as file:
             return _recognised(file, found)
+    except UnreadSplats:
+        raise
     except FileFormatError:
         return None
 
@@ -135,16 +142,20 @@ def _recognised(file: BinaryIO, path: Path) -> SplatFormat:
     if re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
         return _recognised_json(file, path, convert)
     if name.endswith(".ksplat"):
-        raise FileFormatError(f"{path}: .ksplat files are not read here; {convert}")
+        raise UnreadSplats(f"{path}: .ksplat files are not read here; {convert}")
     if is_dot_splat(file):
         return "splat"
     if name.endswith(".splat"):
-        raise FileFormatError(
+        raise UnreadSplats(
             f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
             f" (it has {path.stat().st_size:,} bytes)"
         )
     if head[:2] == b"\x1f\x8b":
-        raise FileFormatError(f"{path}: a gzip file, but not SPZ; unpack it first")
+        raise UnreadSplats(f"{path}: a gzip file, but not SPZ; unpack it first")
+    if head.startswith(b"version https://git-lfs"):
+        raise UnreadSplats(f"{path}: a Git LFS pointer, not the file itself, which 'git lfs pull' brings")
+    if re.match(rb"\s*<(!doctype html|html)", head, re.IGNORECASE):
+        raise UnreadSplats(f"{path}: a web page, not the file itself: did the download ask for a login?")
     raise FileFormatError(
         f"{path}: not a splat file that is known here, it begins with {head[:8]!r}; expected {_EXPECTED}"
     )
@@ -161,7 +172,7 @@ def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
     if b'"asset"' in text:
         return "gltf"
     if path.suffix.lower() in (".lcc", ".lcc2") or (b'"splats"' in text and b'"totalLevel"' in text):
-        raise FileFormatError(f"{path}: .lcc scenes are not read here; {convert}")
+        raise UnreadSplats(f"{path}: .lcc scenes are not read here; {convert}")
     if b'"means"' in text:
         return "sog"
     raise FileFormatError(f"{path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
@@ -189,6 +200,12 @@ def _splat_file(path: Path) -> Path:
             return max(iterations)[1]
         if (folder / "point_cloud.ply").is_file():
             return folder / "point_cloud.ply"
+    photographs = [n for n in ("transforms.json", "transforms_train.json", "sparse") if (path / n).exists()]
+    if photographs:
+        raise FileFormatError(
+            f"{path}: photographs, not splats ({photographs[0]} is there); commands take them with --data,"
+            " load_dataset reads them"
+        )
     raise FileFormatError(
         f"{path}: a folder without splats; expected a model folder with"
         " point_cloud/iteration_*/point_cloud.ply"

@@ -26,7 +26,7 @@ _COLOR_SCALE = 0.15
 """Colours are stored as 0.5 + 0.15 f_dc, which leaves room beyond [0, 1]."""
 _REST = (0, 3, 8, 15, 24)
 """Coefficients a channel beyond the first, by degree."""
-_ANTIALIASED, _EXTENDED = 1, 2
+_ANTIALIASED, _EXTENDED, _TREE = 1, 2, 128
 _COORDINATE_SYSTEM = 0xADBE0003
 _SYSTEMS = ["RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"]
 _SYSTEMS += ["LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
@@ -115,6 +115,8 @@ def _header(raw: bytes, versions: range, where: object) -> _Header:
         raise FileFormatError(f"{where}: no SPZ header, it begins with {magic!r}")
     if version not in versions:
         known = f"{versions[0]} to {versions[-1]}" if len(versions) > 1 else str(versions[0])
+        if versions[0] == 4 and version in range(1, 4):
+            raise FileFormatError(f"{where}: SPZ of version {version} that is not gzipped, as it must be")
         raise FileFormatError(f"{where}: SPZ version {version} in a container of version {known}")
     if degree >= len(_REST):
         raise FileFormatError(f"{where}: SPZ harmonics of degree {degree}, expected 0 to 4")
@@ -154,7 +156,8 @@ def _inflate(
         )
     extensions = body[wanted:]
     if extensions and not header.flags & _EXTENDED:
-        raise FileFormatError(f"{where}: {len(extensions):,} bytes follow the {header.splats:,} splats")
+        what = "; those of Spark's level-of-detail tree, which is not read" if header.flags & _TREE else ""
+        raise FileFormatError(f"{where}: {len(extensions):,} bytes follow the {header.splats:,} splats{what}")
     streams, at = {}, 0
     for name, size in sizes.items():
         streams[name] = np.frombuffer(body, np.uint8, size, at)

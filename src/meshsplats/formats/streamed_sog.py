@@ -11,9 +11,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._cloud_builder import joined
 from meshsplats.formats.mesh_checks import Budget
 from meshsplats.formats.sog import read_sog
 from meshsplats.gaussians import GaussianCloud
@@ -40,7 +39,7 @@ def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
     kernels = sorted({part.kernel for part in parts})
     if len(kernels) > 1:
         raise FileFormatError(f"{path}: its parts are of several kinds of splats: {', '.join(kernels)}")
-    return _together(parts, budget)
+    return joined(parts, budget)
 
 
 class _Index:
@@ -120,21 +119,3 @@ class _Index:
 
     def _error(self, message: str) -> FileFormatError:
         return FileFormatError(f"{self._path}: {message}")
-
-
-def _together(parts: list[GaussianCloud], budget: Budget) -> GaussianCloud:
-    """One cloud, of as many spherical harmonics as the part with most of them."""
-    count, width = sum(map(len, parts)), max(part.sh.shape[1] for part in parts)
-    budget.spend((44 + 12 * width) * count, f"its {count:,} splats")
-    sh = np.zeros((count, width, 3), np.float32)
-    start = 0
-    for part in parts:
-        sh[start : start + len(part), : part.sh.shape[1]] = part.sh
-        start += len(part)
-
-    def joined(name: str) -> np.ndarray:
-        return np.concatenate([getattr(part, name) for part in parts])
-
-    return GaussianCloud(
-        joined("means"), joined("quaternions"), joined("scales"), joined("opacities"), sh, parts[0].kernel
-    )
