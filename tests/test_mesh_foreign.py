@@ -112,6 +112,125 @@ def test_gltf_nodes_place_their_meshes(tmp_path):
     np.testing.assert_allclose(np.abs(mesh.normals[6]), [0.8, 0.6, 0], atol=1e-6)
 
 
+def skinned(weights=((1, 0, 0, 0), (0, 1, 0, 0), (0.5, 0.5, 0, 0)), **more):
+    """A triangle whose first joint moves by 10 in x and whose second, its child, doubles. It was bound where
+    the second stood at (0, 1, 0). The node that holds the mesh is somewhere else."""
+    joints = np.array([[0, 1, 7, 7]] * 3, "<u2") % 2
+    bound = np.stack([np.eye(4), np.eye(4)]).astype("<f4")
+    bound[1, 3, 1] = -1  # column by column: the translation is in the last row
+    normals = np.array([[0.6, 0.8, 0]] * 3, "<f4")
+    return gltf(
+        [
+            (TRIANGLE, "VEC3", False),
+            (normals, "VEC3", False),
+            (joints, "VEC4", False),
+            (np.array(weights, "<f4"), "VEC4", False),
+            (bound.reshape(2, 16), "MAT4", False),
+        ],
+        primitive={"attributes": {"POSITION": 0, "NORMAL": 1, "JOINTS_0": 2, "WEIGHTS_0": 3}},
+        nodes=[
+            {"mesh": 0, "skin": 0, "scale": [100, 100, 100], "translation": [7, 7, 7]},
+            {"translation": [10, 0, 0], "children": [2]},
+            {"translation": [0, 1, 0], "scale": [2, 1, 2]},
+        ],
+        scenes=[{"nodes": [0, 1]}],
+        skins=[{"joints": [1, 2], "inverseBindMatrices": 4}],
+        **more,
+    )
+
+
+def test_gltf_skins_stand_as_their_joints_do(tmp_path):
+    """glTF 2.0, 3.7.3.3: the node's own transform has no part in it."""
+    mesh = load(tmp_path, skinned())
+    # The second joint takes p to (10 + 2 x, p_y, 2 z); the third corner is half way between the two, both the
+    # same here.
+    np.testing.assert_allclose(mesh.vertices, [[10, 0, 0], [12, 0, 0], [10, 2, 0]], atol=1e-6)
+    np.testing.assert_allclose(mesh.normals[0], [0.6, 0.8, 0], atol=1e-6)
+    stretched = np.array([0.6 / 2, 0.8, 0]) / np.hypot(0.3, 0.8)
+    np.testing.assert_allclose(mesh.normals[1], stretched, atol=1e-6)
+    # Weights that do not sum to 1 are scaled; without any the first joint counts.
+    mesh = load(tmp_path, skinned(weights=[(0, 0, 0, 0), (0, 3, 0, 0), (0, 0.2, 0, 0)]))
+    np.testing.assert_allclose(mesh.vertices, [[10, 0, 0], [12, 0, 0], [10, 2, 0]], atol=1e-6)
+    document = skinned()
+    del document["skins"][0]["inverseBindMatrices"]  # then they are the identity
+    np.testing.assert_allclose(
+        load(tmp_path, document).vertices, [[10, 0, 0], [12, 1, 0], [10, 2.5, 0]], atol=1e-6
+    )
+    # A second set of four joints adds to the first.
+    document = skinned(weights=[(0.5, 0, 0, 0), (0, 0.25, 0, 0), (0, 0.5, 0, 0)])
+    document["meshes"][0]["primitives"][0]["attributes"] |= {"JOINTS_1": 2, "WEIGHTS_1": 3}
+    np.testing.assert_allclose(
+        load(tmp_path, document).vertices, [[10, 0, 0], [12, 0, 0], [10, 2, 0]], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["skins"][0].update(joints=[1, 9]), r"joints that are nodes of the scene, got \[9\]"),
+        (lambda d: d["skins"][0].update(joints=[]), "joints that are nodes of the scene"),
+        (lambda d: d["skins"][0].update(joints="all"), "joints of a skin must be an array"),
+        (lambda d: d["skins"][0].update(joints=[1]), "JOINTS_0 runs up to 1, the skin has 1 joints"),
+        (lambda d: d["skins"][0].update(joints=[1, 2, 1]), "must be 3 matrices of 16 numbers"),
+        (lambda d: d["skins"][0].update(inverseBindMatrices=3), "must be 2 matrices of 16 numbers"),
+        (lambda d: d["nodes"][0].update(skin=1), "refers to number 1 of 1 skins"),
+        (
+            lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(JOINTS_0=3),
+            "must be 3 times 4 whole numbers",
+        ),
+        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("WEIGHTS_0"), "WEIGHTS_0 refers to"),
+    ],
+)
+def test_gltf_skins_that_lie(tmp_path, change, message):
+    document = skinned()
+    change(document)
+    with pytest.raises(FileFormatError, match=message):
+        load(tmp_path, document)
+
+
+def instanced(**rows):
+    kinds = {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}
+    arrays = [(np.array(values, "<f4"), kinds[name], False) for name, values in rows.items()]
+    numbers = {name: 1 + i for i, name in enumerate(rows)}
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": numbers}}
+    return gltf(
+        [(TRIANGLE, "VEC3", False), *arrays],
+        nodes=[{"mesh": 0, "translation": [0, 0, 1], "extensions": extension}],
+        extensionsRequired=["EXT_mesh_gpu_instancing"],
+    )
+
+
+def test_gltf_instances_are_all_there(tmp_path):
+    half = 0.5**0.5
+    mesh = load(
+        tmp_path,
+        instanced(
+            TRANSLATION=[[0, 0, 0], [5, 0, 0]],
+            ROTATION=[[0, 0, 0, 1], [0, 0, half, half]],
+            SCALE=[[1, 1, 1], [1, 3, 1]],
+        ),
+    )
+    first = [[0, 0, 1], [1, 0, 1], [0, 2, 1]]
+    second = [[5, 0, 1], [5, 1, 1], [-1, 0, 1]]  # scaled, turned by a quarter about z, moved
+    np.testing.assert_allclose(mesh.vertices, first + second, atol=1e-6)
+    assert mesh.faces.tolist() == [[0, 1, 2], [3, 4, 5]]
+    moved = load(tmp_path, instanced(TRANSLATION=[[0, 0, 0], [5, 0, 0], [9, 0, 0]]))
+    np.testing.assert_allclose(moved.vertices[6:], np.add(first, [9, 0, 0]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ({}, "as many of each attribute"),
+        ({"TRANSLATION": [[0, 0, 0]], "SCALE": [[1, 1, 1]] * 2}, "as many of each attribute"),
+        ({"ROTATION": [[0, 0, np.nan, 1]]}, "finite"),
+    ],
+)
+def test_gltf_instances_that_lie(tmp_path, rows, message):
+    with pytest.raises(FileFormatError, match=message):
+        load(tmp_path, instanced(**rows))
+
+
 @pytest.mark.parametrize(
     ("mode", "faces"),
     [

@@ -292,7 +292,7 @@ def put(*keys):
         (put("accessors", 0, "count", 2.5), "needs a whole number 'count'"),
         (put("accessors", 0, "count", True), "needs a whole number 'count'"),
         (put("accessors", 0, "byteOffset", 1), "claims 3 elements"),
-        (put("accessors", 0, "type", "MAT4"), "has type MAT4"),
+        (put("accessors", 0, "type", "MAT3"), "has type MAT3"),
         (put("accessors", 0, "type", "VEC2"), "POSITION must be 3 vectors of 3"),
         (put("accessors", 0, "componentType", 7), "of components 7"),
         (put("accessors", 0, "sparse", {}), "sparse accessor"),

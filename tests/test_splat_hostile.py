@@ -132,7 +132,10 @@ FILES = {
         spz_body(version=2, count=1, degree=0, flags=128, rest=bytes(19 + 6)),
         "6 bytes follow the 1 splats; those of Spark's level-of-detail tree",
     ),
-    "not zipped.spz": (gzip.decompress(spz_body(version=2, rest=bytes(40))), "SPZ of version 2 that is not gzipped"),
+    "not zipped.spz": (
+        gzip.decompress(spz_body(version=2, rest=bytes(40))),
+        "SPZ of version 2 that is not gzipped",
+    ),
     "zeros.splat": (bytes(3200), "rotations are unit quaternions"),
     # SOG archives
     "no meta.sog": (encode.bundle({"a.webp": b""}), "without meta.json is no SOG file"),

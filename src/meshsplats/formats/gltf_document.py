@@ -22,7 +22,7 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats.mesh_checks import Budget
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _MAX_JSON_TOKENS = 4_000_000
 """Brackets and commas: what makes parsed JSON large. Real files have thousands."""
 _READABLE = {
@@ -30,6 +30,7 @@ _READABLE = {
     "KHR_mesh_quantization",
     "KHR_texture_transform",
     "KHR_texture_basisu",
+    "EXT_mesh_gpu_instancing",
     "EXT_texture_webp",
     "EXT_texture_avif",
     "KHR_lights_punctual",

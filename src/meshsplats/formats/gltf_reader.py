@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -17,6 +16,7 @@ from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
 from meshsplats.formats.glb import up_quaternion
 from meshsplats.formats.gltf_document import GltfDocument
+from meshsplats.formats.gltf_scene import Placed, placed_meshes, rotation_matrix
 from meshsplats.formats.mesh_checks import checked_binding, checked_mesh, straight_colors
 from meshsplats.mesh import Blending, SplatMesh
 
@@ -51,14 +51,14 @@ def _read(document: GltfDocument) -> SplatMesh:
     path = document.path
     placed = list(placed_meshes(document))
     pieces, skipped, textured = [], 0, 0
-    own = placed[0][0] if len(placed) == 1 else {}
+    own = placed[0].mesh if len(placed) == 1 else {}
     note = _our_note(own)
-    for mesh, matrix in placed:
-        if note and _is_own_placement(matrix, note):
-            matrix = np.eye(4)
+    for place in placed:
+        if note and _is_own_placement(place.matrix, note):
+            place = place._replace(matrix=np.eye(4))
         elif note:  # someone has moved the mesh in the scene
             note["up"] = [0.0, 1.0, 0.0]
-        for primitive in objects_in(document, mesh.get("primitives"), "primitives of a mesh"):
+        for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
             mode = primitive.get("mode", _TRIANGLES)
             if mode in POINTS_TO_LINES:
                 skipped += 1
@@ -66,7 +66,7 @@ def _read(document: GltfDocument) -> SplatMesh:
                 continue
             material = material_of(document, primitive)
             textured += "baseColorTexture" in pbr_of(material)
-            pieces.append(_piece(document, primitive, material, matrix))
+            pieces.append(_piece(document, primitive, material, place))
     if skipped:
         _warn(f"{path}: {skipped:,} primitives of points or lines were left out")
     if textured:
@@ -77,55 +77,8 @@ def _read(document: GltfDocument) -> SplatMesh:
     return _join(document, pieces, own, note)
 
 
-def placed_meshes(document: GltfDocument) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Each mesh of the scene with the (4, 4) matrix from its own to the scene's frame."""
-    nodes, scenes = document.items("nodes"), document.items("scenes")
-    if scenes:
-        roots = document.item("scenes", document.json.get("scene", 0), "the file").get("nodes", [])
-    elif nodes:
-        below = {c for n in nodes for c in _list(document, n.get("children", []), "children of a node")}
-        roots = [i for i in range(len(nodes)) if i not in below]
-    else:
-        yield from ((mesh, np.eye(4)) for mesh in document.items("meshes"))
-        return
-    seen: set[int] = set()
-    stack = [(root, np.eye(4)) for root in reversed(_list(document, roots, "nodes of a scene"))]
-    while stack:
-        index, parent = stack.pop()
-        node = document.item("nodes", index, "a scene or node")
-        if index in seen:
-            raise document.error(f"node {index} has two parents")
-        seen.add(index)
-        matrix = parent @ _local_matrix(document, node)
-        if "mesh" in node:
-            yield document.item("meshes", node["mesh"], f"node {index}"), matrix
-        children = _list(document, node.get("children", []), "children of a node")
-        stack += [(child, matrix) for child in reversed(children)]
-
-
-def _local_matrix(document: GltfDocument, node: dict[str, Any]) -> np.ndarray:
-    if "matrix" in node:
-        return document.numbers(node["matrix"], 16, "matrix of a node").reshape(4, 4).T
-    matrix = _rotation(document.numbers(node.get("rotation", [0, 0, 0, 1]), 4, "rotation of a node"))
-    matrix[:3, :3] *= document.numbers(node.get("scale", [1, 1, 1]), 3, "scale of a node")
-    matrix[:3, 3] = document.numbers(node.get("translation", [0, 0, 0]), 3, "translation of a node")
-    return matrix
-
-
-def _rotation(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
-    """(4, 4) matrix of a unit quaternion x, y, z, w."""
-    x, y, z, w = quaternion
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return matrix
-
-
 def _piece(
-    document: GltfDocument, primitive: dict[str, Any], material: dict[str, Any], matrix: np.ndarray
+    document: GltfDocument, primitive: dict[str, Any], material: dict[str, Any], place: Placed
 ) -> _Piece:
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict) or "POSITION" not in attributes:
@@ -153,15 +106,7 @@ def _piece(
     for name, values in (("POSITION", vertices), ("NORMAL", normals)):
         if values is not None and values.shape != (v, 3):
             raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")
-    if (matrix != np.eye(4)).any():
-        vertices = (vertices @ matrix[:3, :3].T + matrix[:3, 3]).astype(np.float32)
-        if normals is not None:
-            # Normals follow the inverse transpose or, as its length does not matter, the matrix of cofactors.
-            a, b, c = matrix[:3, :3].T
-            cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-            turned = normals @ cofactors.T
-            length = np.linalg.norm(turned, axis=1, keepdims=True)
-            normals = (turned / np.where(length > 0, length, 1)).astype(np.float32)
+    vertices, normals = place.applied(document, attributes, vertices, normals)
     return _Piece(vertices, faces, linear, normals)
 
 
@@ -240,7 +185,7 @@ def _our_note(mesh: dict[str, Any]) -> dict[str, Any]:
 
 def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
     """Whether the node still does what we wrote: turn the mesh's up direction to +y, nothing more."""
-    wanted = _rotation(up_quaternion(np.array(note["up"], np.float64)))
+    wanted = rotation_matrix(up_quaternion(np.array(note["up"], np.float64)))
     return bool(np.abs(matrix - wanted).max() < 1e-5)
 
 
@@ -365,12 +310,6 @@ def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:
 
 def dict_or_empty(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
-
-
-def _list(document: GltfDocument, value: object, what: str) -> list[Any]:
-    if not isinstance(value, list) or not all(isinstance(x, int) for x in value):
-        raise document.error(f"{what} must be an array of whole numbers")
-    return value
 
 
 def objects_in(document: GltfDocument, value: object, what: str) -> list[dict[str, Any]]:

@@ -19,9 +19,9 @@ from meshsplats.formats.gltf_reader import (
     material_of,
     objects_in,
     pbr_of,
-    placed_meshes,
     primitive_faces,
 )
+from meshsplats.formats.gltf_scene import placed_meshes
 
 _WRAPS: dict[object, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _SOURCES = ("EXT_texture_webp",)
@@ -39,8 +39,8 @@ def gltf_textures(
     document = GltfDocument(path)
     shelf = _Shelf(document, read)
     parts: list[tuple[np.ndarray, np.ndarray]] = []
-    for mesh, _ in placed_meshes(document):
-        for primitive in objects_in(document, mesh.get("primitives"), "primitives of a mesh"):
+    for place in placed_meshes(document):
+        for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
             if primitive.get("mode", 4) in POINTS_TO_LINES:
                 continue
             attributes = dict_or_empty(primitive.get("attributes"))

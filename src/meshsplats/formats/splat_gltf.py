@@ -18,7 +18,7 @@ from meshsplats.errors import DataWarning
 from meshsplats.formats._cloud_builder import CloudBuilder, joined
 from meshsplats.formats._orientation import transformed
 from meshsplats.formats.gltf_document import GltfDocument
-from meshsplats.formats.gltf_reader import placed_meshes
+from meshsplats.formats.gltf_scene import placed_meshes
 from meshsplats.formats.spz import read_spz
 from meshsplats.gaussians import GaussianCloud
 
@@ -37,11 +37,11 @@ def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
     """The splats of all nodes of a glTF scene, in its frame; errors as ``load_gaussians``."""
     document = GltfDocument(path, also_known=frozenset({EXTENSION, *_COMPRESSED}))
     clouds = []
-    for mesh, matrix in placed_meshes(document):
-        for primitive in _splat_primitives(document, mesh):
+    for place in placed_meshes(document):
+        for primitive in _splat_primitives(document, place.mesh):
             cloud = _cloud(document, primitive, strict=strict)
             try:
-                clouds.append(transformed(cloud, matrix))
+                clouds.append(transformed(cloud, place.matrix))
             except ValueError as error:
                 raise document.error(f"a node's transform cannot be applied to splats: {error}") from None
     if not clouds:
