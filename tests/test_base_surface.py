@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import numpy as np
@@ -148,6 +149,28 @@ def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     assert len(base.faces) == pytest.approx(600, abs=2)
     assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out)]) == 1
     assert main(["base", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
+    assert main(["base", str(out), "-o", str(out), "--force"]) == 2
+    assert "is read by this command" in capsys.readouterr().err
+
+
+def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
+    save_gaussians(discs(), tmp_path / "scene.ply")
+    assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.npz")]) == 0
+    options = ["--resolution", "16", "--views", "8"]
+    told = []
+    for source, more in (("scene.ply", ["--axes", "y-up"]), ("mesh.npz", [])):
+        arguments = ["base", str(tmp_path / source), "-o", str(tmp_path / f"{source}.obj"), *options, *more]
+        assert main(arguments) == 0
+        told.append(capsys.readouterr().out.splitlines()[-1])
+    assert re.search(r"--splats \S*scene.ply --axes y-up -o prior.npz", told[0])
+    assert "--data photos/ -o prior.npz" in told[1]
+    assert (
+        main(
+            ["prior", str(tmp_path / "scene.ply.obj"), "--splats", str(tmp_path / "mesh.npz"), "-o", "p.npz"]
+        )
+        == 1
+    )
+    assert "mesh.npz: a mesh, not splats" in capsys.readouterr().err
 
 
 def test_a_base_of_real_splats_looks_like_them():

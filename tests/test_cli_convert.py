@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 
 import numpy as np
 import pytest
 from _splats import few_splats
 from PIL import Image
 
-from meshsplats.camera import orbit, save_cameras
+from meshsplats.camera import load_cameras, orbit, save_cameras
 from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
+from meshsplats.metrics import psnr
+from meshsplats.rendering import render, render_splats
 
 
 @pytest.fixture
@@ -112,6 +116,58 @@ def test_nothing_is_overwritten(splats, tmp_path, capsys, taken):
     assert (tmp_path / taken).read_bytes() == b"mine"
     assert run(splats, "-o", tmp_path / "mesh.glb", "--force") == 0
     assert (tmp_path / taken).read_bytes() != b"mine"
+
+
+def test_another_format_lies_beside_the_first(splats, tmp_path):
+    for suffix in (".npz", ".glb"):
+        assert run(splats, "-o", tmp_path / f"mesh{suffix}") == 0
+    names = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("mesh"))
+    records = ["mesh.config.json", "mesh.preview.png", "mesh.glb.config.json", "mesh.glb.preview.png"]
+    assert names == sorted(["mesh.npz", "mesh.glb", *records])
+    assert run(splats, "-o", tmp_path / "mesh.glb") == 1  # the mesh itself is there
+    assert run(splats, "-o", tmp_path / "mesh.npz") == 1
+
+
+def test_the_input_is_never_the_output(splats, tmp_path, capsys):
+    before = splats.read_bytes()
+    (tmp_path / "link.ply").symlink_to(splats)
+    for output in (splats, tmp_path / "link.ply"):
+        assert run(splats, "-o", output, "--force") == 2
+        assert "is read by this command: give another name" in capsys.readouterr().err
+    assert run(splats, "-o", splats, "--as-splats", "--force") == 2
+    assert splats.read_bytes() == before
+
+
+@pytest.mark.parametrize("options", [[], ["--axes", "y-up"], ["--cameras", "cameras.json"]])
+def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, options, monkeypatch):
+    if not options:
+        pytest.importorskip("pxr", reason="install meshsplats[usd]")
+    monkeypatch.chdir(tmp_path)
+    cloud = load_gaussians(splats)
+    save_cameras(orbit(cloud, 2, width=40, height=40, elevation=60), tmp_path / "cameras.json")
+    assert run(splats, "-o", "made.usdc" if not options else "made.npz", "--preset", "paper", *options) == 0
+    command = shlex.split(re.search(r"next: meshsplats (.*)", capsys.readouterr().out)[1])
+    assert main([*command, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    axes = options[1] if options[:1] == ["--axes"] else "auto"
+    cloud, mesh = load_gaussians(splats, axes=axes), load_mesh(command[2])
+    cameras = load_cameras(tmp_path / "made-compare")
+    if options[:1] == ["--cameras"]:
+        assert [c.world_to_camera.tolist() for c in cameras] == [
+            c.world_to_camera.tolist() for c in load_cameras(tmp_path / "cameras.json")
+        ]
+    drawn = render(mesh, cameras[0], samples=2).color
+    wanted = psnr(drawn, render_splats(cloud, cameras[0]).color)
+    assert told["views"][0]["psnr"] == pytest.approx(wanted, abs=0.01)
+
+
+def test_a_part_is_shown_not_compared_with_the_whole(splats, tmp_path, capsys):
+    box = ["--crop", "-1", "-1", "-1", "1", "1", "1"]
+    assert run(splats, "-o", tmp_path / "part.npz", *box) == 0
+    out = capsys.readouterr().out
+    part = load_mesh(tmp_path / "part.npz").splat_count
+    assert f"40 splats, {part} of them converted -> " in out
+    assert "next: meshsplats render" in out
 
 
 @pytest.mark.parametrize(

@@ -19,14 +19,14 @@ pytest.importorskip("torch")
 
 from _photographs import write_photographs
 
-from meshsplats.camera import orbit, save_cameras
+from meshsplats.camera import load_cameras, orbit, save_cameras
 from meshsplats.cli import main
 from meshsplats.cli.finetune import Finetune
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config, worthwhile_views
 from meshsplats.formats.meshes import load_mesh
-from meshsplats.formats.splats import save_gaussians
+from meshsplats.formats.splats import load_gaussians, save_gaussians
 from meshsplats.rendering import render_splats
 
 SMALL = ("--views", "4", "--held-out", "2", "--width", "32")
@@ -97,15 +97,105 @@ def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_pa
     assert told == pytest.approx(scored, abs=0.005)
 
 
-def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys):
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--sh-degree", "0"],
+        ["--axes", "y-up"],
+        ["--width", "40", "--distance", "0.4", "0.6"],
+        ["--cameras", "nine.json"],
+    ],
+)
+def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys, options, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     cloud = make_scene(300)
     sh = np.zeros((len(cloud), 4, 3), np.float32)
     sh[:, 0], sh[:, 2] = cloud.sh[:, 0], 1
-    save_gaussians(replace(cloud, sh=sh), tmp_path / "scene.ply")
-    options = ["--views", "4", "--sh-degree", "0", "--steps", "2"]
-    assert run(tmp_path / "scene.ply", "-o", tmp_path / "tuned.npz", *options) == 0
+    save_gaussians(replace(cloud, sh=sh), "scene.ply")
+    save_cameras(orbit(cloud, 9, width=48, height=48, elevation=50), "nine.json")
+    assert run("scene.ply", "-o", "tuned.npz", "--views", "4", "--steps", "2", *options) == 0
     told, scored = told_score(capsys.readouterr().out, capsys)
     assert told == pytest.approx(scored, abs=0.005)
+
+
+def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):
+    cloud = load_gaussians(splats)
+    middle = np.median(cloud.means, axis=0)
+    box = ["--crop", *middle, *(middle + 10)]
+    out = tmp_path / "part.npz"
+    assert run(splats, "-o", out, *SMALL, "--steps", "20", "--json", *box) == 0
+    scores = json.loads(capsys.readouterr().out)["held_out_psnr"]
+    assert min(scores.values()) > 20  # the whole scene's pictures give 8
+    assert (load_mesh(out).vertices[:, 0] > middle[0] - 1).all()
+    assert run(splats, "-o", tmp_path / "b.npz", "--data", tmp_path, *box) == 2
+    assert "--crop has no effect on photographs" in capsys.readouterr().err
+
+
+def test_a_record_of_everything_given(splats, tmp_path):
+    given = ("--preset", "paper", "--steps", "2")
+    assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, *given) == 0
+    options = json.loads((tmp_path / "tuned.config.json").read_text())["options"]
+    assert (options["preset"], options["steps"], options["width"]) == ("paper", 2, 32)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--cameras", "c.json", "--placement", "inside"], "--placement has no effect with --cameras"),
+        (["--cameras", "c.json", "--up", "z"], "--up has no effect with --cameras"),
+        (["--views", "0"], "--views must be at least 1, got 0"),
+        (["--exposure", "True"], "--exposure has no effect without --data"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(splats, tmp_path, capsys, options, message):
+    assert run(splats, "-o", tmp_path / "t.npz", "--steps", "1", *options) == 2
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cameras_of_a_model_folder_give_way_to_a_placement(tmp_path):
+    cloud = make_scene(300)
+    folder = tmp_path / "model"
+    (folder / "point_cloud/iteration_7").mkdir(parents=True)
+    save_gaussians(cloud, folder / "point_cloud/iteration_7/point_cloud.ply")
+    save_cameras(orbit(cloud, 9, width=48, height=48, elevation=50), folder / "cameras.json")
+    for name, options in (("own", []), ("placed", ["--distance", "0.5", "0.5"])):
+        out = tmp_path / f"{name}.npz"
+        assert run(folder, "-o", out, "--views", "4", "--width", "32", "--steps", "1", *options) == 0
+    held = [load_cameras(tmp_path / f"{name}.run/held_out.cameras.json") for name in ("own", "placed")]
+    assert [len(cameras) for cameras in held] == [2, 8]
+    assert held[0][0].center == pytest.approx(load_cameras(folder)[int(2 * 0.25 * 9 / 2)].center)
+
+
+def test_what_is_read_is_never_written(splats, tmp_path, capsys):
+    before = splats.read_bytes()
+    assert run(splats, "-o", splats, *SMALL, "--steps", "1", "--force") == 2
+    assert "is read by this command" in capsys.readouterr().err
+    assert splats.read_bytes() == before
+
+
+def test_a_run_that_has_ended_is_not_resumed(splats, tmp_path, capsys):
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "-o", out, *SMALL, "--steps", "2") == 0
+    assert run(splats, "-o", out, *SMALL, "--steps", "2", "--resume") == 1
+    assert "the run has come to its end: nothing to resume" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--sh-degree", "0"], "pictures of other splats"),
+        (["--held-out", "1"], "other views"),
+        (["--axes", "y-up"], "another mesh.*options of reading it"),
+    ],
+)
+def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
+    save_gaussians(make_scene(300), tmp_path / "scene.ply")
+    arguments = (tmp_path / "scene.ply", "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "2")
+    assert run(*arguments) == 0
+    assert run(*arguments, *options, "--resume", "--force") == 1
+    assert re.search(message, capsys.readouterr().err)
+    assert run(*arguments, "--resume", "--force") == 0
 
 
 def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):

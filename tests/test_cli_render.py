@@ -121,6 +121,15 @@ def test_orbit_of_splats(splats, tmp_path, capsys):
         assert (image.n_frames, image.size) == (3, (20, 16))
 
 
+def test_no_picture_of_an_earlier_orbit_is_left(splats, tmp_path):
+    out = tmp_path / "out"
+    assert run(splats, "-o", out, "--orbit", "4", "--width", "8", "--depth", "png") == 0
+    (out / "view_0009.png").write_bytes(b"mine")  # no earlier run of four views made this
+    assert run(splats, "-o", out, "--orbit", "2", "--width", "8", "--force") == 0
+    names = {path.name for path in out.iterdir() if path.suffix == ".png"}
+    assert names == {"view_0000.png", "view_0001.png", "view_0009.png"}
+
+
 def test_splats_become_a_mesh_unless_asked(splats, tmp_path):
     from meshsplats.conversion import convert
 

@@ -355,7 +355,14 @@ def test_known_cameras_are_used_as_they_are(cloud):
         np.testing.assert_array_equal(view.camera.world_to_camera, given[view.name].world_to_camera)
         assert (view.camera.width, view.camera.height) == (32, 24)
     few = splat_dataset(cloud, cameras=cameras[:3], train=10, test=2, width=32)
-    assert (len(few.train), len(few.test)) == (1, 2)
+    assert (len(few.train), len(few.test)) == (2, 1)  # at most every eighth, but one
+
+
+@pytest.mark.parametrize(("given", "held"), [(1, 0), (2, 1), (8, 1), (9, 2), (40, 5), (100, 8)])
+def test_of_few_cameras_most_are_trained_on_and_none_is_held_out_too(cloud, given, held):
+    dataset = splat_dataset(cloud, cameras=ms.orbit(cloud, given, width=16), train=200, test=8)
+    assert (len(dataset.train), len(dataset.test)) == (given - held, held)
+    assert not {view.name for view in dataset.train} & {view.name for view in dataset.test}
 
 
 @pytest.mark.parametrize(

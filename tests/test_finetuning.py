@@ -222,6 +222,8 @@ def test_resuming_with_other_inputs_is_refused(scene, tmp_path):
         finetune(mesh.prune(0.5), dataset, make_config(steps=2), run=again)
     with pytest.raises(ValueError, match="other views"):
         finetune(mesh, dataset.over((0, 0, 0)), make_config(steps=2), run=again)
+    with pytest.raises(ValueError, match="other views"):
+        finetune(mesh, replace(dataset, test=dataset.test[:-1]), make_config(steps=2), run=again)
 
 
 def test_a_checkpoint_with_arrays_that_do_not_fit_is_refused(scene, tmp_path):

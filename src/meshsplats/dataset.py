@@ -218,7 +218,7 @@ def splat_views(
     red, green, blue = map(float, background)
     store = PictureStore(cache_bytes)
     return tuple(
-        View(camera, _Drawn(cloud, camera, sh_degree, samples, threads, store), (red, green, blue))
+        View(camera, DrawnSplats(cloud, camera, sh_degree, samples, threads, store), (red, green, blue))
         for camera in cameras
     )
 
@@ -248,8 +248,8 @@ class PictureStore:
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
-    """A picture of splats."""
+class DrawnSplats:
+    """A picture of splats, drawn when it is asked for."""
 
     cloud: GaussianCloud
     camera: Camera

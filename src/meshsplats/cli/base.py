@@ -60,7 +60,7 @@ class Base:
         check_mesh_suffix(self.output)
         if self.cameras is not None and self.views != type(self).views:
             raise UsageError("--views has no effect with --cameras")
-        check_outputs([self.output], self.force)
+        check_outputs([self.output], self.force, inputs=[self.input])
         scene = load_scene(self.input, self.reading)
         base = base_surface(
             scene,
@@ -77,5 +77,7 @@ class Base:
             print(json.dumps(result, indent=1))
             return
         print(f"{self.output} ({len(base.faces):,} triangles, {size_of(self.output)}) in {seconds:.1f} s")
-        splats = shlex.quote(str(self.input))
-        print(f"next: meshsplats prior {shlex.quote(str(self.output))} --splats {splats} -o prior.npz")
+        splats = ["--splats", str(self.input)]
+        splats += ["--axes", self.reading.axes] if self.reading.axes != "auto" else []
+        source = ["--data", "photos/"] if isinstance(scene, SplatMesh) else splats
+        print(f"next: {shlex.join(['meshsplats', 'prior', str(self.output), *source, '-o', 'prior.npz'])}")

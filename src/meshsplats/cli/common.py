@@ -53,6 +53,8 @@ class SplatOptions:
     def load(self, path: Path) -> GaussianCloud:
         from meshsplats.formats.splats import load_gaussians
 
+        if identify(path) == "mesh":
+            raise FileFormatError(f"{path}: a mesh, not splats")
         return load_gaussians(path, strict=self.strict, axes=self.axes)
 
 
@@ -236,14 +238,20 @@ def check_mesh_suffix(path: Path) -> None:
         raise UsageError(f"-o must end in {', '.join(MESH_SUFFIXES)}, got {path.name!r}")
 
 
-def check_outputs(paths: Sequence[Path], force: bool, folder: Path | None = None) -> None:
-    """Before the work: raises OSError if an output exists already (unless ``force``) or cannot be made.
+def check_outputs(
+    paths: Sequence[Path], force: bool, folder: Path | None = None, *, inputs: Sequence[Path] = ()
+) -> None:
+    """Before the work: raises OSError if an output exists already (unless ``force``) or cannot be made, and
+    UsageError, ``force`` or not, if it is one of ``inputs``.
 
     ``folder`` holds all of them and is made later, but not the one above it: a misspelt path must not make a
     tree of folders.
     """
     from meshsplats.formats.atomic import refuse_existing
 
+    for path in paths:
+        if path.exists() and any(source.exists() and path.samefile(source) for source in inputs):
+            raise UsageError(f"{path} is read by this command: give another name for the output")
     refuse_existing(paths, force)
     if folder is not None and folder.exists() and not folder.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, "must be a folder, this is a file", str(folder))
@@ -277,7 +285,9 @@ def configuration(command: str, options: Any) -> dict:
 
     flat: dict[str, Any] = {}
     for key, value in asdict(options).items():
-        flat |= value if isinstance(value, dict) else {key: value}
+        parts = value if isinstance(value, dict) else {key: value}
+        # A group may hide an option that the command has by itself: what was given counts.
+        flat |= {k: v for k, v in parts.items() if v is not None or k not in flat}
     return {
         "command": command,
         "meshsplats": meshsplats.__version__,

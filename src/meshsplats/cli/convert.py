@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
 import numpy as np
 import tyro
 
-from meshsplats.camera import load_cameras, orbit
+from meshsplats.camera import Camera, load_cameras, orbit
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     File,
@@ -121,9 +122,7 @@ class Convert:
         if suffix != ".glb" and glb_only != ("uint16", "blend", "none"):
             raise UsageError("--color-type, --alpha and --compression are for .glb files")
         up = None if self.up is None else parse_up(self.up)
-        preview = None if self.no_preview else self.output.with_suffix(".preview.png")
-        config = self.output.with_suffix(".config.json")
-        check_outputs([path for path in (self.output, preview, config) if path], self.force)
+        preview, config = self._records()
         self._check_input()
         if self.data is not None:
             if self.cameras is not None:
@@ -152,12 +151,14 @@ class Convert:
         write_json(config, configuration("convert", self))
         if preview:
             _draw_preview(mesh, preview)
+        made_of = mesh.splat_count or 0
         read, made, saved = np.diff(times).round(4).tolist()
         if self.json:
             result = {
                 "mesh": str(self.output),
                 "preview": str(preview) if preview else None,
                 "splats": len(cloud),
+                "converted": made_of,
                 "triangles": len(mesh.faces),
                 "vertices": len(mesh.vertices),
                 "bytes": self.output.stat().st_size,
@@ -165,12 +166,26 @@ class Convert:
             }
             print(json.dumps(result, indent=1))
             return
-        print(f"{len(cloud):,} splats -> {len(mesh.faces):,} triangles, {len(mesh.vertices):,} vertices")
+        kept = "" if made_of == len(cloud) else f", {made_of:,} of them converted"
+        print(
+            f"{len(cloud):,} splats{kept} -> {len(mesh.faces):,} triangles, {len(mesh.vertices):,} vertices"
+        )
         timing = f"read {read:.2f} s, converted {made:.2f} s, saved {saved:.2f} s"
         print(f"{self.output} ({size_of(self.output)}): {timing}")
         if preview:
             print(f"preview: {preview}")
-        print(f"next: {self._next()}")
+        if self.compression == "none":  # what is compressed is not read here
+            print(f"next: {self._next(cameras)}")
+
+    def _records(self) -> tuple[Path | None, Path]:
+        """Names of the preview and the configuration, checked with that of the mesh. Where the usual ones are
+        those of the same mesh in another format, names with all of the output's own."""
+        preview, config = _records_of(self.output.with_suffix(""))
+        if not self.force and _converted_to(config) not in (None, self.output.name):
+            preview, config = _records_of(self.output)
+        wanted = [self.output, config] if self.no_preview else [self.output, preview, config]
+        check_outputs(wanted, self.force, inputs=[self.input])
+        return (None if self.no_preview else preview), config
 
     def _check_input(self) -> None:
         if identify(self.input) != "splats":
@@ -190,9 +205,7 @@ class Convert:
             flags = ", ".join("--" + name.replace("_", "-") for name in idle)
             raise UsageError(f"{flags}: for a mesh, no effect with --as-splats")
         self.conversion.resolved("paper", has_cameras=False)
-        preview = None if self.no_preview else self.output.with_suffix(".preview.png")
-        config = self.output.with_suffix(".config.json")
-        check_outputs([path for path in (self.output, preview, config) if path], self.force)
+        preview, config = self._records()
         self._check_input()
         start = time.perf_counter()
         cloud = self.reading.load(self.input)
@@ -218,12 +231,33 @@ class Convert:
         if preview:
             print(f"preview: {preview}")
 
-    def _next(self) -> str:
-        splats, mesh, folder = (
-            shlex.quote(str(path)) for path in (self.input, self.output, self.output.with_suffix(""))
-        )
-        readable = self.output.suffix.lower() in (".npz", ".ply", ".glb") and self.compression == "none"
-        return f"meshsplats compare {splats} {mesh + ' ' if readable else ''}-o {folder}-compare"
+    def _next(self, cameras: Sequence[Camera]) -> str:
+        """The command that compares the mesh with the splats from where it was made for, or one that shows it
+        where only a part of them was converted."""
+        folder = self.output.with_suffix("")
+        if self.conversion.crop is not None:
+            return shlex.join(["meshsplats", "render", str(self.output), "-o", f"{folder}-pictures"])
+        words: list[str | Path] = ["meshsplats", "compare", self.input, self.output]
+        if self.data is not None:
+            words += ["--data", self.data]
+        elif cameras:
+            words += ["--cameras", self.input if self.cameras is None else self.cameras]
+        words += ["--axes", self.reading.axes] if self.reading.axes != "auto" else []
+        return shlex.join(map(str, [*words, "-o", f"{folder}-compare"]))
+
+
+def _records_of(name: Path) -> tuple[Path, Path]:
+    """Preview and configuration."""
+    return name.with_name(f"{name.name}.preview.png"), name.with_name(f"{name.name}.config.json")
+
+
+def _converted_to(config: Path) -> str | None:
+    """Name of the mesh that a configuration of this command stands beside, None if it is none."""
+    try:
+        record = json.loads(config.read_text(encoding="utf-8"))
+        return Path(record["options"]["output"]).name if record["command"] == "convert" else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:

@@ -47,7 +47,7 @@ class Deform:
         if not self.base:
             raise UsageError("give the edited base with --base")
         targets = self.targets()
-        check_outputs(targets, self.force)
+        check_outputs(targets, self.force, inputs=[self.input, *self.base])
         prior = load_prior(self.input)
         bases = [load_base(path, textures=False) for path in self.base]
         for path, base in zip(self.base, bases, strict=True):  # all, before anything is written

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -68,7 +68,8 @@ class Evaluate:
     before: File = None
     """Another mesh to score beside, for instance the one before it was fine-tuned."""
     splats: File = None
-    """The splats, scored beside the mesh at degree 0 and with all their spherical harmonics."""
+    """The splats: with --data, or pictures made elsewhere, scored beside the mesh at degree 0 and with all
+    their spherical harmonics; without --data their pictures are the truth."""
     pictures: Folder = None
     """Pictures made elsewhere, by Blender say: a file for each view, by its name or in the views' order."""
     cameras: File = None
@@ -161,10 +162,7 @@ class Evaluate:
         return found
 
     def _load_splats(self, path: Path) -> GaussianCloud:
-        found = load_scene(path, self.reading)
-        if not isinstance(found, GaussianCloud):
-            raise FileFormatError(f"{path}: a mesh, not splats")
-        return found
+        return self.reading.load(path)
 
     def _dataset(self, splats: GaussianCloud | None) -> Dataset:
         background = parse_color(self.background)
@@ -225,10 +223,12 @@ class Evaluate:
             threads=self.threads,
             on_view=keep,
         )
-        about = {
+        about: dict[str, Any] = {
             "background": list(parse_color(self.background)),
             "lpips_network": self.network if lpips else None,
         }
+        if self.cameras is not None:
+            about["held_out"] = None  # nobody knows what a mesh was trained on
         report = replace(report, about={**report.about, **about})
         write_json(folder / RESULTS, report.results())
         write_json(folder / PER_VIEW, report.per_view())

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from meshsplats.camera import save_cameras
+from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     Count,
     Number,
@@ -36,6 +38,7 @@ from meshsplats.cli.training import (
     stopped,
     tell,
 )
+from meshsplats.conversion.selection import choose_splats
 from meshsplats.dataset import Dataset
 from meshsplats.finetuning import (
     FinetuneConfig,
@@ -103,9 +106,18 @@ class Finetune:
         config = self.configured()
         self.target.check()
         files = RunFiles(self.output)
-        files.check(resume=self.resume, force=self.force)
+        if self.conversion.crop is not None and self.target.data is not None:
+            raise UsageError(
+                "--crop has no effect on photographs: what it cuts off would be painted on the rest; cut the"
+                " tuned mesh instead"
+            )
+        files.check([self.input], resume=self.resume, force=self.force)
         need_torch()
         scene = load_scene(self.input, self.reading)
+        if isinstance(scene, GaussianCloud) and self.conversion.crop is not None:
+            # Pictures of what is cut off are nothing to learn from; other choices of splats leave gaps that
+            # the rest has to fill.
+            scene = choose_splats(scene, crop=self.conversion.crop)
         worthwhile = worthwhile_views(config)
         dataset = self.target.make(scene, self.input, background_of(config), self.threads, worthwhile)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
@@ -118,12 +130,14 @@ class Finetune:
             return stopped(stop, files)
         save_mesh(tuned, files.mesh)
         write_json(files.config, configuration("finetune", self) | {"tuning": config.to_dict()})
+        if self.target.data is None:
+            save_cameras([view.camera for view in dataset.test], files.held_out)
         draw_preview(tuned, files.preview)
         triangles = len(tuned.faces)
         seconds = time.perf_counter() - began
         tell(self, files, seconds, {"triangles": triangles}, f"{triangles:,} triangles")
         if not self.json:
-            print(f"next: {self._evaluation(config)}")
+            print(f"next: {self._next(files, config, len(dataset.test))}")
         return 0
 
     def configured(self) -> FinetuneConfig:
@@ -135,17 +149,20 @@ class Finetune:
         cameras = [view.camera for view in dataset.train]
         return starting_mesh(cloud, cameras, preset=start, **asdict(self.conversion))
 
-    def _evaluation(self, config: FinetuneConfig) -> str:
-        """The command that scores the result as it was trained."""
-        target = self.target
+    def _next(self, files: RunFiles, config: FinetuneConfig, held_out: int) -> str:
+        """The command that scores the result as it was trained, or one that shows it where there is none."""
+        target, folder = self.target, self.output.with_suffix("")
+        if self.conversion.crop is not None or (target.data is None and not held_out):
+            return shlex.join(["meshsplats", "render", str(self.output), "-o", f"{folder}-pictures"])
         words: list[str | Path | int] = ["meshsplats", "evaluate", self.output]
         if target.data is not None:
             words += ["--data", target.data]
             words += ["--downscale", target.downscale] if target.downscale != 1 else []
             words += ["--test-every", target.test_every] if target.test_every != 8 else []
         else:
-            words += ["--splats", self.input]
+            words += ["--splats", self.input, "--cameras", files.held_out]
+            words += ["--axes", self.reading.axes] if self.reading.axes != "auto" else []
             words += ["--sh-degree", target.sh_degree] if target.sh_degree is not None else []
         words += ["--background", "black"] if config.background == "black" else []
-        words += ["-o", f"{self.output.with_suffix('')}-evaluation"]
+        words += ["-o", f"{folder}-evaluation"]
         return shlex.join(map(str, words))

@@ -111,7 +111,9 @@ class Prior:
         config = self.configured()
         self._check()
         files = RunFiles(self.output)
-        files.check(resume=self.resume, force=self.force)
+        files.check(
+            [path for path in (self.input, self.splats) if path], resume=self.resume, force=self.force
+        )
         need_torch()
         wants_texture = self.laying.colors in ("auto", "texture")
         base = load_base(self.input, texture=self.laying.texture, textures=wants_texture)
@@ -153,7 +155,9 @@ class Prior:
         if self.output.suffix.lower() not in SUFFIXES:
             known = " or ".join(SUFFIXES)
             raise UsageError(f"-o must end in {known}, which keep the binding, got {self.output.name!r}")
-        if (self.splats is None) == (self.target.data is None):
+        if self.splats is not None and self.target.data is not None:
+            raise UsageError("give --data or --splats, not both")
+        if self.splats is None and self.target.data is None:
             raise UsageError("give photographs with --data, or splats with --splats, to learn from")
         if self.laying.texture is not None and self.laying.colors not in ("auto", "texture"):
             raise UsageError(f"--texture has no effect with --colors {self.laying.colors}")

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, save_cameras
+from meshsplats.camera import Camera, load_cameras, save_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     DrawOptions,
@@ -100,6 +100,8 @@ class Render:
         unit = None
         if self.depth == "png" and isinstance(scene, SplatMesh):
             record["depth_unit"] = unit = _depth_unit(scene, cameras)
+        if not single:
+            _remove_older(self.output, files.every)
         self._draw(scene, cameras, files, unit)
         if files.turntable:
             from meshsplats.pictures import load_png, save_animation
@@ -212,3 +214,16 @@ def _depth_unit(scene: GaussianCloud | SplatMesh, cameras: Sequence[Camera]) -> 
         float((corners @ c.world_to_camera[2, :3] + c.world_to_camera[2, 3]).max()) for c in cameras
     )
     return max(farthest, 1e-6) / 65535
+
+
+def _remove_older(folder: Path, kept: Sequence[Path]) -> None:
+    """The pictures of an earlier run in ``folder``, as its records tell, apart from ``kept``."""
+    try:
+        record = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        count = len(load_cameras(folder / "cameras.json")) if record["command"] == "render" else 0
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    for prefix, suffix in (("view", ".png"), ("depth", ".png"), ("depth", ".npy")):
+        for name in view_names(count, prefix, suffix):
+            if folder / name not in kept:
+                (folder / name).unlink(missing_ok=True)

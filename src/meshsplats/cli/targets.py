@@ -7,13 +7,16 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from meshsplats.camera import load_cameras
+from meshsplats.camera import Camera, load_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import Count, File, Folder, Text, cameras_beside, parse_up
 from meshsplats.dataset import Dataset, load_dataset
 from meshsplats.finetuning import FEWEST_VIEWS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+
+PLACING = ("placement", "distance", "up")
+"""Options of cameras that are placed."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class TargetOptions:
     inside a room."""
     cameras: File = None
     """Without --data: cameras to draw from, a JSON list or a cameras.json of a 3DGS trainer. Default: those
-    of a model folder, else cameras are placed."""
+    of a model folder, unless --placement, --distance or --up is given; else cameras are placed."""
     up: Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
     sh_degree: Count = None
@@ -55,10 +58,18 @@ class TargetOptions:
         idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "sh_degree")
         names, source = (idle, "--data") if self.data is not None else (("downscale", "test_every"), "splats")
         for name in names:
-            if getattr(self, name) != next(f.default for f in fields(self) if f.name == name):
+            if self._given(name):
                 raise UsageError(f"--{name.replace('_', '-')} has no effect with {source}")
+        for name in PLACING:
+            if self.cameras is not None and self._given(name):
+                raise UsageError(f"--{name} has no effect with --cameras")
+        if self.views is not None and self.views < 1:
+            raise UsageError(f"--views must be at least 1, got {self.views}")
         if not self.cache >= 0:
             raise ValueError(f"--cache must be a number of gigabytes, >= 0, got {self.cache}")
+
+    def _given(self, name: str) -> bool:
+        return getattr(self, name) != next(f.default for f in fields(self) if f.name == name)
 
     @property
     def cache_bytes(self) -> int:
@@ -85,7 +96,10 @@ class TargetOptions:
             raise UsageError(f"{source} is a mesh: give its photographs with --data, or splats in its place")
         from meshsplats.datasets.around import splat_dataset
 
-        cameras = load_cameras(self.cameras) if self.cameras is not None else cameras_beside(source)
+        if self.cameras is not None:
+            cameras: list[Camera] | None = load_cameras(self.cameras)
+        else:
+            cameras = None if any(map(self._given, PLACING)) else cameras_beside(source)
         return splat_dataset(
             scene,
             placement=self.placement,

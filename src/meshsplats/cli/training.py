@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ import tyro
 
 from meshsplats.camera import orbit
 from meshsplats.cli import UsageError
-from meshsplats.cli.common import check_outputs, size_of
+from meshsplats.cli.common import check_outputs, plural, size_of
 from meshsplats.dataset import Dataset
 from meshsplats.errors import MissingDependencyError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
@@ -71,7 +71,12 @@ class RunFiles:
     def run(self) -> Path:
         return self.mesh.with_suffix(".run")
 
-    def check(self, *, resume: bool, force: bool) -> None:
+    @property
+    def held_out(self) -> Path:
+        """Cameras of the pictures that were held out, where they were drawn."""
+        return self.run / "held_out.cameras.json"
+
+    def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
         """Before the work: OSError if something would be overwritten, cannot be written, or is missing to go
         on from."""
         from meshsplats.finetuning.journal import CHECKPOINT
@@ -83,12 +88,19 @@ class RunFiles:
             raise FileExistsError(
                 f"{checkpoint} is left from an earlier run: --resume goes on with it, --force begins anew"
             )
-        check_outputs([self.mesh, self.config, self.preview], force)
+        if resume and self.mesh.exists() and not force:
+            raise FileExistsError(
+                f"{self.mesh} is there, so the run has come to its end: nothing to resume; --force writes it"
+                " again"
+            )
+        check_outputs([self.mesh, self.config, self.preview], force, inputs=inputs)
 
 
 def given(command: Finetune | Prior) -> dict[str, Any]:
     """What of the configuration was given, its length with it."""
     tuning = {k: v for k, v in asdict(command.tuning).items() if v is not None}
+    if tuning.get("exposure") and command.target.data is None:
+        raise UsageError("--exposure has no effect without --data: drawn pictures are all exposed alike")
     lengths = {name: getattr(command, name) for name in ("epochs", "steps", "minutes")}
     lengths = {name: value for name, value in lengths.items() if value is not None}
     if len(lengths) > 1:
@@ -106,7 +118,7 @@ def announce(what: str, mesh: SplatMesh, dataset: Dataset, cache_bytes: int) -> 
     from meshsplats.finetuning.memory import available_memory, check_memory, readable
 
     needed, free = check_memory(mesh, dataset, cache_bytes=cache_bytes), available_memory()
-    views = f"{len(dataset.train)} training views, {len(dataset.test)} held out"
+    views = f"{plural(len(dataset.train), 'training view')}, {len(dataset.test)} held out"
     say(f"{what}; {views}; memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else ""))
 
 

@@ -75,8 +75,9 @@ def splat_dataset(
         'auto': 'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object'.
         'inside' must be asked for: splats do not tell a room from a hollow thing.
     cameras: where the scene was trained from, as in a model folder's cameras.json. They are used in place of
-        a placement: as many as are asked for, spread over all, those held out between the others, scaled to
-        ``width``. ``height``, ``fov``, ``distance`` and ``up`` then have no part.
+        a placement: as many as are asked for, spread over all, those held out (at most every eighth)
+        between the others, scaled to ``width``. ``height``, ``fov``, ``distance`` and ``up`` then have no
+        part.
     train, test: numbers of views. Those held out are the first of a sequence with which the others go on, so
         both are spread evenly, none lies on another, and the first ``HELD_OUT`` are never trained on,
         however many views are.
@@ -127,7 +128,7 @@ def splat_dataset(
         threads=threads,
         cache_bytes=cache_bytes,
     )
-    return Dataset(views[first:], views[:test], "splats")
+    return Dataset(views[first:], views[: min(test, first)], "splats")
 
 
 def has_surroundings(cloud: GaussianCloud) -> bool:
@@ -265,11 +266,11 @@ def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np
 
 
 def _given(cameras: Sequence[Camera], train: int, test: int, width: int) -> tuple[list[Camera], int]:
-    """Up to ``test`` of the cameras, spread over them, then up to ``train`` of the others; with pictures
-    ``width`` pixels wide. And the number of the first of those."""
+    """Up to ``test`` of the cameras, at most every eighth, spread over them, then up to ``train`` of the
+    others; with pictures ``width`` pixels wide. And the number of the first of those."""
     if len(cameras) < 1:
         raise ValueError("cameras is empty; leave it out to have cameras placed")
-    held = _spread(len(cameras), min(test, len(cameras) - 1))
+    held = _spread(len(cameras), min(test, -(-len(cameras) // 8) if len(cameras) > 1 else 0))
     rest = np.delete(np.arange(len(cameras)), held)
     chosen = [*held, *rest[_spread(len(rest), min(train, len(rest)))]]
     return [cameras[i].scaled(width / cameras[i].width) for i in chosen], len(held)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.binding import Binding
-from meshsplats.dataset import Dataset
+from meshsplats.dataset import Dataset, DrawnSplats
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.formats.atomic import atomic_path
@@ -108,9 +108,15 @@ def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset
             f"the checkpoint is of another configuration: {told}; give the same options as before"
         )
     if found.mesh != mesh:
-        raise ValueError("the checkpoint began with another mesh; give the same input and conversion options")
+        raise ValueError(
+            "the checkpoint began with another mesh: give the same input, and the same options of reading it,"
+            " converting it, and of the views, for which it was made"
+        )
     if found.dataset != dataset:
-        raise ValueError("the checkpoint was made with other views; give the same data set and view options")
+        raise ValueError(
+            "the checkpoint was made with other views, or pictures of other splats: give the same data set or"
+            " splats and the same options of the views"
+        )
 
 
 def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:
@@ -168,13 +174,22 @@ def mesh_fingerprint(mesh: SplatMesh) -> str:
 
 
 def dataset_fingerprint(dataset: Dataset) -> str:
-    """Changes with the cameras, names and backgrounds of the training views; pictures are not looked at."""
-    digest = hashlib.sha256()
-    for view in dataset.train:
+    """Changes with the cameras, names and backgrounds of the views, the splats that they are drawn from and
+    how, and which are held out; pictures are not looked at."""
+    digest = hashlib.sha256(repr((len(dataset.train), len(dataset.test))).encode())
+    for view in dataset.views:
         camera = view.camera
         lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height)
         digest.update(repr((view.name, lens, view.background)).encode())
         digest.update(camera.world_to_camera.tobytes())
+    drawn = [view.source for view in dataset.views if isinstance(view.source, DrawnSplats)]
+    for source in drawn:
+        degree = source.cloud.sh_degree if source.sh_degree is None else source.sh_degree
+        digest.update(repr((degree, source.samples, source.cloud.kernel)).encode())
+    for splats in {id(source.cloud): source.cloud for source in drawn}.values():
+        for array in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.sh):
+            digest.update(repr(array.shape).encode())
+            digest.update(array.data)
     return digest.hexdigest()
 
 
