@@ -160,7 +160,8 @@ def load_dataset(
     - COLMAP, as INRIA's 3DGS and Mip-NeRF 360 use it: ``images/`` and ``sparse/0/`` or ``sparse/``, binary or
       text, any camera model;
     - nerfstudio: ``transforms.json``, also named itself as ``path``;
-    - COLMAP with ``colmap/sparse/0/`` or ``colmap/sparse/``.
+    - COLMAP with ``colmap/sparse/0/`` or ``colmap/sparse/``, with the only model in ``sparse/``, or with the
+      model beside ``images/``.
 
     ``masks/``, or the masks a file names, say which pixels count. Photographs of lenses that are no pinhole
     are undistorted when they are read; what the lens did not see is black and masked. Only the headers of
