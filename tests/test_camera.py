@@ -276,7 +276,8 @@ def test_cameras_come_back_with_every_digit(tmp_path):
 
 
 BROKEN = {
-    "no list": ({"cameras": [OURS]}, "JSON list"),
+    "no list": ({"cameras": [OURS]}, "JSON list of cameras, this is a JSON object$"),
+    "a data set": ({"frames": []}, "JSON object with 'frames': of a data set, which load_dataset"),
     "empty": ([], "no camera"),
     "no object": ([OURS, 3], "camera 1"),
     "null": ([None], "camera 0"),

@@ -5,12 +5,15 @@ import json
 import struct
 import warnings
 
+import _splat_encoders as encode
 import numpy as np
 import pytest
 from _meshes import random_mesh
+from _splat_files import random_splats
 from conftest import shared_data
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
+from meshsplats.formats.recognition import identify
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], "<f4")
 
@@ -390,6 +393,46 @@ def test_ply_without_colours_is_grey_with_a_word(tmp_path):
     with pytest.warns(DataWarning, match="no vertex colours"):
         mesh = load_mesh(tmp_path / "m.ply")
     assert mesh.colors.tolist() == [[0.5, 0.5, 0.5, 1]] * 5
+
+
+COLORED = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property {kind} red
+property {kind} green
+property {kind} blue
+property float opacity
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 255 0 51 1
+1 0 0 255 0 51 1
+0 1 0 255 0 51 1
+3 0 1 2
+"""
+
+
+@pytest.mark.parametrize("kind", ["uchar", "short", "int"])
+def test_ply_bytes_in_a_wider_signed_type_are_bytes(tmp_path, kind):
+    (tmp_path / "m.ply").write_text(COLORED.format(kind=kind))
+    np.testing.assert_allclose(load_mesh(tmp_path / "m.ply").colors, [[1, 0, 0.2, 1]] * 3, atol=1e-7)
+
+
+def test_a_ply_mesh_with_opacities_is_a_mesh(tmp_path):
+    path = tmp_path / "m.ply"
+    path.write_text(COLORED.format(kind="uchar"))
+    assert identify(path) == "mesh"
+    path.write_text(COLORED.format(kind="uchar").replace("face 1", "face 0"))
+    assert identify(path) == "splats"  # which lack the rest, as their reader says
+
+
+def test_compressed_splats_are_no_mesh(tmp_path):
+    (tmp_path / "s.ply").write_bytes(encode.compressed_ply(random_splats(9, degree=0)))
+    with pytest.raises(FileFormatError, match="holds Gaussian splats, not a mesh"):
+        load_mesh(tmp_path / "s.ply")
 
 
 def test_ply_that_is_no_mesh(tmp_path):
