@@ -178,7 +178,14 @@ def test_a_run_that_has_ended_is_not_resumed(splats, tmp_path, capsys):
     out = tmp_path / "tuned.npz"
     assert run(splats, "-o", out, *SMALL, "--steps", "2") == 0
     assert run(splats, "-o", out, *SMALL, "--steps", "2", "--resume") == 1
-    assert "the run has come to its end: nothing to resume" in capsys.readouterr().err
+    assert "the run has come to its end, or there was one before" in capsys.readouterr().err
+
+
+def test_without_views_held_out_the_next_command_shows_the_mesh(splats, tmp_path, capsys):
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "-o", out, "--views", "3", "--held-out", "0", "--width", "32", "--steps", "1") == 0
+    assert "next: meshsplats render" in capsys.readouterr().out
+    assert not (tmp_path / "tuned.run/held_out.cameras.json").exists()
 
 
 @pytest.mark.parametrize(

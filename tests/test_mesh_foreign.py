@@ -234,6 +234,21 @@ def test_gltf_instances_that_lie(tmp_path, rows, message):
         load(tmp_path, instanced(**rows))
 
 
+def test_gltf_skins_and_instances_do_not_multiply_memory(tmp_path):
+    document = skinned()
+    document["skins"][0]["joints"] = [1, 2] * 10_000
+    del document["skins"][0]["inverseBindMatrices"]
+    document["nodes"] += [{"mesh": 0, "skin": 0}] * 5000
+    document["scenes"][0]["nodes"] += list(range(3, 5003))
+    with pytest.raises(FileFormatError, match="the 20,000 joints of a node would take the data beyond"):
+        load(tmp_path, document)
+    document = instanced(TRANSLATION=np.zeros((10_000, 3)))
+    document["nodes"] = document["nodes"] * 500
+    document["scenes"][0]["nodes"] = list(range(500))
+    with pytest.raises(FileFormatError, match="would take the data beyond"):
+        load(tmp_path, document)
+
+
 @pytest.mark.parametrize(
     ("mode", "faces"),
     [

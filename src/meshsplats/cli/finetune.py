@@ -130,7 +130,7 @@ class Finetune:
             return stopped(stop, files)
         save_mesh(tuned, files.mesh)
         write_json(files.config, configuration("finetune", self) | {"tuning": config.to_dict()})
-        if self.target.data is None:
+        if self.target.data is None and dataset.test:
             save_cameras([view.camera for view in dataset.test], files.held_out)
         draw_preview(tuned, files.preview)
         triangles = len(tuned.faces)

@@ -90,8 +90,8 @@ class RunFiles:
             )
         if resume and self.mesh.exists() and not force:
             raise FileExistsError(
-                f"{self.mesh} is there, so the run has come to its end: nothing to resume; --force writes it"
-                " again"
+                f"{self.mesh} is there: the run has come to its end, or there was one before;"
+                " --resume --force goes on and overwrites it"
             )
         check_outputs([self.mesh, self.config, self.preview], force, inputs=inputs)
 

@@ -11,6 +11,8 @@ from meshsplats.formats.gltf_document import GltfDocument
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _AT_ONCE = 1 << 15
+_PLACE_BYTES = 512
+"""About what a matrix takes on the way."""
 
 
 class Placed(NamedTuple):
@@ -134,6 +136,7 @@ def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray])
         raise document.error(
             f"a skin needs joints that are nodes of the scene, got {str(missing or numbers)[:60]}"
         )
+    document.budget.spend(_PLACE_BYTES * len(numbers), f"the {len(numbers):,} joints of a node")
     bound = np.eye(4)[None]
     if "inverseBindMatrices" in skin:
         bound = document.floats(skin["inverseBindMatrices"], "inverseBindMatrices").astype(np.float64)
@@ -161,7 +164,9 @@ def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:
     counts = {len(values) for values in rows.values()}
     if len(counts) != 1:
         raise document.error(f"{INSTANCING} needs as many of each attribute, got {sorted(counts)}")
-    for i in range(counts.pop()):
+    count = counts.pop()
+    document.budget.spend(_PLACE_BYTES * count, f"{count:,} instances")
+    for i in range(count):
         yield _matrix(
             *(rows[name][i] if name in rows else None for name in ("TRANSLATION", "ROTATION", "SCALE"))
         )
