@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,14 +11,15 @@ from _datasets import simple_colmap
 from _photographs import write_photographs
 from PIL import Image
 
-from meshsplats.camera import orbit, save_cameras
+from meshsplats.camera import load_cameras, orbit, save_cameras
 from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.dataset import load_dataset
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation import evaluate
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.formats.splats import save_gaussians
+from meshsplats.formats.splats import load_gaussians, save_gaussians
+from meshsplats.metrics import psnr
 from meshsplats.pictures import save_png
 from meshsplats.rendering import render, render_splats
 
@@ -65,6 +67,25 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     with Image.open(out / "strips" / "view_0000.png") as image:
         assert image.width == 8 + 5 * 48  # truth, three methods, error
     assert "| splats | mesh |" in (out / "table.md").read_text()
+
+
+def test_what_degree_0_shows_of_splats_with_more_is_scored_beside_a_mesh(scene, tmp_path, capsys):
+    cloud = load_gaussians(scene / "scene.ply")
+    sh = np.zeros((len(cloud), 4, 3), np.float32)
+    sh[:, 0], sh[:, 2] = cloud.sh[:, 0], 0.5
+    save_gaussians(replace(cloud, sh=sh), tmp_path / "more.ply")
+    cameras = ("--cameras", scene / "cameras.json")
+    assert (
+        run(scene / "mesh.npz", "-o", tmp_path / "a", "--splats", tmp_path / "more.ply", *cameras, "--json")
+        == 0
+    )
+    report = json.loads(capsys.readouterr().out)["scenes"][0]
+    assert set(report["methods"]) == {"mesh", "splats_sh0"}
+    camera = load_cameras(scene / "cameras.json")[0]
+    both = [render_splats(replace(cloud, sh=sh), camera, sh_degree=d).color for d in (0, None)]
+    told = report["methods"]["splats_sh0"]["views"][0]["psnr"]
+    assert told == pytest.approx(psnr(*(np.clip(p, 0, 1) for p in both)), abs=0.01)
+    assert report["held_out"] is None  # given cameras may have been trained on
 
 
 def test_against_photographs(scene, tmp_path, capsys):

@@ -81,8 +81,8 @@ def told_score(out: str, capsys) -> tuple[float, float]:
     told = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
     command = shlex.split(re.search(r"next: meshsplats (.*)", out)[1])
     assert main([*command, "--strips", "0", "--json"]) == 0
-    (method,) = json.loads(capsys.readouterr().out)["scenes"][0]["methods"].values()
-    return told, method["mean"]["psnr"]
+    methods = json.loads(capsys.readouterr().out)["scenes"][0]["methods"]
+    return told, methods["mesh"]["mean"]["psnr"]
 
 
 @pytest.mark.parametrize("options", [["--downscale", "2", "--background", "black"], ["--test-every", "3"]])

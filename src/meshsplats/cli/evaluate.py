@@ -69,7 +69,8 @@ class Evaluate:
     """Another mesh to score beside, for instance the one before it was fine-tuned."""
     splats: File = None
     """The splats: with --data, or pictures made elsewhere, scored beside the mesh at degree 0 and with all
-    their spherical harmonics; without --data their pictures are the truth."""
+    their spherical harmonics; without --data their pictures are the truth, beside it they are scored at
+    degree 0."""
     pictures: Folder = None
     """Pictures made elsewhere, by Blender say: a file for each view, by its name or in the views' order."""
     cameras: File = None
@@ -117,8 +118,11 @@ class Evaluate:
             before = None if self.before is None else self._load_mesh(self.before)
             splats = None if self.splats is None else self._load_splats(self.splats)
             dataset = self._dataset(splats)
-            own_truth = self.data is None
-            reports = [self._score(self.output, dataset, mesh, None if own_truth else splats, before)]
+            if self.data is None and splats is not None:
+                # Their own pictures are the truth; what a mesh could show of it is degree 0.
+                more = splats.sh_degree > 0 and self.sh_degree != 0
+                splats = replace(splats, sh=splats.sh[:, :1]) if more else None
+            reports = [self._score(self.output, dataset, mesh, splats, before)]
         seconds = round(time.perf_counter() - start, 2)
         write_json(self.output / CONFIGURATION, configuration("evaluate", self))
         if self.json:
