@@ -81,6 +81,12 @@ def test_trained_on_splats(scene, tmp_path, capsys):
     assert load_prior(out).lift == pytest.approx(-0.01)
 
 
+def test_a_prior_is_no_base(scene, trained, tmp_path, capsys):
+    arguments = ("--splats", scene / "scene.ply", "-o", tmp_path / "p.npz")
+    assert run("prior", trained, *arguments) == 1
+    assert "bound to a mesh, not the mesh that carries them" in capsys.readouterr().err
+
+
 def test_deform_follows_the_base(scene, trained, tmp_path, capsys):
     prior = load_prior(trained)
     out = tmp_path / "edited.npz"

@@ -32,14 +32,18 @@ def load_base(
         texture: a picture that is laid on the whole mesh instead, by its texture coordinates (`.obj`, glTF).
         textures: False leaves them unread.
 
-    Raises what ``load_mesh`` raises, FileFormatError for broken pictures and materials, and ValueError where
-    ``texture`` is given and the mesh has no texture coordinates. Warns with a DataWarning where a texture is
-    missing or of a kind that is not read: those faces count as untextured.
+    Raises what ``load_mesh`` raises, FileFormatError for a mesh prior and for broken pictures and materials,
+    and ValueError where ``texture`` is given and the mesh has no texture coordinates. Warns with a
+    DataWarning where a texture is missing or of a kind that is not read: those faces count as untextured.
     """
     source = Path(path)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         mesh = load_mesh(source)
+    if mesh.binding is not None:
+        raise FileFormatError(
+            f"{source}: splats that are bound to a mesh, not the mesh that carries them: give that one"
+        )
     bare = False
     for warning in told:
         bare |= issubclass(warning.category, NoColorsWarning)
