@@ -153,6 +153,16 @@ def test_options_that_would_do_nothing_are_refused(splats, tmp_path, capsys, opt
     assert list(tmp_path.iterdir()) == []
 
 
+def test_photographs_that_are_all_held_out_are_nothing_to_learn_from(splats, tmp_path, capsys):
+    cloud = make_scene(300)
+    camera = orbit(cloud, 1, width=24, height=16)[0]
+    data = write_photographs(tmp_path / "photos", [camera], [render_splats(cloud, camera).color])
+    assert run(splats, "-o", tmp_path / "t.npz", "--data", data, "--steps", "1") == 1
+    assert "all its 1 views are held out" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "t.npz", "--data", data, "--steps", "1", "--test-every", "0") == 0
+    assert "1 training view, 0 held out, of 24 x 16 pixels" in capsys.readouterr().err
+
+
 def test_cameras_of_a_model_folder_give_way_to_a_placement(tmp_path):
     cloud = make_scene(300)
     folder = tmp_path / "model"

@@ -85,13 +85,19 @@ class TargetOptions:
     ) -> Dataset:
         """The data set; of so many views as are ``worthwhile`` where nothing else was said."""
         if self.data is not None:
-            return load_dataset(
+            dataset = load_dataset(
                 self.data,
                 downscale=self.downscale,
                 test_every=self.test_every,
                 background=background,
                 cache_bytes=self.cache_bytes,
             )
+            if not dataset.train:
+                raise ValueError(
+                    f"{self.data}: all its {len(dataset.test)} views are held out, so there is nothing to"
+                    " learn from; --test-every 0 holds none out"
+                )
+            return dataset
         if not isinstance(scene, GaussianCloud):
             raise UsageError(f"{source} is a mesh: give its photographs with --data, or splats in its place")
         from meshsplats.datasets.around import splat_dataset

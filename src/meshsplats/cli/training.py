@@ -118,7 +118,9 @@ def announce(what: str, mesh: SplatMesh, dataset: Dataset, cache_bytes: int) -> 
     from meshsplats.finetuning.memory import available_memory, check_memory, readable
 
     needed, free = check_memory(mesh, dataset, cache_bytes=cache_bytes), available_memory()
+    camera = dataset.train[0].camera
     views = f"{plural(len(dataset.train), 'training view')}, {len(dataset.test)} held out"
+    views += f", of {camera.width} x {camera.height} pixels"
     say(f"{what}; {views}; memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else ""))
 
 
