@@ -126,6 +126,9 @@ def test_another_format_lies_beside_the_first(splats, tmp_path):
     assert names == sorted(["mesh.npz", "mesh.glb", *records])
     assert run(splats, "-o", tmp_path / "mesh.glb") == 1  # the mesh itself is there
     assert run(splats, "-o", tmp_path / "mesh.npz") == 1
+    before = (tmp_path / "mesh.config.json").read_bytes()
+    assert run(splats, "-o", tmp_path / "mesh.glb", "--force") == 0
+    assert (tmp_path / "mesh.config.json").read_bytes() == before
 
 
 def test_the_input_is_never_the_output(splats, tmp_path, capsys):
@@ -136,6 +139,11 @@ def test_the_input_is_never_the_output(splats, tmp_path, capsys):
         assert "is read by this command: give another name" in capsys.readouterr().err
     assert run(splats, "-o", splats, "--as-splats", "--force") == 2
     assert splats.read_bytes() == before
+    inner = tmp_path / "model/point_cloud/iteration_7/point_cloud.ply"
+    inner.parent.mkdir(parents=True)
+    inner.write_bytes(before)
+    assert run(tmp_path / "model", "-o", inner, "--as-splats", "--force") == 2
+    assert inner.read_bytes() == before
 
 
 @pytest.mark.parametrize("options", [[], ["--axes", "y-up"], ["--cameras", "cameras.json"]])

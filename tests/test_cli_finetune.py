@@ -127,8 +127,11 @@ def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):
     scores = json.loads(capsys.readouterr().out)["held_out_psnr"]
     assert min(scores.values()) > 20  # the whole scene's pictures give 8
     assert (load_mesh(out).vertices[:, 0] > middle[0] - 1).all()
-    assert run(splats, "-o", tmp_path / "b.npz", "--data", tmp_path, *box) == 2
-    assert "--crop has no effect on photographs" in capsys.readouterr().err
+    camera = orbit(cloud, 1, width=24, height=16)[0]
+    data = write_photographs(tmp_path / "photos", [camera], [render_splats(cloud, camera).color])
+    arguments = ("--data", data, "--test-every", "0", "--steps", "1")
+    assert run(splats, "-o", tmp_path / "b.npz", *arguments, *box) == 0
+    assert "will be painted on the rest" in capsys.readouterr().err
 
 
 def test_a_record_of_everything_given(splats, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
@@ -326,6 +327,18 @@ def test_pictures_of_another_shape_are_refused(tmp_path):
     refused(folder, "16 x 8 pixels do not fit its camera, which took 12 x 8")
     save(folder / "images/p01.png", np.zeros((12, 8, 3), np.uint8))
     refused(folder, "8 x 12 pixels do not fit.*It is turned")
+
+
+def test_a_model_beside_its_pictures_is_no_numbered_one(tmp_path):
+    """Nor does an empty sparse/ hide it, nor is a test.txt beside the pictures a list of them."""
+    folder = simple_colmap(tmp_path / "0", 3, place=".")
+    simple_colmap(tmp_path / "1", 9, place=".")
+    (folder / "sparse").mkdir()
+    (folder / "test.txt").write_text("what I tested\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dataset = load_dataset(folder)
+    assert (len(dataset.train), len(dataset.test)) == (2, 1)
 
 
 def test_a_larger_second_model_is_told(tmp_path):

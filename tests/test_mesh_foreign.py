@@ -167,11 +167,24 @@ def test_gltf_skins_stand_as_their_joints_do(tmp_path):
     )
 
 
+def test_gltf_skins_that_stand_apart(tmp_path):
+    """Joints of no scene, numbers that have no weight, primitives without weights."""
+    document = skinned()
+    wanted = load(tmp_path, document).vertices
+    document["scenes"] = [{"nodes": [0]}]
+    np.testing.assert_array_equal(load(tmp_path, document).vertices, wanted)
+    document = skinned(weights=[(1, 0, 0, 0)] * 3)
+    document["skins"][0] = {"joints": [1]}  # the second, which the vertices name too, has no weight
+    np.testing.assert_allclose(load(tmp_path, document).vertices, np.add(TRIANGLE, [10, 0, 0]), atol=1e-6)
+    del document["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"]
+    np.testing.assert_allclose(load(tmp_path, document).vertices, 100 * TRIANGLE + 7, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["skins"][0].update(joints=[1, 9]), r"joints that are nodes of the scene, got \[9\]"),
-        (lambda d: d["skins"][0].update(joints=[]), "joints that are nodes of the scene"),
+        (lambda d: d["skins"][0].update(joints=[1, 9]), "a skin or node refers to number 9 of 3 nodes"),
+        (lambda d: d["skins"][0].update(joints=[]), "a skin needs joints"),
         (lambda d: d["skins"][0].update(joints="all"), "joints of a skin must be an array"),
         (lambda d: d["skins"][0].update(joints=[1]), "JOINTS_0 runs up to 1, the skin has 1 joints"),
         (lambda d: d["skins"][0].update(joints=[1, 2, 1]), "must be 3 matrices of 16 numbers"),
@@ -181,7 +194,12 @@ def test_gltf_skins_stand_as_their_joints_do(tmp_path):
             lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(JOINTS_0=3),
             "must be 3 times 4 whole numbers",
         ),
-        (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("WEIGHTS_0"), "WEIGHTS_0 refers to"),
+        (
+            lambda d: d.update(
+                scenes=[{"nodes": [0]}], nodes=[d["nodes"][0], {"children": [2]}, {"children": [1]}]
+            ),
+            "node [12] is above itself",
+        ),
     ],
 )
 def test_gltf_skins_that_lie(tmp_path, change, message):
@@ -217,6 +235,10 @@ def test_gltf_instances_are_all_there(tmp_path):
     second = [[5, 0, 1], [5, 1, 1], [-1, 0, 1]]  # scaled, turned by a quarter about z, moved
     np.testing.assert_allclose(mesh.vertices, first + second, atol=1e-6)
     assert mesh.faces.tolist() == [[0, 1, 2], [3, 4, 5]]
+    document = instanced(TRANSLATION=[[0, 0, 0], [5, 0, 0]])
+    extension = document["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]
+    extension["attributes"] = {"_ID": 1}  # of the application
+    np.testing.assert_allclose(load(tmp_path, document).vertices, first + first, atol=1e-6)
     moved = load(tmp_path, instanced(TRANSLATION=[[0, 0, 0], [5, 0, 0], [9, 0, 0]]))
     np.testing.assert_allclose(moved.vertices[6:], np.add(first, [9, 0, 0]), atol=1e-6)
 
@@ -428,6 +450,11 @@ end_header
 0 1 0 255 0 51 1
 3 0 1 2
 """
+
+
+def test_ply_colours_of_0_and_1_in_a_signed_type_stay(tmp_path):
+    (tmp_path / "m.ply").write_text(COLORED.format(kind="int").replace("255 0 51", "1 0 1"))
+    assert load_mesh(tmp_path / "m.ply").colors[0].tolist() == [1, 0, 1, 1]
 
 
 @pytest.mark.parametrize("kind", ["uchar", "short", "int"])

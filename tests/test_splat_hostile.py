@@ -295,6 +295,29 @@ def test_streamed_sog(tmp_path, name):
     check(tmp_path / "scene", message)
 
 
+def test_parts_that_each_unpack_far_do_not_do_so_together(tmp_path):
+    """50 parts of a few kilobytes, each of which may have 260,000 equal splats."""
+    side, count = 512, 50
+    values = random_splats(9, degree=0)
+    part = {name: encode.picture(np.zeros((side, side, 4), np.uint8), "PNG") for name in encode.sog(values)}
+    part["quats.webp"] = encode.picture(np.full((side, side, 4), (128, 128, 128, 252), np.uint8), "PNG")
+    described = json.loads(encode.sog(values)["meta.json"]) | {"count": side * side}
+    part["meta.json"] = json.dumps(described).encode()
+    names = [f"p{k}" for k in range(count)]
+    for name in names:
+        (tmp_path / name).mkdir()
+        for file_name, data in part.items():
+            (tmp_path / name / file_name).write_bytes(data)
+    index = {
+        "lodLevels": 1,
+        "filenames": [f"{name}/meta.json" for name in names],
+        "tree": {"children": [tree(file=k, count=side * side) for k in range(count)]},
+    }
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    assert len(load_gaussians(tmp_path / "p0")) == side * side
+    refused(tmp_path / "lod-meta.json", "the splats of 'p[0-9]+/meta.json' would take the data beyond", 600e6)
+
+
 def test_many_names_of_one_part_do_not_multiply_its_splats(tmp_path):
     index = {"tree": {"children": [tree()] * 100_000}}
     for file_name, data in streamed(**index).items():

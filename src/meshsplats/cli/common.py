@@ -249,8 +249,9 @@ def check_outputs(
     """
     from meshsplats.formats.atomic import refuse_existing
 
+    read = [_file_of(source) for source in inputs if source.exists()]
     for path in paths:
-        if path.exists() and any(source.exists() and path.samefile(source) for source in inputs):
+        if path.exists() and any(path.samefile(source) for source in read):
             raise UsageError(f"{path} is read by this command: give another name for the output")
     refuse_existing(paths, force)
     if folder is not None and folder.exists() and not folder.is_dir():
@@ -262,6 +263,16 @@ def check_outputs(
             raise FileNotFoundError(errno.ENOENT, "this folder for the output does not exist", str(above))
         if not os.access(above, os.W_OK):
             raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
+
+
+def _file_of(source: Path) -> Path:
+    """The file that is read where ``source`` is a folder."""
+    from meshsplats.formats.splats import splat_file
+
+    try:
+        return splat_file(source) if source.is_dir() else source
+    except FileFormatError:
+        return source
 
 
 def record_beside(output: Path, kind: str) -> Path:

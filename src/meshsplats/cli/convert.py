@@ -181,7 +181,7 @@ class Convert:
         """Names of the preview and the configuration, checked with that of the mesh. Where the usual ones are
         those of the same mesh in another format, names with all of the output's own."""
         preview, config = _records_of(self.output.with_suffix(""))
-        if not self.force and _converted_to(config) not in (None, self.output.name):
+        if _converted_to(config) not in (None, self.output.name):
             preview, config = _records_of(self.output)
         wanted = [self.output, config] if self.no_preview else [self.output, preview, config]
         check_outputs(wanted, self.force, inputs=[self.input])

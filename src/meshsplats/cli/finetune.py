@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
+import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -11,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from meshsplats.camera import save_cameras
-from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     Count,
     Number,
@@ -39,7 +39,8 @@ from meshsplats.cli.training import (
     tell,
 )
 from meshsplats.conversion.selection import choose_splats
-from meshsplats.dataset import Dataset
+from meshsplats.dataset import Dataset, Picture
+from meshsplats.errors import DataWarning
 from meshsplats.finetuning import (
     FinetuneConfig,
     Interrupted,
@@ -106,11 +107,6 @@ class Finetune:
         config = self.configured()
         self.target.check()
         files = RunFiles(self.output)
-        if self.conversion.crop is not None and self.target.data is not None:
-            raise UsageError(
-                "--crop has no effect on photographs: what it cuts off would be painted on the rest; cut the"
-                " tuned mesh instead"
-            )
         files.check([self.input], resume=self.resume, force=self.force)
         need_torch()
         scene = load_scene(self.input, self.reading)
@@ -120,6 +116,8 @@ class Finetune:
             scene = choose_splats(scene, crop=self.conversion.crop)
         worthwhile = worthwhile_views(config)
         dataset = self.target.make(scene, self.input, background_of(config), self.threads, worthwhile)
+        if self.conversion.crop is not None and self.target.data is not None:
+            _warn_of_the_rest(dataset.train[0].picture)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
         announce(f"{len(mesh.faces):,} triangles", mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
@@ -166,3 +164,13 @@ class Finetune:
         words += ["--background", "black"] if config.background == "black" else []
         words += ["-o", f"{folder}-evaluation"]
         return shlex.join(map(str, words))
+
+
+def _warn_of_the_rest(picture: Picture) -> None:
+    if picture.alpha is None and picture.mask is None:
+        warnings.warn(
+            "--crop with photographs that have neither masks nor alpha: what it cuts off is still on them,"
+            " and will be painted on the rest; to have a part, cut the tuned mesh",
+            DataWarning,
+            stacklevel=2,
+        )

@@ -223,7 +223,9 @@ def _remove_older(folder: Path, kept: Sequence[Path]) -> None:
         count = len(load_cameras(folder / "cameras.json")) if record["command"] == "render" else 0
     except (OSError, ValueError, KeyError, TypeError):
         return
+    names = [f"turntable.{kind}" for kind in ("webp", "gif", "png")] if count else []
     for prefix, suffix in (("view", ".png"), ("depth", ".png"), ("depth", ".npy")):
-        for name in view_names(count, prefix, suffix):
-            if folder / name not in kept:
-                (folder / name).unlink(missing_ok=True)
+        names += view_names(count, prefix, suffix)
+    for name in names:
+        if folder / name not in kept:
+            (folder / name).unlink(missing_ok=True)

@@ -49,17 +49,20 @@ def _other_model(path: Path) -> Path | None:
                 f"{path}: sparse/ holds the models {', '.join(sorted(m.name for m in found))} but none named"
                 " 0: rename the one to use"
             )
-        return found[0] if found else None
+        if found:
+            return found[0]
     return find_model(path, (".",)) if (path / "images").is_dir() else None
 
 
 def _colmap(model: Path, album: Album, test_every: int) -> Views:
     # Sizes of the model's cameras are those of images/; without it, pictures may lie beside sparse/.
     frames = read_model(model, "images")
-    _warn_of_larger_model(model)
+    numbered = model.parent.name == "sparse"
+    if numbered:
+        _warn_of_larger_model(model)
     taken = album.views(frames, str(model))
     album.report(str(model), len(taken))
-    chosen = _listed_test(model / "test.txt")
+    chosen = _listed_test(model / "test.txt") if numbered or model.name == "sparse" else None
     if chosen is None:
         return _views(*split(taken, test_every))
     stems = {name.rsplit(".", 1)[0] for name in chosen}

@@ -114,8 +114,8 @@ def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset
         )
     if found.dataset != dataset:
         raise ValueError(
-            "the checkpoint was made with other views, or pictures of other splats: give the same data set or"
-            " splats and the same options of the views"
+            "the checkpoint was made with other views or pictures of other splats, or by an earlier"
+            " meshsplats: give the same data set or splats and the same options of the views"
         )
 
 

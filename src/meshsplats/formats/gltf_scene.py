@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,9 +23,9 @@ class Placed(NamedTuple):
     mesh: dict[str, Any]
     matrix: np.ndarray
     """(4, 4) from the mesh's frame to the scene's."""
-    joints: np.ndarray | None = None
-    """(j, 4, 4) the same by joint of its skin, which take the place of ``matrix`` where a primitive names
-    joints; None: it has no skin."""
+    joints: Callable[[], np.ndarray] | None = None
+    """Gives (j, 4, 4), the same by joint of its skin, which take the place of ``matrix`` where a primitive
+    names joints and weights; None: it has no skin."""
 
     def applied(
         self,
@@ -33,8 +35,8 @@ class Placed(NamedTuple):
         normals: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Vertices and normals (v, 3) float32 of a primitive in the scene's frame."""
-        if self.joints is not None and "JOINTS_0" in attributes:
-            mixed = _Mix(document, attributes, self.joints, len(vertices))
+        if self.joints is not None and {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
+            mixed = _Mix(document, attributes, self.joints(), len(vertices))
         elif (self.matrix == np.eye(4)).all():
             return vertices, normals
         else:
@@ -65,18 +67,21 @@ class _Mix:
     ) -> None:
         self._joints = joints
         self._sets: list[tuple[np.ndarray, np.ndarray]] = []
-        while (name := f"JOINTS_{len(self._sets)}") in attributes:
+        for k in count():
+            name, weights_name = f"JOINTS_{k}", f"WEIGHTS_{k}"
+            if name not in attributes or weights_name not in attributes:
+                break
             numbers = document.accessor(attributes[name], name)
-            weights_name = f"WEIGHTS_{len(self._sets)}"
-            weights = document.floats(attributes.get(weights_name), weights_name)
+            weights = document.floats(attributes[weights_name], weights_name)
             if numbers.shape != (v, 4) or weights.shape != (v, 4) or numbers.dtype.kind != "u":
                 raise document.error(
                     f"{name} and {weights_name} must be {v:,} times 4 whole numbers and weights, got shapes"
                     f" {numbers.shape} and {weights.shape}"
                 )
-            if v and numbers.max() >= len(joints):
-                raise document.error(f"{name} runs up to {numbers.max()}, the skin has {len(joints)} joints")
-            self._sets.append((numbers, weights))
+            used = np.where(weights != 0, numbers, 0)  # what has no weight may be any number
+            if v and used.max() >= len(joints):
+                raise document.error(f"{name} runs up to {used.max()}, the skin has {len(joints)} joints")
+            self._sets.append((used, weights))
 
     def of(self, part: slice) -> np.ndarray:
         """(n, 4, 4) for these vertices; weights are scaled to a sum of 1, without any the first joint
@@ -118,7 +123,7 @@ def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
         if "mesh" not in node:
             continue
         mesh = document.item("meshes", node["mesh"], f"node {index}")
-        joints = _joints(document, node["skin"], matrices) if "skin" in node else None
+        joints = partial(_joints, document, node["skin"], matrices) if "skin" in node else None
         extensions = node.get("extensions")
         if isinstance(extensions, dict) and INSTANCING in extensions:
             yield from (Placed(mesh, matrix @ own) for own in _instances(document, extensions[INSTANCING]))
@@ -131,11 +136,8 @@ def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray])
     it (glTF 2.0, 3.7.3.3)."""
     skin = document.item("skins", index, "a node")
     numbers = _numbers(document, skin.get("joints"), "joints of a skin")
-    missing = [n for n in numbers if n not in matrices]
-    if missing or not numbers:
-        raise document.error(
-            f"a skin needs joints that are nodes of the scene, got {str(missing or numbers)[:60]}"
-        )
+    if not numbers:
+        raise document.error("a skin needs joints")
     document.budget.spend(_PLACE_BYTES * len(numbers), f"the {len(numbers):,} joints of a node")
     bound = np.eye(4)[None]
     if "inverseBindMatrices" in skin:
@@ -145,7 +147,33 @@ def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray])
                 f"inverseBindMatrices must be {len(numbers)} matrices of 16 numbers, got shape {bound.shape}"
             )
         bound = bound[: len(numbers)].reshape(-1, 4, 4).transpose(0, 2, 1)
+    outside = set(numbers) - matrices.keys()
+    if outside:  # of another scene, or of none
+        matrices = matrices | _matrices_by_parents(document, outside)
     return np.stack([matrices[n] for n in numbers]) @ bound
+
+
+def _matrices_by_parents(document: GltfDocument, wanted: set[int]) -> dict[int, np.ndarray]:
+    """(4, 4) to the world's frame of nodes wherever they are."""
+    nodes = document.items("nodes")
+    parents: dict[int, int] = {}
+    for index, node in enumerate(nodes):
+        for child in _numbers(document, node.get("children", []), "children of a node"):
+            parents[child] = index
+    found: dict[int, np.ndarray] = {}
+    for index in wanted:
+        way: list[int] = []
+        at: int | None = index
+        while at is not None and at not in found:
+            way.append(at)
+            if len(way) > len(nodes):
+                raise document.error(f"node {index} is above itself")
+            at = parents.get(at)
+        matrix = np.eye(4) if at is None else found[at]
+        for step in reversed(way):
+            matrix = matrix @ _local_matrix(document, document.item("nodes", step, "a skin or node"))
+            found[step] = matrix
+    return found
 
 
 def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:
@@ -162,11 +190,16 @@ def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:
                     f"{name} of instances must have {columns} columns, got {rows[name].shape}"
                 )
     counts = {len(values) for values in rows.values()}
+    if not rows:  # attributes of the application alone, one of each for an instance
+        counts = {
+            document.whole(document.item("accessors", i, INSTANCING), "count", INSTANCING)
+            for i in attributes.values()
+        }
     if len(counts) != 1:
         raise document.error(f"{INSTANCING} needs as many of each attribute, got {sorted(counts)}")
-    count = counts.pop()
-    document.budget.spend(_PLACE_BYTES * count, f"{count:,} instances")
-    for i in range(count):
+    number = counts.pop()
+    document.budget.spend(_PLACE_BYTES * number, f"{number:,} instances")
+    for i in range(number):
         yield _matrix(
             *(rows[name][i] if name in rows else None for name in ("TRANSLATION", "ROTATION", "SCALE"))
         )

@@ -29,6 +29,11 @@ class Budget:
         self._left = _BASE_BYTES
         self.extend(os.stat(path).st_size)
 
+    @property
+    def file_bytes(self) -> int:
+        """Bytes of the file and of all that belongs to it."""
+        return self._file_bytes
+
     def extend(self, file_bytes: int) -> None:
         """Adds the share of a further file that belongs to the first."""
         self._file_bytes += file_bytes

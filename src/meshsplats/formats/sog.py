@@ -193,11 +193,13 @@ class _Reader:
         """What picks the splats of ``ranges`` from the rows of all, and their number."""
         if ranges is None:
             return slice(None), stored
-        chosen = np.zeros(stored, bool)
+        edges = np.zeros(stored + 1, np.int64)  # ranges may overlap, any number of times
         for first, end in ranges:
             if end > stored:
                 raise self._error(f"the splats {first:,} to {end:,} are asked for, but it has {stored:,}")
-            chosen[first:end] = True
+            edges[first] += 1
+            edges[end] -= 1
+        chosen = np.cumsum(edges[:-1]) > 0
         return chosen, int(np.count_nonzero(chosen))
 
     # -- meta.json

@@ -61,7 +61,7 @@ def load_gaussians(
     """
     if axes not in get_args(Axes):
         raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
-    found = _splat_file(Path(path))
+    found = splat_file(Path(path))
     with found.open("rb") as file:
         kind = _recognised(file, found)
         file.seek(0)
@@ -93,7 +93,7 @@ def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
     """
     source = Path(path)
     try:
-        found = _splat_file(source)
+        found = splat_file(source)
         with found.open("rb") as file:
             return _recognised(file, found)
     except UnreadSplats:
@@ -178,7 +178,7 @@ def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
     raise FileFormatError(f"{path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
 
 
-def _splat_file(path: Path) -> Path:
+def splat_file(path: Path) -> Path:
     """The file that ``path`` stands for: itself, or the newest one of a model folder."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")

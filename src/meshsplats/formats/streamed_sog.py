@@ -32,8 +32,12 @@ def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
         part = path.parent / name
         if not part.is_file():
             raise FileFormatError(f"{path}: the part {name!r} that it names is missing")
-        budget.extend(part.stat().st_size)
-        parts.append(read_sog(part, budget, strict=strict, ranges=ranges))
+        # What reading a part takes is given back after it; the splats stay.
+        own = Budget(part)
+        cloud = read_sog(part, own, strict=strict, ranges=ranges)
+        budget.extend(own.file_bytes)
+        budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
+        parts.append(cloud)
     if not parts:
         raise FileFormatError(f"{path}: no splats, its tree has none")
     kernels = sorted({part.kernel for part in parts})
