@@ -1,6 +1,5 @@
 """Meshes of other programs."""
 
-import base64
 import json
 import struct
 import warnings
@@ -8,43 +7,13 @@ import warnings
 import _splat_encoders as encode
 import numpy as np
 import pytest
+from _gltf_meshes import TRIANGLE, gltf, instanced, skinned
 from _meshes import random_mesh
 from _splat_files import random_splats
 from conftest import shared_data
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
 from meshsplats.formats.recognition import identify
-
-TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], "<f4")
-
-
-def gltf(arrays, *, primitive=None, **more):
-    """A glTF document around ``arrays`` (name, array, type, normalized): accessor i holds array i."""
-    components = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125, "i2": 5122}
-    blob, views, accessors = b"", [], []
-    for array, kind, normalized in arrays:
-        views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": array.nbytes})
-        accessors.append(
-            {
-                "bufferView": len(views) - 1,
-                "componentType": components[array.dtype.str[1:]],
-                "count": len(array),
-                "type": kind,
-                "normalized": normalized,
-            }
-        )
-        blob += array.tobytes() + b"\0" * (-array.nbytes % 4)
-    uri = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
-    return {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive or {"attributes": {"POSITION": 0}}]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(blob), "uri": uri}],
-    } | more
 
 
 def load(tmp_path, document):
@@ -115,33 +84,6 @@ def test_gltf_nodes_place_their_meshes(tmp_path):
     np.testing.assert_allclose(np.abs(mesh.normals[6]), [0.8, 0.6, 0], atol=1e-6)
 
 
-def skinned(weights=((1, 0, 0, 0), (0, 1, 0, 0), (0.5, 0.5, 0, 0)), **more):
-    """A triangle whose first joint moves by 10 in x and whose second, its child, doubles. It was bound where
-    the second stood at (0, 1, 0). The node that holds the mesh is somewhere else."""
-    joints = np.array([[0, 1, 7, 7]] * 3, "<u2") % 2
-    bound = np.stack([np.eye(4), np.eye(4)]).astype("<f4")
-    bound[1, 3, 1] = -1  # column by column: the translation is in the last row
-    normals = np.array([[0.6, 0.8, 0]] * 3, "<f4")
-    return gltf(
-        [
-            (TRIANGLE, "VEC3", False),
-            (normals, "VEC3", False),
-            (joints, "VEC4", False),
-            (np.array(weights, "<f4"), "VEC4", False),
-            (bound.reshape(2, 16), "MAT4", False),
-        ],
-        primitive={"attributes": {"POSITION": 0, "NORMAL": 1, "JOINTS_0": 2, "WEIGHTS_0": 3}},
-        nodes=[
-            {"mesh": 0, "skin": 0, "scale": [100, 100, 100], "translation": [7, 7, 7]},
-            {"translation": [10, 0, 0], "children": [2]},
-            {"translation": [0, 1, 0], "scale": [2, 1, 2]},
-        ],
-        scenes=[{"nodes": [0, 1]}],
-        skins=[{"joints": [1, 2], "inverseBindMatrices": 4}],
-        **more,
-    )
-
-
 def test_gltf_skins_stand_as_their_joints_do(tmp_path):
     """glTF 2.0, 3.7.3.3: the node's own transform has no part in it."""
     mesh = load(tmp_path, skinned())
@@ -207,18 +149,6 @@ def test_gltf_skins_that_lie(tmp_path, change, message):
     change(document)
     with pytest.raises(FileFormatError, match=message):
         load(tmp_path, document)
-
-
-def instanced(**rows):
-    kinds = {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}
-    arrays = [(np.array(values, "<f4"), kinds[name], False) for name, values in rows.items()]
-    numbers = {name: 1 + i for i, name in enumerate(rows)}
-    extension = {"EXT_mesh_gpu_instancing": {"attributes": numbers}}
-    return gltf(
-        [(TRIANGLE, "VEC3", False), *arrays],
-        nodes=[{"mesh": 0, "translation": [0, 0, 1], "extensions": extension}],
-        extensionsRequired=["EXT_mesh_gpu_instancing"],
-    )
 
 
 def test_gltf_instances_are_all_there(tmp_path):

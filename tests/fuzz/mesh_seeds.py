@@ -12,6 +12,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+from _gltf_meshes import instanced, skinned
 from _meshes import random_mesh
 from fuzz.seeds import Change, Seed
 
@@ -125,6 +126,8 @@ def _binary_polygons() -> Seed:
     return Seed("mesh-ply-polygons", {"m.ply": header + b"".join(rows)}, "m.ply", load=load_mesh)
 
 
+_INSTANCED = instanced(TRANSLATION=[[0, 0, 0], [5, 0, 0]], SCALE=[[1, 1, 1], [1, 3, 1]])
+
 MESH_SEEDS = [
     _saved("npz", ".npz", inside=_in_archive),
     _saved("mesh-ply", ".ply"),
@@ -132,6 +135,8 @@ MESH_SEEDS = [
     Seed("mesh-ply-ascii", {"m.ply": _ASCII_PLY}, "m.ply", load=load_mesh),
     _saved("glb", ".glb", inside=_in_json),
     _gltf(),
+    Seed("gltf-skinned", {"m.gltf": json.dumps(skinned()).encode()}, "m.gltf", load=load_mesh),
+    Seed("gltf-instanced", {"m.gltf": json.dumps(_INSTANCED).encode()}, "m.gltf", load=load_mesh),
     Seed("obj", {"m.obj": _OBJ}, "m.obj", load=load_mesh),
     *([_saved(s[1:], s, slow=True) for s in (".usdc", ".usda")] if importlib.util.find_spec("pxr") else []),
 ]
