@@ -134,6 +134,7 @@ def test_info_on_splats(tmp_path, capsys):
     assert main(["info", str(tmp_path / "scene.ply"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["kind"], found["splats"], found["sh_degree"], found["kernel"]) == ("splats", 30, 1, "3dgs")
+    assert found["format"] == "ply"
     assert found["faint_splats"] == 1
     assert found["flatness_median"] == pytest.approx(0.5)
     np.testing.assert_allclose(found["lower"], cloud().means.min(axis=0), rtol=1e-5)

@@ -13,6 +13,7 @@ import tyro
 
 from meshsplats.camera import Camera, load_cameras
 from meshsplats.cli.common import SplatOptions, cameras_beside, identify
+from meshsplats.formats.splats import splat_format
 from meshsplats.framing import guess_up, scene_bounds
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -48,7 +49,7 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
     if path.is_file():
         found["bytes"] = path.stat().st_size
     if kind == "splats":
-        found |= _splats(reading.load(path))
+        found |= {"format": splat_format(path)} | _splats(reading.load(path))
         if cameras := cameras_beside(path):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
     elif kind == "mesh":
