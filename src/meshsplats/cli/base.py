@@ -77,7 +77,6 @@ class Base:
             print(json.dumps(result, indent=1))
             return
         print(f"{self.output} ({len(base.faces):,} triangles, {size_of(self.output)}) in {seconds:.1f} s")
-        splats = ["--splats", str(self.input)]
-        splats += ["--axes", self.reading.axes] if self.reading.axes != "auto" else []
+        splats = ["--splats", str(self.input), *self.reading.again()]
         source = ["--data", "photos/"] if isinstance(scene, SplatMesh) else splats
         print(f"next: {shlex.join(['meshsplats', 'prior', str(self.output), *source, '-o', 'prior.npz'])}")

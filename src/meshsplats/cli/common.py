@@ -53,9 +53,16 @@ class SplatOptions:
     def load(self, path: Path) -> GaussianCloud:
         from meshsplats.formats.splats import load_gaussians
 
-        if identify(path) == "mesh":
-            raise FileFormatError(f"{path}: a mesh, not splats")
-        return load_gaussians(path, strict=self.strict, axes=self.axes)
+        try:
+            return load_gaussians(path, strict=self.strict, axes=self.axes)
+        except FileFormatError:
+            if identify(path) == "mesh":
+                raise FileFormatError(f"{path}: a mesh, not splats") from None
+            raise
+
+    def again(self) -> list[str]:
+        """What another command needs to read the file with the same axes."""
+        return ["--axes", self.axes] if self.axes != "auto" else []
 
 
 @dataclass(frozen=True)
@@ -304,6 +311,16 @@ def configuration(command: str, options: Any) -> dict:
         "meshsplats": meshsplats.__version__,
         "options": {k: str(v) if isinstance(v, Path) else v for k, v in flat.items()},
     }
+
+
+def recorded_options(path: Path, command: str) -> dict[str, Any] | None:
+    """The options in the file at ``path`` that ``configuration`` made for ``command``; None if it is no such
+    file."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        return dict(record["options"]) if record["command"] == command else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def track(items: Iterable[T], label: str, total: int) -> Iterable[T]:

@@ -28,6 +28,7 @@ from meshsplats.cli.common import (
     data_cameras,
     identify,
     parse_up,
+    recorded_options,
     size_of,
     write_json,
 )
@@ -181,7 +182,8 @@ class Convert:
         """Names of the preview and the configuration, checked with that of the mesh. Where the usual ones are
         those of the same mesh in another format, names with all of the output's own."""
         preview, config = _records_of(self.output.with_suffix(""))
-        if _converted_to(config) not in (None, self.output.name):
+        other = (recorded_options(config, "convert") or {}).get("output")
+        if isinstance(other, str) and Path(other).name != self.output.name:
             preview, config = _records_of(self.output)
         wanted = [self.output, config] if self.no_preview else [self.output, preview, config]
         check_outputs(wanted, self.force, inputs=[self.input])
@@ -242,22 +244,12 @@ class Convert:
             words += ["--data", self.data]
         elif cameras:
             words += ["--cameras", self.input if self.cameras is None else self.cameras]
-        words += ["--axes", self.reading.axes] if self.reading.axes != "auto" else []
-        return shlex.join(map(str, [*words, "-o", f"{folder}-compare"]))
+        return shlex.join(map(str, [*words, *self.reading.again(), "-o", f"{folder}-compare"]))
 
 
 def _records_of(name: Path) -> tuple[Path, Path]:
     """Preview and configuration."""
     return name.with_name(f"{name.name}.preview.png"), name.with_name(f"{name.name}.config.json")
-
-
-def _converted_to(config: Path) -> str | None:
-    """Name of the mesh that a configuration of this command stands beside, None if it is none."""
-    try:
-        record = json.loads(config.read_text(encoding="utf-8"))
-        return Path(record["options"]["output"]).name if record["command"] == "convert" else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def _draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:

@@ -116,7 +116,7 @@ class Evaluate:
             self._check_outputs(self.output)
             mesh = None if self.mesh is None else self._load_mesh(self.mesh)
             before = None if self.before is None else self._load_mesh(self.before)
-            splats = None if self.splats is None else self._load_splats(self.splats)
+            splats = None if self.splats is None else self.reading.load(self.splats)
             dataset = self._dataset(splats)
             if self.data is None and splats is not None:
                 # Their own pictures are the truth; what a mesh could show of it is degree 0.
@@ -164,9 +164,6 @@ class Evaluate:
                 f"{path}: splats, not a mesh; give them with --splats, or convert them first"
             )
         return found
-
-    def _load_splats(self, path: Path) -> GaussianCloud:
-        return self.reading.load(path)
 
     def _dataset(self, splats: GaussianCloud | None) -> Dataset:
         background = parse_color(self.background)

@@ -145,7 +145,8 @@ class Finetune:
     def _converted(self, cloud: GaussianCloud, dataset: Dataset) -> SplatMesh:
         start = self.preset if self.start == "same" else self.start
         cameras = [view.camera for view in dataset.train]
-        return starting_mesh(cloud, cameras, preset=start, **asdict(self.conversion))
+        options = asdict(self.conversion) | {"crop": None}  # that is done
+        return starting_mesh(cloud, cameras, preset=start, **options)
 
     def _next(self, files: RunFiles, config: FinetuneConfig, held_out: int) -> str:
         """The command that scores the result as it was trained, or one that shows it where there is none."""
@@ -158,8 +159,7 @@ class Finetune:
             words += ["--downscale", target.downscale] if target.downscale != 1 else []
             words += ["--test-every", target.test_every] if target.test_every != 8 else []
         else:
-            words += ["--splats", self.input, "--cameras", files.held_out]
-            words += ["--axes", self.reading.axes] if self.reading.axes != "auto" else []
+            words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
             words += ["--sh-degree", target.sh_degree] if target.sh_degree is not None else []
         words += ["--background", "black"] if config.background == "black" else []
         words += ["-o", f"{folder}-evaluation"]

@@ -25,6 +25,7 @@ from meshsplats.cli.common import (
     parse_color,
     plural,
     record_beside,
+    recorded_options,
     size_of,
     track,
     view_names,
@@ -218,12 +219,13 @@ def _depth_unit(scene: GaussianCloud | SplatMesh, cameras: Sequence[Camera]) -> 
 
 def _remove_older(folder: Path, kept: Sequence[Path]) -> None:
     """The pictures of an earlier run in ``folder``, as its records tell, apart from ``kept``."""
-    try:
-        record = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-        count = len(load_cameras(folder / "cameras.json")) if record["command"] == "render" else 0
-    except (OSError, ValueError, KeyError, TypeError):
+    if recorded_options(folder / "config.json", "render") is None:
         return
-    names = [f"turntable.{kind}" for kind in ("webp", "gif", "png")] if count else []
+    try:
+        count = len(load_cameras(folder / "cameras.json"))
+    except (OSError, ValueError):
+        return
+    names = [f"turntable.{kind}" for kind in ("webp", "gif", "png")]
     for prefix, suffix in (("view", ".png"), ("depth", ".png"), ("depth", ".npy")):
         names += view_names(count, prefix, suffix)
     for name in names:

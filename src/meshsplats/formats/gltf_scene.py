@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import count
 from typing import Any, NamedTuple
 
@@ -100,30 +100,22 @@ class _Mix:
 def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
     """Each mesh of the scene as often as it stands there."""
     nodes, scenes = document.items("nodes"), document.items("scenes")
-    if scenes:
-        roots = document.item("scenes", document.json.get("scene", 0), "the file").get("nodes", [])
-    elif nodes:
-        below = {c for n in nodes for c in _numbers(document, n.get("children", []), "children of a node")}
-        roots = [i for i in range(len(nodes)) if i not in below]
-    else:
+    if not scenes and not nodes:
         yield from (Placed(mesh, np.eye(4)) for mesh in document.items("meshes"))
         return
-    matrices: dict[int, np.ndarray] = {}
-    stack = [(root, np.eye(4)) for root in reversed(_numbers(document, roots, "nodes of a scene"))]
-    while stack:
-        index, parent = stack.pop()
-        node = document.item("nodes", index, "a scene or node")
-        if index in matrices:
-            raise document.error(f"node {index} has two parents")
-        matrices[index] = parent @ _local_matrix(document, node)
-        children = _numbers(document, node.get("children", []), "children of a node")
-        stack += [(child, matrices[index]) for child in reversed(children)]
+    if scenes:
+        scene = document.item("scenes", document.json.get("scene", 0), "the file")
+        roots = _numbers(document, scene.get("nodes", []), "nodes of a scene")
+    else:
+        roots = _nodes_below_none(document)
+    matrices = _world_matrices(document, roots)
     for index, matrix in matrices.items():
         node = nodes[index]
         if "mesh" not in node:
             continue
         mesh = document.item("meshes", node["mesh"], f"node {index}")
-        joints = partial(_joints, document, node["skin"], matrices) if "skin" in node else None
+        # Primitives share it, and whoever looks at other things of the scene never needs it.
+        joints = cache(partial(_joints, document, node["skin"], matrices)) if "skin" in node else None
         extensions = node.get("extensions")
         if isinstance(extensions, dict) and INSTANCING in extensions:
             yield from (Placed(mesh, matrix @ own) for own in _instances(document, extensions[INSTANCING]))
@@ -149,31 +141,34 @@ def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray])
         bound = bound[: len(numbers)].reshape(-1, 4, 4).transpose(0, 2, 1)
     outside = set(numbers) - matrices.keys()
     if outside:  # of another scene, or of none
-        matrices = matrices | _matrices_by_parents(document, outside)
+        matrices = matrices | _world_matrices(document, _nodes_below_none(document))
+        for n in outside:
+            document.item("nodes", n, "a skin or node")
+            if n not in matrices:
+                raise document.error(f"node {n} is above itself")
     return np.stack([matrices[n] for n in numbers]) @ bound
 
 
-def _matrices_by_parents(document: GltfDocument, wanted: set[int]) -> dict[int, np.ndarray]:
-    """(4, 4) to the world's frame of nodes wherever they are."""
+def _world_matrices(document: GltfDocument, roots: Sequence[int]) -> dict[int, np.ndarray]:
+    """(4, 4) from the frame of each node at or below ``roots`` to the world's, in the order of the file's
+    tree."""
+    matrices: dict[int, np.ndarray] = {}
+    stack = [(root, np.eye(4)) for root in reversed(roots)]
+    while stack:
+        index, parent = stack.pop()
+        node = document.item("nodes", index, "a scene or node")
+        if index in matrices:
+            raise document.error(f"node {index} has two parents")
+        matrices[index] = parent @ _local_matrix(document, node)
+        children = _numbers(document, node.get("children", []), "children of a node")
+        stack += [(child, matrices[index]) for child in reversed(children)]
+    return matrices
+
+
+def _nodes_below_none(document: GltfDocument) -> list[int]:
     nodes = document.items("nodes")
-    parents: dict[int, int] = {}
-    for index, node in enumerate(nodes):
-        for child in _numbers(document, node.get("children", []), "children of a node"):
-            parents[child] = index
-    found: dict[int, np.ndarray] = {}
-    for index in wanted:
-        way: list[int] = []
-        at: int | None = index
-        while at is not None and at not in found:
-            way.append(at)
-            if len(way) > len(nodes):
-                raise document.error(f"node {index} is above itself")
-            at = parents.get(at)
-        matrix = np.eye(4) if at is None else found[at]
-        for step in reversed(way):
-            matrix = matrix @ _local_matrix(document, document.item("nodes", step, "a skin or node"))
-            found[step] = matrix
-    return found
+    below = {c for n in nodes for c in _numbers(document, n.get("children", []), "children of a node")}
+    return [i for i in range(len(nodes)) if i not in below]
 
 
 def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:

@@ -138,9 +138,8 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
         if types[name].kind == "u":
             arrays["colors"][:, i] /= np.float32(np.iinfo(types[name]).max)
         elif types[name].kind == "i" and arrays["colors"][:, i].max(initial=0) > 1:
-            arrays["colors"][:, i] /= np.float32(
-                255
-            )  # bytes in a wider type: no signed one's largest is white
+            # Bytes in a wider type: no program has the largest signed number for white.
+            arrays["colors"][:, i] /= np.float32(255)
     faces, numbers = read_faces(file, header, face, ("face_splat", "depth_group"), budget, path)
     return checked_mesh(
         path,

@@ -51,6 +51,20 @@ def read_sog(
         raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
 
 
+def json_object(raw: bytes, most: int, what: str, where: Path) -> dict[str, Any]:
+    """What ``what``, a JSON file of at most ``most`` bytes, holds. FileFormatError, which begins with
+    ``where``, if it is longer or no object."""
+    if len(raw) > most:
+        raise FileFormatError(f"{where}: {what} is longer than {most:,} bytes")
+    try:
+        found = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{where}: {what} cannot be read: {str(error)[:120]}") from None
+    if not isinstance(found, dict):
+        raise FileFormatError(f"{where}: {what} must be an object")
+    return found
+
+
 class _Folder:
     """Files beside meta.json."""
 
@@ -118,7 +132,7 @@ class _Archive:
 class _Reader:
     def __init__(self, files: _Folder | _Archive, where: Path, budget: Budget) -> None:
         self._files, self._where, self._budget = files, where, budget
-        self._meta = self._parse(files.read_meta())
+        self._meta = json_object(files.read_meta(), _MAX_META_BYTES, "meta.json", where)
 
     def _error(self, message: str) -> FileFormatError:
         return FileFormatError(f"{self._where}: {message}")
@@ -203,17 +217,6 @@ class _Reader:
         return chosen, int(np.count_nonzero(chosen))
 
     # -- meta.json
-
-    def _parse(self, raw: bytes) -> dict[str, Any]:
-        if len(raw) > _MAX_META_BYTES:
-            raise self._error(f"meta.json is longer than {_MAX_META_BYTES:,} bytes")
-        try:
-            meta = json.loads(raw)
-        except (ValueError, RecursionError) as error:
-            raise self._error(f"meta.json cannot be read: {str(error)[:120]}") from None
-        if not isinstance(meta, dict):
-            raise self._error("meta.json must be an object")
-        return meta
 
     def _section(self, name: str) -> dict[str, Any]:
         section = self._meta.get(name)

@@ -6,7 +6,6 @@ has the most detail. Specification: developer.playcanvas.com, "The Streamed SOG 
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._cloud_builder import joined
 from meshsplats.formats.mesh_checks import Budget
-from meshsplats.formats.sog import read_sog
+from meshsplats.formats.sog import json_object, read_sog
 from meshsplats.gaussians import GaussianCloud
 
 _MAX_INDEX_BYTES = 64 << 20
@@ -53,16 +52,8 @@ class _Index:
         self._path = path
         with open(path, "rb") as file:
             raw = file.read(_MAX_INDEX_BYTES + 1)
-        if len(raw) > _MAX_INDEX_BYTES:
-            raise self._error(f"it is longer than {_MAX_INDEX_BYTES:,} bytes")
-        try:
-            document = json.loads(raw)
-        except (ValueError, RecursionError) as error:
-            raise self._error(f"it cannot be read: {str(error)[:120]}") from None
-        if not isinstance(document, dict):
-            raise self._error("it must be an object")
-        self._document: dict[str, Any] = document
-        version = document.get("version", 1)
+        self._document = json_object(raw, _MAX_INDEX_BYTES, "the index", path)
+        version = self._document.get("version", 1)
         if version != 1:
             raise self._error(f"streamed SOG of version {str(version)[:20]}, known is 1")
 
