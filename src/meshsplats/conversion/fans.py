@@ -106,8 +106,8 @@ def semi_axes(quaternions: np.ndarray, order: np.ndarray, sigma: np.ndarray) -> 
     columns[2] = two * (x * z + w * y), two * (y * z - w * x), 1 - two * (x * x + y * y)
     result = np.empty((order.shape[1], 3, n), np.float32)
     for k in range(order.shape[1]):
-        numbers = order[:, k] * np.int64(3 * n)
-        numbers += np.arange(n)
+        # int64 before the product: NumPy 1 keeps the small type of an array times a scalar, and overflows.
+        numbers = order[:, k].astype(np.int64) * (3 * n) + np.arange(n)
         for coordinate in range(3):
             np.take(columns, numbers, out=result[k, coordinate], mode="clip")
             numbers += n
