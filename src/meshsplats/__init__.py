@@ -34,6 +34,8 @@ _HOME = {
     "render": "meshsplats.rendering",
     "render_splats": "meshsplats.rendering",
     "Rendering": "meshsplats.rendering",
+    "draw_splats": "meshsplats.rendering.looks",
+    "needed_samples": "meshsplats.rendering.samples",
     "finetune": "meshsplats.finetuning",
     "FinetuneConfig": "meshsplats.finetuning",
     "MeshPrior": "meshsplats.prior",

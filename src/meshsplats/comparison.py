@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from meshsplats.rendering.looks import Look
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class ComparedView:
 
     camera: Camera
     splats: np.ndarray
-    """(h, w, 3) float32 in [0, 1]: the splats drawn the 3DGS way."""
+    """(h, w, 3) float32 in [0, 1]: the splats, in the look that was asked for."""
     mesh: np.ndarray
     """(h, w, 3) float32 in [0, 1]."""
     score: ViewScore
@@ -64,33 +67,38 @@ def compare_views(
     mesh: SplatMesh,
     cameras: Sequence[Camera],
     *,
+    look: Look = "area",
     sh_degree: int | None = None,
     background: Sequence[float] = (1, 1, 1),
-    samples: int = 2,
+    samples: int | None = None,
     max_layers: int | None = None,
     threads: int | None = None,
 ) -> Iterator[ComparedView]:
     """The views one by one, so that only one pair of pictures is in memory.
 
-    The splats are drawn as their trainer draws them, at the centres of the pixels with a filter of a pixel's
-    size; a mesh has no such filter and needs several samples a pixel instead.
-
     Parameters
     ----------
+    look: what the mesh is compared with. 'area': the mean over each pixel's area, which programs that take
+        several samples a pixel show. 'splats': what a 3DGS viewer shows at this size of the image.
     sh_degree: spherical harmonics of the splats up to this degree; all by default. A mesh has one colour a
         vertex: 0 leaves the change of colour with the view out of the comparison.
     background, threads: as in ``render``, display RGB; pictures are clipped to [0, 1] as they are when saved.
         A mesh made for blending in linear light is drawn so, and encoded for display after.
-    samples, max_layers: as in ``render``, for the mesh.
+    samples, max_layers: as in ``render``, for the mesh; samples: by default as many as it needs for 'area',
+        1 for 'splats'.
     """
     from meshsplats.evaluation import mesh_picture
     from meshsplats.metrics import psnr, ssim
-    from meshsplats.rendering import render_splats
+    from meshsplats.rendering.looks import check_look, draw_splats, mesh_samples
 
+    check_look(look)
+    samples = mesh_samples(look, mesh, cameras) if samples is None else samples
     options: dict[str, Any] = {"samples": samples, "max_layers": max_layers, "threads": threads}
     for i, camera in enumerate(cameras):
-        a = render_splats(cloud, camera, sh_degree=sh_degree, background=background, threads=threads).color
-        a = np.clip(a, 0, 1)
+        drawn = draw_splats(
+            cloud, camera, look, sh_degree=sh_degree, background=background, threads=threads
+        )
+        a = np.clip(drawn.color, 0, 1)
         b = np.clip(mesh_picture(mesh, camera, background, **options)[0], 0, 1)
         yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))
 

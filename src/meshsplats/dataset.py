@@ -8,12 +8,15 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
+
+if TYPE_CHECKING:
+    from meshsplats.rendering.looks import Look
 
 CACHE_BYTES = 2 << 30
 """Pictures of a data set kept in memory after their first use, in bytes, where nothing else is asked for."""
@@ -118,6 +121,9 @@ class Dataset:
     train: tuple[View, ...]
     test: tuple[View, ...] = ()
     name: str = ""
+    look: Look = "area"
+    """What the images are the truth of (``rendering.looks``); photographs are means over each pixel's
+    area."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", tuple(self.train))
@@ -204,22 +210,26 @@ def splat_views(
     cloud: GaussianCloud,
     cameras: Sequence[Camera],
     *,
+    look: Look = "area",
     sh_degree: int | None = None,
     background: Sequence[float] = WHITE,
-    samples: int = 1,
+    samples: int | None = None,
     threads: int | None = None,
     cache_bytes: int = CACHE_BYTES,
 ) -> tuple[View, ...]:
-    """Views of the splats themselves, drawn the 3DGS way: targets where there are no photographs.
+    """Views of the splats themselves: targets where there are no photographs.
 
-    ``sh_degree``, ``samples`` and ``threads`` are those of ``render_splats``. Pictures have alpha, so any
-    background can be put behind them; ``background`` is that of ``View.image``. They are drawn when first
-    asked for and kept in float16, 8 bytes a pixel, as in ``load_dataset``.
+    ``look``, ``sh_degree``, ``samples`` and ``threads`` are those of ``rendering.looks.draw_splats``. Images
+    have alpha, so any background can be put behind them; ``background`` is that of ``View.image``. They are
+    drawn when first asked for and kept in float16, 8 bytes a pixel, as in ``load_dataset``.
     """
+    from meshsplats.rendering.looks import check_look
+
+    check_look(look)
     red, green, blue = map(float, background)
     store = PictureStore(cache_bytes)
     return tuple(
-        View(camera, DrawnSplats(cloud, camera, sh_degree, samples, threads, store), (red, green, blue))
+        View(camera, DrawnSplats(cloud, camera, look, sh_degree, samples, threads, store), (red, green, blue))
         for camera in cameras
     )
 
@@ -254,19 +264,21 @@ class DrawnSplats:
 
     cloud: GaussianCloud
     camera: Camera
+    look: Look
     sh_degree: int | None
-    samples: int
+    samples: int | None
     threads: int | None
     store: PictureStore = field(repr=False)
 
     def load(self) -> Picture:
-        from meshsplats.rendering import render_splats
+        from meshsplats.rendering.looks import draw_splats
 
         picture = self.store.find(self)
         if picture is None:
-            drawn = render_splats(
+            drawn = draw_splats(
                 self.cloud,
                 self.camera,
+                self.look,
                 background=(0, 0, 0),
                 samples=self.samples,
                 sh_degree=self.sh_degree,

@@ -11,10 +11,11 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.dataset import Dataset, View
+from meshsplats.dataset import Dataset, DrawnSplats, View
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.metrics import psnr
+from meshsplats.rendering.looks import Look, draw_splats, mesh_samples
 
 if TYPE_CHECKING:
     from meshsplats.lpips import Lpips
@@ -144,7 +145,7 @@ def evaluate(
     before: SplatMesh | None = None,
     splats: GaussianCloud | None = None,
     pictures: PictureAt | None = None,
-    samples: int = 1,
+    samples: int | None = None,
     lpips: Lpips | None = None,
     fit_exposure: bool = False,
     threads: int | None = None,
@@ -161,7 +162,9 @@ def evaluate(
     before: method ``'before'``, for instance the mesh before it was fine-tuned.
     splats: methods ``'splats_sh0'``, and ``'splats'`` with all their spherical harmonics where they have
     more. pictures: method ``'pictures'``, made elsewhere (``picture_folder``).
-    samples: side of the grid of samples in each pixel, for meshes; splats have a filter of a pixel's size.
+    samples: side of the grid of samples in each pixel, for meshes. None: as many as the mesh needs at this
+        size where the images are means over each pixel's area (``Dataset.look``), photographs among them;
+        1 where they are a splat viewer's.
     lpips: the distance of ``load_lpips``; without it the column stays empty.
     fit_exposure: also give the PSNR after a gain and an offset a channel are fitted to each picture.
     on_view: called with each view when it is scored.
@@ -169,19 +172,26 @@ def evaluate(
     Raises ValueError if there is nothing to score or no view, or a view without a pixel that counts.
     """
     methods: dict[str, PictureAt] = {}
+    views = dataset.test or dataset.views
+    if samples is None:
+        drawn_by = [view.camera for view in views]
+        samples = max(
+            (mesh_samples(dataset.look, m, drawn_by) for m in (mesh, before) if m is not None), default=1
+        )
     if mesh is not None:
         methods["mesh"] = _of_mesh(mesh, samples, threads)
     if before is not None:
         methods["before"] = _of_mesh(before, samples, threads)
     if splats is not None:
-        methods["splats_sh0"] = _of_splats(splats, 0, threads)
+        # Beside photographs splats are drawn as they were trained, beside their own images as these are.
+        look = dataset.look if _drawn(dataset) else "splats"
+        methods["splats_sh0"] = _of_splats(splats, look, 0, threads)
         if splats.sh_degree > 0:
-            methods["splats"] = _of_splats(splats, None, threads)
+            methods["splats"] = _of_splats(splats, look, None, threads)
     if pictures is not None:
         methods["pictures"] = pictures
     if not methods:
         raise ValueError("there is nothing to evaluate: give a mesh, splats or pictures")
-    views = dataset.test or dataset.views
     if not views:
         raise ValueError("the data set has no view to evaluate with")
     found: dict[str, list[ViewScores]] = {name: [] for name in methods}
@@ -202,6 +212,7 @@ def evaluate(
     about = {
         "views": len(views),
         "held_out": bool(dataset.test),
+        "look": dataset.look,
         "samples": samples,
         "triangles": None if mesh is None else len(mesh.faces),
         "splats": None if splats is None else len(splats),
@@ -282,6 +293,11 @@ def _empty(view: View) -> np.ndarray | None:
     return ~shown if view.mask is None else ~shown & view.mask
 
 
+def _drawn(dataset: Dataset) -> bool:
+    """Whether the images are those of splats."""
+    return any(isinstance(view.source, DrawnSplats) for view in dataset.views[:1])
+
+
 def _of_mesh(mesh: SplatMesh, samples: int, threads: int | None) -> PictureAt:
     def at(camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         return mesh_picture(mesh, camera, background, samples=samples, threads=threads)
@@ -289,11 +305,9 @@ def _of_mesh(mesh: SplatMesh, samples: int, threads: int | None) -> PictureAt:
     return at
 
 
-def _of_splats(cloud: GaussianCloud, degree: int | None, threads: int | None) -> PictureAt:
-    from meshsplats.rendering import render_splats
-
+def _of_splats(cloud: GaussianCloud, look: Look, degree: int | None, threads: int | None) -> PictureAt:
     def at(camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        drawn = render_splats(cloud, camera, background=background, sh_degree=degree, threads=threads)
+        drawn = draw_splats(cloud, camera, look, background=background, sh_degree=degree, threads=threads)
         return drawn.color, drawn.alpha
 
     return at

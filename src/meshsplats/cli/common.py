@@ -158,8 +158,8 @@ class DrawOptions:
     background: str = "white"
     """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
     samples: Count = None
-    """Side of the grid of samples in each pixel. Default: 2, which means 2 x 2, for meshes; 1 for splats,
-    whose filter is as wide as a pixel. compare: of the mesh."""
+    """Side of the grid of samples in each pixel. Default: as many as the mesh needs at this size, 2 (which
+    means 2 x 2) to 8; 1 for splats, whose filter is as wide as a pixel. compare: of the mesh."""
     sh_degree: Count = None
     """Draw splats with spherical harmonics up to this degree, 0 to 3. Default: all that are stored."""
     max_layers: Count = None

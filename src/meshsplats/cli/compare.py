@@ -27,7 +27,12 @@ from meshsplats.cli.common import (
 )
 from meshsplats.comparison import Comparison, compare_views
 from meshsplats.errors import FileFormatError
+from meshsplats.rendering.looks import mesh_samples
 
+LOOKS = {
+    "area": "splats as means over each pixel's area; the mesh with",
+    "splats": "splats as a 3DGS viewer draws them at this size; the mesh with",
+}
 CONFIGURATION, RESULTS, CAMERAS = "config.json", "results.json", "cameras.json"
 
 
@@ -44,6 +49,9 @@ class Compare:
     """Folder for strips, results.json, cameras.json and config.json."""
     preset: Literal["default", "paper"] = "default"
     """Preset of the conversion where no mesh is given."""
+    look: Literal["area", "splats"] = "area"
+    """What the mesh is compared with. area: the mean over each pixel's area, as photographs, Blender, MSAA
+    and ray tracers show it. splats: the image of a 3DGS viewer at this size."""
     views: ViewOptions = field(default_factory=ViewOptions)
     """8 views of an orbit, 400 pixels wide, where nothing else is asked for."""
     draw: DrawOptions = field(default_factory=DrawOptions)
@@ -78,13 +86,15 @@ class Compare:
             mesh = load_mesh(self.mesh)
         start = time.perf_counter()
         scores = []
+        samples = self.draw.samples or mesh_samples(self.look, mesh, cameras)
         views = compare_views(
             cloud,
             mesh,
             cameras,
+            look=self.look,
             sh_degree=self.draw.sh_degree,
             background=background,
-            samples=2 if self.draw.samples is None else self.draw.samples,
+            samples=samples,
             max_layers=self.draw.max_layers,
             threads=self.draw.threads,
         )
@@ -98,6 +108,8 @@ class Compare:
         result = {
             "splats": len(cloud),
             "triangles": len(mesh.faces),
+            "look": self.look,
+            "samples": samples,
             "ssim_convention": "3dgs",
             "error_amplified": self.amplify,
             "seconds": round(time.perf_counter() - start, 3),
@@ -110,6 +122,7 @@ class Compare:
             print(json.dumps(result, indent=1, allow_nan=False))
             return
         _print_table(comparison)
+        print(f"look {self.look}: {LOOKS[self.look]} {samples} x {samples} samples a pixel")
         print(f"{len(cloud):,} splats against {len(mesh.faces):,} triangles, {result['seconds']:.1f} s")
         print(f"strips splats | mesh | error x {self.amplify:g}: {self.output}/")
 

@@ -255,9 +255,10 @@ def _records_of(name: Path) -> tuple[Path, Path]:
 def _draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
     from meshsplats.pictures import save_png
     from meshsplats.rendering import render, render_splats
+    from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
     if isinstance(scene, SplatMesh):
-        save_png(path, render(scene, camera, samples=2).color)
+        save_png(path, render(scene, camera, samples=needed_samples(scene, [camera])).color)
     else:
         save_png(path, render_splats(scene, camera).color)

@@ -75,6 +75,9 @@ class Evaluate:
     """Pictures made elsewhere, by Blender say: a file for each view, by its name or in the views' order."""
     cameras: File = None
     """Without --data: cameras to draw the splats from. Default: as finetune holds them out."""
+    look: Literal["area", "splats"] = "area"
+    """Without --data: what the splats' pictures show, the truth. area: means over each pixel's area, as in
+    programs that take several samples a pixel. splats: what a 3DGS viewer shows at this size."""
     sh_degree: Count = None
     """Without --data: the splats' pictures are the truth up to this degree. Default: all that are stored."""
     lpips: Weights = ()
@@ -83,8 +86,9 @@ class Evaluate:
     """Network of LPIPS; splatting papers use vgg."""
     fit_exposure: bool = False
     """Also score after a gain and an offset a channel are fitted to each picture."""
-    samples: int = 1
-    """Side of the grid of samples in each pixel, for meshes."""
+    samples: Count = None
+    """Side of the grid of samples in each pixel, for meshes. Default: as many as the mesh needs at this size,
+    2 to 8; 1 with --look splats."""
     background: str = "white"
     """Behind everything: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
     downscale: Count = None
@@ -148,8 +152,10 @@ class Evaluate:
             raise UsageError("nothing to score: give a mesh, --pictures, or --splats with --data")
         if self.data is None and self.splats is None:
             raise UsageError("nothing to compare with: give --data, or --splats")
-        if self.data is not None and (self.cameras is not None or self.sh_degree is not None):
-            raise UsageError("--cameras and --sh-degree have no effect with --data")
+        given = {"cameras": self.cameras, "sh_degree": self.sh_degree, "look": self.look}
+        for name, value in given.items():
+            if self.data is not None and value not in (None, "area"):
+                raise UsageError(f"--{name.replace('_', '-')} has no effect with --data")
         if self.data is None and self.downscale is not None:
             raise UsageError("--downscale has no effect without --data")
 
@@ -176,12 +182,13 @@ class Evaluate:
             views = splat_views(
                 splats,
                 load_cameras(self.cameras),
+                look=self.look,
                 sh_degree=self.sh_degree,
                 background=background,
                 threads=self.threads,
             )
-            return Dataset((), views, "splats")
-        made = TargetOptions(sh_degree=self.sh_degree).make(splats, self.splats, background, self.threads)
+            return Dataset((), views, "splats", self.look)
+        made = TargetOptions(look=self.look, sh_degree=self.sh_degree).make(splats, self.splats, background, self.threads)
         return replace(made, train=())
 
     def _score(

@@ -160,6 +160,7 @@ class Finetune:
             words += ["--test-every", target.test_every] if target.test_every != 8 else []
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
+            words += ["--look", target.look] if target.look != "area" else []
             words += ["--sh-degree", target.sh_degree] if target.sh_degree is not None else []
         words += ["--background", "black"] if config.background == "black" else []
         words += ["-o", f"{folder}-evaluation"]

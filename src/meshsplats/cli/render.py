@@ -170,6 +170,7 @@ class Render:
         from meshsplats.colors import linear_to_srgb, srgb_to_linear
         from meshsplats.pictures import save_array, save_depth_png, save_png, straight_rgba
         from meshsplats.rendering import render, render_splats
+        from meshsplats.rendering.samples import needed_samples
 
         background = (0.0, 0.0, 0.0) if self.transparent else parse_color(self.draw.background)
         # A mesh made for blending in linear light is drawn so and encoded for display after.
@@ -178,7 +179,7 @@ class Render:
             background = tuple(srgb_to_linear(np.array(background)).tolist())
         samples = self.draw.samples
         if samples is None:
-            samples = 1 if isinstance(scene, GaussianCloud) else 2
+            samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
         options: dict[str, Any] = {
             "background": background,
             "samples": samples,

@@ -47,6 +47,10 @@ class TargetOptions:
     of a model folder, unless --placement, --distance or --up is given; else cameras are placed."""
     up: Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
+    look: Literal["area", "splats"] = "area"
+    """Without --data: what the pictures show. area: means over each pixel's area, right at every size in
+    programs that take several samples a pixel: Blender, MSAA, ray tracers. splats: what a 3DGS viewer
+    shows."""
     sh_degree: Count = None
     """Without --data: draw the splats with spherical harmonics up to this degree. Default: all that are
     stored."""
@@ -55,7 +59,7 @@ class TargetOptions:
 
     def check(self) -> None:
         """UsageError for options that would do nothing."""
-        idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "sh_degree")
+        idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "look", "sh_degree")
         names, source = (idle, "--data") if self.data is not None else (("downscale", "test_every"), "splats")
         for name in names:
             if self._given(name):
@@ -115,6 +119,7 @@ class TargetOptions:
             width=self.width,
             distance=self.distance,
             up=None if self.up is None else parse_up(self.up),
+            look=self.look,
             sh_degree=self.sh_degree,
             background=background,
             threads=threads,

@@ -222,9 +222,10 @@ def _text(progress: Progress, loss: float | None) -> str:
 def draw_preview(mesh: SplatMesh, path: Path) -> None:
     from meshsplats.evaluation import mesh_picture
     from meshsplats.pictures import save_png
+    from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
-    save_png(path, mesh_picture(mesh, camera, (1, 1, 1), samples=2)[0])
+    save_png(path, mesh_picture(mesh, camera, (1, 1, 1), samples=needed_samples(mesh, [camera]))[0])
 
 
 def need_torch() -> None:

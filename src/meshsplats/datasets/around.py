@@ -19,6 +19,7 @@ from meshsplats.framing import (
     weighted_quantile,
 )
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.rendering.looks import Look
 
 Placement = Literal["auto", "object", "surrounded", "inside"]
 
@@ -41,6 +42,8 @@ STANDS = 12
 HELD_OUT = 8
 """Views that are held out at the least, asked for or not: a mesh can be measured on them later
 without knowing what it was trained on."""
+TRAINING_SAMPLES = 2
+"""Side of the grid of samples in the pixels of images to learn from, for the look 'area'."""
 CANDIDATES = 512
 """Points tried as such a place."""
 ROOMY = 0.4
@@ -59,13 +62,14 @@ def splat_dataset(
     fov: float | None = None,
     distance: tuple[float, float] = DISTANCES,
     up: Sequence[float] | np.ndarray | None = None,
+    look: Look = "area",
     sh_degree: int | None = None,
     background: Sequence[float] = WHITE,
-    samples: int = 1,
+    samples: int | None = None,
     threads: int | None = None,
     cache_bytes: int = CACHE_BYTES,
 ) -> Dataset:
-    """A data set made of splats alone: pictures drawn the 3DGS way from cameras placed round them.
+    """A data set made of splats alone: their images from cameras placed round them.
 
     Parameters
     ----------
@@ -87,7 +91,11 @@ def splat_dataset(
         which the sphere just fits the picture that holds 90 % of the splats' opacity (or all of the subject,
         if it is smaller than that).
     up: (3,) direction; None: ``framing.guess_up``.
-    sh_degree, background, samples, threads, cache_bytes: as in ``dataset.splat_views``.
+    look: what the images are. 'area': means over each pixel's area, right for every program that takes
+        several samples a pixel. 'splats': what a 3DGS viewer shows at this size.
+    samples: side of the grid of samples in each pixel. None: for 'area', ``TRAINING_SAMPLES`` in training
+        views, which are quick to draw, and the exact mean in test views; else 1.
+    sh_degree, background, threads, cache_bytes: as in ``dataset.splat_views``.
 
     Raises ValueError for an empty cloud or an option out of its range.
     """
@@ -119,16 +127,24 @@ def splat_dataset(
             height=height or width,
             fov=50.0 if fov is None else fov,
         )
-    views = splat_views(
-        cloud,
-        placed,
-        sh_degree=sh_degree,
-        background=background,
-        samples=samples,
-        threads=threads,
-        cache_bytes=cache_bytes,
+    quick = TRAINING_SAMPLES if look == "area" else None
+    held_out, learned = (
+        splat_views(
+            cloud,
+            part,
+            look=look,
+            sh_degree=sh_degree,
+            background=background,
+            samples=side if samples is None else samples,
+            threads=threads,
+            cache_bytes=share,
+        )
+        for part, side, share in (
+            (placed[: min(test, first)], None, cache_bytes // 8),
+            (placed[first:], quick, cache_bytes - cache_bytes // 8),
+        )
     )
-    return Dataset(views[first:], views[: min(test, first)], "splats")
+    return Dataset(learned, held_out, "splats", look)
 
 
 def has_surroundings(cloud: GaussianCloud) -> bool:

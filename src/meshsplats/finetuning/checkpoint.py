@@ -185,7 +185,7 @@ def dataset_fingerprint(dataset: Dataset) -> str:
     drawn = [view.source for view in dataset.views if isinstance(view.source, DrawnSplats)]
     for source in drawn:
         degree = source.cloud.sh_degree if source.sh_degree is None else source.sh_degree
-        digest.update(repr((degree, source.samples, source.cloud.kernel)).encode())
+        digest.update(repr((source.look, degree, source.samples, source.cloud.kernel)).encode())
     for splats in {id(source.cloud): source.cloud for source in drawn}.values():
         for array in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.sh):
             digest.update(repr(array.shape).encode())

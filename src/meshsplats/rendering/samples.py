@@ -1,0 +1,65 @@
+"""How many samples a pixel a mesh needs at the size at which it is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshsplats._arrays import evenly
+from meshsplats.camera import Camera
+from meshsplats.framing import weighted_quantile
+from meshsplats.mesh import SplatMesh, splat_starts
+
+FEWEST, MOST = 2, 8
+"""Sides of the grid of samples in each pixel to choose from."""
+
+SPAN = 8.0
+"""Samples along the side of a small fan. Of five real scenes, images are then within 46 to 57 dB of those of
+12 x 12 samples; the error falls nearly with the square of the side of the grid."""
+
+SMALL = 0.1
+"""A small fan: this share of what shows, by opacity times area, lies on smaller ones."""
+
+FANS = 20_000
+"""Fans that are looked at, evenly spread."""
+
+CAMERAS = 4
+"""Cameras that are looked at, evenly spread."""
+
+
+def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
+    """Side of the grid of samples in each pixel, 2 to 8, with which ``mesh`` shows no noise from the
+    placement of the samples in the images of ``cameras``; the same for all of them, so that animations do
+    not flicker.
+
+    Fans are the triangles of one splat (``face_splat``); a mesh without gets the fewest.
+    """
+    if mesh.face_splat is None or not len(mesh.faces):
+        return FEWEST
+    starts = splat_starts(mesh.face_splat)
+    counts = np.diff(np.append(starts, len(mesh.faces)))
+    step = -(-len(starts) // FANS)
+    starts, counts = starts[::step], counts[::step]
+    first = np.cumsum(counts) - counts
+    rows = np.arange(int(counts.sum())) - np.repeat(first, counts) + np.repeat(starts, counts)
+    corners = mesh.faces[rows]
+    opacity = mesh.colors[corners, 3].mean(axis=1)
+    points = mesh.vertices[corners].astype(np.float64)
+    sides = []
+    for camera in evenly(cameras, CAMERAS):
+        x, y, z = np.moveaxis(points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3], 2, 0)
+        depth = np.maximum(z, camera.near)
+        u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+        area = 0.5 * np.abs(
+            (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+        )
+        shown = (z > camera.near).all(axis=1) & (u.max(axis=1) > 0) & (u.min(axis=1) < camera.width)
+        shown &= (v.max(axis=1) > 0) & (v.min(axis=1) < camera.height)
+        area *= shown
+        whole, weight = np.add.reduceat(area, first), np.add.reduceat(area * opacity, first)
+        if weight.sum() > 0:
+            sides.append(weighted_quantile(np.sqrt(whole), weight, SMALL))
+    if not sides or min(sides) <= 0:
+        return FEWEST
+    return int(np.clip(round(SPAN / min(sides)), FEWEST, MOST))
