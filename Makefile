@@ -40,7 +40,7 @@ $(VENV)/installed: $(BUILD_INPUTS) | $(BIN)/python
 
 $(VENV)/installed-dev: $(BUILD_INPUTS) | $(BIN)/python
 	@echo 'Compiling the core and installing MeshSplats with what its tests need, torch too: some minutes'
-	@$(PIP) install --editable '.[dev,finetune]' --constraint ci-constraints.txt
+	@$(PIP) install --editable '.[dev,torch]' --constraint ci-constraints.txt
 	@touch $(VENV)/installed $@
 
 demo: $(VENV)/installed

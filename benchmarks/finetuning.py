@@ -127,12 +127,9 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
 
 def by_processor_time(mesh, data, config: FinetuneConfig, options, seconds) -> tuple[ms.SplatMesh, int]:
     """The same loop with rates and end by processor time."""
-    import torch
-
     from meshsplats.finetuning.state import State
     from meshsplats.finetuning.tuning import kept_faces, make_step
 
-    torch.set_num_threads(1)
     state = State.begin(mesh, len(data.train), config, options.threads)
     step, interval = 0, config.prune_interval(len(data.train))
     while (fraction := seconds() / (options.minutes * 60)) < 1:

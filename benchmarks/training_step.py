@@ -10,7 +10,7 @@ parts are timed within the same steps. --beside takes a picture and the gradient
 scene: by this program, by the float64 reference in torch, and by Mitsuba's path integrator with automatic
 differentiation (llvm_ad_rgb, which needs an LLVM library), one sample a pixel. Mitsuba draws the same
 triangles as diffuse surfaces with an opacity under a white sky, not the same picture: it has no unlit
-blending. Needs torch.
+blending. --beside needs torch.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-import torch
 from rendering import SCENES, clocked, random_fans
 
 from meshsplats.camera import Camera
 from meshsplats.finetuning.adam import RowAdam
-from meshsplats.finetuning.losses import photometric_loss
+from meshsplats.finetuning.kernels import compare_pictures
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering import reference_autograd, render
-from meshsplats.rendering.autograd import rasterize
+from meshsplats.rendering import render
 from meshsplats.rendering.core import available_variants
+from meshsplats.rendering.recorded import RecordedPicture
 
 
 def table(heads: list[str]) -> None:
@@ -47,34 +46,38 @@ class Step:
 
     def __init__(self, mesh: SplatMesh, camera: Camera, threads: int) -> None:
         self.mesh, self.camera, self.threads = mesh, camera, threads
-        self.vertices = torch.from_numpy(mesh.vertices.copy()).requires_grad_()
-        self.colors = torch.from_numpy(mesh.colors.copy()).requires_grad_()
-        generator = torch.Generator().manual_seed(0)
-        self.truth = torch.rand(camera.height, camera.width, 3, generator=generator)
+        self.vertices, self.colors = mesh.vertices.copy(), mesh.colors.copy()
+        size = (1, camera.height, camera.width, 3)
+        self.truth = np.random.default_rng(0).random(size, np.float32)
         # Rates so small that every step draws the same scene.
         self.optimizers = [RowAdam(self.vertices, lr=1e-9), RowAdam(self.colors, lr=1e-9, bounds=(0, 1))]
 
-    def draw(self) -> torch.Tensor:
-        return rasterize(
+    def draw(self) -> RecordedPicture:
+        return RecordedPicture(
             self.vertices,
             self.mesh.faces,
             self.colors,
+            None,
             self.camera,
             face_splat=self.mesh.face_splat,
             threads=self.threads,
-        ).color
+        )
 
     def __call__(self) -> list[float]:
         times = [time.perf_counter()]
         picture = self.draw()
         times.append(time.perf_counter())
-        loss = photometric_loss(picture, self.truth, threads=self.threads)
+        rates = dict(l1_rate=0.6 / self.truth.size, ssim_rate=-0.4 / self.truth.size)
+        compared = compare_pictures(
+            picture.color[None], self.truth, gradient=True, threads=self.threads, **rates
+        )
+        assert compared.gradient is not None
         times.append(time.perf_counter())
-        loss.backward()
+        gradients = [np.zeros_like(values) for values in (self.vertices, self.colors)]
+        picture.back(compared.gradient[0], None, None, vertices=gradients[0], colors=gradients[1])
         times.append(time.perf_counter())
-        for optimizer, values in zip(self.optimizers, (self.vertices, self.colors), strict=True):
-            optimizer.step(values.grad)
-            values.grad = None
+        for optimizer, gradient in zip(self.optimizers, gradients, strict=True):
+            optimizer.step(gradient)
         times.append(time.perf_counter())
         return list(np.diff(times))
 
@@ -89,7 +92,6 @@ def steps(scenes: list[str], threads: list[int], repeat: int) -> None:
     for name in scenes:
         mesh, camera = random_fans(*SCENES[name])
         for count in threads:
-            torch.set_num_threads(count)
             times = timed(Step(mesh, camera, count), repeat)
             size = f"{camera.width} x {camera.height}"
             row(f"{len(mesh.faces):,}", size, f"{count}", *(f"{t:.0f}" for t in (*times, sum(times))))
@@ -183,6 +185,12 @@ def mitsuba_picture(mesh: SplatMesh, camera: Camera) -> tuple[str, Callable[[], 
 
 
 def beside(fans: int, repeat: int) -> None:
+    import torch
+
+    from meshsplats.rendering import reference_autograd
+    from meshsplats.rendering.autograd import rasterize
+
+    print(f"torch {torch.__version__}.\n")
     radius, opacity, side = 0.12, 0.05, 100
     mesh, camera = random_fans(fans, radius, opacity, side)
     torch.set_num_threads(2)
@@ -217,7 +225,7 @@ def main() -> None:
     parser.add_argument("--beside", action="store_true")
     parser.add_argument("--fans", type=int, default=1250, help="of the scene of --beside")
     args = parser.parse_args()
-    print(f"Core: {available_variants()[0]}; torch {torch.__version__}.\n")
+    print(f"Core: {available_variants()[0]}.\n")
     if args.growth:
         growth(args.repeat)
     elif args.beside:

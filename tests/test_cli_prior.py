@@ -6,9 +6,6 @@ import json
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-
 from _photographs import write_photographs
 from _priors import bumpy
 

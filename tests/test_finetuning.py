@@ -13,20 +13,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
-
-from meshsplats.camera import Camera, orbit  # noqa: E402
-from meshsplats.conversion import convert  # noqa: E402
-from meshsplats.dataset import Dataset, Picture, View, splat_views  # noqa: E402
-from meshsplats.datasets.around import splat_dataset  # noqa: E402
-from meshsplats.demo_scene import make_scene  # noqa: E402
-from meshsplats.errors import DivergenceError, FileFormatError  # noqa: E402
-from meshsplats.evaluation import evaluate  # noqa: E402
-from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config  # noqa: E402
-from meshsplats.finetuning.journal import Journal  # noqa: E402
-from meshsplats.finetuning.state import State  # noqa: E402
-from meshsplats.finetuning.tuning import (  # noqa: E402
-    encoded,
+from meshsplats.camera import Camera, orbit
+from meshsplats.conversion import convert
+from meshsplats.dataset import Dataset, Picture, View, splat_views
+from meshsplats.datasets.around import splat_dataset
+from meshsplats.demo_scene import make_scene
+from meshsplats.errors import DivergenceError, FileFormatError
+from meshsplats.evaluation import evaluate
+from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
+from meshsplats.finetuning.journal import Journal
+from meshsplats.finetuning.state import State
+from meshsplats.finetuning.tuning import (
+    LEAST_LIGHT,
+    encoding_slope,
     importance,
     kept_faces,
     make_step,
@@ -34,8 +33,8 @@ from meshsplats.finetuning.tuning import (  # noqa: E402
     target_of,
     view_of_step,
 )
-from meshsplats.gaussians import GaussianCloud  # noqa: E402
-from meshsplats.mesh import SplatMesh  # noqa: E402
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
 
 
 @pytest.fixture(scope="module")
@@ -106,16 +105,56 @@ def test_linear_light(scene):
         finetune(tuned, dataset, make_config(blending="display"))
 
 
-def test_linear_encoding_is_the_curve_with_a_finite_slope():
+def test_the_slope_of_the_encoding_is_finite():
     from meshsplats.colors import linear_to_srgb
 
-    values = np.linspace(0, 1, 1001, dtype=np.float32)
-    tensor = torch.from_numpy(values).requires_grad_(True)
-    found = encoded(tensor)
-    assert np.allclose(found.detach().numpy(), linear_to_srgb(values), atol=2e-6)
-    found.sum().backward()
-    assert torch.isfinite(tensor.grad).all()
-    assert tensor.grad[0] == pytest.approx(12.92)
+    values = np.linspace(0.01, 1, 100)
+    step = 1e-3
+    differences = (linear_to_srgb(values + step).astype(float) - linear_to_srgb(values - step)) / (2 * step)
+    assert np.allclose(encoding_slope(values.astype(np.float32)), differences, rtol=2e-3)
+    assert encoding_slope(np.float32([-1, 0, 0.003])).tolist() == pytest.approx([12.92] * 3)
+
+
+@pytest.mark.parametrize("blending", ["display", "linear"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeypatch):
+    """Loss, and its gradients by positions, colours and exposure, against autograd through rasterize."""
+    torch = pytest.importorskip("torch", reason="torch's gradients are the model here")
+    from meshsplats.colors import srgb_to_linear
+    from meshsplats.finetuning.losses import photometric_loss
+    from meshsplats.rendering.autograd import rasterize
+
+    _, dataset, mesh = scene
+    state = State.begin(
+        replace(mesh, blending=blending), 1, make_config(ssim_weight=0.3, l2_weight=7.0, exposure=True), None
+    )
+    assert state.exposures is not None
+    gain, offset = np.float32([1.1, 0.9, 1.2]), np.float32([0.05, -0.1, 0.02])
+    state.exposures[0] = [*gain, *offset]
+    mask = np.random.default_rng(0).random((48, 48)) < 0.6 if masked else None
+    image, background = dataset.train[0].picture.over((0.2, 0.9, 0.4)), (0.3, 0.1, 0.8)
+    view = View(dataset.train[0].camera, Picture(image, None, mask), background)
+    found = []
+    monkeypatch.setattr(State, "step", lambda state, gradients, *rest: found.extend(gradients))
+    loss = make_step(state, [view], 0, 0.0)
+
+    leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]
+    exposure = torch.tensor([*gain, *offset], requires_grad=True)
+    behind = srgb_to_linear(np.float32(background)) if blending == "linear" else np.float32(background)
+    options = dict(face_splat=mesh.face_splat, min_transmittance=LEAST_LIGHT[blending])
+    picture = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
+    if blending == "linear":
+        curve = 1.055 * picture.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+        picture = torch.where(picture <= 0.0031308, 12.92 * picture, curve)
+    picture = picture * exposure[:3] + exposure[3:]
+    truth, inside = torch.from_numpy(image), None if mask is None else torch.from_numpy(mask)
+    square = (picture - truth).square()
+    expected = photometric_loss(picture, truth, ssim_weight=0.3, mask=inside)
+    expected = expected + 7 * (square if mask is None else square[inside]).mean()
+    expected.backward()
+    assert loss == pytest.approx(float(expected.detach()), rel=1e-5)
+    for ours, theirs in zip(found, (*leaves, exposure), strict=True):
+        assert np.allclose(ours, theirs.grad, rtol=1e-3, atol=1e-5 * float(theirs.grad.abs().max()))
 
 
 def test_exposures_of_photographs_are_found(scene):
@@ -271,7 +310,7 @@ def test_backgrounds_are_random_only_where_alpha_is_known(scene):
         wanted = target_of(drawn, random, step).background if step % 2 else (0, 0, 0)
         assert target_of(on_black, mixed, step).background == wanted
     target = target_of(drawn, random, 3)
-    assert np.allclose(target.color.numpy(), drawn.picture.over(target.background))
+    assert np.allclose(target.color, drawn.picture.over(target.background))
 
 
 def test_a_step_changes_only_what_its_view_shows(scene):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from meshsplats import metrics
 
-torch = pytest.importorskip("torch", reason="the losses need torch: pip install 'meshsplats[finetune]'")
+torch = pytest.importorskip("torch", reason="the losses need torch: pip install 'meshsplats[torch]'")
 
 from meshsplats.finetuning import losses  # noqa: E402
 from meshsplats.finetuning.kernels import compare_pictures  # noqa: E402

@@ -160,7 +160,6 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
     for command in commands:
         small = ["--width", "48"] if command[1] in ("render", "compare") and "--width" not in command else []
         if command[1] == "finetune":
-            pytest.importorskip("torch")
             at = command.index("--minutes")
             command[at : at + 2] = []
             small = ["--width", "48", "--views", "3", "--held-out", "1", "--steps", "2"]

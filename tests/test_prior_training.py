@@ -6,12 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from _priors import bumpy, cube, rotation
 from hypothesis import given
 from hypothesis import strategies as st
-
-pytest.importorskip("torch")
-
-from _priors import bumpy, cube, rotation
 
 from meshsplats import Dataset, SplatMesh, orbit, psnr, render
 from meshsplats.dataset import Picture, View

@@ -17,7 +17,7 @@ from _rendering import camera, fan, layers, soup, turned
 from meshsplats import SplatMesh
 from meshsplats.rendering import core, reference, render
 
-torch = pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[finetune]'")
+torch = pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[torch]'")
 
 from meshsplats.rendering import reference_autograd  # noqa: E402
 from meshsplats.rendering.autograd import rasterize  # noqa: E402

@@ -7,9 +7,6 @@ import shlex
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("torch")
-
 from _photographs import write_photographs
 
 from meshsplats.camera import orbit

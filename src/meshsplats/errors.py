@@ -8,7 +8,13 @@ class FileFormatError(ValueError):
 
 
 class MissingDependencyError(ImportError):
-    """An optional library is needed here; the message names the extra that installs it."""
+    """An optional library is needed here; the message says how to install it."""
+
+
+GET_TORCH = (
+    "the build for processors will do: pip install torch --index-url https://download.pytorch.org/whl/cpu"
+)
+"""For messages: torch as most registries have it brings gigabytes of CUDA libraries on Linux."""
 
 
 class DataWarning(UserWarning):

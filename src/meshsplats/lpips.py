@@ -11,7 +11,7 @@ network     features, from torchvision       weights of the channels, from the p
 ==========  ===============================  ================================================================
 
 The state of a whole ``lpips.LPIPS`` module, saved as one file, will do as well. Needs torch (extra
-``finetune``).
+``torch``).
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats.errors import FileFormatError, MissingDependencyError
+from meshsplats.errors import GET_TORCH, FileFormatError, MissingDependencyError
+from meshsplats.formats.safetensors import load_safetensors
 from meshsplats.metrics import checked_pictures
 
 if TYPE_CHECKING:
@@ -241,18 +242,12 @@ def _tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         import torch
     except ImportError as error:
-        raise MissingDependencyError("LPIPS needs torch: pip install 'meshsplats[finetune]'") from error
+        raise MissingDependencyError(f"LPIPS needs torch; {GET_TORCH}") from error
     try:
         if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            return load_file(path)
+            return {name: torch.from_numpy(array) for name, array in load_safetensors(path)[0].items()}
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{path} needs safetensors: pip install 'meshsplats[finetune]'"
-        ) from error
-    except OSError:
+    except (OSError, FileFormatError):
         raise
     except Exception as error:
         # Broken files end in errors of many kinds, some with pages of advice to read them in unsafe ways.

@@ -32,7 +32,6 @@ from meshsplats.cli.training import (
     described,
     draw_preview,
     given,
-    need_torch,
     run_options,
     shown,
     stopped,
@@ -108,7 +107,6 @@ class Finetune:
         self.target.check()
         files = RunFiles(self.output)
         files.check([self.input], resume=self.resume, force=self.force)
-        need_torch()
         scene = load_scene(self.input, self.reading)
         if isinstance(scene, GaussianCloud) and self.conversion.crop is not None:
             # Pictures of what is cut off are nothing to learn from; other choices of splats leave gaps that

@@ -24,7 +24,6 @@ from meshsplats.cli.training import (
     described,
     draw_preview,
     given,
-    need_torch,
     run_options,
     shown,
     stopped,
@@ -114,7 +113,6 @@ class Prior:
         files.check(
             [path for path in (self.input, self.splats) if path], resume=self.resume, force=self.force
         )
-        need_torch()
         wants_texture = self.laying.colors in ("auto", "texture")
         base = load_base(self.input, texture=self.laying.texture, textures=wants_texture)
         dataset = self._dataset(base, config)

@@ -18,7 +18,6 @@ from meshsplats.camera import orbit
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import check_outputs, plural, size_of
 from meshsplats.dataset import Dataset
-from meshsplats.errors import MissingDependencyError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
 from meshsplats.mesh import SplatMesh
 
@@ -226,18 +225,6 @@ def draw_preview(mesh: SplatMesh, path: Path) -> None:
 
     camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
     save_png(path, mesh_picture(mesh, camera, (1, 1, 1), samples=needed_samples(mesh, [camera]))[0])
-
-
-def need_torch() -> None:
-    """Before any work: MissingDependencyError without the extra."""
-    try:
-        import safetensors
-        import torch  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"fine-tuning needs {error.name}: pip install 'meshsplats[finetune]'"
-        ) from error
-    del safetensors
 
 
 def say(text: str) -> None:

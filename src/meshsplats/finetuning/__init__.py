@@ -1,6 +1,6 @@
 """Fine-tuning meshes on pictures: ``finetune``, its configuration, losses, optimiser and checkpoints.
 
-Running needs the extra ``finetune``; importing this package does not.
+Nothing but the package itself is needed; ``meshsplats.finetuning.losses`` has the losses for torch.
 """
 
 from meshsplats.finetuning.config import (

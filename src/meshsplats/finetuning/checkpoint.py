@@ -17,9 +17,9 @@ import numpy as np
 
 from meshsplats.binding import Binding
 from meshsplats.dataset import Dataset, DrawnSplats
-from meshsplats.errors import FileFormatError, MissingDependencyError
+from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.config import FinetuneConfig
-from meshsplats.formats.atomic import atomic_path
+from meshsplats.formats.safetensors import load_safetensors, save_safetensors
 from meshsplats.mesh import SplatMesh
 
 VERSION = 1
@@ -49,33 +49,21 @@ class Checkpoint:
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
     """Writes ``checkpoint``, in place of an older one of that name once it is whole."""
-    tensors = _safetensors()
     names = ("step", "seconds", "config", "mesh", "dataset", "losses")
     header = {name: getattr(checkpoint, name) for name in names}
-    arrays = {name: np.array(array, order="C") for name, array in checkpoint.arrays.items()}
-    with atomic_path(path) as temporary:
-        metadata = {_KEY: json.dumps({"version": VERSION, **header})}
-        tensors.numpy.save_file(arrays, temporary, metadata=metadata)
+    save_safetensors(path, checkpoint.arrays, {_KEY: json.dumps({"version": VERSION, **header})})
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
     """The checkpoint at ``path``. FileFormatError if it is broken, of another kind, or of a later version;
     FileNotFoundError if there is none."""
-    tensors = _safetensors()
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}: leave out --resume to begin anew")
+    arrays, texts = load_safetensors(path)
     try:
-        with tensors.safe_open(path, framework="numpy") as file:
-            text = (file.metadata() or {}).get(_KEY)
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no iterator)
-    except OSError:
-        raise
-    except Exception as error:  # the reader's errors are of several kinds
-        raise FileFormatError(f"{path}: not a checkpoint ({error})") from error
-    try:
-        header = json.loads(text or "")
-    except ValueError:
+        header = json.loads(texts.get(_KEY, ""))
+    except (ValueError, RecursionError):
         header = None
     if not isinstance(header, dict) or any(name not in header for name in _REQUIRED):
         raise FileFormatError(f"{path}: a safetensors file, but not a checkpoint of meshsplats")
@@ -191,14 +179,3 @@ def dataset_fingerprint(dataset: Dataset) -> str:
             digest.update(repr(array.shape).encode())
             digest.update(array.data)
     return digest.hexdigest()
-
-
-def _safetensors():
-    try:
-        import safetensors
-        import safetensors.numpy
-    except ImportError as error:
-        raise MissingDependencyError(
-            "checkpoints need safetensors: pip install 'meshsplats[finetune]'"
-        ) from error
-    return safetensors

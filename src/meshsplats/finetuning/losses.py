@@ -6,15 +6,13 @@ number of threads.
 
 from __future__ import annotations
 
-from meshsplats.errors import MissingDependencyError
+from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.finetuning.kernels import compare_pictures
 
 try:
     import torch
 except ImportError as error:
-    raise MissingDependencyError(
-        "meshsplats.finetuning.losses needs torch: pip install 'meshsplats[finetune]'"
-    ) from error
+    raise MissingDependencyError(f"meshsplats.finetuning.losses needs torch; {GET_TORCH}") from error
 
 SSIM_WEIGHT = 0.4
 """Share of SSIM in the loss of the MeshSplats paper, 0.6 L1 + 0.4 (1 - SSIM)."""

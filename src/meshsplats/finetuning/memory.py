@@ -18,7 +18,7 @@ FACE_BYTES = 12 + 4 + 4 + 64
 PIXEL_BYTES = 12 * 12 + 64
 """Pictures, truth and gradients of one step, and the fragments that wait in the renderer's tiles."""
 BASE_BYTES = 300 << 20
-"""Python, torch and the libraries."""
+"""Python and the libraries."""
 
 
 def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BYTES) -> int:

@@ -117,10 +117,9 @@ def finetune(
         MemoryError: it would not fit; nothing was written.
         DivergenceError: a view gave values that are not finite; names it.
         Interrupted: after SIGINT or SIGTERM, with a checkpoint, if there is a folder.
-        MissingDependencyError: torch or safetensors is missing.
     """
     config, run = config or FinetuneConfig(), run or RunOptions()
-    from meshsplats.finetuning.state import State, torch
+    from meshsplats.finetuning.state import State
 
     if not dataset.train:
         raise ValueError("the data set has no training views")
@@ -141,13 +140,7 @@ def finetune(
         step, spent, losses = 0, 0.0, ()
         if journal is not None:
             journal.begin(config.to_dict())
-    threads = torch.get_num_threads()
-    try:
-        # Sums over pixels then have one order; the core has threads of its own.
-        torch.set_num_threads(1)
-        return _Run(state, dataset, config, run, journal, prints, step, spent, losses, on_progress).go()
-    finally:
-        torch.set_num_threads(threads)
+    return _Run(state, dataset, config, run, journal, prints, step, spent, losses, on_progress).go()
 
 
 class _Run:

@@ -1,14 +1,15 @@
-"""What a fine-tuning changes: positions, colours and exposures as torch tensors with their optimisers."""
+"""What a fine-tuning changes: positions, colours and exposures, with their optimisers."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from meshsplats.colors import srgb_to_linear
-from meshsplats.errors import FileFormatError, MissingDependencyError
+from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
@@ -18,26 +19,38 @@ from meshsplats.finetuning.relocation import HALF, Usage, find_moves, halves
 from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.mesh import SplatMesh
 
-try:
-    import torch
-except ImportError as error:
-    raise MissingDependencyError("fine-tuning needs torch: pip install 'meshsplats[finetune]'") from error
-
 GAIN, OFFSET = slice(0, 3), slice(3, 6)
+
+
+class Gradients(NamedTuple):
+    """Of the loss of one picture. float32, C-contiguous."""
+
+    vertices: np.ndarray
+    """(v, 3)."""
+    colors: np.ndarray
+    """(v, 4)."""
+    exposure: np.ndarray | None = None
+    """(6,): gain and offset of this view; None if they are not fitted."""
+
+    def finite(self) -> bool:
+        """Whether all are finite."""
+        # A sum of finite numbers may overflow, but then training has failed, too.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return all(bool(np.isfinite(part.sum())) for part in self if part is not None)
 
 
 class State:
     """The mesh in the making.
 
     Attributes:
-        vertices: (v, 3) float32 leaf tensor, scene units.
-        colors: (v, 4) float32 leaf tensor, straight RGBA in [0, 1], in the space of ``blending``.
+        vertices: (v, 3) float32, scene units, changed in place.
+        colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, changed in place.
         mesh: the mesh it began with, as far as it was not dropped: triangles, their splats, attributes.
         sizes: (v,) float32, the unit of each vertex' position or, on a base mesh, of its weights.
         bound: the weights that are optimised instead of positions where the mesh is bound to a base, else
             None; ``vertices`` follow them.
-        exposures: (views, 6) float32 leaf tensor: gain and offset of red, green and blue of each training
-            view; None if they are not fitted.
+        exposures: (views, 6) float32: gain and offset of red, green and blue of each training view; None if
+            they are not fitted.
     """
 
     def __init__(
@@ -49,11 +62,8 @@ class State:
         threads: int | None,
     ) -> None:
         self.mesh, self.sizes, self.config, self.threads = mesh, sizes, config, threads
-        self.vertices = torch.from_numpy(mesh.vertices.copy()).requires_grad_(True)
-        self.colors = torch.from_numpy(mesh.colors.copy()).requires_grad_(True)
-        self.exposures = (
-            None if exposures is None else torch.from_numpy(exposures.copy()).requires_grad_(True)
-        )
+        self.vertices, self.colors = mesh.vertices.copy(), mesh.colors.copy()
+        self.exposures = None if exposures is None else exposures.copy()
         adam = partial(RowAdam, betas=(config.beta1, config.beta2), eps=config.epsilon, threads=threads)
         self.bound = None if mesh.binding is None else BoundPositions(mesh.binding)
         if self.bound is not None:
@@ -121,7 +131,7 @@ class State:
         """What ``resume`` needs."""
         arrays = mesh_arrays(self.result()) | {"sizes": self.sizes}
         if self.exposures is not None:
-            arrays["exposure.values"] = self.exposures.detach().numpy()
+            arrays["exposure.values"] = self.exposures
         for name, adam in self._optimisers().items():
             arrays |= {f"{name}.{key}": value for key, value in adam.state().items()}
         if self._usage is not None:
@@ -132,58 +142,41 @@ class State:
         """The mesh as it is now."""
         return replace(
             self.mesh,
-            vertices=self.vertices.detach().numpy().copy(),
-            colors=self.colors.detach().numpy().copy(),
+            vertices=self.vertices.copy(),
+            colors=self.colors.copy(),
             binding=None if self.bound is None else self.bound.binding(),
         )
 
-    def finite_gradients(self) -> bool:
-        """Whether all gradients of the last backward pass are finite."""
-        gradients = [
-            t.grad
-            for t in (self.vertices, self.colors, self.exposures)
-            if t is not None and t.grad is not None
-        ]
-        # A sum of finite numbers may overflow, but then training has failed, too.
-        return all(bool(torch.isfinite(gradient.sum())) for gradient in gradients)
-
-    def step(self, color_rate: float, position_rate: float, view: int) -> None:
-        """One step of Adam on what training view number ``view`` reached, with the gradients that are
-        there."""
-        assert self.colors.grad is not None
-        assert self.vertices.grad is not None
+    def step(self, gradients: Gradients, color_rate: float, position_rate: float, view: int) -> None:
+        """One step of Adam along ``gradients`` on what training view number ``view`` reached."""
         # Nothing in a picture moves without its opacity mattering; one column is quick to look through.
-        reached = self.colors.grad[:, 3].numpy() != 0
-        opacity = self.colors.detach().numpy()[:, 3]
+        reached = gradients.colors[:, 3] != 0
+        opacity = self.colors[:, 3]
         clear = None if self._edges is None else self._edges & (opacity == 0)
         if self._usage is not None:
-            self._usage.add(self.colors.grad.numpy(), self.vertices.grad.numpy(), self.sizes, reached)
+            self._usage.add(gradients.colors, gradients.vertices, self.sizes, reached)
         self._colors.lr = color_rate
-        self._colors.step(self.colors.grad, reached)
+        self._colors.step(gradients.colors, reached)
         if clear is not None:
             opacity[clear] = 0
         if position_rate > 0:
             self._positions.lr = position_rate
             if self.bound is None:
-                self._positions.step(self.vertices.grad, reached)
+                self._positions.step(gradients.vertices, reached)
             else:
                 # A vertex in a corner of its face has nowhere to go.
                 movable = reached & (self.bound.weights < 1).all(axis=1)
                 rows = np.flatnonzero(movable)
                 before = self.bound.weights[rows]
-                self._positions.step(self.bound.gradient(self.vertices.grad.numpy(), rows), movable)
-                self.bound.settle(before, rows, self.vertices.detach().numpy())
-        if self._exposures is not None and self.exposures is not None and self.exposures.grad is not None:
-            self._exposures.step(self.exposures.grad, np.array([view], np.int32))
-            with torch.no_grad():
-                # A gain of all pictures and one of the mesh's colours would be the same: means stay.
-                self.exposures -= self.exposures.mean(0) - torch.tensor([1.0, 1, 1, 0, 0, 0])
-        self.forget_gradients()
-
-    def forget_gradients(self) -> None:
-        self.vertices.grad = self.colors.grad = None
-        if self.exposures is not None:
-            self.exposures.grad = None
+                self._positions.step(self.bound.gradient(gradients.vertices, rows), movable)
+                self.bound.settle(before, rows, self.vertices)
+        if self._exposures is not None and self.exposures is not None and gradients.exposure is not None:
+            towards = np.zeros_like(self.exposures)
+            towards[view] = gradients.exposure
+            self._exposures.step(towards, np.array([view], np.int32))
+            # A gain of all pictures and one of the mesh's colours would be the same: means stay.
+            mean = self.exposures.mean(axis=0, dtype=np.float64) - [1, 1, 1, 0, 0, 0]
+            self.exposures -= mean.astype(np.float32)
 
     def relocate(self, looked_at: np.ndarray) -> int:
         """Lets splats that show next to nothing though they are ``looked_at``, (v,) bool, take over halves of
@@ -193,7 +186,7 @@ class State:
             return 0
         idle, needed = find_moves(self.mesh, self._usage, looked_at, self.config.relocate_share)
         if len(idle):
-            positions, colors = self.vertices.detach().numpy(), self.colors.detach().numpy()
+            positions, colors = self.vertices, self.colors
             positions[needed], positions[idle] = halves(positions[needed])
             colors[idle] = colors[needed]
             # Sizes are the sides of squares.
@@ -212,8 +205,7 @@ class State:
         used = np.zeros(len(self.mesh.vertices), bool)
         used[self.mesh.faces[keep].ravel()] = True
         mesh = self.result().keep_faces(keep)
-        exposures = None if self.exposures is None else self.exposures.detach().numpy()
-        smaller = State(mesh, self.sizes[used], exposures, self.config, self.threads)
+        smaller = State(mesh, self.sizes[used], self.exposures, self.config, self.threads)
         rows = np.flatnonzero(used)
         places = smaller.vertices if smaller.bound is None else smaller.bound.weights
         smaller._positions = self._positions.select(places, rows)

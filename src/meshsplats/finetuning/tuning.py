@@ -9,21 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import evenly
-from meshsplats.colors import srgb_to_linear
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.dataset import View
-from meshsplats.errors import DivergenceError, MissingDependencyError
+from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKDROPS, FinetuneConfig, rates
-from meshsplats.finetuning.losses import photometric_loss
-from meshsplats.finetuning.state import GAIN, OFFSET, State
+from meshsplats.finetuning.kernels import compare_pictures
+from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
-from meshsplats.rendering.autograd import rasterize
-from meshsplats.rendering.recorded import shown_pixels
-
-try:
-    import torch
-except ImportError as error:
-    raise MissingDependencyError("fine-tuning needs torch: pip install 'meshsplats[finetune]'") from error
-
+from meshsplats.rendering.recorded import RecordedPicture, shown_pixels
 
 IMPORTANCE_VIEWS = 64
 """Most training views, evenly spread, that are drawn to find out what they show of each splat."""
@@ -38,9 +31,9 @@ lifted where it is dark."""
 class Target(NamedTuple):
     """What a picture should look like."""
 
-    color: torch.Tensor
+    color: np.ndarray
     """(h, w, 3) float32 display RGB."""
-    mask: torch.Tensor | None
+    mask: np.ndarray | None
     """(h, w) bool, True where pixels count; None: everywhere."""
     background: tuple[float, float, float]
     """Display RGB behind everything."""
@@ -61,49 +54,83 @@ def target_of(view: View, config: FinetuneConfig, step: int) -> Target:
         if config.background == "random" or (config.background == "mixed" and step % 2):
             drawn = np.random.default_rng([config.seed, step, 1]).random(3)
             background = tuple(drawn.astype(np.float32).tolist())
-    mask = None if picture.mask is None else torch.from_numpy(picture.mask)
-    return Target(torch.from_numpy(picture.over(background)), mask, background)
+    return Target(picture.over(background), picture.mask, background)
 
 
-def draw(state: State, view: View, background: Sequence[float]) -> torch.Tensor:
-    """(h, w, 3) display RGB of the mesh, with gradients to the state's tensors."""
+class Drawn:
+    """A picture of the mesh, with a way back.
+
+    Attributes:
+        color: (h, w, 3) float32 display RGB.
+    """
+
+    def __init__(self, recorded: RecordedPicture, linear: bool) -> None:
+        self._recorded, self._linear = recorded, linear
+        self.color = linear_to_srgb(recorded.color) if linear else recorded.color
+
+    def back(self, towards: np.ndarray) -> Gradients:
+        """Those of vertices and colours, from that of ``color``, (h, w, 3) float32."""
+        if self._linear:
+            towards = towards * encoding_slope(self._recorded.color)
+        count = self._recorded.vertex_count
+        gradients = Gradients(np.zeros((count, 3), np.float32), np.zeros((count, 4), np.float32))
+        self._recorded.back(towards, None, None, vertices=gradients.vertices, colors=gradients.colors)
+        return gradients
+
+
+def draw(state: State, view: View, background: Sequence[float]) -> Drawn:
+    """The mesh as ``view`` has it before it, over a display ``background``."""
     linear = state.mesh.blending == "linear"
     behind = np.asarray(background, np.float32)
-    raster = rasterize(
+    recorded = RecordedPicture(
         state.vertices,
         state.mesh.faces,
         state.colors,
+        None,
         view.camera,
-        background=torch.from_numpy(srgb_to_linear(behind) if linear else behind),
+        background=srgb_to_linear(behind) if linear else behind,
         samples=state.config.samples,
         min_transmittance=LEAST_LIGHT[state.mesh.blending],
         face_splat=state.mesh.face_splat,
         depth_group=state.mesh.depth_group,
         threads=state.threads,
     )
-    return encoded(raster.color) if linear else raster.color
+    return Drawn(recorded, linear)
 
 
-def encoded(linear: torch.Tensor) -> torch.Tensor:
-    """Display values of linear light, as ``colors.linear_to_srgb``; the slope at 0 is the finite one
-    there."""
-    curve = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
+def encoding_slope(linear: np.ndarray) -> np.ndarray:
+    """Derivative of ``colors.linear_to_srgb``, float32; the finite one at 0 and below."""
+    power = np.maximum(linear, np.float32(0.0031308)) ** np.float32(1 / 2.4 - 1)
+    return np.where(linear <= np.float32(0.0031308), np.float32(12.92), np.float32(1.055 / 2.4) * power)
 
 
 def loss_of(
-    picture: torch.Tensor, target: Target, config: FinetuneConfig, threads: int | None
-) -> torch.Tensor:
-    """The loss as ``FinetuneConfig`` states it, () float32."""
-    loss = photometric_loss(
-        picture, target.color, ssim_weight=config.ssim_weight, mask=target.mask, threads=threads
+    picture: np.ndarray, target: Target, config: FinetuneConfig, threads: int | None
+) -> tuple[float, np.ndarray]:
+    """The loss as ``FinetuneConfig`` states it, and its gradient, (h, w, 3) float32 like the ``picture``."""
+    mask = target.mask
+    count = picture.size if mask is None else int(mask.sum()) * picture.shape[2]
+    share = config.ssim_weight
+    compared = compare_pictures(
+        picture[None],
+        target.color[None],
+        None if mask is None else mask[None],
+        l1_rate=(1 - share) / count,
+        ssim_rate=-share / count,
+        gradient=True,
+        threads=threads,
     )
+    assert compared.gradient is not None
+    loss = (1 - share) * compared.l1 / count + share * (1 - compared.ssim / count)
+    gradient = compared.gradient[0]
     if config.l2_weight:
-        square = (picture - target.color).square()
-        if target.mask is not None:
-            square = square[target.mask]
-        loss = loss + config.l2_weight * square.mean()
-    return loss
+        difference = picture - target.color
+        if mask is not None:
+            difference[~mask] = 0  # values under the mask are never looked at
+        loss += config.l2_weight * float(np.square(difference).sum()) / count
+        difference *= np.float32(2 * config.l2_weight / count)
+        gradient += difference
+    return loss, gradient
 
 
 def make_step(state: State, views: Sequence[View], step: int, fraction: float) -> float | None:
@@ -118,23 +145,35 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
     target = target_of(view, config, step)
     if target.mask is not None and not target.mask.any():
         return None
-    picture = draw(state, view, target.background)
+    drawn = draw(state, view, target.background)
+    picture = drawn.color
     if state.exposures is not None:
         own = state.exposures[number]
         picture = picture * own[GAIN] + own[OFFSET]
-    loss = loss_of(picture, target, config, state.threads)
-    value = float(loss.detach())
-    if np.isfinite(value):
-        loss.backward()
-    if not np.isfinite(value) or not state.finite_gradients():
-        state.forget_gradients()
-        what = "the loss" if not np.isfinite(value) else "a gradient"
+    loss, towards = loss_of(picture, target, config, state.threads)
+    what, gradients = "the loss", None
+    if np.isfinite(loss):
+        exposure = None
+        if state.exposures is not None:
+            exposure = exposure_gradient(drawn.color, towards)
+            towards = towards * own[GAIN]
+        what, gradients = "a gradient", drawn.back(towards)._replace(exposure=exposure)
+    if gradients is None or not gradients.finite():
         raise DivergenceError(
             f"step {step + 1}, view {view.name!r}: {what} is not finite. Look at this view's picture and"
             " camera first; if it is sound, lower the rates. The last checkpoint is from before this step"
         )
-    state.step(*rates(config, step, fraction), number)
-    return value
+    state.step(gradients, *rates(config, step, fraction), number)
+    return loss
+
+
+def exposure_gradient(picture: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """(6,) float32: of gain and offset of ``picture * gain + offset``, whose gradient is ``towards``."""
+    gradient = np.empty(6, np.float32)
+    # Row by row first: quick, and no sum is long enough to lose digits.
+    gradient[GAIN] = np.einsum("hwc,hwc->hc", picture, towards).sum(axis=0, dtype=np.float64)
+    gradient[OFFSET] = np.einsum("hwc->hc", towards).sum(axis=0, dtype=np.float64)
+    return gradient
 
 
 def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
@@ -160,7 +199,7 @@ def relocate(state: State, views: Sequence[View]) -> int:
     """Moves splats to where they are needed (see ``relocation``); returns how many."""
     if not state.config.relocate_share or state.bound is not None:
         return 0
-    positions = state.vertices.detach().numpy()
+    positions = state.vertices
     looked_at = np.zeros(len(positions), bool)
     for view in evenly(views, IMPORTANCE_VIEWS):
         looked_at |= view.camera.sees(positions)
@@ -169,7 +208,7 @@ def relocate(state: State, views: Sequence[View]) -> int:
 
 def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     """What ``views`` show of each vertex: (v,) float32 pixels, (v,) bool whether any has it before it."""
-    vertices, colors = state.vertices.detach().numpy(), state.colors.detach().numpy()
+    vertices, colors = state.vertices, state.colors
     shown = np.zeros(len(vertices), np.float32)
     before = np.zeros(len(shown), bool)
     for view in views:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.errors import MissingDependencyError
+from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.rendering.api import MIN_TRANSMITTANCE
 from meshsplats.rendering.recorded import LOG_BYTES, RecordedPicture
 
@@ -16,9 +16,7 @@ try:
     import torch
     from torch.autograd.function import once_differentiable
 except ImportError as error:
-    raise MissingDependencyError(
-        "meshsplats.rendering.autograd needs torch: pip install 'meshsplats[finetune]'"
-    ) from error
+    raise MissingDependencyError(f"meshsplats.rendering.autograd needs torch; {GET_TORCH}") from error
 
 
 class Raster(NamedTuple):

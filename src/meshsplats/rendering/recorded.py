@@ -81,6 +81,10 @@ class RecordedPicture:
             )
         self.fragments = int(picture.fragments)
 
+    @property
+    def vertex_count(self) -> int:
+        return self._mesh.vertex_count
+
     def __del__(self) -> None:
         if getattr(self, "_log", None):
             core.load_core().ms_forget(self._log)
