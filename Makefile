@@ -16,12 +16,20 @@ BPY ?= 4.2.23 5.0.1
 BLENDER_PYTHON ?= $(shell for name in python3.11 python3 python; do \
 	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && echo $$name && break; done)
 
-.PHONY: help demo test test-blender lint format clean
+# The lowest versions that pyproject.toml allows want the lowest Python. That of pyenv answers to its short name only
+# where it was chosen, so it is looked for by its place, too.
+LOWEST_VENV ?= .venv-lowest
+LOWEST_PYTHON ?= $(shell for name in python3.10 $(wildcard $(HOME)/.pyenv/versions/3.10.*/bin/python) python3.11 python3 \
+	python; do $$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))' \
+	2>/dev/null && echo $$name && break; done)
+
+.PHONY: help demo test test-lowest test-blender lint format clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo 'make demo    splats to mesh, GLB, pictures and a comparison, in $(DEMO)/'
 	@echo 'make test    the tests'
+	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make lint    ruff and mypy (make format tidies the source)'
 	@echo 'make clean   removes everything that these made'
@@ -55,17 +63,29 @@ demo: $(VENV)/installed
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest
 
-$(BLENDER_VENV)/wheel/made: $(BUILD_INPUTS) $(shell find src -name '*.py')
-	@if [ -z "$(BLENDER_PYTHON)" ]; then echo 'Blender needs Python 3.11 with venv, and it was not found.' \
-	  'Name it: make test-blender BLENDER_PYTHON=...' >&2; exit 1; fi
+# One wheel serves all versions of Python.
+build/wheel/made: $(BUILD_INPUTS) $(shell find src -name '*.py') | $(BIN)/python
 	@echo 'Compiling the core: about a minute'
-	@$(BLENDER_PYTHON) -m venv $(BLENDER_VENV)/build
 	@rm -f $(@D)/*.whl
-	@$(BLENDER_VENV)/build/bin/python -m pip --disable-pip-version-check --quiet wheel --no-deps \
-	  --config-settings=build-dir=build/blender --wheel-dir $(@D) .
+	@$(PIP) wheel --no-deps --config-settings=build-dir=build/for-wheel --wheel-dir $(@D) .
 	@touch $@
 
-$(BLENDER_VENV)/%/installed: $(BLENDER_VENV)/wheel/made
+$(LOWEST_VENV)/installed: build/wheel/made lowest-constraints.txt
+	@if [ -z "$(LOWEST_PYTHON)" ]; then echo 'The lowest versions need Python 3.10 or 3.11 with venv; neither was found.' \
+	  'Name it: make test-lowest LOWEST_PYTHON=...' >&2; exit 1; fi
+	@echo 'Installing the lowest versions into $(@D) with $(LOWEST_PYTHON)'
+	@test -x $(@D)/bin/python || $(LOWEST_PYTHON) -m venv $(@D)
+	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --only-binary :all: \
+	  --constraint lowest-constraints.txt pytest hypothesis $(<D)/*.whl
+	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --force-reinstall --no-deps $(<D)/*.whl
+	@touch $@
+
+test-lowest: $(LOWEST_VENV)/installed
+	$(LOWEST_VENV)/bin/python -m pytest
+
+$(BLENDER_VENV)/%/installed: build/wheel/made
+	@if [ -z "$(BLENDER_PYTHON)" ]; then echo 'Blender needs Python 3.11 with venv, and it was not found.' \
+	  'Name it: make test-blender BLENDER_PYTHON=...' >&2; exit 1; fi
 	@echo 'Installing Blender $* into $(@D)'
 	@test -x $(@D)/bin/python || $(BLENDER_PYTHON) -m venv $(@D)
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install 'bpy==$*' 'numpy<2' pytest hypothesis \
@@ -78,8 +98,8 @@ $(BLENDER_VENV)/%/installed: $(BLENDER_VENV)/wheel/made
 test-blender: $(BPY:%=$(BLENDER_VENV)/%/installed)
 	@for version in $(BPY); do \
 	  echo "Blender $$version"; \
-	  MESHSPLATS_WHEEL=$$(echo $(BLENDER_VENV)/wheel/*.whl) $(BLENDER_VENV)/$$version/bin/python -m pytest tests/blender \
-	    || exit 1; \
+	  MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$$version/bin/python -m pytest \
+	    tests/blender tests/test_conversion.py tests/test_demo_mesh.py || exit 1; \
 	done
 
 lint: $(VENV)/installed-dev
@@ -91,5 +111,5 @@ format: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check --fix .
 
 clean:
-	rm -rf $(VENV) $(BLENDER_VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST_VENV) $(BLENDER_VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests examples benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -184,6 +184,8 @@ def picture(pixels, kind="WEBP"):
     out = io.BytesIO()
     options = {"lossless": True, "exact": True} if kind == "WEBP" else {}
     Image.fromarray(pixels).save(out, kind, **options)
+    if kind == "WEBP" and not np.array_equal(Image.open(out).convert("RGBA"), pixels):
+        return picture(pixels, "PNG")  # older Pillow drops colours where alpha is 0 from a WebP
     return out.getvalue()
 
 

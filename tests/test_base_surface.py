@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import sys
 
@@ -14,6 +15,11 @@ from meshsplats.cli import main
 from meshsplats.errors import MissingDependencyError
 from meshsplats.prior import bind
 from meshsplats.prior.surface import base_surface, isosurface
+
+needs_extra = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("skimage", "fast_simplification")),
+    reason="install meshsplats[base]",
+)
 
 
 def ball(radius=1.0, center=(0.0, 0, 0), n=40) -> SplatMesh:
@@ -38,6 +44,7 @@ def volume(vertices, faces) -> float:
     return float(np.linalg.det(vertices[faces].astype(float)).sum()) / 6
 
 
+@needs_extra
 def test_the_surface_of_a_plane_and_of_a_ball():
     grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 3, indexing="ij"), -1)
     vertices, faces = isosurface(grid[..., 0] - 4.25)
@@ -57,6 +64,7 @@ def test_the_surface_of_a_plane_and_of_a_ball():
         assert len(isosurface(empty)[1]) == 0
 
 
+@needs_extra
 def test_as_many_faces_as_asked_for():
     grid = np.stack(np.meshgrid(*[np.arange(40.0)] * 3, indexing="ij"), -1)
     distance = np.linalg.norm(grid - 19.4, axis=-1) - 15
@@ -77,6 +85,7 @@ def test_without_the_extra_it_is_named(monkeypatch):
         base_surface(ball(), resolution=8, cameras=4)
 
 
+@needs_extra
 def test_the_surface_of_a_ball():
     center = np.array([3.0, -2, 5])
     base = base_surface(ball(2, center), resolution=32, cameras=24, threads=1)
@@ -91,6 +100,7 @@ def test_the_surface_of_a_ball():
     np.testing.assert_allclose(base.up, [0, 0, 1], atol=1e-6)
 
 
+@needs_extra
 def test_crumbs_are_left_out():
     large, crumb = ball(), ball(0.08, (1.4, 0, 0), n=8)
     both = SplatMesh(
@@ -102,6 +112,7 @@ def test_crumbs_are_left_out():
     assert base.vertices[:, 0].max() < 1.2
 
 
+@needs_extra
 def test_what_cannot_be_done():
     mesh = ball()
     for options, message in [
@@ -137,6 +148,7 @@ def discs(count=1500) -> GaussianCloud:
     )
 
 
+@needs_extra
 def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     save_gaussians(discs(), tmp_path / "scene.ply")
     out = tmp_path / "base.obj"
@@ -153,6 +165,7 @@ def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     assert "is read by this command" in capsys.readouterr().err
 
 
+@needs_extra
 def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
     save_gaussians(discs(), tmp_path / "scene.ply")
     assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.npz")]) == 0
@@ -173,6 +186,7 @@ def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
     assert "mesh.npz: a mesh, not splats" in capsys.readouterr().err
 
 
+@needs_extra
 def test_a_base_of_real_splats_looks_like_them():
     from meshsplats import orbit, render, render_splats
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from meshsplats.camera import Camera
 from meshsplats.conversion import convert
+from meshsplats.conversion.fans import semi_axes
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -147,6 +148,19 @@ class TestPaper:
         np.testing.assert_array_equal(plain.vertices, with_cameras.vertices)
         np.testing.assert_array_equal(plain.colors, with_cameras.colors)
         np.testing.assert_allclose(with_cameras.up, [0, 0, 1], atol=1e-6)
+
+
+class TestSemiAxes:
+    # Multiples of the small numbers of axes, up to 6 times these counts, fit 8 or 16 bits, just do or do not.
+    @pytest.mark.parametrize("count", [1, 14, 15, 21, 42, 43, 3_640, 3_641, 5_461, 8_192, 10_922, 10_923])
+    def test_they_are_columns_of_the_rotation(self, count):
+        cloud = many(count)
+        order = np.random.default_rng(1).permuted(np.tile(np.arange(3, dtype=np.int8), (count, 1)), axis=1)
+        sigma = np.take_along_axis(cloud.scales, order.astype(np.int64), axis=1)
+        found = semi_axes(cloud.quaternions, order, sigma)
+        for k in range(3):
+            columns = cloud.rotations[np.arange(count), :, order[:, k]]
+            np.testing.assert_allclose(found[k].T, columns * sigma[:, k, None], rtol=1e-5, atol=1e-6)
 
 
 class TestEllipses:

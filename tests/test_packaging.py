@@ -111,6 +111,8 @@ def resolves(dotted: str) -> bool:
     for cut in range(len(parts), 0, -1):
         try:
             found = importlib.import_module(".".join(parts[:cut]))
+        except MissingDependencyError:
+            return True  # it is there, but what it holds can be seen with its extra only
         except ImportError:
             continue
         for part in parts[cut:]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFont
 
 from meshsplats.pictures import (
     CAPTION,
@@ -146,6 +146,16 @@ def test_strip():
     assert titled[:CAPTION, 100:].min() < 0.5
     with pytest.raises(ValueError, match="one shape"):
         strip([a, b[:3]])
+
+
+@pytest.mark.parametrize("name", ["load_default", "load_default_imagefont"])
+def test_captions_in_any_script(name, monkeypatch):
+    """Pillow's own font has Latin letters only where it was built without FreeType, and before version 10.1."""
+    if not hasattr(ImageFont, name):
+        pytest.skip(f"this Pillow has no {name}")
+    monkeypatch.setattr(ImageFont, "load_default", getattr(ImageFont, name))
+    titled = strip([np.ones((4, 90, 3))], ["méthode Ω"])
+    assert titled[:CAPTION].min() < 0.5
 
 
 def test_amplified_error():

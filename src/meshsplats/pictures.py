@@ -153,8 +153,11 @@ def _text(captions: Sequence[str], step: int, width: int) -> np.ndarray:
 
     line = Image.new("RGB", (width, CAPTION), "white")
     draw = ImageDraw.Draw(line)
+    font = ImageFont.load_default()
     for i, caption in enumerate(captions):
-        draw.text((GAP + i * step, 6), caption, fill=(60, 60, 60), font=ImageFont.load_default())
+        if isinstance(font, ImageFont.ImageFont):  # before Pillow 10.1, or without FreeType
+            caption = caption.encode("latin-1", "replace").decode("latin-1")
+        draw.text((GAP + i * step, 6), caption, fill=(60, 60, 60), font=font)
     return np.asarray(line, np.float32) / 255
 
 

@@ -10,11 +10,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from meshsplats.camera import Camera
+from meshsplats.errors import MissingDependencyError
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import reference
+
+try:
+    import torch
+except ImportError as error:
+    raise MissingDependencyError(
+        "meshsplats.rendering.reference_autograd needs torch: pip install 'meshsplats[finetune]'"
+    ) from error
+
 from meshsplats.rendering.autograd import Raster
 
 
