@@ -14,6 +14,9 @@ from meshsplats.binding import Binding
 
 Blending = Literal["display", "linear"]
 
+MAX_FILTER_PX2 = 100.0
+"""Largest ``filter_px2``."""
+
 
 @dataclass(frozen=True, eq=False)
 class SplatMesh:
@@ -45,6 +48,9 @@ class SplatMesh:
     'linear'."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Further float32 arrays (v,) or (v, c) by name, one row a vertex."""
+    filter_px2: float = 0.0
+    """Variance in square pixels, 0 to 100, of the low-pass filter that the triangles of each splat want when
+    they are drawn, as splats are drawn with one; 0: none. Needs ``face_splat``."""
     binding: Binding | None = None
     """Where on the faces of a base mesh the vertices lie, for a mesh prior: each triangle on one face."""
 
@@ -83,6 +89,7 @@ class SplatMesh:
         if self.blending not in get_args(Blending):
             known = ", ".join(get_args(Blending))
             raise ValueError(f"blending must be one of {known}, got {self.blending!r}")
+        set_("filter_px2", checked_filter(self.filter_px2, self.face_splat))
         attributes = {}
         for name, value in self.attributes.items():
             ndim = np.ndim(value)
@@ -130,6 +137,22 @@ class SplatMesh:
         """Without the triangles all of whose corners are below ``min_opacity``, and without orphaned
         vertices."""
         return self.keep_faces((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
+
+
+def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
+    """``px2`` as the variance of a filter for meshes with such splat numbers. ValueError where it cannot be
+    that."""
+    number = isinstance(px2, (int, float, np.integer, np.floating)) and not isinstance(px2, bool)
+    if not number or not 0 <= px2 <= MAX_FILTER_PX2:
+        raise ValueError(
+            f"filter_px2 must be a variance in square pixels, 0 to {MAX_FILTER_PX2:g}, got {px2!r}"
+        )
+    if px2 > 0 and face_splat is None:
+        raise ValueError(
+            f"a filter of {px2:g} px^2 widens each splat's triangles together, but the mesh does not know its"
+            " splats: give face_splat, or filter_px2=0"
+        )
+    return float(px2)
 
 
 def splat_starts(face_splat: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.conversion.detail import LEVELS, choose_levels, look
 from meshsplats.conversion.fans import Shape, build, pattern
-from meshsplats.conversion.footprint import FILTER_PX2, Views, pixel_sizes, widen
+from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, Views, pixel_sizes, widen
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
 from meshsplats.conversion.selection import disc_areas, inside_box, mean_shadow, most_important
@@ -63,6 +63,7 @@ def convert(
         ValueError: an option out of range, options that contradict each other, or nothing left to draw.
     """
     chosen = make_options(options).resolved(preset, has_cameras=bool(cameras))
+    filter_px2 = _filter_of(cloud, chosen)
     direction = guess_up(None, cameras) if up is None else unit_up(up)
     rows = _worth_drawing(cloud, chosen)
     part = cloud
@@ -116,7 +117,7 @@ def convert(
             pick(drawn),
         )
         owners = np.repeat(pick(rows), counts[pick(choice)])
-        return SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction)
+        return SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction, filter_px2=filter_px2)
 
     mesh = assembled(shapes, choice, keep)
     if chosen.detail == "cameras":
@@ -126,6 +127,18 @@ def convert(
         choice[keep] = choose_levels(seen.need[rows[keep]], len(mesh.faces))
         mesh = assembled([_ellipse(sides, rings, chosen) for sides, rings in LEVELS], choice, keep)
     return mesh
+
+
+def _filter_of(cloud: GaussianCloud, options: ConversionOptions) -> float:
+    """Variance in square pixels of the filter that the mesh is to be drawn with, 0 for none."""
+    if options.footprint != "filter":
+        return 0.0
+    if cloud.kernel != "3dgs":
+        raise ValueError(
+            f"footprint='filter' draws as 3DGS does, but these splats are of kernel {cloud.kernel!r}, which"
+            " filters in another way: choose another footprint, or none"
+        )
+    return DRAWN_PX2 if options.footprint_px2 is None else float(options.footprint_px2)
 
 
 def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:

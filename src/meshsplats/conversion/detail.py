@@ -82,6 +82,7 @@ def look(mesh: SplatMesh, means: np.ndarray, cloud: GaussianCloud, cameras: Sequ
             camera,
             background=(0, 0, 0),
             face_splat=mesh.face_splat,
+            filter_px2=mesh.filter_px2,
         )
         # Over black, and in opacity: then no background hides a difference.
         truth = render_splats(cloud, camera, background=(0, 0, 0))

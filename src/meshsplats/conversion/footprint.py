@@ -22,6 +22,9 @@ FILTER_PX2 = {"3dgs": 0.5, "antialiased": 0.4, "2dgs": 0.3}
 """Variance of the filter in square pixels. 3DGS and its antialiased kernel add 0.3 and 2DGS has 0.5; these
 serve best over the distances of the given cameras and up to eight times as far."""
 
+DRAWN_PX2 = 0.3
+"""Variance that 3DGS adds at whatever size it draws: that of the filter of a mesh that is drawn with one."""
+
 MAX_CAMERAS = 32
 """Of more cameras, so many are used, evenly spaced in their order."""
 
@@ -213,12 +216,13 @@ def _every_third_bit(values: np.ndarray) -> np.ndarray:
 def pixel_sizes(
     cloud: GaussianCloud, options: ConversionOptions, views: Views | None, up: np.ndarray
 ) -> np.ndarray | None:
-    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none'.
+    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none' and
+    'filter'.
 
     Splats that no camera sees take the median of the others. ``up`` (3,) is the axis of the cameras of
     'framing'.
     """
-    if options.footprint == "none":
+    if options.footprint in ("none", "filter"):
         return None
     if options.footprint == "distance":
         pixel = options.viewing_distance / options.focal  # type: ignore[operator]

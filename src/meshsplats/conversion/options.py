@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 Mode = Literal["crossed", "flat", "3d"]
-Footprint = Literal["cameras", "framing", "distance", "density", "none"]
+Footprint = Literal["cameras", "framing", "distance", "density", "filter", "none"]
 Colors = Literal["degree0", "cameras"]
 Detail = Literal["even", "cameras"]
 
@@ -52,11 +52,14 @@ class ConversionOptions:
     """Where the size of a pixel at each splat comes from, for the low-pass filter that splats were trained
     with. cameras: the cameras given. framing: pictures of 1000 pixels from all round that just hold the
     subject, or finer where splats lie too densely for these. distance: one stated distance. density: the
-    spacing of the splats alone. none: no filter, for a model trained without it. Default: cameras if there
-    are any, else distance if stated, else framing; paper: none."""
+    spacing of the splats alone. filter: none of these; the mesh is to be drawn with a filter of its own
+    (``SplatMesh.filter_px2``), which is right at every size, but which only this project's pictures have; for
+    splats of kernel '3dgs'. none: no filter, for a model trained without it. Default: cameras if there are
+    any, else distance if stated, else framing; paper: none."""
     footprint_px2: float | None = None
     """Variance of that filter in square pixels, 0 to 100; every standard deviation s becomes
-    sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats trained as 2DGS."""
+    sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats trained as 2DGS.
+    footprint = filter: ``filter_px2`` of the mesh, 0.3 by default, as 3DGS draws."""
     viewing_distance: float | None = None
     """Distance the mesh will be seen from, scene units; for footprint = distance."""
     focal: float | None = None

@@ -70,7 +70,9 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
     const int threads = (int)std::min<int64_t>(options.threads, grid.tiles());
     const int channels = given.attributes ? mesh.attribute_count : 0;
     const MsPicture nothing{};  // what is drawn once more is only logged
-    ms::VertexGradients sum(mesh, out, channels, threads);
+    std::vector<float> moved(scene.filter ? 3 * mesh.vertex_count : 0);
+    const MsVertexGradients of_drawn{scene.filter ? moved.data() : out.vertices, out.colors, out.attributes};
+    ms::VertexGradients sum(mesh, of_drawn, channels, threads);
 
     // Gradients of a few tiles at a time wait to be added in order: of so few that they need little memory, but enough for
     // threads not to wait for each other.
@@ -120,9 +122,13 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
             wave += count;
         }
     };
-    if (!redraws) return run(0, grid.tiles(), nullptr);
-    ms::TileLists lists(grid, scene.items, threads);
-    while (lists.next()) run(lists.begin(), lists.end(), &lists);
+    if (redraws) {
+        ms::TileLists lists(grid, scene.items, threads);
+        while (lists.next()) run(lists.begin(), lists.end(), &lists);
+    } else {
+        run(0, grid.tiles(), nullptr);
+    }
+    if (scene.filter) scene.filter->back(scene.unfiltered, scene.vertices, moved.data(), out, options.threads);
 }
 
 template <class Body>
@@ -133,6 +139,9 @@ int guarded(char *message, int size, Body body) {
     } catch (const std::bad_alloc &) {
         std::snprintf(message, size, "not enough memory");
         return 1;
+    } catch (const ms::SharedVertices &e) {
+        std::snprintf(message, size, "%s", e.what());
+        return 3;
     } catch (const std::exception &e) {
         std::snprintf(message, size, "%s", e.what());
         return 2;
@@ -143,7 +152,7 @@ int guarded(char *message, int size, Body body) {
 
 extern "C" {
 
-MS_EXPORT int ms_interface_version() { return 2; }
+MS_EXPORT int ms_interface_version() { return 3; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 
@@ -161,7 +170,8 @@ MS_EXPORT const char *ms_best_variant() {
     return "baseline";
 }
 
-// All functions from here on return 0, or 1 (memory) or 2 (other) with a message.
+// All functions from here on return 0, or 1 (memory), 3 (splats that share vertices cannot be filtered) or 2 (other) with a
+// message.
 MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, MsPicture *picture,
                              char *message, int message_size) {
     return guarded(message, message_size, [&] {

@@ -40,7 +40,12 @@ class GradientTile {
     GradientTile(const Scene &scene, const MsOptions &options, const MsCamera &camera, const MsPictureGradient &given)
         : scene_(scene), mesh_(scene.mesh), grid_(scene.grid), options_(options), camera_(camera), given_(given),
           extra_(given.attributes ? mesh_.attribute_count : 0), towards_extra_((size_t)extra_ * SAMPLES), fragments_(CHUNK), lit_(CHUNK),
-          depths_(extra_ ? CHUNK : 0), at_(CHUNK), corner_extras_(3 * extra_) {}
+          depths_(extra_ ? CHUNK : 0), at_(CHUNK), corner_extras_(3 * extra_) {
+        // A filter goes on from gradients in camera space.
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                rotation_[3 * i + j] = scene.filter ? (float)(i == j) : (float)scene.projection.m[4 * i + j];
+    }
 
     void run(int tile_x, int tile_y, const PackedLog &log, TileGradients &out) {
         area_ = TileArea(grid_, tile_x, tile_y);
@@ -439,7 +444,7 @@ class GradientTile {
             const Lanes x = d[0] * lanes((float)pr.fx), y = d[1] * lanes((float)pr.fy);
             Lanes world[3];
             for (int j = 0; j < 3; ++j)
-                world[j] = mul_add(lanes((float)pr.m[j]), x, mul_add(lanes((float)pr.m[4 + j]), y, lanes((float)pr.m[8 + j]) * z));
+                world[j] = mul_add(lanes(rotation_[j]), x, mul_add(lanes(rotation_[3 + j]), y, lanes(rotation_[6 + j]) * z));
             put_columns(world[0], world[1], world[2], lanes(0), [&](int i) { return sums[k][i].position; });
         }
         out.make_room(3 * LANES, extra_);
@@ -474,6 +479,7 @@ class GradientTile {
     const MsCamera &camera_;
     const MsPictureGradient &given_;
     const int extra_;  // channels of attributes
+    float rotation_[9];  // from the space of the gradients to that of the camera
     TileArea area_;
     alignas(64) float towards_[3][SAMPLES];  // gradient of each sample's colour
     alignas(64) float behind_[SAMPLES];      // of the background, times that gradient

@@ -2,8 +2,10 @@
 #pragma once
 
 #include <climits>
+#include <memory>
 #include <vector>
 
+#include "fan_filter.h"
 #include "grid.h"
 #include "large.h"
 #include "triangle.h"
@@ -46,6 +48,8 @@ struct Scene {
     const Grid &grid;
     Projection projection;
     Large<Projected> vertices;
+    std::unique_ptr<FanFilter> filter;  // or none
+    Large<Projected> unfiltered;        // vertices before it, if there is one
     std::vector<int32_t> group_start;  // triangles [group_start[g], group_start[g + 1]) are one group
     std::vector<DepthPlane> planes;    // by depth group
     Large<TileBox> boxes;        // by triangle
@@ -57,6 +61,11 @@ struct Scene {
         parallel_blocks(threads, mesh.vertex_count, 1 << 16, [&](int64_t a, int64_t b, int) {
             for (int64_t i = a; i < b; ++i) vertices[i] = projection.project(projection.to_camera(mesh.vertices + 3 * i));
         });
+        if (mesh.filter_px2 > 0) {
+            filter = std::make_unique<FanFilter>(mesh, projection, grid.samples);
+            unfiltered.swap(vertices);
+            filter->apply(unfiltered, vertices, threads);
+        }
         if (!with_items) return;
         find_groups();
         if (mesh.depth_group) find_planes();
@@ -66,6 +75,11 @@ struct Scene {
     // The corners of a triangle in camera space, x and y in samples times depth (see triangle.h), moved by (x0, y0).
     void homogeneous(const int32_t *face, double x0, double y0, Vec3 out[3]) const {
         for (int k = 0; k < 3; ++k) {
+            const Projected &p = vertices[face[k]];
+            if (filter && p.w > 0) {
+                out[k] = {(p.x - x0) / p.w, (p.y - y0) / p.w, 1 / p.w};
+                continue;
+            }
             Vec3 c = projection.to_camera(mesh.vertices + 3 * (int64_t)face[k]);
             out[k] = {projection.fx * c.x + (projection.cx - x0) * c.z, projection.fy * c.y + (projection.cy - y0) * c.z,
                       c.z};

@@ -31,6 +31,7 @@ struct MsMesh {
     const float *normals;        // or null: the faces' own
     const float *attributes;     // attribute_count numbers a vertex, or null
     int32_t attribute_count;
+    double filter_px2;           // variance of the low-pass filter of its fans; needs face_splat where it is not 0
 };
 
 struct MsSplats {

@@ -114,6 +114,7 @@ def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:
         "mesh.faces": mesh.faces,
         "mesh.colors": mesh.colors,
         "mesh.up": mesh.up,
+        "mesh.filter_px2": np.array(mesh.filter_px2),
     }
     for name in ("face_splat", "depth_group"):
         if getattr(mesh, name) is not None:
@@ -141,6 +142,7 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
             up=arrays["mesh.up"],
             blending=blending,  # type: ignore[arg-type]
             attributes={n[len(prefix) :]: a for n, a in arrays.items() if n.startswith(prefix)},
+            filter_px2=float(arrays.get("mesh.filter_px2", 0.0)),
             binding=binding,
         )
     except KeyError as error:
@@ -150,8 +152,10 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
 
 
 def mesh_fingerprint(mesh: SplatMesh) -> str:
-    """Changes with every bit of positions, triangles, colours, binding and blending."""
+    """Changes with every bit of positions, triangles, colours, binding, blending and filter."""
     digest = hashlib.sha256(mesh.blending.encode())
+    if mesh.filter_px2:
+        digest.update(repr(mesh.filter_px2).encode())
     arrays = [mesh.vertices, mesh.faces, mesh.colors]
     if mesh.binding is not None:
         arrays += [getattr(mesh.binding, name) for name in _BINDING]

@@ -93,6 +93,7 @@ def draw(state: State, view: View, background: Sequence[float]) -> Drawn:
         min_transmittance=LEAST_LIGHT[state.mesh.blending],
         face_splat=state.mesh.face_splat,
         depth_group=state.mesh.depth_group,
+        filter_px2=state.mesh.filter_px2,
         threads=state.threads,
     )
     return Drawn(recorded, linear)
@@ -221,6 +222,7 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
             samples=state.config.samples,
             face_splat=state.mesh.face_splat,
             depth_group=state.mesh.depth_group,
+            filter_px2=state.mesh.filter_px2,
             threads=state.threads,
         )
         before |= view.camera.sees(vertices)

@@ -137,6 +137,8 @@ def _document(
         "blending": mesh.blending,
         "up": [float(u) for u in mesh.up],
     }
+    if mesh.filter_px2 and with_extras:
+        extras["filter_px2"] = mesh.filter_px2
     attributes = {
         "POSITION": buffer.accessor(
             mesh.vertices,

@@ -204,6 +204,12 @@ def _restore(
                 lost.append(name)
             else:
                 result[name] = values
+    if "filter_px2" in note:
+        variance = float(document.numbers([note["filter_px2"]], 1, "filter_px2")[0])
+        if "face_splat" in result:
+            result["filter_px2"] = variance
+        else:
+            lost.append("the filter of its splats")
     if isinstance(note.get("alpha"), str):
         true_alpha = _attribute(
             document, mesh["primitives"][0]["attributes"], {"semantic": note["alpha"]}, v, 1

@@ -42,6 +42,8 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
         f"comment meshsplats up {up}",
         f"comment meshsplats blending {mesh.blending}",
     ]
+    if mesh.filter_px2:
+        header.append(f"comment meshsplats filter_px2 {mesh.filter_px2!r}")
     columns = [mesh.vertices]
     names = ["x", "y", "z"]
     if mesh.normals is not None:
@@ -159,7 +161,7 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
 def _notes(
     header: PlyHeader, vertex: Element, path: Path
 ) -> tuple[dict[str, tuple[bool, tuple[str, ...]]], dict[str, Any]]:
-    """What our comments say: each attribute's (whether it is (v,), its properties), and up and blending."""
+    """What our comments say: each attribute's (whether it is (v,), its properties), and settings."""
     attributes: dict[str, tuple[bool, tuple[str, ...]]] = {}
     settings: dict[str, Any] = {}
     for comment in header.comments:
@@ -176,6 +178,11 @@ def _notes(
                     ) from None
             case ["blending", space]:
                 settings["blending"] = space
+            case ["filter_px2", variance]:
+                try:
+                    settings["filter_px2"] = float(variance)
+                except ValueError:
+                    raise FileFormatError(f"{path}: filter_px2 must be a number: {comment[:60]}") from None
             case ["attribute", name, width]:
                 names: tuple[str, ...] = (name,)
                 if width.isascii() and width.isdecimal() and len(width) <= 4:

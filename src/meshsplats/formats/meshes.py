@@ -32,6 +32,8 @@ _WRITERS: dict[str, Callable[..., None]] = {
 _GLB = (".glb",)
 BOUND_SUFFIXES = (".npz", ".glb")
 """Formats that keep the binding of a mesh prior."""
+_UNFILTERED = (*_GLB, *_USD, ".obj")
+"""Formats for programs that draw triangles as they are."""
 _OPTION_SUFFIXES = {"lit": (*_GLB, *_USD), "color_type": _GLB, "alpha": _GLB, "compression": _GLB}
 
 MESH_SUFFIXES = tuple(_WRITERS)
@@ -96,7 +98,9 @@ def save_mesh(
       primvars. Needs the extra ``usd``.
     - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
 
-    All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning.
+    All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning. All but `.obj` keep
+    ``filter_px2``; as the programs that `.glb`, USD and `.obj` are for draw without a filter, a mesh that
+    wants one is written to these with a DataWarning: ``bake_filter`` makes it part of the triangles.
 
     Options, each for the formats named; given for another one they are a ValueError:
 
@@ -130,6 +134,14 @@ def save_mesh(
         warnings.warn(
             f"{target.name}: the binding to a base mesh is left out; only .npz or .glb keep what later poses"
             " need",
+            DataWarning,
+            stacklevel=2,
+        )
+    if mesh.filter_px2 and suffix in _UNFILTERED:
+        warnings.warn(
+            f"{target.name}: the mesh is to be drawn with a filter of {mesh.filter_px2:g} px^2, which other"
+            " programs do not have: from afar it will look thin there. Make it part of the triangles for the"
+            " views that count: bake_filter(mesh, cameras), or meshsplats bake",
             DataWarning,
             stacklevel=2,
         )

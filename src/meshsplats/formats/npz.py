@@ -2,10 +2,10 @@
 
 Arrays: ``vertices`` (v, 3) float32, ``faces`` (f, 3) int32, ``vertex_colors`` (v, 4) float32 straight RGBA;
 where the mesh has them ``normals``, ``face_splat``, ``depth_group`` and one ``attribute_NAME`` for each
-attribute; ``up`` (3,) and ``blending`` (a text); for a mesh prior its ``binding_base_vertices`` (n, 3),
-``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,), ``binding_weights`` (v, 3), ``binding_layers``
-(v,) and ``binding_lift``, as ``Binding`` names them. The first three names are those of the published
-MeshSplats code, whose files are read as well.
+attribute; ``up`` (3,), ``blending`` (a text) and, if it is not 0, ``filter_px2``; for a mesh prior its
+``binding_base_vertices`` (n, 3), ``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,),
+``binding_weights`` (v, 3), ``binding_layers`` (v,) and ``binding_lift``, as ``Binding`` names them. The first
+three names are those of the published MeshSplats code, whose files are read as well.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _BROKEN_ZIP = (
 """What the zip reader raises on broken archives; its own checks do not cover every field."""
 _BINDING = ("base_vertices", "base_faces", "vertex_face", "weights", "layers", "lift")
 _BOUND = tuple(f"binding_{name}" for name in _BINDING)
-_OPTIONAL = ("normals", "face_splat", "depth_group", "up", "blending", *_BOUND)
+_OPTIONAL = ("normals", "face_splat", "depth_group", "up", "blending", "filter_px2", *_BOUND)
 
 
 def write_npz(mesh: SplatMesh, path: Path) -> None:
@@ -67,6 +67,8 @@ def write_npz(mesh: SplatMesh, path: Path) -> None:
         value = getattr(mesh, name)
         if value is not None:
             arrays[name] = value
+    if mesh.filter_px2:
+        arrays["filter_px2"] = np.array(mesh.filter_px2)
     for name, value in mesh.attributes.items():
         arrays[_ATTRIBUTE + name] = value
     if mesh.binding is not None:
@@ -137,6 +139,7 @@ def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
         budget.spend(member.info.file_size, f"array {name!r}")
     arrays = {name: _load(archive, member, name, path) for name, member in members.items()}
     blending = str(arrays.pop("blending", np.array("display")))
+    filter_px2 = float(arrays.pop("filter_px2", np.array(0.0)))
     bound = {
         name: arrays.pop(stored) for stored, name in zip(_BOUND, _BINDING, strict=True) if stored in arrays
     }
@@ -146,6 +149,7 @@ def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
         faces=arrays.pop("faces"),
         colors=straight_colors(arrays.pop("vertex_colors"), path),
         blending=blending,
+        filter_px2=filter_px2,
         attributes={
             name.removeprefix(_ATTRIBUTE): arrays.pop(name)
             for name in list(arrays)
@@ -233,6 +237,7 @@ def _check_shapes(members: dict[str, _Member], path: Path) -> None:
         "depth_group": ((f,),),
         "up": ((3,),),
         "blending": ((), (1,)),
+        "filter_px2": ((),),
         "binding_base_vertices": ((rows_of("binding_base_vertices"), 3),),
         "binding_base_faces": ((rows_of("binding_base_faces"), 3),),
         "binding_vertex_face": ((v,),),

@@ -75,6 +75,8 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     note |= {name: True for name in ("face_splat", "depth_group") if getattr(mesh, name) is not None}
     if lit and mesh.normals is None:
         note["normals"] = "computed"
+    if mesh.filter_px2:
+        note["filter_px2"] = mesh.filter_px2
     taken = {"displayColor", "displayOpacity", "normals", "face_splat", "depth_group"}
     stored: list[tuple[str, str, int]] = []
     for name, values in mesh.attributes.items():

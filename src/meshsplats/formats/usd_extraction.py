@@ -283,8 +283,8 @@ def _own_placement(up: list[float]) -> np.ndarray:
 def _restored(
     shape: Any, note: dict[str, Any], arrays: dict[str, np.ndarray], told: dict[str, Any]
 ) -> dict[str, np.ndarray]:
-    """Splat numbers, depth groups and attributes. What another program has dropped or altered is left out,
-    with a warning: better no splat numbers than wrong ones."""
+    """Splat numbers, depth groups, attributes and the filter. What another program has dropped or altered is
+    left out, with a warning: better no splat numbers than wrong ones."""
     from pxr import UsdGeom
 
     def stored(name: str, dtype: type) -> np.ndarray:
@@ -301,6 +301,14 @@ def _restored(
                 restored[name] = values
             else:
                 lost.append(name)
+    if "filter_px2" in note:
+        variance = note["filter_px2"]
+        if not isinstance(variance, (int, float)):
+            raise FileFormatError(f"filter_px2 must be a number, got {str(variance)[:60]}")
+        if "face_splat" in restored:
+            told["filter_px2"] = float(variance)
+        else:
+            lost.append("the filter of its splats")
     for name, plain, columns in _attributes_of(note):
         v, wide = len(arrays["vertices"]), abs(columns)
         values = stored(plain, np.float32) if wide else np.empty(0, np.float32)

@@ -71,6 +71,7 @@ def read_usd(path: Path) -> SplatMesh:
         colors=colors,
         up=told["up"],
         blending=told["blending"],
+        filter_px2=told.get("filter_px2", 0.0),
         attributes=attributes,
         **arrays,
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, checked_filter
 from meshsplats.rendering import core
 
 MIN_TRANSMITTANCE = 1e-6
@@ -49,6 +49,7 @@ def render(
     depth: bool = False,
     normals: bool = False,
     attributes: Sequence[str] = (),
+    filter_px2: float | None = None,
     threads: int | None = None,
 ) -> Rendering:
     """The picture of a mesh of translucent triangles, exact at every sample.
@@ -59,6 +60,14 @@ def render(
     by two triangles belongs to exactly one (top-left rule). Triangles are seen from both sides and are cut
     at the near plane.
 
+    A mesh that wants a filter of s = ``filter_px2`` is drawn with its splats' triangles spread on the
+    picture, as 3D Gaussian Splatting widens splats by 0.3 px^2 at whatever size they are drawn. With c and M
+    the mean and the covariance of a splat's opacity on the picture, projected vertices p move to ``c + A (p -
+    c)``, ``A = (M + s I)^(1/2) M^(-1/2)``; depths, colours and opacities stay. No direction counts as
+    narrower than a variance of s / 10,000: a splat seen exactly edge on has no triangle to spread. Splats
+    that reach nearer than the near plane stay as they are. The variance is that of pixels, whatever
+    ``samples`` is.
+
     Args:
         mesh: what to draw.
         camera: from where.
@@ -68,10 +77,12 @@ def render(
             passes.
         min_transmittance: a sample stops once less than this fraction of light comes through; 0 never stops.
         depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
+        filter_px2: takes the place of ``mesh.filter_px2``; 0 draws the triangles as they are.
         threads: at most this many; all processors by default. The picture does not depend on it.
 
     Raises:
-        ValueError: an option out of its range, or an attribute that the mesh does not have.
+        ValueError: an option out of its range, an attribute that the mesh does not have, or a filter for a
+            mesh without ``face_splat`` or whose splats share vertices.
         MemoryError: the scene does not fit.
     """
     keep = Alive()
@@ -85,6 +96,7 @@ def render(
     options.max_layers = int(max_layers or 0)
     options.min_transmittance = min_transmittance
 
+    px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
     values, widths = None, {}
     if attributes:
         for name in attributes:
@@ -107,6 +119,7 @@ def render(
         normals=keep(mesh.normals),
         attributes=keep(values),
         attribute_count=sum(widths.values()),
+        filter_px2=px2,
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)

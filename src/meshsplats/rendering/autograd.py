@@ -42,6 +42,7 @@ def rasterize(
     samples: int = 1,
     face_splat: torch.Tensor | np.ndarray | None = None,
     depth_group: torch.Tensor | np.ndarray | None = None,
+    filter_px2: float = 0.0,
     min_transmittance: float = MIN_TRANSMITTANCE,
     threads: int | None = None,
     log_bytes: int = LOG_BYTES,
@@ -67,12 +68,14 @@ def rasterize(
             poses. The last row is not used.
         samples: side of the grid of samples in each pixel.
         face_splat, depth_group: (f,) int32, as in ``SplatMesh``.
+        filter_px2: variance in square pixels of the filter for splats, as in ``render``. Gradients go through
+            the filter to positions and opacities.
         min_transmittance: a sample stops once less than this fraction of light comes through.
         threads: at most this many; all processors by default.
 
     Raises:
         ValueError: tensors of other types, shapes or devices; faces that name missing vertices; options out
-            of range.
+            of range; a filter without ``face_splat``, or for splats that share vertices.
         RuntimeError: from torch, where a second derivative is asked for.
     """
     single = isinstance(cameras, Camera)
@@ -110,7 +113,7 @@ def rasterize(
         _faces(faces, len(vertices)),
         _per_face("face_splat", face_splat, len(faces)),
         _per_face("depth_group", depth_group, len(faces)),
-        dict(samples=samples, min_transmittance=min_transmittance, threads=threads),
+        dict(filter_px2=filter_px2, samples=samples, min_transmittance=min_transmittance, threads=threads),
         log_bytes,
     )
     inputs = (vertices, attributes, behind, poses)

@@ -13,7 +13,7 @@ import numpy as np
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
 
-INTERFACE_VERSION = 2
+INTERFACE_VERSION = 3
 
 
 class CameraStruct(ctypes.Structure):
@@ -52,6 +52,7 @@ class MeshStruct(ctypes.Structure):
         ("normals", c_void_p),
         ("attributes", c_void_p),
         ("attribute_count", c_int32),
+        ("filter_px2", c_double),
     ]
 
 
@@ -169,12 +170,18 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
 
 
 def call(name: str, *arguments) -> None:
-    """Runs a function of the core. Raises MemoryError or RuntimeError with the core's message."""
+    """Runs a function of the core. Raises MemoryError, RuntimeError or, for splats that share vertices and
+    cannot be filtered, ValueError, with the core's message."""
     message = ctypes.create_string_buffer(256)
     status = getattr(load_core(), name)(*arguments, message, len(message))
     if status == 1:
         raise MemoryError(
             f"{name}: {message.value.decode()}; render fewer triangles, pixels or samples at a time"
+        )
+    if status == 3:
+        raise ValueError(
+            f"{message.value.decode()}: the filter moves each splat's vertices on their own. Give every splat"
+            " its own vertices, or draw without the filter (filter_px2=0)"
         )
     if status:
         raise RuntimeError(f"{name}: {message.value.decode()}")

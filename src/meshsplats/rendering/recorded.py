@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.mesh import checked_filter
 from meshsplats.rendering import core
 from meshsplats.rendering.api import MIN_TRANSMITTANCE, Alive, camera_struct, checked_options, compact_groups
 
@@ -31,6 +32,7 @@ class RecordedPicture:
         world_to_camera: np.ndarray | None = None,
         face_splat: np.ndarray | None = None,
         depth_group: np.ndarray | None = None,
+        filter_px2: float = 0.0,
         samples: int = 1,
         min_transmittance: float = MIN_TRANSMITTANCE,
         threads: int | None = None,
@@ -58,6 +60,7 @@ class RecordedPicture:
             normals=None,
             attributes=keep(attributes if width else None),
             attribute_count=width,
+            filter_px2=checked_filter(filter_px2, face_splat),
         )
         h, w = camera.height, camera.width
         self.color = np.empty((h, w, 3), np.float32)
@@ -146,6 +149,7 @@ def shown_pixels(
     samples: int = 1,
     face_splat: np.ndarray | None = None,
     depth_group: np.ndarray | None = None,
+    filter_px2: float = 0.0,
     threads: int | None = None,
 ) -> np.ndarray:
     """(v,) float32 pixels that a picture shows of each vertex: sums of its blending weights, of pixels where
@@ -158,6 +162,7 @@ def shown_pixels(
         camera,
         face_splat=face_splat,
         depth_group=depth_group,
+        filter_px2=filter_px2,
         samples=samples,
         threads=threads,
     )

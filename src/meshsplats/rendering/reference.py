@@ -14,7 +14,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, checked_filter
 from meshsplats.rendering.api import Rendering
 
 SPLAT_MIN_ALPHA = 1 / 255
@@ -23,6 +23,15 @@ SPLAT_MAX_ALPHA = 0.99
 """No splat is more opaque than this at a sample, as in 3DGS."""
 SPLAT_MIN_TRANSMITTANCE = 1e-4
 """A sample ends before the splat that would let less light than this through, as in 3DGS."""
+
+FILTER_NARROWEST = 1e-4
+"""No fan is narrower than this, as a share of its filter's variance, for the filter."""
+FILTER_SIDEWAYS = 0.1
+"""Share at which a fan's extent in depth counts for the areas of its triangles."""
+FILTER_FAINTEST = 1e-6
+"""Added to opacities for the filter, so that a fan without any has a shape, too."""
+CUBATURE = (((1 / 3, 1 / 3, 1 / 3), -27 / 48), *((np.roll((0.6, 0.2, 0.2), k), 25 / 48) for k in range(3)))
+"""Barycentric positions and weights whose sum is the mean over a triangle of a polynomial of degree 3."""
 
 
 def render(
@@ -36,6 +45,7 @@ def render(
     depth: bool = False,
     normals: bool = False,
     attributes: Sequence[str] = (),
+    filter_px2: float | None = None,
 ) -> Rendering:
     """The picture of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
 
@@ -44,6 +54,8 @@ def render(
     background, with T_k the product of the (1 - a) in front. Fragments with a = 0 do not count.
     ``max_layers`` blends only that many of the nearest fragments of each sample; a sample stops once its T is
     below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
+
+    ``filter_px2``, by default the mesh's, spreads the triangles of each splat first (see :func:`filtered`).
 
     ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
 
@@ -56,7 +68,8 @@ def render(
         present = ", ".join(mesh.attributes) or "none"
         raise ValueError(f"the mesh has no attribute {unknown[0]!r}; it has {present}")
     x, y = _sample_positions(camera, samples)
-    sheet = _fragments(mesh, camera, x, y)
+    px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
+    sheet = _fragments(mesh, camera, x, y, px2)
     corners = mesh.faces[sheet.face]
 
     def interpolated(values: np.ndarray) -> np.ndarray:
@@ -200,8 +213,51 @@ class _Fragments:
     """(n, 3) perspective-correct barycentric weights of the corners"""
 
 
-def _fragments(mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray) -> _Fragments:
+def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) -> np.ndarray:
+    """(v, 3) the mesh's vertices in the camera's frame, ``points``, with the filter of variance ``px2``.
+
+    Over the picture, the opacity of a splat's triangles (linear inside each) is a density. With its mean c
+    and covariance M, px^2, the projected vertices p move to c + A (p - c), A = (M + px2 I)^(1/2) M^(-1/2), at
+    their depth, so that the density has the covariance M + px2 I. M is widened by ``FILTER_NARROWEST`` px2
+    before. Areas are those of triangles in (x, y, k / z), with k = ``FILTER_SIDEWAYS`` f z_1 and z_1 the
+    depth of the splat's first corner: what is seen edge on keeps a little of its own. A splat that reaches
+    nearer than the near plane, or has no area at all, stays as it is.
+    """
+    assert mesh.face_splat is not None
+    result = points.copy()
+    with np.errstate(all="ignore"):
+        picture = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy)
+        nearness = 1 / points[:, 2]
+    for splat in np.unique(mesh.face_splat):
+        faces = mesh.faces[mesh.face_splat == splat]
+        if not (points[faces, 2] >= camera.near).all():
+            continue
+        k = FILTER_SIDEWAYS * np.sqrt(camera.fx * camera.fy) * points[faces[0, 0], 2]
+        lifted = np.column_stack([picture, k * nearness])[faces]
+        area = np.linalg.norm(np.cross(lifted[:, 1] - lifted[:, 0], lifted[:, 2] - lifted[:, 0]), axis=1)
+        if not area.sum() > 0:
+            continue
+        corners = picture[faces]
+        opacity = mesh.colors[faces, 3].astype(np.float64) + FILTER_FAINTEST
+        position = np.concatenate([np.einsum("k,tkc->tc", at, corners) for at, _ in CUBATURE])
+        share = np.concatenate([weight * area * (opacity @ at) for at, weight in CUBATURE])
+        share /= share.sum()
+        mean = share @ position
+        covariance = np.einsum("n,ni,nj->ij", share, position - mean, position - mean)
+        variances, axes = np.linalg.eigh(covariance + FILTER_NARROWEST * px2 * np.eye(2))
+        spread = axes @ np.diag(np.sqrt((variances + px2) / variances)) @ axes.T
+        own = np.unique(faces)
+        moved = mean + (picture[own] - mean) @ spread
+        result[own, :2] = moved / (camera.fx, camera.fy) * points[own, 2:]
+    return result
+
+
+def _fragments(
+    mesh: SplatMesh, camera: Camera, x: np.ndarray, y: np.ndarray, filter_px2: float = 0.0
+) -> _Fragments:
     points = _to_camera(mesh.vertices, camera)
+    if filter_px2:
+        points = filtered(points, mesh, camera, filter_px2)
     # Pixel space before the division by z: a point (X, Y, Z) is seen at (X / Z, Y / Z) pixels.
     homogeneous = points.copy()
     homogeneous[:, 0] = camera.fx * points[:, 0] + camera.cx * points[:, 2]

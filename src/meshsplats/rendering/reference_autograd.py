@@ -35,7 +35,9 @@ def rasterize(
     background: Sequence[float] | np.ndarray | torch.Tensor = (1, 1, 1),
     world_to_camera: torch.Tensor | None = None,
     samples: int = 1,
+    face_splat: np.ndarray | None = None,
     depth_group: np.ndarray | None = None,
+    filter_px2: float = 0.0,
 ) -> Raster:
     """What ``autograd.rasterize`` returns, in float64, with no limit to the layers that are blended.
 
@@ -52,11 +54,14 @@ def rasterize(
             background=background,
             world_to_camera=pose,
             samples=samples,
+            face_splat=face_splat,
             depth_group=depth_group,
+            filter_px2=filter_px2,
         )
         return Raster(*(part[0] for part in batch))
     backdrop = torch.as_tensor(background).double()
     pictures = []
+    constant = dict(samples=samples, face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2)
     for number, camera in enumerate(cameras):
         pose = (
             torch.from_numpy(camera.world_to_camera)
@@ -65,24 +70,62 @@ def rasterize(
         )
         behind = backdrop[number] if backdrop.ndim == 4 else backdrop
         pictures.append(
-            _picture(
-                vertices.double(), faces, attributes.double(), camera, pose, behind, samples, depth_group
-            )
+            _picture(vertices.double(), faces, attributes.double(), camera, pose, behind, **constant)
         )
     return Raster(*(torch.stack(parts) for parts in zip(*pictures, strict=True)))
 
 
-def _picture(vertices, faces, attributes, camera, pose, background, samples, depth_group) -> Raster:
+def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
+    """``reference.filtered``: (v, 3) ``points`` in the camera's frame, spread with (v,) ``opacity``."""
+    result = points.clone()
+    focal = points.new_tensor([camera.fx, camera.fy])
+    for splat in np.unique(face_splat):
+        corner = torch.from_numpy(np.asarray(faces, np.int64)[face_splat == splat])
+        z = points[corner][..., 2:]
+        if not bool((z >= camera.near).all()):
+            continue
+        picture = points[corner][..., :2] / z * focal
+        k = reference.FILTER_SIDEWAYS * focal.prod().sqrt() * z[0, 0]
+        a, b, c = torch.cat([picture, k / z], dim=2).unbind(1)
+        area = torch.linalg.cross(b - a, c - a).norm(dim=1)
+        if not bool(area.sum() > 0):
+            continue
+        weights, shares = zip(*reference.CUBATURE, strict=True)
+        at = points.new_tensor(np.array(weights))
+        share = (
+            points.new_tensor(shares) * area[:, None] * ((opacity[corner] + reference.FILTER_FAINTEST) @ at.T)
+        )
+        share = share / share.sum()
+        position = torch.einsum("nk,tkc->tnc", at, picture)
+        mean = (share[..., None] * position).sum((0, 1))
+        covariance = torch.einsum("tn,tni,tnj->ij", share, position - mean, position - mean)
+        one = torch.eye(2, dtype=points.dtype)
+        square = one + px2 * torch.linalg.inv(covariance + reference.FILTER_NARROWEST * px2 * one)
+        root = torch.linalg.det(square).sqrt()
+        spread = (square + root * one) / (torch.trace(square) + 2 * root).sqrt()  # its square root
+        own = torch.unique(corner)
+        moved = mean + (points[own, :2] / points[own, 2:] * focal - mean) @ spread
+        moved = torch.cat([moved / focal * points[own, 2:], points[own, 2:]], dim=1)
+        result = result.index_put((own,), moved)
+    return result
+
+
+def _picture(
+    vertices, faces, attributes, camera, pose, background, *, samples, face_splat, depth_group, filter_px2
+) -> Raster:
     seen = replace(camera, world_to_camera=pose.detach().numpy())
     x, y = reference._sample_positions(camera, samples)
-    colors = np.zeros((len(vertices), 4))  # have no part in what is seen
-    mesh = SplatMesh(vertices.detach().numpy(), faces, colors, depth_group=depth_group)
-    sheet = reference._fragments(mesh, seen, x, y)
+    colors = np.zeros((len(vertices), 4))
+    colors[:, 3] = attributes[:, 3].detach().numpy()  # moves what a filter spreads; else they have no part
+    mesh = SplatMesh(vertices.detach().numpy(), faces, colors, face_splat=face_splat, depth_group=depth_group)
+    sheet = reference._fragments(mesh, seen, x, y, filter_px2)
     sample, face = torch.from_numpy(sheet.sample), torch.from_numpy(sheet.face)
 
     corner = torch.from_numpy(np.asarray(faces, np.int64))[face]
     # Weights of the corners at each fragment (reference._cover).
     in_camera = vertices @ pose[:3, :3].T + pose[:3, 3]
+    if filter_px2:
+        in_camera = filtered(in_camera, faces, attributes[:, 3], camera, face_splat, filter_px2)
     z = in_camera[:, 2]
     corners = torch.stack(
         [camera.fx * in_camera[:, 0] + camera.cx * z, camera.fy * in_camera[:, 1] + camera.cy * z, z], dim=1
