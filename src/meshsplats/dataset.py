@@ -271,28 +271,37 @@ class DrawnSplats:
     store: PictureStore = field(repr=False)
 
     def load(self) -> Picture:
+        return self._drawn(self.samples)
+
+    def points(self) -> Picture:
+        """The values at the pixels' centres alone, of which the mean over their areas is made (look
+        'area')."""
+        return self._drawn(1)
+
+    def _drawn(self, samples: int | None) -> Picture:
         from meshsplats.rendering.looks import draw_splats
 
-        picture = self.store.find(self)
+        picture = self.store.find((self, samples))
         if picture is None:
             drawn = draw_splats(
                 self.cloud,
                 self.camera,
                 self.look,
                 background=(0, 0, 0),
-                samples=self.samples,
+                samples=samples,
                 sh_degree=self.sh_degree,
                 threads=self.threads,
             )
             # Beyond float16 lies only what no display can show.
             color = np.clip(drawn.color, 0, 60_000).astype(np.float16)
             picture = Picture(color, drawn.alpha.astype(np.float16))
-            self.store.keep(self, picture)
+            self.store.keep((self, samples), picture)
         return picture
 
     @property
     def nbytes(self) -> int:
-        return 8 * self.camera.width * self.camera.height
+        kinds = 2 if self.look == "area" else 1  # means and points
+        return 8 * kinds * self.camera.width * self.camera.height
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

@@ -113,7 +113,7 @@ class Finetune:
             # the rest has to fill.
             scene = choose_splats(scene, crop=self.conversion.crop)
         worthwhile = worthwhile_views(config)
-        dataset = self.target.make(scene, self.input, background_of(config), self.threads, worthwhile)
+        dataset = self.target.make(scene, self.input, background_of(config), self.threads, worthwhile, self.preset)
         if self.conversion.crop is not None and self.target.data is not None:
             _warn_of_the_rest(dataset.train[0].picture)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
@@ -133,7 +133,7 @@ class Finetune:
         seconds = time.perf_counter() - began
         tell(self, files, seconds, {"triangles": triangles}, f"{triangles:,} triangles")
         if not self.json:
-            print(f"next: {self._next(files, config, len(dataset.test))}")
+            print(f"next: {self._next(files, config, len(dataset.test), dataset.look)}")
         return 0
 
     def configured(self) -> FinetuneConfig:
@@ -144,9 +144,9 @@ class Finetune:
         start = self.preset if self.start == "same" else self.start
         cameras = [view.camera for view in dataset.train]
         options = asdict(self.conversion) | {"crop": None}  # that is done
-        return starting_mesh(cloud, cameras, preset=start, **options)
+        return starting_mesh(cloud, cameras, preset=start, look=dataset.look, **options)
 
-    def _next(self, files: RunFiles, config: FinetuneConfig, held_out: int) -> str:
+    def _next(self, files: RunFiles, config: FinetuneConfig, held_out: int, look: str) -> str:
         """The command that scores the result as it was trained, or one that shows it where there is none."""
         target, folder = self.target, self.output.with_suffix("")
         if self.conversion.crop is not None or (target.data is None and not held_out):
@@ -158,7 +158,7 @@ class Finetune:
             words += ["--test-every", target.test_every] if target.test_every != 8 else []
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
-            words += ["--look", target.look] if target.look != "area" else []
+            words += ["--look", look] if look != "area" else []
             words += ["--sh-degree", target.sh_degree] if target.sh_degree is not None else []
         words += ["--background", "black"] if config.background == "black" else []
         words += ["-o", f"{folder}-evaluation"]

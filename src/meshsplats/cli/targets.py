@@ -47,10 +47,12 @@ class TargetOptions:
     of a model folder, unless --placement, --distance or --up is given; else cameras are placed."""
     up: Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
-    look: Literal["area", "splats"] = "area"
+    look: Literal["area", "splats"] | None = None
     """Without --data: what the pictures show. area: means over each pixel's area, right at every size in
-    programs that take several samples a pixel: Blender, MSAA, ray tracers. splats: what a 3DGS viewer
-    shows."""
+    programs that take several samples a pixel: Blender, MSAA, ray tracers. splats: what a 3DGS viewer shows;
+    the mesh is then made to be drawn with the viewer's filter, by this project's own pictures, and wants
+    'meshsplats bake' for others. Default: area; splats, without the filter, with --preset paper and
+    published."""
     sh_degree: Count = None
     """Without --data: draw the splats with spherical harmonics up to this degree. Default: all that are
     stored."""
@@ -86,8 +88,10 @@ class TargetOptions:
         background: Sequence[float],
         threads: int | None,
         worthwhile: int = FEWEST_VIEWS,
+        preset: str = "default",
     ) -> Dataset:
-        """The data set; of so many views as are ``worthwhile`` where nothing else was said."""
+        """The data set; of so many views as are ``worthwhile`` where nothing else was said, and with the look
+        that suits the ``preset``."""
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
@@ -119,7 +123,8 @@ class TargetOptions:
             width=self.width,
             distance=self.distance,
             up=None if self.up is None else parse_up(self.up),
-            look=self.look,
+            look=self.look or ("area" if preset == "default" else "splats"),
+            zooms=None if preset == "default" else (1,),
             sh_degree=self.sh_degree,
             background=background,
             threads=threads,

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.conversion.detail import LEVELS, choose_levels, look
+from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, Views, pixel_sizes, widen
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
@@ -18,6 +18,7 @@ from meshsplats.conversion.selection import disc_areas, inside_box, mean_shadow,
 from meshsplats.framing import guess_up, unit_up
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.looks import Look
 
 __all__ = ["PRESETS", "ConversionOptions", "Profile", "convert", "fidelity", "fit_profile"]
 
@@ -121,7 +122,9 @@ def convert(
 
     mesh = assembled(shapes, choice, keep)
     if chosen.detail == "cameras":
-        seen = look(mesh, cloud.means, part, cameras or ())
+        # Fans that were widened are to look as in a splat viewer, others as what lies in each pixel's area.
+        made_for: Look = "area" if chosen.footprint == "none" else "splats"
+        seen = visibility(mesh, cloud.means, part, cameras or (), made_for)
         visible = keep & ~seen.hidden[rows]
         keep = visible if visible.any() else keep
         choice[keep] = choose_levels(seen.need[rows[keep]], len(mesh.faces))

@@ -16,7 +16,7 @@ from meshsplats._arrays import evenly
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import render_splats
+from meshsplats.rendering.looks import Look, draw_splats
 from meshsplats.rendering.recorded import RecordedPicture
 
 LEVELS = ((3, 1), (4, 1), (6, 1), (8, 1), (8, 2), (12, 2), (12, 3), (16, 3))
@@ -35,6 +35,9 @@ good as 0.7."""
 PICTURES = (16, 64)
 """Fewest and most pictures that are looked at: of an eighth of the cameras, evenly spread."""
 
+AREA_SAMPLES = 2
+"""Side of the grid of samples in each pixel of these pictures, for the look 'area'."""
+
 SIDE = 400
 """Greatest side of these pictures. What they show is counted in pixels of the cameras' own."""
 
@@ -46,7 +49,7 @@ LOOKED_AT = 4
 """Only those that at least so many pictures have before them: they could have been shown."""
 
 
-class Look(NamedTuple):
+class Visibility(NamedTuple):
     """What pictures of a mesh show of n splats."""
 
     pixels: np.ndarray
@@ -62,14 +65,17 @@ class Look(NamedTuple):
         return np.sqrt(self.pixels * self.error)
 
 
-def look(mesh: SplatMesh, means: np.ndarray, cloud: GaussianCloud, cameras: Sequence[Camera]) -> Look:
+def visibility(
+    mesh: SplatMesh, means: np.ndarray, cloud: GaussianCloud, cameras: Sequence[Camera], look: Look
+) -> Visibility:
     """What ``cameras`` show of the splats with centres ``means`` (n, 3), whose rows ``mesh.face_splat``
-    numbers; the pictures should be those of ``cloud``."""
+    numbers; the images should be those of ``cloud`` in that ``look``."""
     assert mesh.face_splat is not None
     n = len(means)
     owner = np.zeros(len(mesh.vertices), np.int64)
     owner[mesh.faces.ravel()] = np.repeat(mesh.face_splat, 3)
     pixels, error, looked_at = np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
+    samples = 1 if look == "splats" else AREA_SAMPLES
     fewest, most = PICTURES
     chosen = evenly(cameras, min(max(len(cameras) // 8, fewest), most))
     for own in chosen:
@@ -81,11 +87,12 @@ def look(mesh: SplatMesh, means: np.ndarray, cloud: GaussianCloud, cameras: Sequ
             np.zeros((len(owner), 2), np.float32),
             camera,
             background=(0, 0, 0),
+            samples=samples,
             face_splat=mesh.face_splat,
             filter_px2=mesh.filter_px2,
         )
         # Over black, and in opacity: then no background hides a difference.
-        truth = render_splats(cloud, camera, background=(0, 0, 0))
+        truth = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples)
         square = np.square(picture.color - truth.color).sum(axis=2) + np.square(picture.alpha - truth.alpha)
         sums = picture.spread(np.stack([np.ones_like(square), square], axis=2))
         of_own = own.width * own.height / (camera.width * camera.height)
@@ -93,7 +100,7 @@ def look(mesh: SplatMesh, means: np.ndarray, cloud: GaussianCloud, cameras: Sequ
         error += of_own * np.bincount(owner, sums[:, 1], n)
         looked_at += camera.sees(means)
     hidden = (pixels < HIDDEN * looked_at) & (looked_at >= LOOKED_AT)
-    return Look(pixels / len(chosen), error / len(chosen), hidden)
+    return Visibility(pixels / len(chosen), error / len(chosen), hidden)
 
 
 def choose_levels(need: np.ndarray, budget: int) -> np.ndarray:

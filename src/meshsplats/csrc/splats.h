@@ -241,7 +241,7 @@ class SplatScene {
         for (int k = 0; k < 3; ++k) out.w[k] = (float)row[2][k];
         // Box of the disc u^2 + v^2 <= radius^2 on the picture, and of the low pass round the centre.
         double radius2 = 2 * std::log(255 * opacity) + 1e-6;
-        double low_pass = std::sqrt(radius2 / 2) * grid_.samples;
+        double low_pass = std::sqrt(radius2 * cloud_.dilation) * grid_.samples;
         double d = radius2 * (row[2][0] * row[2][0] + row[2][1] * row[2][1]) - row[2][2] * row[2][2];
         for (int i = 0; i < 2; ++i) {
             double at = i ? splat.y : splat.x, middle = 0, half = std::numeric_limits<double>::infinity();
@@ -264,7 +264,7 @@ class SplatTile {
     SplatTile(const SplatScene &scene, const Grid &grid, const MsOptions &options, const MsPicture &picture,
               const MsCamera &camera, const MsSplats &cloud)
         : scene_(scene), grid_(grid), options_(options), picture_(picture), camera_(camera), planar_(cloud.kernel == 2),
-          near_((float)camera.near), low_pass_(2.0f / (grid.samples * grid.samples)) {
+          near_((float)camera.near), low_pass_(1 / std::max(cloud.dilation, 1e-6f) / (grid.samples * grid.samples)) {
         for (int i = 0; i < TILE; ++i) center_[i] = i + 0.5f;
     }
 

@@ -44,7 +44,7 @@ struct MsSplats {
     int32_t sh_stored;         // coefficients a channel in the file
     int32_t sh_used;           // coefficients a channel to be used
     int32_t kernel;            // 0: 3dgs, 1: antialiased, 2: 2dgs
-    float dilation;            // px^2
+    float dilation;            // px^2; 2dgs: variance of the low pass
 };
 
 struct MsPicture {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ from meshsplats.framing import (
     weighted_quantile,
 )
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.rendering.looks import Look
+from meshsplats.rendering.looks import Look, check_look
 
 Placement = Literal["auto", "object", "surrounded", "inside"]
 
@@ -42,6 +43,10 @@ STANDS = 12
 HELD_OUT = 8
 """Views that are held out at the least, asked for or not: a mesh can be measured on them later
 without knowing what it was trained on."""
+ZOOMS = {"area": (1,), "splats": (1, 1, 2, 4)}
+"""Training views of each look, in turn: the whole image, or as large a window of one so many times as large.
+A splat viewer's filter is another in every size of image, and a mesh that is drawn with it has to learn what
+lies under it. Means over areas hold for all sizes at once."""
 TRAINING_SAMPLES = 2
 """Side of the grid of samples in the pixels of images to learn from, for the look 'area'."""
 CANDIDATES = 512
@@ -63,6 +68,7 @@ def splat_dataset(
     distance: tuple[float, float] = DISTANCES,
     up: Sequence[float] | np.ndarray | None = None,
     look: Look = "area",
+    zooms: Sequence[int] | None = None,
     sh_degree: int | None = None,
     background: Sequence[float] = WHITE,
     samples: int | None = None,
@@ -92,7 +98,9 @@ def splat_dataset(
         if it is smaller than that).
     up: (3,) direction; None: ``framing.guess_up``.
     look: what the images are. 'area': means over each pixel's area, right for every program that takes
-        several samples a pixel. 'splats': what a 3DGS viewer shows at this size.
+        several samples a pixel. 'splats': what a 3DGS viewer shows.
+    zooms: training views in turn are the whole image (1), or as large a window of one so many times as
+        large. None: ``ZOOMS`` of the look.
     samples: side of the grid of samples in each pixel. None: for 'area', ``TRAINING_SAMPLES`` in training
         views, which are quick to draw, and the exact mean in test views; else 1.
     sh_degree, background, threads, cache_bytes: as in ``dataset.splat_views``.
@@ -127,6 +135,11 @@ def splat_dataset(
             height=height or width,
             fov=50.0 if fov is None else fov,
         )
+    check_look(look)
+    zooms = ZOOMS[look] if zooms is None else zooms
+    if not zooms or min(zooms) < 1:
+        raise ValueError(f"zooms must be whole numbers from 1 on, got {zooms!r}")
+    learned_from = [_window(camera, zooms[i % len(zooms)], i) for i, camera in enumerate(placed[first:])]
     quick = TRAINING_SAMPLES if look == "area" else None
     held_out, learned = (
         splat_views(
@@ -141,7 +154,7 @@ def splat_dataset(
         )
         for part, side, share in (
             (placed[: min(test, first)], None, cache_bytes // 8),
-            (placed[first:], quick, cache_bytes - cache_bytes // 8),
+            (learned_from, quick, cache_bytes - cache_bytes // 8),
         )
     )
     return Dataset(learned, held_out, "splats", look)
@@ -279,6 +292,24 @@ def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np
         away = np.linalg.norm(tried[roomy][:, None] - tried[chosen], axis=2).min(axis=1)
         chosen.append(int(roomy[away.argmax()]))
     return tried[chosen], clearance[chosen]
+
+
+def _window(camera: Camera, zoom: int, number: int) -> Camera:
+    """As large an image, cut out of that of ``camera`` drawn ``zoom`` times as large; ``number`` spreads such
+    windows over the middle of the image."""
+    if zoom == 1:
+        return camera
+    # Most of what there is to see lies in the middle, and windows reach half their size beyond their own.
+    u, v = 0.15 + 0.7 * ((0.5 + np.array(STEPS[:2]) * number) % 1)
+    left = round(min(max(u * zoom - 0.5, 0), zoom - 1) * camera.width)
+    top = round(min(max(v * zoom - 0.5, 0), zoom - 1) * camera.height)
+    return replace(
+        camera,
+        fx=camera.fx * zoom,
+        fy=camera.fy * zoom,
+        cx=camera.cx * zoom - left,
+        cy=camera.cy * zoom - top,
+    )
 
 
 def _given(cameras: Sequence[Camera], train: int, test: int, width: int) -> tuple[list[Camera], int]:

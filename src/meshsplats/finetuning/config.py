@@ -87,8 +87,13 @@ class FinetuneConfig:
     blending: Literal["mesh", "display", "linear"] = "mesh"
     """Space in which the triangles are blended: as the mesh says; display values; or linear light, for
     exports that will be lit or blended by engines that work in linear light."""
-    samples: int = 1
-    """Side of the grid of samples in each pixel."""
+    samples: int | None = None
+    """Side of the grid of samples in each pixel. None: 2, for images that are means over each pixel's area,
+    photographs among them; 1 for those of a splat viewer (``Dataset.look``)."""
+    point_share: float = 0.6
+    """Images of splats that are means over each pixel's area: at first, for this share of the run, the mesh
+    learns from their values at the pixels' centres, at one sample a pixel. That is quicker, and shows detail
+    finer than a pixel as it is. 0: from means alone."""
     seed: int = 0
     """Of the views' order and the random backgrounds. The same seed gives the same result to the last bit,
     with any number of threads, unless the length is given in minutes."""
@@ -96,7 +101,7 @@ class FinetuneConfig:
     def __post_init__(self) -> None:
         for name, low, high, whole in _RANGES:
             value = getattr(self, name)
-            if value is None and name in LENGTHS:
+            if value is None and name in (*LENGTHS, "samples"):
                 continue
             number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
             if not number or not low <= value <= high or (whole and int(value) != value):
@@ -156,6 +161,7 @@ _RANGES: list[tuple[str, float, float, bool]] = [
     ("relocate_share", 0, 0.5, False),
     ("relocate_epochs", 1e-3, 1e6, False),
     ("samples", 1, 16, True),
+    ("point_share", 0, 1, False),
     ("seed", 0, 2**63 - 1, True),
 ]
 
@@ -175,6 +181,8 @@ _PAPER = FinetuneConfig(
     ssim_weight=0.4,
     l2_weight=0.0,
     background="white",
+    samples=1,
+    point_share=0.0,
     prune_epochs=10,
     epsilon=1e-8,
     prune_opacity=math.exp(-4),

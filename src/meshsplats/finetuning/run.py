@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,11 +22,10 @@ from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
+from meshsplats.finetuning.state import State
+from meshsplats.finetuning.tuning import kept_faces, make_step, relocate, samples_of
 from meshsplats.mesh import SplatMesh
 from meshsplats.metrics import psnr
-
-if TYPE_CHECKING:
-    from meshsplats.finetuning.state import State
 
 RELOCATED = 0.5
 """Splats are moved in this share of the run: those moved later would not settle any more."""
@@ -119,8 +117,6 @@ def finetune(
         Interrupted: after SIGINT or SIGTERM, with a checkpoint, if there is a folder.
     """
     config, run = config or FinetuneConfig(), run or RunOptions()
-    from meshsplats.finetuning.state import State
-
     if not dataset.train:
         raise ValueError("the data set has no training views")
     if not len(mesh.faces):
@@ -192,8 +188,6 @@ class _Run:
         return self.step / self.steps if self.steps else 1.0
 
     def go(self) -> SplatMesh:
-        from meshsplats.finetuning.tuning import kept_faces, make_step, relocate
-
         views = self.dataset.train
         interval = self.config.prune_interval(len(views))
         moves = self.config.relocate_interval(len(views))
@@ -266,7 +260,7 @@ class _Run:
         self.journal.preview(self.step, np.clip(view.image, 0, 1), picture)
 
     def _picture(self, mesh: SplatMesh, view: View) -> np.ndarray:
-        samples, threads = self.config.samples, self.run.threads
+        samples, threads = samples_of(view, self.config), self.run.threads
         return mesh_picture(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
 
     def _save(self) -> None:

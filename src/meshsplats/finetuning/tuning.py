@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats._arrays import evenly
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.dataset import View
+from meshsplats.dataset import DrawnSplats, View
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKDROPS, FinetuneConfig, rates
 from meshsplats.finetuning.kernels import compare_pictures
@@ -26,6 +26,10 @@ LEAST_LIGHT = {"display": 1e-3, "linear": 1e-4}
 """A pixel is finished when less of its light than this is left to what comes next; that is the background's.
 It saves a tenth to a sixth of the time, and pictures change by 0.0002 (rms). Less in linear light, which is
 lifted where it is dark."""
+
+
+AREA_SAMPLES = 2
+"""Side of the grid of samples with which a mesh is compared with means over each pixel's area."""
 
 
 class Target(NamedTuple):
@@ -45,9 +49,15 @@ def view_of_step(config: FinetuneConfig, step: int, views: int) -> int:
     return int(np.random.default_rng([config.seed, epoch, 0]).permutation(views)[place])
 
 
-def target_of(view: View, config: FinetuneConfig, step: int) -> Target:
-    """The truth of ``view`` in step ``step``."""
-    picture = view.picture
+def learns_from_points(view: View, config: FinetuneConfig, fraction: float) -> bool:
+    """Whether ``view`` still gives its values at the pixels' centres (see ``FinetuneConfig.point_share``)."""
+    source = view.source
+    return fraction < config.point_share and isinstance(source, DrawnSplats) and source.look == "area"
+
+
+def target_of(view: View, config: FinetuneConfig, step: int, points: bool = False) -> Target:
+    """The truth of ``view`` in step ``step``; ``points``: at the pixels' centres, not of their areas."""
+    picture = view.source.points() if points and isinstance(view.source, DrawnSplats) else view.picture
     background = view.background
     if picture.alpha is not None:
         background = BACKDROPS.get(config.background, background)
@@ -78,7 +88,15 @@ class Drawn:
         return gradients
 
 
-def draw(state: State, view: View, background: Sequence[float]) -> Drawn:
+def samples_of(view: View, config: FinetuneConfig) -> int:
+    """Side of the grid of samples with which the mesh is drawn to be compared with ``view``."""
+    if config.samples is not None:
+        return config.samples
+    viewer = isinstance(view.source, DrawnSplats) and view.source.look == "splats"
+    return 1 if viewer else AREA_SAMPLES
+
+
+def draw(state: State, view: View, background: Sequence[float], samples: int) -> Drawn:
     """The mesh as ``view`` has it before it, over a display ``background``."""
     linear = state.mesh.blending == "linear"
     behind = np.asarray(background, np.float32)
@@ -89,7 +107,7 @@ def draw(state: State, view: View, background: Sequence[float]) -> Drawn:
         None,
         view.camera,
         background=srgb_to_linear(behind) if linear else behind,
-        samples=state.config.samples,
+        samples=samples,
         min_transmittance=LEAST_LIGHT[state.mesh.blending],
         face_splat=state.mesh.face_splat,
         depth_group=state.mesh.depth_group,
@@ -143,10 +161,11 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
     config = state.config
     number = view_of_step(config, step, len(views))
     view = views[number]
-    target = target_of(view, config, step)
+    points = learns_from_points(view, config, fraction)
+    target = target_of(view, config, step, points)
     if target.mask is not None and not target.mask.any():
         return None
-    drawn = draw(state, view, target.background)
+    drawn = draw(state, view, target.background, 1 if points else samples_of(view, config))
     picture = drawn.color
     if state.exposures is not None:
         own = state.exposures[number]
@@ -219,7 +238,7 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
             colors,
             view.camera,
             mask=view.mask,
-            samples=state.config.samples,
+            samples=samples_of(view, state.config),
             face_splat=state.mesh.face_splat,
             depth_group=state.mesh.depth_group,
             filter_px2=state.mesh.filter_px2,

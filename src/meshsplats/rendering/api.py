@@ -156,7 +156,7 @@ def render_splats(
     sample ends before the splat that would leave less than 1e-4 of the light. Every sample where a splat's
     opacity reaches 1/255 is drawn, however far from its centre. The cloud's kernel decides what is drawn:
     '3dgs' as above, 'antialiased' with the opacity lowered by as much as the widening adds, '2dgs' flat
-    splats met by the ray (no widening; a low pass of variance 1/2 px^2).
+    splats met by the ray (no widening; a low pass of variance 5/3 ``dilation``, so 1/2 px^2).
 
     Args:
         cloud: the splats.
@@ -191,7 +191,7 @@ def render_splats(
         sh_stored=cloud.sh.shape[1],
         sh_used=(degree + 1) ** 2,
         kernel=("3dgs", "antialiased", "2dgs").index(cloud.kernel),
-        dilation=dilation,
+        dilation=0.5 * (dilation / 0.3) if cloud.kernel == "2dgs" else dilation,
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)

@@ -116,8 +116,8 @@ def render_splats(
 
     Splats are blended front to back in the order of the depth z of their centres, equal depths by number;
     those with a centre nearer than ``camera.near`` are left out. ``dilation`` (pixels squared, of the picture
-    whatever ``samples`` is) widens every projected splat; kernel '2dgs' has its own widening and does not use
-    it. ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
+    whatever ``samples`` is) widens every projected splat; for the kernel '2dgs' its low pass, 5/3 of it, is the
+    least variance. ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
 
     Unlike the published rasterisers this has no tiles and no cut at three standard deviations: a splat is
     drawn wherever its alpha reaches 1/255.
@@ -144,7 +144,7 @@ def render_splats(
     fragments = 0
     for i in nearest_first:
         if cloud.kernel == "2dgs":
-            falloff = _flat_falloff(centers[i], axes[i], scales[i], camera, x, y)
+            falloff = _flat_falloff(centers[i], axes[i], scales[i], camera, x, y, dilation)
         else:
             falloff = _projected_falloff(centers[i], axes[i], scales[i], camera, x, y, dilation, cloud.kernel)
         alpha = np.minimum(SPLAT_MAX_ALPHA, opacities[i] * falloff)
@@ -490,14 +490,20 @@ def _projected_falloff(
 
 
 def _flat_falloff(
-    center: np.ndarray, axes: np.ndarray, scales: np.ndarray, camera: Camera, x: np.ndarray, y: np.ndarray
+    center: np.ndarray,
+    axes: np.ndarray,
+    scales: np.ndarray,
+    camera: Camera,
+    x: np.ndarray,
+    y: np.ndarray,
+    dilation: float,
 ) -> np.ndarray:
     """exp(-rho / 2) of one flat splat at all samples, rho = min(rho3d, rho2d) (2DGS, Huang et al. 2024).
 
     rho3d is the squared distance, in standard deviations, from the centre to where the ray meets the plane of
     the splat's first two axes; it is infinite where that is nearer than ``camera.near``, behind the camera or
-    nowhere, and beside the line that a splat with a scale of 0 is. rho2d = 2 |p - c|^2, with p the sample and
-    c the projected centre in pixels, keeps splats that are tiny or seen edge on from falling between the
+    nowhere, and beside the line that a splat with a scale of 0 is. rho2d = 0.6 / dilation |p - c|^2 (2DGS: 2),
+    with p the sample and c the projected centre in pixels, keeps splats that are tiny or seen edge on from falling between the
     samples.
     """
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
@@ -509,4 +515,4 @@ def _flat_falloff(
     rho3d = np.where((z >= camera.near) & np.isfinite(rho3d), rho3d, np.inf)
     dx = x - (camera.fx * center[0] / center[2] + camera.cx)
     dy = y - (camera.fy * center[1] / center[2] + camera.cy)
-    return np.exp(-0.5 * np.minimum(rho3d, 2 * (dx * dx + dy * dy)))
+    return np.exp(-0.5 * np.minimum(rho3d, 0.6 / max(dilation, 1e-6) * (dx * dx + dy * dy)))

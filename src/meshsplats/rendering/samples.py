@@ -33,8 +33,11 @@ def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
     placement of the samples in the images of ``cameras``; the same for all of them, so that animations do
     not flicker.
 
-    Fans are the triangles of one splat (``face_splat``); a mesh without gets the fewest.
+    Fans are the triangles of one splat (``face_splat``); a mesh without gets 2, one with a filter of its own
+    (``filter_px2``) 1.
     """
+    if mesh.filter_px2:
+        return 1  # as in the splats that it imitates, its filter is as wide as a pixel
     if mesh.face_splat is None or not len(mesh.faces):
         return FEWEST
     starts = splat_starts(mesh.face_splat)
