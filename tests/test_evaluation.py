@@ -245,7 +245,7 @@ def test_protocols_are_those_of_the_papers_table():
     assert set(PROTOCOLS["tanks-and-temples"].scenes) == {"train", "truck"}
     assert set(PROTOCOLS["deep-blending"].scenes) == {"drjohnson", "playroom"}
     for protocol in PROTOCOLS.values():
-        assert (protocol.test_every, protocol.sh_degree, protocol.background) == (8, 0, (1, 1, 1))
+        assert (protocol.test_every, protocol.sh_degree) == (8, 0)
 
 
 def test_a_scenes_input_is_found_by_name(tmp_path):

@@ -41,6 +41,7 @@ _HOME = {
     "MeshPrior": "meshsplats.prior",
     "load_prior": "meshsplats.prior",
     "evaluate": "meshsplats.evaluation",
+    "find_background": "meshsplats.backgrounds",
     "Report": "meshsplats.evaluation",
     "psnr": "meshsplats.metrics",
     "ssim": "meshsplats.metrics",

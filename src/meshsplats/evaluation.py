@@ -154,7 +154,8 @@ def evaluate(
     """Scores on the test views of ``dataset`` (all of them where it holds none out).
 
     Pictures are clipped to [0, 1]; pixels outside a view's mask do not count. Views whose pictures have alpha
-    are composited over ``View.background``, and so is everything drawn.
+    are composited over ``View.background``, and so is everything drawn: beside photographs without alpha it
+    has to be what the splats were trained over (``find_background``, ``Dataset.over``).
 
     Parameters
     ----------

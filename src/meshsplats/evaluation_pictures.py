@@ -105,9 +105,10 @@ def markdown_table(
     *,
     title: str = "",
     reported: Mapping[str, tuple[float, float, float]] | None = None,
+    notes: Sequence[str] = (),
 ) -> str:
     """A table of the scenes' means by method, with the mean over the scenes where there are several, and
-    figures ``reported`` elsewhere (PSNR, SSIM, LPIPS)."""
+    figures ``reported`` elsewhere (PSNR, SSIM, LPIPS); ``notes`` follow it."""
     lines = [f"# {title}", ""] if title else []
     lines += ["| scene | method | PSNR | median PSNR | SSIM | LPIPS |", "|---|---|---|---|---|---|"]
     rows: dict[str, list[list[float | None]]] = {}
@@ -123,7 +124,7 @@ def markdown_table(
             lines.append(_row("mean", method, means))
     for name, (psnr, ssim, lpips) in (reported or {}).items():
         lines.append(_row("reported", name, [psnr, None, ssim, lpips]))
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *(f"\n{note}" for note in notes)]) + "\n"
 
 
 def _row(scene: str, method: str, values: Sequence[float | None]) -> str:

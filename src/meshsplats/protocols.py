@@ -18,7 +18,6 @@ class Protocol:
     reported: Mapping[str, tuple[float, float, float]]
     """Figures from the literature for the same scenes: PSNR, SSIM, LPIPS (VGG)."""
     test_every: int = 8
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     sh_degree: int = 0
 
 
@@ -46,8 +45,8 @@ PROTOCOLS: Mapping[str, Protocol] = {
     ),
 }
 """Those of Table 1 of arXiv 2502.07754, at the resolutions of the 3DGS paper: every 8th view by name is held
-out, the background is white, splats count at degree 0. Its 7 scenes of Mip-NeRF 360 are the public ones; the
-other two are to be had on request."""
+out, splats count at degree 0; the background is what each scene's splats were trained over. Its 7 scenes of
+Mip-NeRF 360 are the public ones; the other two are to be had on request."""
 
 _SUFFIXES = (".npz", ".glb", ".gltf", ".ply", ".obj", ".splat", ".spz", ".sog")
 

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -15,8 +15,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
+from meshsplats.backgrounds import Background
 from meshsplats.camera import MAX_SIDE, Camera, dome, load_cameras, look_around, orbit
 from meshsplats.cli import UsageError
+from meshsplats.dataset import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.recognition import identify
 from meshsplats.framing import guess_up
@@ -32,7 +34,7 @@ File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="
 Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
-NAMED_COLORS = {
+NAMED_COLORS: dict[str, tuple[float, float, float]] = {
     "white": (1.0, 1.0, 1.0),
     "black": (0.0, 0.0, 0.0),
     "grey": (0.5, 0.5, 0.5),
@@ -81,6 +83,8 @@ class ViewOptions:
     one."""
     data: Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio): the cameras of its test views."""
+    downscale: int = 1
+    """With --data: pictures this many times smaller than the photographs."""
     elevation: Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0
@@ -102,8 +106,25 @@ class ViewOptions:
         """Whether the views make a turntable."""
         return self.cameras is None and self.data is None and self.dome is None
 
-    def make(self, scene: GaussianCloud | SplatMesh, source: Path, *, count: int, side: int) -> list[Camera]:
-        """The cameras; ``count`` views of an orbit, ``side`` pixels wide, where nothing else is asked for."""
+    def photographs(self) -> Dataset | None:
+        """The data set, where one was named."""
+        if self.data is None:
+            return None
+        from meshsplats.dataset import load_dataset
+
+        return load_dataset(self.data, downscale=self.downscale)
+
+    def make(
+        self,
+        scene: GaussianCloud | SplatMesh,
+        source: Path,
+        *,
+        count: int,
+        side: int,
+        photographs: Dataset | None = None,
+    ) -> list[Camera]:
+        """The cameras; ``count`` views of an orbit, ``side`` pixels wide, where nothing else is asked for.
+        ``photographs`` are those of ``photographs()``, if they are there already."""
         self.check()
         for name in ("width", "height"):
             value = getattr(self, name)
@@ -111,7 +132,9 @@ class ViewOptions:
                 raise ValueError(f"--{name} must be a number of pixels from 1 to {MAX_SIDE}, got {value}")
         if self.cameras is not None or self.data is not None:
             if self.data is not None:
-                cameras = data_cameras(self.data, "test")
+                dataset = photographs or self.photographs()
+                assert dataset is not None
+                cameras = [view.camera for view in dataset.test or dataset.views]
             else:
                 assert self.cameras is not None
                 cameras = load_cameras(self.cameras)
@@ -132,6 +155,12 @@ class ViewOptions:
 
     def check(self) -> None:
         """UsageError for options that exclude each other or would do nothing."""
+        if self.downscale != 1 and (self.data is None or self.width is not None):
+            raise UsageError(
+                "--downscale has no effect without --data"
+                if self.data is None
+                else "give --downscale or --width"
+            )
         modes = [
             name
             for name in ("orbit", "dome", "look_around", "cameras", "data")
@@ -155,8 +184,9 @@ class ViewOptions:
 class DrawOptions:
     """How pictures are drawn."""
 
-    background: str = "white"
-    """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
+    background: Text = None
+    """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; with --data
+    what the model folder says, or the photographs."""
     samples: Count = None
     """Side of the grid of samples in each pixel. Default: as many as the mesh needs at this size, 2 (which
     means 2 x 2) to 8; 1 for splats, whose filter is as wide as a pixel. compare: of the mesh."""
@@ -194,12 +224,28 @@ def cameras_beside(source: Path) -> list[Camera] | None:
         return None
 
 
-def data_cameras(path: Path, part: Literal["train", "test"]) -> list[Camera]:
-    """Cameras of the training or test views of a data set; of all where it holds none out."""
-    from meshsplats.dataset import load_dataset
+def chosen_background(
+    given: str | None,
+    photographs: Dataset | None,
+    scenes: Mapping[str, GaussianCloud | SplatMesh],
+    source: Path | None,
+    threads: int | None,
+    *,
+    whole: bool = True,
+) -> Background:
+    """What pictures of ``scenes`` are drawn over: what was ``given``; else white, or beside ``photographs``
+    what the model folder ``source`` names or fits the scenes best. Warns where scenes and photographs do not
+    agree; unless they cannot, as scenes that are not ``whole``."""
+    from meshsplats.backgrounds import find_background, model_background, warn_of_other_worlds
 
-    dataset = load_dataset(path)
-    return [view.camera for view in getattr(dataset, part) or dataset.views]
+    color = None if given is None else parse_color(given)
+    if photographs is None:
+        return Background(color or WHITE, "usual" if color is None else "given")
+    named = None if source is None else model_background(source)
+    found = find_background(photographs, scenes, given=color, named=named, threads=threads)
+    if whole:
+        warn_of_other_worlds(found)
+    return found
 
 
 def parse_up(text: str) -> np.ndarray:
@@ -215,12 +261,13 @@ def parse_up(text: str) -> np.ndarray:
     return np.array(numbers)
 
 
-def parse_color(text: str) -> tuple[float, ...]:
+def parse_color(text: str) -> tuple[float, float, float]:
     """RGB in [0, 1] from a name, ``#rrggbb`` or ``r,g,b``. Raises ValueError for anything else."""
     if text.lower() in NAMED_COLORS:
         return NAMED_COLORS[text.lower()]
     if text.startswith("#") and len(text) == 7 and all(c in "0123456789abcdefABCDEF" for c in text[1:]):
-        return tuple(int(text[i : i + 2], 16) / 255 for i in (1, 3, 5))
+        red, green, blue = (int(text[i : i + 2], 16) / 255 for i in (1, 3, 5))
+        return red, green, blue
     numbers = _numbers(text)
     if numbers is None or not all(0 <= v <= 1 for v in numbers):
         raise ValueError(
@@ -229,12 +276,12 @@ def parse_color(text: str) -> tuple[float, ...]:
     return numbers
 
 
-def _numbers(text: str) -> tuple[float, ...] | None:
+def _numbers(text: str) -> tuple[float, float, float] | None:
     try:
-        numbers = tuple(float(part) for part in text.split(","))
+        x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         return None
-    return numbers if len(numbers) == 3 and np.isfinite(numbers).all() else None
+    return (x, y, z) if np.isfinite([x, y, z]).all() else None
 
 
 def check_mesh_suffix(path: Path) -> None:

@@ -18,6 +18,7 @@ from meshsplats.cli.common import (
     SplatOptions,
     ViewOptions,
     check_outputs,
+    chosen_background,
     configuration,
     identify,
     parse_color,
@@ -68,9 +69,12 @@ class Compare:
 
         if not self.amplify > 0:
             raise ValueError(f"--amplify must be positive, got {self.amplify}")
-        background = parse_color(self.draw.background)
+        if self.draw.background is not None:
+            parse_color(self.draw.background)
+        self.views.check()
         cloud = self.reading.load(self.splats)
-        cameras = self.views.make(cloud, self.splats, count=8, side=400)
+        photographs = self.views.photographs()
+        cameras = self.views.make(cloud, self.splats, count=8, side=400, photographs=photographs)
         strips = view_names(len(cameras))
         names = (*strips, RESULTS, CAMERAS, CONFIGURATION)
         check_outputs([self.output / name for name in names], self.force, self.output)
@@ -85,6 +89,9 @@ class Compare:
                 raise FileFormatError(f"{self.mesh}: not a mesh; give splats first, then the mesh")
             mesh = load_mesh(self.mesh)
         start = time.perf_counter()
+        background = chosen_background(
+            self.draw.background, photographs, {"splats": cloud}, self.splats, self.draw.threads
+        )
         scores = []
         samples = self.draw.samples or mesh_samples(self.look, mesh, cameras)
         views = compare_views(
@@ -93,7 +100,7 @@ class Compare:
             cameras,
             look=self.look,
             sh_degree=self.draw.sh_degree,
-            background=background,
+            background=background.color,
             samples=samples,
             max_layers=self.draw.max_layers,
             threads=self.draw.threads,
@@ -112,6 +119,7 @@ class Compare:
             "samples": samples,
             "ssim_convention": "3dgs",
             "error_amplified": self.amplify,
+            **background.to_dict(),
             "seconds": round(time.perf_counter() - start, 3),
             **comparison.to_dict(),
         }
@@ -124,6 +132,7 @@ class Compare:
         _print_table(comparison)
         print(f"look {self.look}: {LOOKS[self.look]} {samples} x {samples} samples a pixel")
         print(f"{len(cloud):,} splats against {len(mesh.faces):,} triangles, {result['seconds']:.1f} s")
+        print(f"background: {background.describe()}")
         print(f"strips splats | mesh | error x {self.amplify:g}: {self.output}/")
 
 

@@ -25,7 +25,6 @@ from meshsplats.cli.common import (
     check_mesh_suffix,
     check_outputs,
     configuration,
-    data_cameras,
     identify,
     parse_up,
     recorded_options,
@@ -128,7 +127,10 @@ class Convert:
         if self.data is not None:
             if self.cameras is not None:
                 raise UsageError("give --cameras or --data, not both")
-            cameras = data_cameras(self.data, "train")
+            from meshsplats.dataset import load_dataset
+
+            dataset = load_dataset(self.data)
+            cameras = [view.camera for view in dataset.train or dataset.views]
         elif self.cameras is not None:
             cameras = load_cameras(self.cameras)
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from meshsplats.backgrounds import Background
 from meshsplats.camera import load_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
@@ -21,7 +22,9 @@ from meshsplats.cli.common import (
     Folder,
     Output,
     SplatOptions,
+    Text,
     check_outputs,
+    chosen_background,
     configuration,
     load_scene,
     parse_color,
@@ -31,7 +34,7 @@ from meshsplats.cli.common import (
     write_json,
 )
 from meshsplats.cli.targets import TargetOptions
-from meshsplats.dataset import Dataset, load_dataset, splat_views
+from meshsplats.dataset import WHITE, Dataset, load_dataset, splat_views
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation import SSIM_CONVENTION, Report, ScoredView, evaluate
 from meshsplats.evaluation_pictures import markdown_table, picture_folder, view_crop, view_strip
@@ -89,8 +92,9 @@ class Evaluate:
     samples: Count = None
     """Side of the grid of samples in each pixel, for meshes. Default: as many as the mesh needs at this size,
     2 to 8; 1 with --look splats."""
-    background: str = "white"
-    """Behind everything: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
+    background: Text = None
+    """Behind everything: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; for photographs
+    without alpha what the model folder says, else of black and white the one that fits the splats best."""
     downscale: Count = None
     """Pictures this many times smaller. Default: 1; that of the protocol."""
     test_every: int = 8
@@ -122,21 +126,26 @@ class Evaluate:
             before = None if self.before is None else self._load_mesh(self.before)
             splats = None if self.splats is None else self.reading.load(self.splats)
             dataset = self._dataset(splats)
+            scenes = {"splats": splats, "mesh": mesh, "mesh before": before}
+            background = self._background(dataset, scenes, self.splats or self.mesh)
             if self.data is None and splats is not None:
                 # Their own pictures are the truth; what a mesh could show of it is degree 0.
                 more = splats.sh_degree > 0 and self.sh_degree != 0
                 splats = replace(splats, sh=splats.sh[:, :1]) if more else None
-            reports = [self._score(self.output, dataset, mesh, splats, before)]
+            reports = [self._score(self.output, dataset, background, mesh, splats, before)]
         seconds = round(time.perf_counter() - start, 2)
         write_json(self.output / CONFIGURATION, configuration("evaluate", self))
         if self.json:
             print(json.dumps({"scenes": [r.to_dict() for r in reports], "seconds": seconds}, indent=1))
             return
         _print_table(reports)
+        for note in _notes(reports):
+            print(note)
         print(f"SSIM: convention {SSIM_CONVENTION!r}; {seconds:.1f} s; {self.output}/")
 
     def _check(self) -> None:
-        parse_color(self.background)
+        if self.background is not None:
+            parse_color(self.background)
         if self.amplify <= 0 or self.strips < 0:
             raise ValueError("--amplify must be positive and --strips >= 0")
         if self.protocol is not None:
@@ -172,10 +181,9 @@ class Evaluate:
         return found
 
     def _dataset(self, splats: GaussianCloud | None) -> Dataset:
-        background = parse_color(self.background)
         if self.data is not None:
-            options = {"downscale": self.downscale or 1, "test_every": self.test_every}
-            return load_dataset(self.data, background=background, **options)
+            return load_dataset(self.data, downscale=self.downscale or 1, test_every=self.test_every)
+        background = WHITE if self.background is None else parse_color(self.background)
         assert splats is not None
         assert self.splats is not None
         if self.cameras is not None:
@@ -191,17 +199,29 @@ class Evaluate:
         made = TargetOptions(look=self.look, sh_degree=self.sh_degree).make(splats, self.splats, background, self.threads)
         return replace(made, train=())
 
+    def _background(
+        self,
+        dataset: Dataset,
+        scenes: Mapping[str, GaussianCloud | SplatMesh | None],
+        source: Path | None,
+    ) -> Background:
+        known = {name: scene for name, scene in scenes.items() if scene is not None}
+        photographs = None if self.data is None else dataset
+        return chosen_background(self.background, photographs, known, source, self.threads)
+
     def _score(
         self,
         folder: Path,
         dataset: Dataset,
+        background: Background,
         mesh: SplatMesh | None,
         splats: GaussianCloud | None,
         before: SplatMesh | None,
     ) -> Report:
-        """Evaluates one scene and writes its files into ``folder``."""
+        """Evaluates one scene over ``background`` and writes its files into ``folder``."""
         from meshsplats.lpips import load_lpips
 
+        dataset = dataset.over(background.color)
         views = dataset.test or dataset.views
         pictures = None if self.pictures is None else picture_folder(self.pictures, [v.camera for v in views])
         lpips = load_lpips(list(self.lpips) or None, network=self.network)
@@ -232,7 +252,7 @@ class Evaluate:
             on_view=keep,
         )
         about: dict[str, Any] = {
-            "background": list(parse_color(self.background)),
+            **background.to_dict(),
             "lpips_network": self.network if lpips else None,
         }
         if self.cameras is not None:
@@ -241,7 +261,7 @@ class Evaluate:
         write_json(folder / RESULTS, report.results())
         write_json(folder / PER_VIEW, report.per_view())
         write_json(folder / REPORT, report.to_dict())
-        _write_text(folder / TABLE, markdown_table([report]))
+        _write_text(folder / TABLE, markdown_table([report], notes=_notes([report])))
         return report
 
     def _run_protocol(self, protocol: Protocol) -> list[Report]:
@@ -265,15 +285,14 @@ class Evaluate:
             )
         reports = []
         for scene, source, factor in found:
-            dataset = load_dataset(
-                self.data / scene,
-                downscale=factor,
-                test_every=protocol.test_every,
-                background=protocol.background,
-            )
-            mesh, splats, before = self._prepared(load_scene(source, self.reading), dataset)
+            dataset = load_dataset(self.data / scene, downscale=factor, test_every=protocol.test_every)
+            given = load_scene(source, self.reading)
+            judge = "splats" if isinstance(given, GaussianCloud) else "mesh"
+            background = self._background(dataset, {judge: given}, source)
+            dataset = dataset.over(background.color)
+            mesh, splats, before = self._prepared(given, dataset)
             self.output.mkdir(exist_ok=True)
-            reports.append(self._score(self.output / scene, dataset, mesh, splats, before))
+            reports.append(self._score(self.output / scene, dataset, background, mesh, splats, before))
         means = {
             name: {
                 key: _mean([r.results().get(name, {}).get(key) for r in reports])
@@ -291,7 +310,7 @@ class Evaluate:
                 "missing": sorted(set(protocol.scenes) - {scene for scene, _, _ in found}),
                 "downscale": {scene: factor for scene, _, factor in found},
                 "test_every": protocol.test_every,
-                "background": list(protocol.background),
+                "background": {r.scene: r.about["background"] for r in reports},
                 "ssim_convention": SSIM_CONVENTION,
                 "mean": means,
                 "reported": {name: list(values) for name, values in protocol.reported.items()},
@@ -299,7 +318,8 @@ class Evaluate:
             },
         )
         title = f"{protocol.title}: {plural(len(found), 'scene')} of {len(protocol.scenes)}"
-        _write_text(self.output / TABLE, markdown_table(reports, title=title, reported=protocol.reported))
+        table = markdown_table(reports, title=title, reported=protocol.reported, notes=_notes(reports))
+        _write_text(self.output / TABLE, table)
         return reports
 
     def _prepared(
@@ -346,6 +366,14 @@ def _write_text(path: Path, text: str) -> None:
 
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _notes(reports: Sequence[Report]) -> list[str]:
+    """What a reader of the table has to know of the scenes' backgrounds."""
+    told = [(report.scene, report.about["background_told"]) for report in reports]
+    if len(told) == 1:
+        return [f"Background: {told[0][1]}."]
+    return [f"Background of {scene}: {text}." for scene, text in told]
 
 
 def _print_table(reports: Sequence[Report]) -> None:

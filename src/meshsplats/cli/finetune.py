@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from meshsplats.backgrounds import Background
 from meshsplats.camera import save_cameras
 from meshsplats.cli.common import (
     Count,
@@ -29,6 +30,7 @@ from meshsplats.cli.training import (
     RunFiles,
     announce,
     background_of,
+    behind,
     described,
     draw_preview,
     given,
@@ -114,8 +116,12 @@ class Finetune:
             scene = choose_splats(scene, crop=self.conversion.crop)
         worthwhile = worthwhile_views(config)
         dataset = self.target.make(scene, self.input, background_of(config), self.threads, worthwhile, self.preset)
-        if self.conversion.crop is not None and self.target.data is not None:
-            _warn_of_the_rest(dataset.train[0].picture)
+        background = None
+        if self.target.data is not None:
+            whole = self.conversion.crop is None
+            if not whole:
+                _warn_of_the_rest(dataset.train[0].picture)
+            dataset, background = behind(dataset, scene, config, self.input, self.threads, whole=whole)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
         announce(f"{len(mesh.faces):,} triangles", mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
@@ -125,7 +131,8 @@ class Finetune:
         except Interrupted as stop:
             return stopped(stop, files)
         save_mesh(tuned, files.mesh)
-        write_json(files.config, configuration("finetune", self) | {"tuning": config.to_dict()})
+        record = configuration("finetune", self) | {"tuning": config.to_dict()}
+        write_json(files.config, record | ({} if background is None else background.to_dict()))
         if self.target.data is None and dataset.test:
             save_cameras([view.camera for view in dataset.test], files.held_out)
         draw_preview(tuned, files.preview)
@@ -133,7 +140,7 @@ class Finetune:
         seconds = time.perf_counter() - began
         tell(self, files, seconds, {"triangles": triangles}, f"{triangles:,} triangles")
         if not self.json:
-            print(f"next: {self._next(files, config, len(dataset.test), dataset.look)}")
+            print(f"next: {self._next(files, config, background, dataset)}")
         return 0
 
     def configured(self) -> FinetuneConfig:
@@ -146,10 +153,12 @@ class Finetune:
         options = asdict(self.conversion) | {"crop": None}  # that is done
         return starting_mesh(cloud, cameras, preset=start, look=dataset.look, **options)
 
-    def _next(self, files: RunFiles, config: FinetuneConfig, held_out: int, look: str) -> str:
+    def _next(
+        self, files: RunFiles, config: FinetuneConfig, background: Background | None, dataset: Dataset
+    ) -> str:
         """The command that scores the result as it was trained, or one that shows it where there is none."""
         target, folder = self.target, self.output.with_suffix("")
-        if self.conversion.crop is not None or (target.data is None and not held_out):
+        if self.conversion.crop is not None or (target.data is None and not dataset.test):
             return shlex.join(["meshsplats", "render", str(self.output), "-o", f"{folder}-pictures"])
         words: list[str | Path | int] = ["meshsplats", "evaluate", self.output]
         if target.data is not None:
@@ -158,9 +167,12 @@ class Finetune:
             words += ["--test-every", target.test_every] if target.test_every != 8 else []
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
-            words += ["--look", look] if look != "area" else []
+            words += ["--look", dataset.look] if dataset.look != "area" else []
             words += ["--sh-degree", target.sh_degree] if target.sh_degree is not None else []
-        words += ["--background", "black"] if config.background == "black" else []
+        if background is not None:
+            words += ["--background", background.name]
+        elif config.background == "black":
+            words += ["--background", "black"]
         words += ["-o", f"{folder}-evaluation"]
         return shlex.join(map(str, words))
 

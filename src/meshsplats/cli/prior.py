@@ -21,6 +21,7 @@ from meshsplats.cli.training import (
     RunFiles,
     announce,
     background_of,
+    behind,
     described,
     draw_preview,
     given,
@@ -125,6 +126,10 @@ class Prior:
             views=dataset.train,
             threads=self.threads,
         )
+        record = configuration("prior", self) | {"tuning": config.to_dict()}
+        if self.target.data is not None:
+            dataset, background = behind(dataset, prior.mesh, config, self.input, self.threads, whole=False)
+            record |= background.to_dict()
         what = f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles"
         announce(what, prior.mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
@@ -134,7 +139,7 @@ class Prior:
         except Interrupted as stop:
             return stopped(stop, files)
         save_mesh(exported(trained, files.mesh), files.mesh)
-        write_json(files.config, configuration("prior", self) | {"tuning": config.to_dict()})
+        write_json(files.config, record)
         draw_preview(trained.mesh, files.preview)
         counts = {"base_faces": len(trained.base_faces), "triangles": len(trained.mesh.faces)}
         made = f"{counts['triangles']:,} triangles on {counts['base_faces']:,} faces"

@@ -20,6 +20,7 @@ from meshsplats.cli.common import (
     SplatOptions,
     ViewOptions,
     check_outputs,
+    chosen_background,
     configuration,
     load_scene,
     parse_color,
@@ -88,7 +89,9 @@ class Render:
         start = time.perf_counter()
         scene = load_scene(self.input, self.reading)
         self._check_scene(scene)
-        cameras = self.views.make(scene, self.input, count=1 if single else 60, side=800)
+        photographs = self.views.photographs()
+        count = 1 if single else 60
+        cameras = self.views.make(scene, self.input, count=count, side=800, photographs=photographs)
         if single and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one .png: give -o a folder")
         files = self._files(single, len(cameras))
@@ -101,9 +104,16 @@ class Render:
         unit = None
         if self.depth == "png" and isinstance(scene, SplatMesh):
             record["depth_unit"] = unit = _depth_unit(scene, cameras)
+        behind = (0.0, 0.0, 0.0)
+        if not self.transparent:
+            what = "splats" if isinstance(scene, GaussianCloud) else "mesh"
+            background = chosen_background(
+                self.draw.background, photographs, {what: scene}, self.input, self.draw.threads, whole=False
+            )
+            behind, record["background"] = background.color, background.to_dict()
         if not single:
             _remove_older(self.output, files.every)
-        self._draw(scene, cameras, files, unit)
+        self._draw(scene, cameras, files, unit, behind)
         if files.turntable:
             from meshsplats.pictures import load_png, save_animation
 
@@ -144,12 +154,13 @@ class Render:
 
     def _check(self, single: bool) -> None:
         self.views.check()
-        parse_color(self.draw.background)
+        if self.draw.background is not None:
+            parse_color(self.draw.background)
         if not single and self.output.suffix:
             raise UsageError(
                 f"-o must end in .png for one picture, or name a folder, got {self.output.name!r}"
             )
-        if self.transparent and self.draw.background != "white":
+        if self.transparent and self.draw.background is not None:
             raise UsageError("--transparent and --background exclude each other")
         if self.transparent and self.animation == "gif":
             raise UsageError("GIF has no translucency: use --animation webp, png or none with --transparent")
@@ -165,14 +176,18 @@ class Render:
             raise UsageError("--sh-degree is for splats: a mesh has one colour a vertex; add --as-splats")
 
     def _draw(
-        self, scene: GaussianCloud | SplatMesh, cameras: Sequence[Camera], files: _Files, unit: float | None
+        self,
+        scene: GaussianCloud | SplatMesh,
+        cameras: Sequence[Camera],
+        files: _Files,
+        unit: float | None,
+        background: tuple[float, ...],
     ) -> None:
         from meshsplats.colors import linear_to_srgb, srgb_to_linear
         from meshsplats.pictures import save_array, save_depth_png, save_png, straight_rgba
         from meshsplats.rendering import render, render_splats
         from meshsplats.rendering.samples import needed_samples
 
-        background = (0.0, 0.0, 0.0) if self.transparent else parse_color(self.draw.background)
         # A mesh made for blending in linear light is drawn so and encoded for display after.
         linear = isinstance(scene, SplatMesh) and scene.blending == "linear"
         if linear:

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import tyro
 
+from meshsplats.backgrounds import Background
 from meshsplats.camera import orbit
 from meshsplats.cli import UsageError
-from meshsplats.cli.common import check_outputs, plural, size_of
+from meshsplats.cli.common import check_outputs, chosen_background, plural, size_of
 from meshsplats.dataset import Dataset
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
@@ -110,6 +112,24 @@ def given(command: Finetune | Prior) -> dict[str, Any]:
 def background_of(config: FinetuneConfig) -> tuple[float, float, float]:
     """Behind pictures where the configuration names none of its own."""
     return (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
+
+
+def behind(
+    dataset: Dataset,
+    scene: GaussianCloud | SplatMesh,
+    config: FinetuneConfig,
+    source: Path,
+    threads: int | None,
+    *,
+    whole: bool = True,
+) -> tuple[Dataset, Background]:
+    """``dataset`` of photographs over the background that ``scene`` is trained over, which the configuration
+    or the model folder ``source`` names, or fits best; and that background. It is said."""
+    given = config.background if config.background in ("black", "white") else None
+    what = "splats" if isinstance(scene, GaussianCloud) else "mesh"
+    found = chosen_background(given, dataset, {what: scene}, source, threads, whole=whole)
+    say(f"background: {found.describe()}")
+    return dataset.over(found.color), found
 
 
 def announce(what: str, mesh: SplatMesh, dataset: Dataset, cache_bytes: int) -> None:
