@@ -142,7 +142,7 @@ def spz_attributes(values, version, bits=12):
             largest, others = smallest_three(np.array([x, y, z, w]))
             word = largest
             for c in others:
-                word = word << 10 | (c < 0) << 9 | round(abs(c) * np.sqrt(2) * 511)
+                word = word << 10 | int(c < 0) << 9 | round(abs(c) * np.sqrt(2) * 511)
             out["rotations"] += struct.pack("<I", word)
         out["sh"] += bytes(byte(128 + 128 * c) for c in rest(values, i).ravel())
     return out

@@ -124,7 +124,7 @@ def bind(
     depth_group = face
     rgba[laid.layers > 0, 3] *= SHELL_OPACITY if spacing else LAYER_OPACITY
     if looks is not None:
-        shells = face * np.int64(layers) + laid.layers[laid.triangles[:, 0]]
+        shells = face.astype(np.int64) * layers + laid.layers[laid.triangles[:, 0]]
         depth_group = np.unique(shells, return_inverse=True)[1].reshape(-1).astype(np.int32)
         if looks.facing == (spacing < 0):
             out = _standing_out(binding, looks)
