@@ -53,7 +53,7 @@ def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
     names = ("step", "seconds", "config", "mesh", "dataset", "losses")
     header = {name: getattr(checkpoint, name) for name in names}
     arrays = {name: np.array(array, order="C") for name, array in checkpoint.arrays.items()}
-    with atomic_path(path) as temporary:
+    with atomic_path(path, needs=sum(array.nbytes for array in arrays.values())) as temporary:
         metadata = {_KEY: json.dumps({"version": VERSION, **header})}
         tensors.numpy.save_file(arrays, temporary, metadata=metadata)
 
