@@ -110,7 +110,7 @@ def test_up(splats, tmp_path):
 @pytest.mark.parametrize("taken", ["mesh.glb", "mesh.preview.png", "mesh.config.json"])
 def test_nothing_is_overwritten(splats, tmp_path, capsys, taken):
     (tmp_path / taken).write_bytes(b"mine")
-    assert run(splats, "-o", tmp_path / "mesh.glb") == 1
+    assert run(splats, "-o", tmp_path / "mesh.glb") == 3
     assert taken in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith("mesh")] == [taken]
     assert (tmp_path / taken).read_bytes() == b"mine"
@@ -124,8 +124,8 @@ def test_another_format_lies_beside_the_first(splats, tmp_path):
     names = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("mesh"))
     records = ["mesh.config.json", "mesh.preview.png", "mesh.glb.config.json", "mesh.glb.preview.png"]
     assert names == sorted(["mesh.npz", "mesh.glb", *records])
-    assert run(splats, "-o", tmp_path / "mesh.glb") == 1  # the mesh itself is there
-    assert run(splats, "-o", tmp_path / "mesh.npz") == 1
+    assert run(splats, "-o", tmp_path / "mesh.glb") == 3  # the mesh itself is there
+    assert run(splats, "-o", tmp_path / "mesh.npz") == 3
     before = (tmp_path / "mesh.config.json").read_bytes()
     assert run(splats, "-o", tmp_path / "mesh.glb", "--force") == 0
     assert (tmp_path / "mesh.config.json").read_bytes() == before

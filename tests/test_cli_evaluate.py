@@ -161,7 +161,7 @@ def test_existing_results_stay(scene, tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / "results.json").write_text("kept")
-    assert run(scene / "mesh.npz", "--splats", scene / "scene.ply", "-o", out) == 1
+    assert run(scene / "mesh.npz", "--splats", scene / "scene.ply", "-o", out) == 3
     assert "--force" in capsys.readouterr().err
     assert (out / "results.json").read_text() == "kept"
 

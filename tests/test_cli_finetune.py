@@ -22,6 +22,7 @@ from meshsplats.cli.finetune import Finetune
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config, worthwhile_views
+from meshsplats.formats.locks import locked
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
 from meshsplats.rendering import render_splats
@@ -66,7 +67,7 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     assert config["tuning"] == make_config(steps=12).to_dict()
     assert config["options"]["width"] == 32
     # Nothing is overwritten, and an older run is not lost.
-    assert run(splats, "-o", out, *SMALL, "--steps", "12") == 1
+    assert run(splats, "-o", out, *SMALL, "--steps", "12") == 3
     assert "--resume goes on with it, --force begins anew" in capsys.readouterr().err
     assert run(splats, "-o", out, *SMALL, "--steps", "12", "--force") == 0
     assert np.array_equal(load_mesh(out).vertices, mesh.vertices)
@@ -187,7 +188,7 @@ def test_what_is_read_is_never_written(splats, tmp_path, capsys):
 def test_a_run_that_has_ended_is_not_resumed(splats, tmp_path, capsys):
     out = tmp_path / "tuned.npz"
     assert run(splats, "-o", out, *SMALL, "--steps", "2") == 0
-    assert run(splats, "-o", out, *SMALL, "--steps", "2", "--resume") == 1
+    assert run(splats, "-o", out, *SMALL, "--steps", "2", "--resume") == 3
     assert "the run has come to its end, or there was one before" in capsys.readouterr().err
 
 
@@ -270,7 +271,7 @@ def test_too_little_memory_is_told_before_the_work(splats, tmp_path, capsys, mon
     from meshsplats.finetuning import memory
 
     monkeypatch.setattr(memory, "available_memory", lambda: 1 << 20)
-    assert run(splats, "-o", tmp_path / "t.npz", *SMALL) == 1
+    assert run(splats, "-o", tmp_path / "t.npz", *SMALL) == 5
     assert "--max-splats" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -313,6 +314,18 @@ def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
     assert run(*[str(whole) if a == str(out) else a for a in arguments]) == 0
     for name in ("vertices", "colors", "faces"):
         assert np.array_equal(getattr(load_mesh(out), name), getattr(load_mesh(whole), name))
+
+
+def test_two_runs_of_one_name(splats, tmp_path, capsys):
+    folder = tmp_path / "tuned.run"
+    folder.mkdir()
+    with locked(folder / ".lock") as ours:
+        assert ours
+        assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "1") == 3
+        assert "tuned.run: another process is writing this run" in capsys.readouterr().err
+        assert [path.name for path in folder.iterdir()] == [".lock"]
+    assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "1") == 0
+    assert not (folder / ".lock").exists()
 
 
 def test_time_before_the_run_counts(splats, tmp_path):

@@ -75,6 +75,7 @@ class Raises:
     """A command that ends in the error given."""
 
     error: ClassVar[BaseException] = ValueError()
+    json: bool = False
 
     def run(self) -> None:
         raise type(self).error
@@ -85,9 +86,11 @@ class Raises:
     [
         (ValueError("two\n lines"), 1, "meshsplats: error: two lines"),
         (FileFormatError("a.ply: broken"), 1, "meshsplats: error: a.ply: broken"),
-        (MissingDependencyError("install x"), 1, "meshsplats: error: install x"),
+        (MissingDependencyError("install x"), 5, "meshsplats: error: install x"),
         (FileNotFoundError(2, "No such file", "a.ply"), 1, "meshsplats: error: a.ply: No such file"),
-        (MemoryError(), 1, "meshsplats: error: out of memory"),
+        (FileExistsError(17, "there already", "a.ply"), 3, "meshsplats: error: a.ply: there already"),
+        (OSError(28, "no space", "a.ply"), 4, "meshsplats: error: a.ply: no space"),
+        (MemoryError(), 5, "meshsplats: error: out of memory"),
         (KeyboardInterrupt(), 130, "meshsplats: interrupted"),
     ],
 )
@@ -99,7 +102,13 @@ def test_errors_are_one_line(monkeypatch, capsys, error, code, line):
     assert out == ""
     assert err.startswith(line)
     assert err.count("\n") == 1
-    if code == 1:
+    if code < 128:
+        kinds = {1: "input", 3: "exists", 4: "space", 5: "missing"}
+        assert main(["raises", "--json"]) == code
+        told = json.loads(capsys.readouterr().out)["error"]
+        assert (told["kind"], told["code"], told["type"]) == (kinds[code], code, type(error).__name__)
+        assert line.endswith(told["message"])
+        assert told["path"] == getattr(error, "filename", None)
         with pytest.raises(type(error)):
             main(["raises", "--debug"])
 

@@ -163,7 +163,7 @@ def test_nothing_is_overwritten(triangle, tmp_path, capsys):
     out = tmp_path / "a.png"
     out.write_bytes(b"mine")
     arguments = (triangle, "-o", out, "--cameras", tmp_path / "one.json")
-    assert run(*arguments) == 1
+    assert run(*arguments) == 3
     assert out.read_bytes() == b"mine"
     assert "--force" in capsys.readouterr().err
     assert run(*arguments, "--force") == 0

@@ -340,15 +340,14 @@ def read_json(path: Path) -> Any:
 
 def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
     """Writes the JSON list that ``load_cameras`` reads; a file of that name is replaced. No digit is lost."""
-    from meshsplats.formats.atomic import atomic_path
+    from meshsplats.formats.atomic import write_text
 
     entries = [
         {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
         | {"world_to_camera": camera.world_to_camera.tolist()}
         for camera in cameras
     ]
-    with atomic_path(path) as temporary:
-        Path(temporary).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(entries, indent=1) + "\n")
 
 
 def _camera_from_json(entry: object, where: str) -> Camera:

@@ -6,13 +6,18 @@ becomes the byte round(255 v). Pillow is imported where it is used.
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from meshsplats.formats.atomic import atomic_path
+from meshsplats.formats.atomic import write_bytes
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 ANIMATIONS = (".webp", ".gif", ".png")
 """Suffixes of the animations that can be written; .png is an animated PNG."""
@@ -52,8 +57,7 @@ def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> None:
     if np.ndim(picture) != 3 or np.shape(picture)[2] not in (3, 4):
         raise ValueError(f"a picture must have shape (h, w, 3) or (h, w, 4), got {np.shape(picture)}")
     image = Image.fromarray(to_bytes(picture))
-    with atomic_path(path) as temporary:
-        image.save(temporary, format="PNG")
+    _save(path, image, format="PNG")
 
 
 def load_png(path: str | os.PathLike[str]) -> np.ndarray:
@@ -78,14 +82,14 @@ def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float)
     steps = np.clip(np.rint(np.asarray(depth, np.float64) / unit), 0, 65535).astype(np.uint16)
     # Something that is there must not become 0.
     steps[(depth > 0) & (steps == 0)] = 1
-    with atomic_path(path) as temporary:
-        Image.fromarray(steps).save(temporary, format="PNG")
+    _save(path, Image.fromarray(steps), format="PNG")
 
 
 def save_array(path: str | os.PathLike[str], array: np.ndarray) -> None:
     """Writes ``array`` as .npy; replaces an older file."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, array, allow_pickle=False)
+    encoded = io.BytesIO()  # as below: written to a file, NumPy tells how many numbers did not fit
+    np.save(encoded, array, allow_pickle=False)
+    write_bytes(path, encoded.getbuffer())
 
 
 def save_animation(
@@ -112,16 +116,23 @@ def save_animation(
     options: dict = {".webp": {"quality": 85, "method": 4}, ".gif": {"disposal": 1}, ".png": {}}[suffix]
     if suffix == ".gif":
         images = [_paletted(image) for image in images]
-    with atomic_path(path) as temporary:
-        images[0].save(
-            temporary,
-            format={".webp": "WEBP", ".gif": "GIF", ".png": "PNG"}[suffix],
-            save_all=True,
-            append_images=images[1:],
-            duration=round(1000 / fps),
-            loop=0,
-            **options,
-        )
+    _save(
+        path,
+        images[0],
+        format={".webp": "WEBP", ".gif": "GIF", ".png": "PNG"}[suffix],
+        save_all=True,
+        append_images=images[1:],
+        duration=round(1000 / fps),
+        loop=0,
+        **options,
+    )
+
+
+def _save(path: str | os.PathLike[str], image: Image.Image, **options: Any) -> None:
+    """Encoded in memory first: Pillow's encoders lose the reason why a disk takes no more."""
+    encoded = io.BytesIO()
+    image.save(encoded, **options)
+    write_bytes(path, encoded.getbuffer())
 
 
 def strip(pictures: Sequence[np.ndarray], captions: Sequence[str] = ()) -> np.ndarray:

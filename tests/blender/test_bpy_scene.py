@@ -131,7 +131,7 @@ def test_command_line_draws_meshes_and_splats(tmp_path, suffix, capsys):
         "view_0000.png",
         "view_0001.png",
     ]
-    assert main(arguments) == 1
+    assert main(arguments) == 3
     assert "exists already" in capsys.readouterr().err
 
 

@@ -6,11 +6,17 @@ A module is imported only when its command runs, so that ``meshsplats --version`
 
 from __future__ import annotations
 
+import errno
 import importlib
+import json
 import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 COMMANDS = {
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
@@ -30,57 +36,135 @@ COMMANDS = {
 _TAKES_SIGN = ("--up", "--azimuth", "--elevation")
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Error numbers of a full disk, as in ``formats.atomic``."""
+OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
+"""Exit codes. FAILED: the input, or a place that was named, is wrong. LACKING: a library, a program or memory
+is not there. Ended by signal n: 128 + n."""
+KINDS = {FAILED: "input", USAGE: "usage", EXISTS: "exists", NO_SPACE: "space", LACKING: "missing"}
+"""What the errors in JSON call them."""
+
+
 class UsageError(Exception):
     """Options that contradict each other: exit code 2."""
+
+
+class Terminated(BaseException):
+    """A signal asks the process to end; ``number`` is the signal's."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line ``argv`` (without the program's name; None: that of the process).
 
-    Returns the exit code: 0, 1 for an error in the input or the files, 2 for wrong usage, 130 for Ctrl-C.
+    Returns the exit code: 0, 1 for an error in the input, 2 for wrong usage, 3 for an output that exists
+    already, 4 for a full disk, 5 for a library, program or memory that is missing, 130 for Ctrl-C, 143 for
+    SIGTERM. With ``--json``, an error is printed as JSON too: ``{"error": {"kind", "code", "message", "path",
+    "type"}}``.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(_overview())
-        return 0
-    if arguments[0] in ("-V", "--version"):
-        import meshsplats
-
-        print(f"meshsplats {meshsplats.__version__}")
-        return 0
-    name = arguments[0]
-    if name not in COMMANDS:
-        return _unknown(name)
-    debug = "--debug" in arguments
+    name = arguments[0] if arguments else ""
+    debug, as_json = "--debug" in arguments, "--json" in arguments
     try:
-        with warnings.catch_warnings():
-            return _run(name, [a for a in arguments[1:] if a != "--debug"])
+        with warnings.catch_warnings(), _signals_raise():
+            code = _answer(name) if name not in COMMANDS else _run(name, _plain(arguments[1:]))
+            sys.stdout.flush()
+            return code
     except SystemExit as stop:  # tyro has shown help, or what is wrong with the arguments
-        return stop.code if isinstance(stop.code, int) else 2
-    except KeyboardInterrupt:
-        _say("interrupted; no file was left half-written")
-        return 130
+        code = stop.code if isinstance(stop.code, int) else USAGE
+        if code == USAGE and as_json:
+            _tell_json(USAGE, UsageError("the options were not understood; standard error says why"))
+        return code
+    except (KeyboardInterrupt, Terminated) as stop:
+        number = getattr(stop, "number", signal.SIGINT)
+        _say(f"{_ENDINGS.get(number, 'ended')}; no file was left half-written")
+        return 128 + number
     except BrokenPipeError:
-        # The reader of our output has gone, `| head` say. Python must not find that out again when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except UsageError as error:
+        _close_output()  # its reader has gone, `| head` say
+        return FAILED
+    except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
         if debug:
             raise
-        _say(f"error: {error} (see meshsplats {name} --help)")
-        return 2
-    except (ValueError, OSError, ImportError, MemoryError) as error:
-        if debug:
-            raise
-        _say(f"error: {_one_line(error)}")
-        return 1
+        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:
+            # All files have names in their errors.
+            error = OSError(error.errno, error.strerror, "standard output")
+            _close_output()
+        hint = f" (see meshsplats {name} --help)" if isinstance(error, UsageError) else ""
+        _say(f"error: {one_line(error)}{hint}")
+        code = exit_code(error)
+        if as_json:
+            _tell_json(code, error)
+        return code
+
+
+def exit_code(error: BaseException) -> int:
+    """The exit code that tells of ``error``."""
+    if isinstance(error, UsageError):
+        return USAGE
+    if isinstance(error, FileExistsError):
+        return EXISTS
+    if isinstance(error, OSError) and error.errno in FULL:
+        return NO_SPACE
+    return LACKING if isinstance(error, (ImportError, MemoryError)) else FAILED
+
+
+def error_record(error: BaseException) -> dict[str, Any]:
+    """``error`` for JSON."""
+    path = os.fsdecode(error.filename) if isinstance(error, OSError) and error.filename else None
+    code = exit_code(error)
+    named = {"kind": KINDS[code], "code": code, "message": one_line(error), "path": path}
+    return named | {"type": type(error).__name__}
+
+
+def _tell_json(code: int, error: BaseException) -> None:
+    try:
+        print(json.dumps({"error": error_record(error)}), flush=True)
+    except OSError:  # the message stands on standard error
+        _close_output()
+
+
+def _close_output() -> None:
+    """Python must not find out again, when it ends, that nothing more can be printed."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+_ENDINGS = {signal.SIGINT: "interrupted"} | {
+    getattr(signal, name): f"ended by {name}" for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
+}
+
+
+@contextmanager
+def _signals_raise() -> Iterator[None]:
+    """While the block runs, SIGTERM and SIGHUP raise ``Terminated``, so that what is under way is tidied up
+    as after Ctrl-C; once, as another one must not break off the tidying. Signals that are ignored (nohup)
+    stay so."""
+
+    def end(number: int, frame: object) -> None:
+        for other in ours:
+            signal.signal(other, signal.SIG_IGN)
+        raise Terminated(number)
+
+    ours = []
+    if threading.current_thread() is threading.main_thread():
+        ours = [n for n in _ENDINGS if n != signal.SIGINT and signal.getsignal(n) == signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _run(name: str, arguments: list[str]) -> int:
     from meshsplats.errors import DataWarning
+    from meshsplats.formats.atomic import promises_kept
 
     warnings.simplefilter("always", DataWarning)
-    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {_one_line(message)}")
+    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {one_line(message)}")
 
     import tyro
 
@@ -92,7 +176,25 @@ def _run(name: str, arguments: list[str]) -> int:
         prog=f"meshsplats {name}",
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    return options.run() or 0
+    with promises_kept():
+        return options.run() or OK
+
+
+def _answer(name: str) -> int:
+    """What is said where no command was named."""
+    if name in ("", "-h", "--help", "help"):
+        print(_overview())
+        return OK
+    if name in ("-V", "--version"):
+        import meshsplats
+
+        print(f"meshsplats {meshsplats.__version__}")
+        return OK
+    return _unknown(name)
+
+
+def _plain(arguments: list[str]) -> list[str]:
+    return [argument for argument in arguments if argument != "--debug"]
 
 
 def _joined(arguments: list[str]) -> list[str]:
@@ -121,6 +223,8 @@ def _overview() -> str:
         "  meshsplats COMMAND --help   options of a command\n"
         "  meshsplats --version\n"
         "  --debug                     with any command: the full traceback of an error\n\n"
+        "exit codes: 0 done, 1 wrong input, 2 wrong usage, 3 the output exists, 4 no space, 5 something is\n"
+        "missing here (a library, a program, memory)\n\n"
         "start with:\n"
         "  meshsplats convert scene.ply -o scene.glb"
     )
@@ -132,10 +236,10 @@ def _unknown(name: str) -> int:
     close = difflib.get_close_matches(name, COMMANDS, 1)
     hint = f"did you mean {close[0]!r}?" if close else f"commands: {', '.join(COMMANDS)}"
     _say(f"error: there is no command {name!r}; {hint}")
-    return 2
+    return USAGE
 
 
-def _one_line(error: object) -> str:
+def one_line(error: object) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         text = f"{os.fsdecode(error.filename)}: {error.strerror}"
     else:

@@ -337,11 +337,9 @@ def record_beside(output: Path, kind: str) -> Path:
 
 def write_json(path: Path, content: Any) -> None:
     """Writes ``content`` whole or not at all; infinities and NaN, which JSON lacks, are a ValueError."""
-    from meshsplats.formats.atomic import atomic_path
+    from meshsplats.formats.atomic import write_text
 
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def configuration(command: str, options: Any) -> dict:
@@ -387,12 +385,9 @@ def plural(count: int, thing: str) -> str:
 
 def size_of(path: Path) -> str:
     """Size of a file for people: 3.2 MB."""
-    size = float(path.stat().st_size)
-    for unit in ("B", "kB", "MB"):
-        if size < 1000:
-            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
-        size /= 1000
-    return f"{size:.2f} GB"
+    from meshsplats.formats.atomic import in_words
+
+    return in_words(path.stat().st_size)
 
 
 def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:

@@ -362,10 +362,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _write_text(path: Path, text: str) -> None:
-    from meshsplats.formats.atomic import atomic_path
+    from meshsplats.formats.atomic import write_text
 
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def _notes(reports: Sequence[Report]) -> list[str]:

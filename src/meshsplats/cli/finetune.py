@@ -126,7 +126,7 @@ class Finetune:
         announce(f"{len(mesh.faces):,} triangles", mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
         try:
-            with shown() as show:
+            with files.claimed([self.input], resume=self.resume, force=self.force), shown() as show:
                 tuned = finetune(mesh, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
             return stopped(stop, files)

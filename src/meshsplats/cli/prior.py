@@ -111,9 +111,8 @@ class Prior:
         config = self.configured()
         self._check()
         files = RunFiles(self.output)
-        files.check(
-            [path for path in (self.input, self.splats) if path], resume=self.resume, force=self.force
-        )
+        inputs = [path for path in (self.input, self.splats) if path]
+        files.check(inputs, resume=self.resume, force=self.force)
         wants_texture = self.laying.colors in ("auto", "texture")
         base = load_base(self.input, texture=self.laying.texture, textures=wants_texture)
         dataset = self._dataset(base, config)
@@ -134,7 +133,7 @@ class Prior:
         announce(what, prior.mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
         try:
-            with shown() as show:
+            with files.claimed(inputs, resume=self.resume, force=self.force), shown() as show:
                 trained = train(prior, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
             return stopped(stop, files)

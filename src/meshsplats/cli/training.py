@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
@@ -20,6 +21,7 @@ from meshsplats.cli import UsageError
 from meshsplats.cli.common import check_outputs, chosen_background, plural, size_of
 from meshsplats.dataset import Dataset
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.formats.locks import locked
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -95,6 +97,25 @@ class RunFiles:
                 " --resume --force goes on and overwrites it"
             )
         check_outputs([self.mesh, self.config, self.preview], force, inputs=inputs)
+
+    @contextmanager
+    def claimed(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> Iterator[None]:
+        """While the block runs, no other process writes this run. FileExistsError if one does, and the errors
+        of ``check``, as one may have ended meanwhile."""
+        self.run.mkdir(exist_ok=True)
+        try:
+            with locked(self.run / ".lock") as ours:
+                if not ours:
+                    raise FileExistsError(
+                        errno.EEXIST,
+                        "another process is writing this run; give another name for the output",
+                        str(self.run),
+                    )
+                self.check(inputs, resume=resume, force=force)
+                yield
+        finally:
+            with suppress(OSError):
+                self.run.rmdir()  # where nothing was written
 
 
 def given(command: Finetune | Prior) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.finetuning.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from meshsplats.formats.atomic import atomic_path
+from meshsplats.formats.atomic import write_text
 from meshsplats.pictures import amplified_error, save_png, strip
 
 CHECKPOINT, METRICS, CONFIGURATION, PREVIEWS = (
@@ -40,17 +40,14 @@ class Journal:
         self.checkpoint_path.unlink(missing_ok=True)
         for preview in self._previews():
             preview.unlink()
-        with atomic_path(self.folder / CONFIGURATION) as temporary:
-            temporary.write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
-        with atomic_path(self.folder / METRICS) as temporary:
-            temporary.write_bytes(b"")
+        write_text(self.folder / CONFIGURATION, json.dumps(config, indent=1) + "\n")
+        write_text(self.folder / METRICS, "")
 
     def resume(self) -> Checkpoint:
         """The checkpoint; metrics and previews of later steps, which will be made again, are dropped."""
         checkpoint = load_checkpoint(self.checkpoint_path)
         kept = [line for line in self.metrics() if line["step"] <= checkpoint.step]
-        with atomic_path(self.folder / METRICS) as temporary:
-            temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+        write_text(self.folder / METRICS, "".join(json.dumps(line) + "\n" for line in kept))
         for preview in self._previews():
             if int(preview.stem.removeprefix("step_")) > checkpoint.step:
                 preview.unlink()
@@ -61,8 +58,12 @@ class Journal:
 
     def note(self, step: int, **values: Any) -> None:
         """Adds a line to the metrics."""
-        with open(self.folder / METRICS, "a", encoding="utf-8") as file:
-            file.write(json.dumps({"step": step, **values}, allow_nan=False) + "\n")
+        line = json.dumps({"step": step, **values}, allow_nan=False) + "\n"
+        try:
+            with open(self.folder / METRICS, "a", encoding="utf-8") as file:
+                file.write(line)
+        except OSError as error:  # of a full disk, say, which names no file
+            raise OSError(error.errno, error.strerror, str(self.folder / METRICS)) from None
 
     def metrics(self) -> list[dict[str, Any]]:
         """All lines; what a kill left half-written is left out."""

@@ -4,29 +4,59 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
+import shutil
+import socket
 import stat
+import sys
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Error numbers of a disk, a quota or a limit on files that is used up."""
+
+_LEFTOVER = re.compile(r"\..*\.([0-9a-f]+)-([0-9a-f]{8})\.[0-9a-f]{16}(\..*)?")
+"""Names of temporary files: process and machine stand before the random part."""
+_swept: set[Path] = set()
+"""Folders in which this process has looked for leftovers."""
+_promised: set[Path] | None = None
+"""Outputs that are new by a command's word, while it runs; see ``promises_kept``."""
+
 
 @contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(
+    path: str | os.PathLike[str],
+    *,
+    needs: int | None = None,
+    temporary: Path | None = None,
+    new: bool = False,
+) -> Iterator[Path]:
     """A temporary path in the folder of ``path``; what is written there becomes ``path`` if all goes well.
 
     The temporary file exists (empty) from the start, is hidden, keeps the suffix of ``path`` and is
     removed if the block raises, Ctrl-C included; an older file at ``path`` then stays as it was. A new
     file gets the usual permissions (the umask decides), one that replaces another gets the permissions of
     the other. Where ``path`` is a symbolic link, the file it points to is replaced and the link stays.
+    Temporary files that killed processes of this machine have left in the folder are removed.
+
+    Args:
+        path: the file to be.
+        needs: about how many bytes it will have, for the message of a full disk.
+        temporary: the temporary path, as ``temporary_beside`` names it, where someone else has to know it.
+        new: ``path`` must not exist. Of several processes that write it at a time, exactly one succeeds.
 
     Raises FileNotFoundError or NotADirectoryError for a missing folder, IsADirectoryError where ``path``
     is a folder, PermissionError where the folder or an existing file may not be written, OSError for a
-    device or pipe: all before the block is entered.
+    device or pipe: all before the block is entered. FileExistsError, with ``new``, before the block or after
+    it. OSError with errno ENOSPC, EDQUOT or EFBIG, which says how much room is missing, for a full disk.
     """
     shown, target = os.fspath(path), Path(os.path.realpath(path))
     if not target.name:
         raise IsADirectoryError(errno.EISDIR, "cannot write a file here, this is a folder", shown)
+    promised = _promised is not None and target in _promised
     try:
         mode = target.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -37,6 +67,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         if not stat.S_ISREG(mode):
             # Renaming over a device such as /dev/null would take it away from everyone.
             raise OSError(errno.EINVAL, "cannot write here, this is not a regular file", shown)
+        if new or promised:
+            raise _written_meanwhile(shown)
         if not os.access(target, os.W_OK):
             raise PermissionError(errno.EACCES, "the existing file is write-protected", shown)
     folder = target.parent
@@ -48,7 +80,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FileNotFoundError(
             errno.ENOENT, f"cannot write a file here, create the folder {folder} first", shown
         )
-    temporary = folder / f".{target.stem[:32]}.{secrets.token_hex(8)}{target.suffix[:16]}"
+    _sweep(folder)
+    temporary = temporary or temporary_beside(target)
     try:
         # Created by os.open and not by tempfile, whose files only their owner may read.
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -60,23 +93,166 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         if mode is not None:
             os.chmod(temporary, stat.S_IMODE(mode))
-        os.replace(temporary, target)
-    except BaseException:
+        if new or promised:
+            _place_new(temporary, target, shown)
+            if _promised is not None:
+                _promised.discard(target)  # from now on it is ours
+        else:
+            os.replace(temporary, target)
+    except BaseException as error:
+        written = 0
+        with suppress(OSError):
+            written = temporary.stat().st_size
         with suppress(OSError):
             temporary.unlink()
-        raise
+        number = _full(error)
+        if number is None:
+            raise
+        raise OSError(number, _no_room(number, folder, needs, written), shown) from None
+
+
+def temporary_beside(path: str | os.PathLike[str]) -> Path:
+    """A new name for the temporary file of ``path``: hidden, with its suffix, and with this process in it."""
+    target = Path(os.path.realpath(path))
+    owner = f"{os.getpid():x}-{_machine():08x}"
+    return target.parent / f".{target.stem[:32]}.{owner}.{secrets.token_hex(8)}{target.suffix[:16]}"
+
+
+def write_bytes(path: str | os.PathLike[str], content: bytes | memoryview) -> None:
+    """Writes ``content`` to ``path`` whole or not at all."""
+    with atomic_path(path, needs=len(content)) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Writes ``text`` to ``path`` as UTF-8, whole or not at all."""
+    write_bytes(path, text.encode("utf-8"))
 
 
 def refuse_existing(paths: Iterable[str | os.PathLike[str]], force: bool) -> None:
     """Raises FileExistsError if one of the outputs ``paths`` exists already, unless ``force``.
 
-    A command calls this before its work, so that an hour of it is not lost to a name that is taken.
+    A command calls this before its work, so that an hour of it is not lost to a name that is taken; within
+    ``promises_kept`` the paths must still be free when they are written.
     """
+    paths = [os.fspath(path) for path in paths]
+    real = {Path(os.path.realpath(path)) for path in paths}
     if force:
+        if _promised is not None:
+            _promised.difference_update(real)
         return
-    taken = [os.fspath(path) for path in paths if os.path.lexists(path)]
+    taken = [path for path in paths if os.path.lexists(path)]
     if taken:
         more = f" (and {len(taken) - 1} more)" if len(taken) > 1 else ""
         raise FileExistsError(
             errno.EEXIST, f"the output exists already{more}; give --force to overwrite it", taken[0]
         )
+    if _promised is not None:
+        _promised.update(real)
+
+
+def is_promised(path: str | os.PathLike[str]) -> bool:
+    """Whether ``path`` must be new when it is written, by ``refuse_existing``."""
+    return _promised is not None and Path(os.path.realpath(path)) in _promised
+
+
+@contextmanager
+def promises_kept() -> Iterator[None]:
+    """While the block runs, what ``refuse_existing`` has found free is written only if it is free then:
+    another process that has written it meanwhile wins, and ours gets a FileExistsError."""
+    global _promised
+    before, _promised = _promised, set()
+    try:
+        yield
+    finally:
+        _promised = before
+
+
+def _place_new(temporary: Path, target: Path, shown: str) -> None:
+    """Moves ``temporary`` to ``target``. FileExistsError if there is something by then."""
+    try:
+        if sys.platform == "win32":
+            os.rename(temporary, target)  # which replaces nothing there
+            return
+        try:
+            os.link(temporary, target)
+        except FileExistsError:
+            raise
+        except OSError:
+            # A file system without hard links: an empty file takes the name first.
+            os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+            os.replace(temporary, target)
+            return
+    except FileExistsError:
+        raise _written_meanwhile(shown) from None
+    temporary.unlink()
+
+
+def _written_meanwhile(shown: str) -> FileExistsError:
+    return FileExistsError(
+        errno.EEXIST,
+        "another process has written this output meanwhile; give another name, or --force to overwrite it",
+        shown,
+    )
+
+
+def _full(error: BaseException) -> int | None:
+    """The error number if ``error`` tells of a full disk, also in the words of another library."""
+    if isinstance(error, OSError) and error.errno is not None:
+        return error.errno if error.errno in FULL else None
+    if not isinstance(error, Exception):
+        return None
+    text = str(error).lower()
+    return next((number for number in FULL if os.strerror(number).lower() in text), None)
+
+
+def _no_room(number: int, folder: Path, needs: int | None, written: int) -> str:
+    wanted = f"about {in_words(needs)}" if needs is not None else f"more than {in_words(written)}"
+    if number == errno.EFBIG:
+        return f"larger than a file may be here (ulimit -f, or the file system): it needs {wanted}"
+    if number == errno.EDQUOT:
+        return f"the disk quota is used up: the file needs {wanted}"
+    with suppress(OSError):
+        free = in_words(shutil.disk_usage(folder).free)
+        return f"no space left on the disk: the file needs {wanted}, {free} are free"
+    return f"no space left on the disk: the file needs {wanted}"
+
+
+def in_words(count: float) -> str:
+    """A number of bytes for people: 3.2 MB."""
+    for unit in ("bytes", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "bytes" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.2f} GB"
+
+
+def _machine() -> int:
+    """A number for the machine, or the container on it, whose process numbers are ours."""
+    name = socket.gethostname()
+    with suppress(OSError):
+        name += os.readlink("/proc/self/ns/pid")
+    return zlib.crc32(name.encode("utf-8", "surrogateescape"))
+
+
+def _sweep(folder: Path) -> None:
+    """Removes the temporary files that killed processes have left in ``folder``; once for each folder."""
+    if folder in _swept or sys.platform == "win32":  # os.kill(.., 0) ends processes there
+        return
+    _swept.add(folder)
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            match = _LEFTOVER.fullmatch(entry.name) if entry.name.startswith(".") else None
+            if match and int(match[2], 16) == _machine() and not _alive(int(match[1], 16)):
+                with suppress(OSError):
+                    os.unlink(entry.path)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True

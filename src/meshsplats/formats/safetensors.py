@@ -62,7 +62,7 @@ def save_safetensors(
         header[name] = {"dtype": _NAMES[packed[name].dtype], "shape": shape, "data_offsets": [begin, end]}
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+    with atomic_path(path, needs=8 + len(text) + end) as temporary, open(temporary, "wb") as file:
         file.write(len(text).to_bytes(8, "little") + text)
         for name in order:
             file.write(packed[name].reshape(-1).view(np.uint8).data)

@@ -192,7 +192,8 @@ def write_float_ply(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     lines.append(f"element vertex {len(cloud)}")
     lines += [f"property float {name}" for name in names] + ["end_header", ""]
     per_chunk = max(1, CHUNK_BYTES // (4 * len(names)))
-    with atomic_path(path) as temporary, Path(temporary).open("wb") as file:
+    size = 4 * len(names) * len(cloud)
+    with atomic_path(path, needs=size) as temporary, Path(temporary).open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
         for start in range(0, len(cloud), per_chunk):
             part = slice(start, start + per_chunk)

@@ -1,0 +1,65 @@
+"""Locks that end with the process that holds them, however it ends."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+
+def try_lock(path: Path) -> int | None:
+    """An open file descriptor that holds the lock of the file ``path``, which is made; None if another
+    process holds it. The lock ends when the descriptor, and every copy that a child has of it, is closed."""
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            if not _lock(descriptor):
+                os.close(descriptor)
+                return None
+            # Whoever held it may have removed the file between our two calls.
+            if sys.platform == "win32" or os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+        except FileNotFoundError:
+            pass
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[bool]:
+    """Whether this process holds the lock of the file ``path`` while the block runs; the file goes after."""
+    descriptor = try_lock(path)
+    try:
+        yield descriptor is not None
+    finally:
+        if descriptor is not None:
+            if sys.platform == "win32":  # open files are not removed there
+                os.close(descriptor)
+            with suppress(OSError):
+                path.unlink()
+            if sys.platform != "win32":
+                os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    if sys.platform == "win32":
+        import msvcrt
+
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system that knows no locks: nobody can hold one
+        return True
+    return True
