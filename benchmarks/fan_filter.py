@@ -4,8 +4,8 @@
 
 Truth: `render_splats`, degree 0, over white, one sample a pixel, at 200, 400, 800 and 1600 pixels from four
 sides (elevation 20 degrees), and at 800 pixels from half as far (twice the focal length). Meshes are drawn
-with one sample a pixel, too: converted by default, without a footprint, with `footprint="filter"` in the modes
-crossed (the default) and flat, and the crossed one baked for the views of 800 pixels.
+with one sample a pixel, too: converted by default, without a footprint, with `footprint="filter"` in the
+modes crossed (the default) and flat, and the crossed one baked for the views of 800 pixels.
 
 Costs are processor milliseconds of one thread, medians, of a picture and of one with its way back, without a
 filter and with one of 1e-9 px^2: it does all its work, but triangles cover what they covered before.
