@@ -6,13 +6,14 @@ import json
 import struct
 import tracemalloc
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from _meshes import random_mesh
 from test_mesh_foreign import TRIANGLE, edit_glb, gltf
 
-from meshsplats import FileFormatError, load_mesh, save_mesh
+from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
 from meshsplats.formats import mesh_checks
 
 MESH = random_mesh(np.random.default_rng(0), 5, 6)
@@ -106,6 +107,10 @@ def test_npz_that_do_not_hold_a_mesh(tmp_path):
         ({"face_splat": np.array([-1])}, "face_splat must be ascending numbers >= 0"),
         ({"up": np.zeros(3)}, "up must not be the zero vector"),
         ({"blending": np.array("additive")}, "blending must be one of display, linear"),
+        ({"filter_px2": np.array(0.3)}, "does not know its splats"),
+        ({"filter_px2": np.array(-1.0), "face_splat": np.array([0])}, "filter_px2 must be a variance"),
+        ({"filter_px2": np.array([0.3])}, r"'filter_px2' has shape \(1,\), expected \(\)"),
+        ({"filter_px2": np.array("0.3")}, "'filter_px2' must hold numbers"),
         ({"blending": np.array("x" * 100)}, "'blending' must hold text"),
         ({"attribute_a": np.ones(2)}, r"'attribute_a' has shape \(2,\), expected \(3,\) or \(3, c\)"),
     ):
@@ -416,6 +421,38 @@ def test_odd_extras_are_ignored(tmp_path, note):
     mesh = load_mesh(tmp_path / "m.glb")
     assert mesh.face_splat is None
     assert not mesh.attributes
+
+
+@pytest.mark.parametrize(
+    ("value", "match"),
+    [
+        (-1, "filter_px2 must be a variance"),
+        ("0.3", "filter_px2 must be 1 numbers"),
+        (None, "filter_px2 must be 1 numbers"),
+        (1e200, "filter_px2 must be a variance"),
+    ],
+)
+def test_filters_that_cannot_be(tmp_path, value, match):
+    save_mesh(MESH, tmp_path / "m.glb")
+    edit_glb(tmp_path / "m.glb", lambda d: d["meshes"][0]["extras"]["meshsplats"].update(filter_px2=value))
+    refused(tmp_path / "m.glb", match)
+    save_mesh(MESH, tmp_path / "m.ply")
+    line = f"comment meshsplats filter_px2 {value}\nelement vertex".encode()
+    (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes().replace(b"element vertex", line, 1))
+    if value != "0.3":
+        refused(tmp_path / "m.ply", "filter_px2 must be a")
+
+
+def test_a_filter_without_splats_is_left_out(tmp_path):
+    """Another program has dropped what tells one splat's triangles from another's."""
+    save_mesh(replace(MESH, face_splat=None), tmp_path / "m.glb")
+    edit_glb(tmp_path / "m.glb", lambda d: d["meshes"][0]["extras"]["meshsplats"].update(filter_px2=0.3))
+    save_mesh(replace(MESH, face_splat=None), tmp_path / "m.ply")
+    line = b"comment meshsplats filter_px2 0.3\nelement vertex"
+    (tmp_path / "m.ply").write_bytes((tmp_path / "m.ply").read_bytes().replace(b"element vertex", line, 1))
+    for name in ("m.glb", "m.ply"):
+        with pytest.warns(DataWarning, match="left out: the filter of its splats"):
+            assert load_mesh(tmp_path / name).filter_px2 == 0
 
 
 def test_base64_that_is_long_is_fine(tmp_path):

@@ -9,7 +9,7 @@ from _meshes import assert_same, random_mesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats import SplatMesh, load_mesh, save_mesh
+from meshsplats import DataWarning, SplatMesh, load_mesh, save_mesh
 from meshsplats.formats import glb, meshes
 
 SUFFIXES = (".npz", ".ply", ".glb")
@@ -23,6 +23,24 @@ def test_round_trip(tmp_path_factory, suffix, seed, extras, blending):
     path = tmp_path_factory.mktemp("mesh") / f"mesh{suffix}"
     save_mesh(mesh, path)
     assert_same(load_mesh(path), mesh, 1 / 10_000 if suffix == ".glb" else 0)
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".usdc", ".usda", ".obj"])
+def test_the_filter_of_the_splats_stays(tmp_path, suffix):
+    """Programs that draw without it get a warning, and .obj files cannot hold it."""
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr", reason="usd-core is not installed")
+    mesh = random_mesh(np.random.default_rng(7))
+    mesh = replace(mesh, filter_px2=0.1, colors=np.column_stack([mesh.colors[:, :3], np.ones(9)]))
+    path = tmp_path / f"m{suffix}"
+    if suffix in (".npz", ".ply"):
+        save_mesh(mesh, path)
+    else:
+        with pytest.warns(DataWarning, match=r"a filter of 0\.1 px\^2, which other programs do not have"):
+            save_mesh(mesh, path)
+    assert load_mesh(path).filter_px2 == (0 if suffix == ".obj" else 0.1)
+    save_mesh(replace(mesh, filter_px2=0), path)
+    assert load_mesh(path).filter_px2 == 0
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".ply"])

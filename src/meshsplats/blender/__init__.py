@@ -44,8 +44,9 @@ def draw(
 
     Unlit (``options.light`` None), Cycles draws what ``meshsplats.render`` draws, and the values of an .exr
     are those of ``Rendering.color``, in the space of the mesh's colours; a .png shows display values, for
-    which those of a mesh with linear ``blending`` are encoded (sRGB). Lit, colours are turned to linear
-    light; an .exr holds that, a .png is shown through Blender's view transform Standard (sRGB).
+    which those of a mesh with linear ``blending`` are encoded (sRGB). A mesh that wants a filter gets it for
+    all cameras at once (``bake_filter``). Lit, colours are turned to linear light; an .exr holds that, a .png
+    is shown through Blender's view transform Standard (sRGB).
 
     Args:
         mesh: what to draw.
@@ -86,6 +87,10 @@ def draw(
         raise ValueError("the mesh has no triangles: there is nothing to draw")
     launch.command(None if executable is None else Path(executable))  # told before the work
     _check_folders([*targets, *([] if blend is None else [Path(blend)])])
+    if mesh.filter_px2:
+        from meshsplats.conversion import bake_filter
+
+        mesh = bake_filter(mesh, cameras)
     layers, limit = subject.count(mesh, cameras, options)
     if layers > MAX_LAYERS:
         _warn(mesh, cameras, layers, options)

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.conversion.baking import bake_filter
 from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, Views, pixel_sizes, widen
@@ -20,7 +21,15 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import Look
 
-__all__ = ["PRESETS", "ConversionOptions", "Profile", "convert", "fidelity", "fit_profile"]
+__all__ = [
+    "PRESETS",
+    "ConversionOptions",
+    "Profile",
+    "bake_filter",
+    "convert",
+    "fidelity",
+    "fit_profile",
+]
 
 CROSSED_REACH = 1.06
 """Rim of crossed ellipses as a multiple of the radius that fits a Gaussian best: seen from between their

@@ -9,13 +9,14 @@ begin with ``meshsplats`` hold the rest.
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any, BinaryIO
 from urllib.parse import quote, unquote
 
 import numpy as np
 
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.mesh_checks import Budget, check_attribute_names, checked_mesh, straight_colors
 from meshsplats.formats.ply_faces import read_faces
 from meshsplats.formats.ply_header import MAX_PROPERTIES, Element, PlyHeader, read_header
@@ -143,6 +144,13 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
             # Bytes in a wider type: no program has the largest signed number for white.
             arrays["colors"][:, i] /= np.float32(255)
     faces, numbers = read_faces(file, header, face, ("face_splat", "depth_group"), budget, path)
+    if settings.get("filter_px2") and "face_splat" not in numbers:
+        del settings["filter_px2"]
+        warnings.warn(
+            f"{path}: another program has altered the file, left out: the filter of its splats",
+            DataWarning,
+            stacklevel=3,
+        )
     return checked_mesh(
         path,
         vertices=arrays["vertices"],

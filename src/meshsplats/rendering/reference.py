@@ -30,7 +30,10 @@ FILTER_SIDEWAYS = 0.1
 """Share at which a fan's extent in depth counts for the areas of its triangles."""
 FILTER_FAINTEST = 1e-6
 """Added to opacities for the filter, so that a fan without any has a shape, too."""
-CUBATURE = (((1 / 3, 1 / 3, 1 / 3), -27 / 48), *((np.roll((0.6, 0.2, 0.2), k), 25 / 48) for k in range(3)))
+CUBATURE: list[tuple[np.ndarray, float]] = [
+    (np.full(3, 1 / 3), -27 / 48),
+    *((np.roll((0.6, 0.2, 0.2), k), 25 / 48) for k in range(3)),
+]
 """Barycentric positions and weights whose sum is the mean over a triangle of a polynomial of degree 3."""
 
 

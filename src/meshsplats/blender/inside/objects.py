@@ -11,6 +11,7 @@ from meshsplats.blender.inside import foreign, frame, materials, meshes, picture
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.subject import lit_arrays
+from meshsplats.conversion.baking import bake_filter
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.prior.model import MeshPrior
 
@@ -26,10 +27,13 @@ LAYERS = "meshsplats_layers"
 
 def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
     """All that takes time and does not touch Blender: may run in another thread. Coplanar layers of a mesh
-    prior are set apart, as exports are."""
+    prior are set apart, as exports are; a filter is made part of the triangles, for pictures of the whole
+    subject."""
     if mesh.binding is not None and mesh.normals is not None:
         prior = MeshPrior(mesh)
         mesh = prior.pose(lift=prior.export_lift)
+    if mesh.filter_px2:
+        mesh = bake_filter(mesh)
     arrays: dict[str, Any] = {"faces": mesh.faces, "colors": mesh.colors, "normals": None, "self_shadow": 0.0}
     if lit:
         made, arrays["self_shadow"] = lit_arrays(mesh)

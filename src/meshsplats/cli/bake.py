@@ -1,0 +1,75 @@
+"""``meshsplats bake``: a mesh that is to be drawn with a filter, for programs without one."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from meshsplats.cli.common import (
+    Number,
+    Output,
+    ViewOptions,
+    check_mesh_suffix,
+    check_outputs,
+    plural,
+    size_of,
+)
+
+
+@dataclass(frozen=True)
+class Bake:
+    """Makes the filter that a mesh wants part of its triangles, for viewers, engines and Blender, which draw
+    triangles as they are.
+
+    Convert with --footprint filter makes such meshes. The result is right for the views asked for and their
+    size; nearer it is soft, farther away it is thin.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """The mesh: .npz, .ply, .glb, .usdc."""
+    output: Output
+    """The mesh to write: .glb, .usdc, .ply, .npz, .obj."""
+    views: ViewOptions = field(default_factory=ViewOptions)
+    filter_px2: Number = None
+    """Variance of the filter in square pixels, 0 to 100. Default: the mesh's own."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.conversion import bake_filter
+        from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
+        from meshsplats.formats.meshes import load_mesh, save_mesh
+
+        start = time.perf_counter()
+        check_mesh_suffix(self.output)
+        self.views.check()
+        check_outputs([self.output], self.force, inputs=[self.input])
+        mesh = load_mesh(self.input)
+        px2 = mesh.filter_px2 if self.filter_px2 is None else self.filter_px2
+        if px2 == 0:
+            raise ValueError(
+                f"{self.input}: the mesh wants no filter, there is nothing to bake; --filter-px2 gives it one"
+            )
+        cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS)
+        baked = bake_filter(mesh, cameras, filter_px2=px2)
+        save_mesh(baked, self.output)
+        seconds = time.perf_counter() - start
+        if self.json:
+            result = {
+                "mesh": str(self.output),
+                "triangles": len(baked.faces),
+                "filter_px2": px2,
+                "views": len(cameras),
+                "seconds": round(seconds, 3),
+            }
+            print(json.dumps(result, indent=1))
+            return
+        seen = f"{plural(len(cameras), 'view')} of {cameras[0].width} x {cameras[0].height}"
+        print(f"{self.output} ({plural(len(baked.faces), 'triangle')}, {size_of(self.output)}): a filter of")
+        print(f"{px2:g} px^2 for {seen}, in {seconds:.1f} s")

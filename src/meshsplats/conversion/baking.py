@@ -1,0 +1,154 @@
+"""bake_filter: the filter that a mesh wants when it is drawn, made part of its triangles for programs without
+one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from meshsplats.camera import Camera, orbit
+from meshsplats.conversion.chunks import chunks
+from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, Views
+from meshsplats.mesh import SplatMesh, checked_filter, splat_starts
+
+NARROWEST = 1e-4
+"""No splat counts as narrower than a variance of this share of the filter's, as in ``render``."""
+FAINTEST = 1e-6
+"""Added to opacities, so that a splat without any has a shape, too."""
+FLATTEST = 1e-10
+"""A splat with less than this share of its largest variance along an axis is flat: only rounding would be
+widened."""
+
+_CHUNK = 1 << 13
+"""Splats done at a time."""
+
+
+def bake_filter(
+    mesh: SplatMesh,
+    cameras: Sequence[Camera] | None = None,
+    *,
+    pixel: float | None = None,
+    filter_px2: float | None = None,
+) -> SplatMesh:
+    """``mesh`` with its filter as a part of the triangles, for programs that draw triangles as they are.
+
+    Right where a pixel has one size at each splat: the one that it has in the mean for ``cameras``, or
+    ``pixel``; by default that of pictures of 1000 pixels from all round that just hold the mesh. With c and S
+    the mean and the covariance of a splat's opacity in the world, its vertices p move to ``c + (S + s
+    I)^(1/2) S^(-1/2) (p - c)``, s = ``filter_px2`` times the square of that size. The variance along each
+    principal axis is taken from the two views along the others, so that of crossed ellipses each counts only
+    where it is seen. Flat splats stay flat.
+
+    Args:
+        mesh: whose triangles know their splats.
+        cameras: where it will be seen from, with the size of the pictures. Splats that none of them sees take
+            the median pixel of the others.
+        pixel: instead of cameras, size of a pixel at the mesh in scene units: distance / focal length.
+        filter_px2: variance in square pixels; ``mesh.filter_px2`` by default.
+
+    Returns:
+        A mesh of ``filter_px2`` 0 and, as its vertices no longer lie where a base has them, without a
+        binding. Nothing else has changed where there is no filter.
+
+    Raises:
+        ValueError: both of cameras and pixel, cameras that see nothing of the mesh, a mesh without
+            ``face_splat``, or splats that share vertices.
+    """
+    variance = checked_filter(mesh.filter_px2 if filter_px2 is None else filter_px2, mesh.face_splat)
+    if cameras and pixel is not None:
+        raise ValueError("give bake_filter cameras or the size of a pixel, not both")
+    if pixel is not None and not (np.isfinite(pixel) and pixel > 0):
+        raise ValueError(f"pixel must be a size in scene units above 0, got {pixel!r}")
+    if variance == 0 or not len(mesh.faces):
+        return replace(mesh, filter_px2=0.0)
+    if not cameras and pixel is None:
+        cameras = orbit(mesh, FRAMING_VIEWS, width=FRAMING_PIXELS, height=FRAMING_PIXELS)
+    assert mesh.face_splat is not None
+    starts = splat_starts(mesh.face_splat)
+    ends = np.append(starts[1:], len(mesh.faces))
+    owner = _owners(mesh, starts)
+    means = np.empty((len(starts), 3))
+    axes = np.empty((len(starts), 3, 3))
+    variances = np.empty((len(starts), 3))
+    for part in chunks(len(starts), _CHUNK):
+        faces = mesh.faces[starts[part.start] : ends[part.stop - 1]]
+        found = _shapes(mesh, faces, starts[part] - starts[part.start])
+        means[part], axes[part], variances[part] = found
+    if cameras:
+        sizes = Views(means.astype(np.float32), cameras).pixel_sizes().astype(np.float64)
+        if not (sizes > 0).any():
+            raise ValueError(f"none of the {len(cameras)} cameras sees any splat of the mesh")
+        sizes = np.where(sizes > 0, sizes, np.median(sizes[sizes > 0]))
+    else:
+        sizes = np.full(len(starts), float(pixel))  # type: ignore[arg-type]
+    added = (variance * sizes**2)[:, None]
+    least = variances + NARROWEST * added
+    flat = variances <= FLATTEST * variances.max(axis=1, keepdims=True)
+    spread = np.where(flat, 1, np.sqrt((least + added) / least))
+
+    vertices = mesh.vertices.copy()
+    used = np.flatnonzero(owner >= 0)
+    for part in chunks(len(used), 4 * _CHUNK):
+        rows = used[part]
+        fan = owner[rows]
+        offsets = np.einsum("nji,nj->ni", axes[fan], mesh.vertices[rows] - means[fan])
+        vertices[rows] = means[fan] + np.einsum("nij,nj->ni", axes[fan], spread[fan] * offsets)
+    return replace(mesh, vertices=vertices, filter_px2=0.0, binding=None)
+
+
+def _owners(mesh: SplatMesh, starts: np.ndarray) -> np.ndarray:
+    """(v,) number of the splat, from 0, whose triangles use a vertex; -1 for none."""
+    fan = np.zeros(len(mesh.faces), np.int64)
+    fan[starts[1:]] = 1
+    fan = np.cumsum(fan)
+    owner = np.full(len(mesh.vertices), -1, np.int64)
+    owner[mesh.faces] = fan[:, None]
+    if (owner[mesh.faces] != fan[:, None]).any():
+        raise ValueError("two splats share a vertex: the filter moves each splat's vertices on their own")
+    return owner
+
+
+def _shapes(
+    mesh: SplatMesh, faces: np.ndarray, starts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of n splats with triangles ``faces`` (f, 3) from numbers ``starts`` (n,) on: the mean (n, 3) of their
+    opacity, its principal axes as columns (n, 3, 3), and the variances along them (n, 3).
+
+    The integrals of opacity, linear in a triangle, and its moments are polynomials of the corners; constant
+    factors are left out of all alike.
+    """
+    counts = np.diff(np.append(starts, len(faces)))
+    total = lambda values: np.add.reduceat(values, starts)  # noqa: E731
+    corners = mesh.vertices[faces].astype(np.float64)
+    origin = corners[starts, 0]
+    corners -= np.repeat(origin, counts, axis=0)[:, None]
+    opacity = mesh.colors[faces, 3].astype(np.float64) + FAINTEST
+    whole = opacity.sum(axis=1)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    mass = 20 * whole
+    first = 5 * np.einsum("tk,tkc->tc", opacity + whole[:, None], corners)
+    everything = total(area * mass)
+    solid = everything > 0
+    center = total(area[:, None] * first) / np.where(solid, everything, 1)[:, None]
+    corners -= np.repeat(center, counts, axis=0)[:, None]
+    sums = corners.sum(axis=1)
+    weighted = np.einsum("tk,tkc->tc", opacity, corners)
+    mixed = weighted[:, :, None] * sums[:, None, :]
+    second = (
+        whole[:, None, None] * sums[:, :, None] * sums[:, None, :]
+        + mixed
+        + mixed.transpose(0, 2, 1)
+        + np.einsum("tk,tki,tkj->tij", whole[:, None] + 2 * opacity, corners, corners)
+    )
+    covariance = total(area[:, None, None] * second) / np.where(solid, everything, 1)[:, None, None]
+    axes = np.linalg.eigh(covariance)[1]
+    of_face = np.repeat(axes, counts, axis=0)
+    seen = np.abs(np.einsum("tc,tck->tk", normal, of_face))  # areas from along each axis
+    along = np.einsum("tik,tij,tjk->tk", of_face, second, of_face)
+    others = seen.sum(axis=1, keepdims=True) - seen
+    masses = total(others * mass[:, None])
+    variances = np.divide(total(others * along), masses, out=np.zeros_like(masses), where=masses > 0)
+    return origin + center, axes, np.maximum(variances, 0)
