@@ -95,9 +95,7 @@ def compare_views(
     samples = mesh_samples(look, mesh, cameras) if samples is None else samples
     options: dict[str, Any] = {"samples": samples, "max_layers": max_layers, "threads": threads}
     for i, camera in enumerate(cameras):
-        drawn = draw_splats(
-            cloud, camera, look, sh_degree=sh_degree, background=background, threads=threads
-        )
+        drawn = draw_splats(cloud, camera, look, sh_degree=sh_degree, background=background, threads=threads)
         a = np.clip(drawn.color, 0, 1)
         b = np.clip(mesh_picture(mesh, camera, background, **options)[0], 0, 1)
         yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import tyro
@@ -43,11 +43,18 @@ _OF_SPLATS = ("input", "output", "as_splats", "no_preview", "conversion", "readi
 """Options of the command that do."""
 
 
-def _with_placeholders(options: type[ConversionOptions]) -> type[ConversionOptions]:
-    """The same options, described to tyro: ``--rings N`` where it would say ``--rings {None}|INT (default:
-    None)``. Their docstrings are the help and say what happens without them."""
-    typed, named = {}, {}
+def _with_placeholders(
+    options: type[ConversionOptions], without: tuple[str, ...] = ()
+) -> type[ConversionOptions]:
+    """The same options but those named in ``without``, described to tyro: ``--rings N`` where it would say
+    ``--rings {None}|INT (default: None)``. Their docstrings are the help and say what happens without
+    them."""
+    typed: dict[str, Any] = {}
+    named = {}
     for name, hint in get_type_hints(options).items():
+        if name in without:
+            typed[name] = tyro.conf.Suppress[object]  # type: ignore[misc]
+            continue
         kind = next(part for part in get_args(hint) if part is not type(None))
         choices = "{" + ",".join(map(str, get_args(kind))) + "}"
         placeholders = {int: "N", float: "X", bool: "{True,False}"}
@@ -62,8 +69,11 @@ def _with_placeholders(options: type[ConversionOptions]) -> type[ConversionOptio
 
 if TYPE_CHECKING:
     _Options = ConversionOptions
+    StartOptions = ConversionOptions
 else:
     _Options = _with_placeholders(ConversionOptions)
+    # What a fine-tuning starts with looks like its targets.
+    StartOptions = _with_placeholders(ConversionOptions, without=("look",))
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,9 @@ class Evaluate:
                 threads=self.threads,
             )
             return Dataset((), views, "splats", self.look)
-        made = TargetOptions(look=self.look, sh_degree=self.sh_degree).make(splats, self.splats, background, self.threads)
+        made = TargetOptions(look=self.look, sh_degree=self.sh_degree).make(
+            splats, self.splats, background, self.threads
+        )
         return replace(made, train=())
 
     def _background(

@@ -23,7 +23,7 @@ from meshsplats.cli.common import (
     load_scene,
     write_json,
 )
-from meshsplats.cli.convert import _Options as ConversionOptions
+from meshsplats.cli.convert import StartOptions as ConversionOptions
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.cli.training import (
     STARTING_UP,
@@ -115,7 +115,9 @@ class Finetune:
             # the rest has to fill.
             scene = choose_splats(scene, crop=self.conversion.crop)
         worthwhile = worthwhile_views(config)
-        dataset = self.target.make(scene, self.input, background_of(config), self.threads, worthwhile, self.preset)
+        dataset = self.target.make(
+            scene, self.input, background_of(config), self.threads, worthwhile, self.preset
+        )
         background = None
         if self.target.data is not None:
             whole = self.conversion.crop is None
@@ -151,6 +153,7 @@ class Finetune:
         start = self.preset if self.start == "same" else self.start
         cameras = [view.camera for view in dataset.train]
         options = asdict(self.conversion) | {"crop": None}  # that is done
+        del options["look"]
         return starting_mesh(cloud, cameras, preset=start, look=dataset.look, **options)
 
     def _next(

@@ -44,6 +44,7 @@ def described(config: type[FinetuneConfig], standard: FinetuneConfig | None = No
         if name in ("preset", "epochs", "steps", "minutes"):
             typed[name] = tyro.conf.Suppress[object]  # type: ignore[misc]
         else:
+            hint = next((part for part in get_args(hint) if part in (int, float)), hint)  # of those or None
             choices = "{" + ",".join(map(str, get_args(hint))) + "}"
             metavar = {int: "N", float: "X", bool: "{True,False}"}.get(hint, choices)
             told = f"(default preset: {getattr(FinetuneConfig, name)})"

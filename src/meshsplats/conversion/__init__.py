@@ -49,9 +49,9 @@ def convert(
     ``preset='paper'`` is the conversion of MeshSplats (arXiv 2502.07754): the two largest axes of a splat
     span an ellipse of 2.7 standard deviations whose opacity falls linearly from the splat's at the centre to
     a fifth of it at the rim, 8 triangles; or, with ``mode='3d'``, three such ellipses. ``preset='default'``
-    draws as many triangles and comes closer to the splats' own picture: two crossed ellipses of 4 triangles,
-    rim opacity 0, a falloff fitted to the Gaussian, integrated opacity kept, and widened by the low-pass
-    filter that the splats were trained with.
+    draws as many triangles and comes closer to the splats' own image: two crossed ellipses of 4 triangles,
+    rim opacity 0, a falloff fitted to the Gaussian and integrated opacity kept. With ``look='splats'`` they
+    are also widened by the low-pass filter that a splat viewer draws with.
 
     Args:
         cloud: the splats.
@@ -131,9 +131,8 @@ def convert(
 
     mesh = assembled(shapes, choice, keep)
     if chosen.detail == "cameras":
-        # Fans that were widened are to look as in a splat viewer, others as what lies in each pixel's area.
-        made_for: Look = "area" if chosen.footprint == "none" else "splats"
-        seen = visibility(mesh, cloud.means, part, cameras or (), made_for)
+        wanted: Look = "splats" if chosen.footprint == "filter" else chosen.look or "area"
+        seen = visibility(mesh, cloud.means, part, cameras or (), wanted)
         visible = keep & ~seen.hidden[rows]
         keep = visible if visible.any() else keep
         choice[keep] = choose_levels(seen.need[rows[keep]], len(mesh.faces))
@@ -175,7 +174,9 @@ def _drawn_gaussians(
     cloud: GaussianCloud, options: ConversionOptions, pixel: np.ndarray | None, axes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) standard deviations along ``axes`` and (n,) opacities of the splats as a renderer draws them."""
-    px2 = FILTER_PX2[cloud.kernel] if options.footprint_px2 is None else options.footprint_px2
+    px2 = options.footprint_px2
+    if px2 is None:
+        px2 = FILTER_PX2[options.look or "area"][cloud.kernel]
     sigma = np.take_along_axis(widen(cloud.scales, pixel, px2, cloud.kernel), axes, axis=1)
     opacity = cloud.opacities
     if cloud.kernel == "antialiased" and pixel is not None:

@@ -8,6 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from meshsplats.rendering.looks import Look
+
 Mode = Literal["crossed", "flat", "3d"]
 Footprint = Literal["cameras", "framing", "distance", "density", "filter", "none"]
 Colors = Literal["degree0", "cameras"]
@@ -48,6 +50,11 @@ class ConversionOptions:
     """0 to 1. 1 scales a splat's opacity so that its ellipses cover, on average over all directions, as much
     opacity times area as the splat itself; 0 leaves the opacity; between, a power of that factor. Paper:
     0."""
+    look: Look | None = None
+    """What the mesh is to look like. area: each pixel the mean over its area, in programs that take several
+    samples a pixel: Blender, engines with MSAA, ray tracers. splats: at the size of the cameras or of the
+    framing, as a 3DGS viewer shows it; it is then wider, and blurs in larger pictures. Default: area; paper:
+    area, as it has no footprint."""
     footprint: Footprint | None = None
     """Where the size of a pixel at each splat comes from, for the low-pass filter that splats were trained
     with. cameras: the cameras given. framing: pictures of 1000 pixels from all round that just hold the
@@ -59,7 +66,9 @@ class ConversionOptions:
     footprint_px2: float | None = None
     """Variance of that filter in square pixels, 0 to 100; every standard deviation s becomes
     sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats trained as 2DGS.
-    footprint = filter: ``filter_px2`` of the mesh, 0.3 by default, as 3DGS draws."""
+    Default: 0.05 for the look 'area', which the samples of a pixel need; for 'splats' 0.5, or 0.4 and 0.3
+    for splats of kernel 'antialiased' and '2dgs'. footprint = filter: ``filter_px2`` of the mesh, 0.3 by
+    default, as 3DGS draws."""
     viewing_distance: float | None = None
     """Distance the mesh will be seen from, scene units; for footprint = distance."""
     focal: float | None = None
@@ -106,7 +115,13 @@ class ConversionOptions:
         return full
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
-        for name, kind in [("mode", Mode), ("footprint", Footprint), ("colors", Colors), ("detail", Detail)]:
+        for name, kind in [
+            ("mode", Mode),
+            ("footprint", Footprint),
+            ("colors", Colors),
+            ("detail", Detail),
+            ("look", Look),
+        ]:
             if getattr(self, name) not in get_args(kind):
                 raise ValueError(
                     f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}"
@@ -175,6 +190,7 @@ _RANGES: list[tuple[str, float, float, bool]] = [
 PRESETS = {
     "default": ConversionOptions(
         mode="crossed",
+        look="area",
         opac_mul=0.0,
         rings=1,
         detail="even",
@@ -187,6 +203,7 @@ PRESETS = {
     ),
     "paper": ConversionOptions(
         mode="flat",
+        look="area",
         scale_mul=2.7,
         no_triag=8,
         opac_mul=0.2,

@@ -33,9 +33,9 @@ def starting_mesh(
         return convert(cloud, preset="paper", cameras=cameras, **options)
     if options.get("mode") is None and options.get("flat_below") is None:
         options["mode"] = "flat"
-    if look == "splats" and options.get("footprint") is None:
-        options["footprint"] = "filter" if cloud.kernel == "3dgs" else "cameras"
+    if look == "splats" and cloud.kernel == "3dgs" and options.get("footprint") is None:
+        options["footprint"] = "filter"
     one_ring = options.get("mode") == "flat" and options.get("rings") in (None, 1)
     if options.get("detail") is None and one_ring:
         options["detail"] = "cameras"
-    return convert(cloud, preset="default", cameras=cameras, **options)
+    return convert(cloud, preset="default", cameras=cameras, look=look, **options)

@@ -119,8 +119,9 @@ def render_splats(
 
     Splats are blended front to back in the order of the depth z of their centres, equal depths by number;
     those with a centre nearer than ``camera.near`` are left out. ``dilation`` (pixels squared, of the picture
-    whatever ``samples`` is) widens every projected splat; for the kernel '2dgs' its low pass, 5/3 of it, is the
-    least variance. ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
+    whatever ``samples`` is) widens every projected splat; for the kernel '2dgs' its low pass, 5/3 of it, is
+    the least variance. ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is
+    stored.
 
     Unlike the published rasterisers this has no tiles and no cut at three standard deviations: a splat is
     drawn wherever its alpha reaches 1/255.
@@ -505,9 +506,9 @@ def _flat_falloff(
 
     rho3d is the squared distance, in standard deviations, from the centre to where the ray meets the plane of
     the splat's first two axes; it is infinite where that is nearer than ``camera.near``, behind the camera or
-    nowhere, and beside the line that a splat with a scale of 0 is. rho2d = 0.6 / dilation |p - c|^2 (2DGS: 2),
-    with p the sample and c the projected centre in pixels, keeps splats that are tiny or seen edge on from falling between the
-    samples.
+    nowhere, and beside the line that a splat with a scale of 0 is. rho2d = 0.6 / dilation |p - c|^2 (2 in the
+    2DGS code), with p the sample and c the projected centre in pixels, keeps splats that are tiny or seen
+    edge on from falling between the samples.
     """
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=1)
     normal = np.cross(axes[:, 0], axes[:, 1])
