@@ -13,7 +13,8 @@ from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.comparison import Comparison, ViewScore, compare, compare_views
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering import render, render_splats
+from meshsplats.rendering import render
+from meshsplats.rendering.looks import draw_splats
 
 
 def scene() -> tuple[GaussianCloud, SplatMesh, list]:
@@ -32,14 +33,16 @@ def scene() -> tuple[GaussianCloud, SplatMesh, list]:
     return cloud, mesh, orbit(cloud, 3, width=40, height=30)
 
 
-def test_scores_are_those_of_the_pictures():
+@pytest.mark.parametrize("look", ["area", "splats"])
+def test_scores_are_those_of_the_pictures(look):
     cloud, mesh, cameras = scene()
-    options = {"background": (0, 0.5, 1), "samples": 1}
+    options = {"look": look, "background": (0, 0.5, 1)}
     views = list(compare_views(cloud, mesh, cameras, sh_degree=0, **options))
     assert [view.score.name for view in views] == ["view_0000", "view_0001", "view_0002"]
     for view, camera in zip(views, cameras, strict=True):
-        a = np.clip(render_splats(cloud, camera, sh_degree=0, **options).color, 0, 1)
-        b = np.clip(render(mesh, camera, **options).color, 0, 1)
+        a = np.clip(draw_splats(cloud, camera, look, sh_degree=0, background=(0, 0.5, 1)).color, 0, 1)
+        samples = {"area": 2, "splats": 1}[look]
+        b = np.clip(render(mesh, camera, samples=samples, background=(0, 0.5, 1)).color, 0, 1)
         np.testing.assert_array_equal(view.splats, a)
         np.testing.assert_array_equal(view.mesh, b)
         error = np.mean((a.astype(float) - b) ** 2)

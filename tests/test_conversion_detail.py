@@ -9,9 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from meshsplats import GaussianCloud, SplatMesh, convert, render, render_splats
+from meshsplats import GaussianCloud, SplatMesh, convert, draw_splats, render
 from meshsplats.camera import look_at
-from meshsplats.conversion.detail import HIDDEN, LEAST, LEVELS, LOOKED_AT, TRIANGLES, choose_levels, look
+from meshsplats.conversion.detail import (
+    HIDDEN,
+    LEAST,
+    LEVELS,
+    LOOKED_AT,
+    TRIANGLES,
+    choose_levels,
+    visibility,
+)
 
 shares = st.lists(st.floats(0, 1e4), min_size=1, max_size=40).map(np.array)
 
@@ -66,22 +74,26 @@ def test_levels_of_a_hand_worked_case():
         choose_levels(shown, 5)
 
 
-def test_shown_pixels_are_the_opacity_of_the_picture():
+@pytest.mark.parametrize("look", ["area", "splats"])
+def test_shown_pixels_are_the_opacity_of_the_picture(look):
     """What all splats show adds up to the opacity of the pictures; one before the other hides it."""
     cloud = scene(0)
     mesh = convert(cloud, mode="flat", footprint="none")
     views = cameras()
-    shown = look(mesh, cloud.means, cloud, views).pixels
-    alpha = np.mean([render(mesh, view, background=(0, 0, 0)).alpha.sum(dtype=np.float64) for view in views])
+    shown = visibility(mesh, cloud.means, cloud, views, look).pixels
+    samples = {"area": 2, "splats": 1}[look]
+    drawn = [render(mesh, view, background=(0, 0, 0), samples=samples) for view in views]
+    alpha = np.mean([picture.alpha.sum(dtype=np.float64) for picture in drawn])
     np.testing.assert_allclose(shown.sum(), alpha, rtol=1e-4)
     one = mesh.keep_faces(mesh.face_splat == 7)
-    alone = render(one, views[0], background=(0, 0, 0)).alpha.sum(dtype=np.float64)
-    only = look(one, cloud.means, cloud, views[:1]).pixels
+    alone = render(one, views[0], background=(0, 0, 0), samples=samples).alpha.sum(dtype=np.float64)
+    only = visibility(one, cloud.means, cloud, views[:1], look).pixels
     np.testing.assert_allclose(only[7], alone, rtol=1e-4)
     assert (np.delete(only, 7) == 0).all()
 
 
-def test_error_is_that_of_the_picture():
+@pytest.mark.parametrize("look", ["area", "splats"])
+def test_error_is_that_of_the_picture(look):
     """Of a mesh that fills every pixel, the squared differences of colour and opacity add up."""
     cloud = scene(5, 1)
     sheet = SplatMesh(
@@ -91,9 +103,9 @@ def test_error_is_that_of_the_picture():
         face_splat=np.zeros(1, np.int32),
     )
     (view,) = cameras(1)
-    truth = render_splats(cloud, view, background=(0, 0, 0))
+    truth = draw_splats(cloud, view, look, background=(0, 0, 0), samples={"area": 2, "splats": 1}[look])
     square = np.square(truth.color - [0.2, 0.5, 0.4]).sum() + np.square(1 - truth.alpha).sum()
-    seen = look(sheet, cloud.means, cloud, [view])
+    seen = visibility(sheet, cloud.means, cloud, [view], look)
     np.testing.assert_allclose(seen.error, square, rtol=1e-4)
     np.testing.assert_allclose(seen.pixels, 64 * 48, rtol=1e-4)
     np.testing.assert_allclose(seen.need, np.sqrt(square * 64 * 48), rtol=1e-4)
@@ -106,7 +118,7 @@ def test_pixels_are_those_of_the_camera():
     mesh = convert(cloud, mode="flat", footprint="none")
     small = [replace(view) for view in cameras()]
     large = [view.scaled(12) for view in small]
-    a, b = (look(mesh, cloud.means, cloud, views).pixels for views in (small, large))
+    a, b = (visibility(mesh, cloud.means, cloud, views, "area").pixels for views in (small, large))
     np.testing.assert_allclose(b.sum() / a.sum(), 144, rtol=0.02)
 
 
@@ -129,9 +141,9 @@ def test_what_is_hidden_gets_no_triangles():
     assert (mesh.face_splat == 0).sum() > 8
     assert (mesh.face_splat == 2).sum() == LEAST
     even = convert(wall, mode="flat", footprint="none")
-    assert look(even, wall.means, wall, views).hidden.tolist() == [False, True, False, False]
-    assert look(even, wall.means, wall, views[1:]).hidden.tolist() == [False] * 4
-    pixels = look(even, wall.means, wall, views).pixels
+    assert visibility(even, wall.means, wall, views, "area").hidden.tolist() == [False, True, False, False]
+    assert visibility(even, wall.means, wall, views[1:], "area").hidden.tolist() == [False] * 4
+    pixels = visibility(even, wall.means, wall, views, "area").pixels
     assert pixels[1] < HIDDEN < pixels[3]
 
 
@@ -147,7 +159,7 @@ def test_as_many_triangles_in_all(mean):
     if mean == LEAST:
         assert (counts == LEAST).all()
         return
-    need = look(even, cloud.means, cloud, views).need
+    need = visibility(even, cloud.means, cloud, views, "area").need
     assert (np.diff(counts[np.argsort(need)]) >= 0).all()
 
 

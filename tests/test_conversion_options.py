@@ -197,6 +197,7 @@ def test_every_option_does_something():
         detail="cameras",
         flat_below=0.6,
         compensation=0.3,
+        look="splats",
         footprint="none",
         footprint_px2=2.0,
         viewing_distance=3.0,

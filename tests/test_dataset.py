@@ -14,6 +14,7 @@ from conftest import shared_data
 from PIL import Image
 
 import meshsplats as ms
+from meshsplats import draw_splats
 from meshsplats.camera import look_at
 from meshsplats.cli import main
 from meshsplats.dataset import Picture, View, load_dataset, splat_views
@@ -210,17 +211,57 @@ def cloud() -> GaussianCloud:
     return make_scene(2000)
 
 
-def test_splat_views_are_their_3dgs_pictures(cloud):
+@pytest.mark.parametrize("look", ["area", "splats"])
+def test_splat_views_are_the_images_of_their_look(cloud, look):
     cameras = ms.orbit(cloud, 2, width=40, height=30)
-    views = splat_views(cloud, cameras, sh_degree=1, background=(0, 0.5, 1))
+    views = splat_views(cloud, cameras, look=look, sh_degree=1, background=(0, 0.5, 1))
     for view, camera in zip(views, cameras, strict=True):
-        want = ms.render_splats(cloud, camera, sh_degree=1, background=(0, 0.5, 1))
+        want = draw_splats(cloud, camera, look, sh_degree=1, background=(0, 0.5, 1))
         np.testing.assert_allclose(view.image, want.color, atol=1e-3)
         np.testing.assert_allclose(view.alpha, want.alpha, atol=1e-3)
-        want = ms.render_splats(cloud, camera, sh_degree=1, background=(1, 0, 0))
+        want = draw_splats(cloud, camera, look, sh_degree=1, background=(1, 0, 0))
         np.testing.assert_allclose(view.picture.over((1, 0, 0)), want.color, atol=1e-3)
         assert view.picture is view.picture  # drawn once
-        assert view.picture.nbytes == view.source.nbytes == 8 * 40 * 30
+        assert view.picture.nbytes == 8 * 40 * 30
+        points = view.source.points()
+        want = draw_splats(cloud, camera, look, sh_degree=1, background=(1, 0, 0), samples=1)
+        np.testing.assert_allclose(points.over((1, 0, 0)), want.color, atol=1e-3)
+        assert view.source.nbytes == {"area": 2, "splats": 1}[look] * view.picture.nbytes
+
+
+def test_means_over_areas_come_from_points(cloud):
+    """As many points as a finer image has pixels: their means are the images of the coarser one."""
+    (camera,) = ms.orbit(cloud, 1, width=40, height=30)
+    (fine,) = splat_views(cloud, [camera.scaled(2)])
+    (coarse,) = splat_views(cloud, [camera], samples=2)
+    # The filter of 0.3 / 16 px^2 is that of either image: only it differs.
+    points = fine.source.points().over().reshape(30, 2, 40, 2, 3).mean(axis=(1, 3))
+    assert ms.psnr(points, coarse.image) > 35
+
+
+def test_windows_are_parts_of_larger_images(cloud):
+    whole = splat_dataset(cloud, train=8, test=0, width=40, look="splats", zooms=(1,))
+    windows = splat_dataset(cloud, train=8, test=0, width=40, look="splats")
+    places = set()
+    for number, (a, b) in enumerate(zip(whole.train, windows.train, strict=True)):
+        zoom = (1, 1, 2, 4)[number % 4]
+        if zoom == 1:
+            np.testing.assert_array_equal(a.image, b.image)
+            continue
+        left, top = round(a.camera.cx * zoom - b.camera.cx), round(a.camera.cy * zoom - b.camera.cy)
+        assert 0 <= left <= 40 * (zoom - 1)
+        assert 0 <= top <= 40 * (zoom - 1)
+        places.add((left, top))
+        large = ms.render_splats(cloud, a.camera.scaled(zoom)).color
+        # Splats are projected by their local affine approximation, which an image's border limits.
+        part = np.abs(large[top : top + 40, left : left + 40] - b.image)
+        assert np.median(part) < 1e-3
+        assert part.mean() < 0.01
+    assert len(places) == 4
+    assert all(view.camera.width == view.camera.height == 40 for view in windows.train)
+    for zooms in ((), (0,)):
+        with pytest.raises(ValueError, match="zooms must be whole numbers"):
+            splat_dataset(cloud, zooms=zooms)
 
 
 def angles_of(cameras, cloud) -> tuple[np.ndarray, np.ndarray]:

@@ -90,7 +90,7 @@ class FinetuneConfig:
     samples: int | None = None
     """Side of the grid of samples in each pixel. None: 2, for images that are means over each pixel's area,
     photographs among them; 1 for those of a splat viewer (``Dataset.look``)."""
-    point_share: float = 0.6
+    point_share: float = 0.5
     """Images of splats that are means over each pixel's area: at first, for this share of the run, the mesh
     learns from their values at the pixels' centres, at one sample a pixel. That is quicker, and shows detail
     finer than a pixel as it is. 0: from means alone."""
