@@ -11,6 +11,7 @@ import pytest
 from _splats import few_splats
 from PIL import Image
 
+import meshsplats
 from meshsplats.camera import load_cameras, orbit, save_cameras
 from meshsplats.cli import main
 from meshsplats.conversion import convert
@@ -88,8 +89,10 @@ def test_json(splats, tmp_path, capsys):
     mesh = load_mesh(tmp_path / "mesh.npz")
     assert (result["splats"], result["triangles"]) == (40, len(mesh.faces))
     assert result["vertices"] == len(mesh.vertices)
-    assert result["bytes"] == (tmp_path / "mesh.npz").stat().st_size
-    assert result["preview"] is None
+    size = (tmp_path / "mesh.npz").stat().st_size
+    assert result["outputs"] == [{"path": str(tmp_path / "mesh.npz"), "bytes": size}]
+    assert (result["input"], result["preview"]) == (str(splats), None)
+    assert (result["warnings"], result["meshsplats"]) == ([], meshsplats.__version__)
     assert not (tmp_path / "mesh.preview.png").exists()
 
 
@@ -203,7 +206,10 @@ def test_mistakes(splats, tmp_path, capsys, monkeypatch, options, code, words):
 
 def test_not_splats(splats, tmp_path, capsys):
     assert run(splats, "-o", tmp_path / "mesh.ply") == 0
-    assert run(tmp_path / "mesh.ply", "-o", tmp_path / "again.ply") == 1
+    assert run(tmp_path / "mesh.ply", "-o", tmp_path / "again.ply", "--as-splats") == 1
+    assert "not splats" in capsys.readouterr().err
+    save_cameras(orbit(np.eye(3), 2), tmp_path / "cameras.json")
+    assert run(tmp_path / "cameras.json", "-o", tmp_path / "again.ply") == 1
     assert "not splats" in capsys.readouterr().err
 
 

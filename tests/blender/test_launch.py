@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import importlib.util
+import json
 import os
+import signal
 import stat
+import subprocess
+import sys
+import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -14,6 +21,9 @@ from _blender_scenes import cameras, random_mesh
 from meshsplats import MissingDependencyError, save_mesh
 from meshsplats.blender import BlenderError, SceneOptions, draw, launch
 from meshsplats.cli import main
+from meshsplats.formats.locks import locked
+
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes and libraries of Linux")
 
 
 @pytest.fixture
@@ -74,7 +84,177 @@ def test_folders_that_cannot_be_written_in_are_told_first(program, tmp_path):
     assert not (tmp_path / "started").exists()
 
 
-@pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="libraries have other names")
+STAND_IN = """
+import json, os, sys, time
+job = json.load(open(sys.argv[-1]))
+for path in job["temporary"].values():
+    open(path, "wb").close()  # as Blender's own writer begins
+child = os.fork()
+print(os.getpid(), file=open(sys.argv[1] + ("/child" if child == 0 else "/parent"), "w"), flush=True)
+time.sleep(600)
+"""
+
+
+def _until(met, seconds=60.0):
+    """Waits for ``met()``; whether it came."""
+    deadline = time.monotonic() + seconds
+    while not met() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return met()
+
+
+def _alive(process: int) -> bool:
+    try:
+        with open(f"/proc/{process}/stat", encoding="ascii", errors="replace") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"  # which waits to be noticed only
+    except OSError:
+        return False
+
+
+@linux
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name)
+def test_blender_ends_with_the_command_and_leaves_nothing(program, tmp_path, number):
+    notes, place, scratch = (tmp_path / name for name in ("notes", "place", "scratch"))
+    for folder in (notes, place, scratch):
+        folder.mkdir()
+    save_mesh(random_mesh(3), tmp_path / "mesh.npz")
+    (tmp_path / "stand_in.py").write_text(STAND_IN)
+    line = f'exec {sys.executable} {tmp_path}/stand_in.py {notes} "$@"'
+    command = [sys.executable, "-m", "meshsplats", "blender", str(tmp_path / "mesh.npz")]
+    command += ["-o", str(place / "a.png"), "--executable", str(program("Blender 5.0.1", line))]
+    environment = os.environ | {"TMPDIR": str(scratch)}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) as process:
+        assert _until(lambda: all((notes / name).exists() for name in ("child", "parent")), 300)
+        assert _until(lambda: all((notes / name).read_text() for name in ("child", "parent")))
+        assert len(os.listdir(place)) == len(os.listdir(scratch)) == 1
+        process.send_signal(number)
+        process.communicate(timeout=30)
+    assert process.returncode == (-number if number == signal.SIGKILL else 128 + number)
+    running = [int((notes / name).read_text()) for name in ("child", "parent")]
+    assert _until(lambda: not any(map(_alive, running)))
+    assert _until(lambda: not os.listdir(place) + os.listdir(scratch))
+
+
+@linux
+def test_the_worker_ends_with_its_guard(tmp_path):
+    """Without the guard's help: kill -9 of the guard, too, ends Blender."""
+    worker = f"""
+import sys, time
+from meshsplats.blender.inside.worker import end_with_parent
+end_with_parent()
+print("ready", file=open({str(tmp_path / "ready")!r}, "w"), flush=True)
+time.sleep(600)
+"""
+    guard = "import subprocess, sys, time\n"
+    guard += f"p = subprocess.Popen([sys.executable, '-c', {worker!r}], stdin=subprocess.DEVNULL)\n"
+    guard += "print(p.pid, flush=True); time.sleep(600)"
+    with subprocess.Popen([sys.executable, "-c", guard], stdout=subprocess.PIPE, text=True) as process:
+        child = int(process.stdout.readline())
+        assert _until((tmp_path / "ready").exists, 300)
+        assert _alive(child)
+        process.kill()
+    assert _until(lambda: not _alive(child))
+
+
+def test_the_pipe_ends_the_worker(monkeypatch):
+    """Where the kernel does not see to it; not where standard input is none of ours."""
+    code = "import sys; sys.platform = 'other'; from meshsplats.blender.inside.worker import end_with_parent;"
+    code += "import time; end_with_parent(); print('ready', flush=True); time.sleep(600)"
+    for greeting in (b"\n", b""):
+        with subprocess.Popen(
+            [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as process:
+            assert process.stdout.readline() == b"ready\n"
+            process.stdin.write(greeting)
+            process.stdin.close()
+            if greeting:
+                assert process.wait(20) == 1
+            else:
+                time.sleep(0.3)
+                assert process.poll() is None
+                process.kill()
+
+
+def test_leftovers_of_crashes_are_removed(program, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    left, used, other = (tmp_path / f"meshsplats-blender-{name}" for name in ("left", "used", "other"))
+    for folder in (left, used, other):
+        folder.mkdir()
+    (left / "lock").write_bytes(b"")
+    (left / "colors.npy").write_bytes(b"much")
+    with locked(used / "lock") as ours:
+        assert ours
+        with pytest.raises(BlenderError):
+            draw(
+                random_mesh(3),
+                cameras()[:1],
+                pictures=[tmp_path / "a.png"],
+                executable=program("Blender 5.0.1", "exit 3"),
+            )
+        assert sorted(path.name for path in tmp_path.iterdir()) == [
+            "blender",
+            "meshsplats-blender-other",
+            "meshsplats-blender-used",
+        ]
+
+
+def test_a_full_disk_inside_blender_is_a_full_disk(program, tmp_path):
+    told = launch.worker.MARK + json.dumps({"error": [errno.ENOSPC, "no space left", "/disk/a.png"]})
+    blender = program("Blender 5.0.1", f"echo '{told}'; exit 1")
+    with pytest.raises(OSError, match="no space left") as caught:
+        draw(random_mesh(3), cameras()[:1], pictures=[tmp_path / "a.png"], executable=blender)
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, "/disk/a.png")
+
+
+def test_what_blender_says_is_passed_on(program, tmp_path):
+    stages = [
+        {"stage": "Sample 4/16", "share": 0.25, "left": "00:10.1"},
+        {"picture": "a", "seconds": 1, "processor": 1},
+    ]
+    lines = "\n".join(f"echo '{launch.worker.MARK}{json.dumps(stage)}'" for stage in stages)
+    ahead, seen = [], []
+    with pytest.raises(BlenderError):
+        draw(
+            random_mesh(3),
+            cameras()[:1],
+            pictures=[tmp_path / "a.png"],
+            executable=program("Blender 5.0.1", lines + "\nexit 1"),
+            announce=ahead.append,
+            progress=seen.append,
+        )
+    assert [(at.done, at.share, at.left) for at in seen] == [(0, 0.25, "00:10.1"), (1, 0.0, None)]
+    camera = cameras()[0]
+    assert ahead[0]["pixels"] == camera.width * camera.height
+    assert (ahead[0]["triangles"], ahead[0]["samples"]) == (3, 1)
+    assert 0 < ahead[0]["mean_layers"] <= ahead[0]["layers"] <= 3
+
+
+@pytest.mark.parametrize(
+    ("text", "share", "left"),
+    [
+        (
+            "Fra:1 Mem:1M | Time:00:00.02 | Remaining:00:10.05 | Scene, ViewLayer | Sample 4/16",
+            0.25,
+            "00:10.05",
+        ),
+        ("Remaining: 00:00.10 | Mem: 3M | Sample 1/8", 0.125, "00:00.10"),
+        ("Mem: 1M | Updating Scene BVH | Building BVH 40%", 0.0, None),
+        ("Mem: 3M | Finished", None, None),
+    ],
+)
+def test_blenders_words_are_understood(text, share, left, capsys):
+    """As versions 4.2 and 5.0 print them."""
+    launch.worker.tell_stage(text)
+    said = capsys.readouterr().out
+    if share is None:
+        assert said == ""
+        return
+    told = json.loads(said.removeprefix(launch.worker.MARK))
+    assert (told["share"], told["left"]) == (share, left)
+    assert told["stage"] in text
+
+
+@linux
 def test_missing_graphics_libraries_are_named(program, monkeypatch, tmp_path):
     def absent(name, *_, **__):
         raise OSError(name)
@@ -84,7 +264,7 @@ def test_missing_graphics_libraries_are_named(program, monkeypatch, tmp_path):
         launch.run_job({}, {}, [], SceneOptions(engine="eevee"), limit=1, executable=program("Blender 5.0.1"))
 
 
-@pytest.mark.skipif(not os.sys.platform.startswith("linux"), reason="libraries have other names")
+@linux
 def test_missing_system_libraries_are_named(monkeypatch, tmp_path):
     """bpy is there, but a library that it is linked with is not."""
     (tmp_path / "bpy.py").write_text("raise ImportError('libSM.so.6: cannot open shared object file')")
@@ -115,6 +295,6 @@ def test_command_line_mistakes(arguments, words, program, tmp_path, monkeypatch,
     (tmp_path / "taken.png").write_bytes(b"")
     blender = program("Blender 5.0.1", "exit 9")
     before = sorted(path.name for path in tmp_path.iterdir())
-    assert main(["blender", "mesh.npz", *arguments, "--executable", str(blender)]) in (1, 2)
+    assert main(["blender", "mesh.npz", *arguments, "--executable", str(blender)]) in (1, 2, 3)
     assert words in " ".join(capsys.readouterr().err.split())
     assert sorted(path.name for path in tmp_path.iterdir()) == before

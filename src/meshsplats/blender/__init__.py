@@ -10,7 +10,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,14 +19,17 @@ from meshsplats.camera import Camera
 from meshsplats.errors import DataWarning
 from meshsplats.mesh import SplatMesh
 
-__all__ = ["BlenderError", "Engine", "Ground", "LightOptions", "SceneOptions", "draw"]
+if TYPE_CHECKING:
+    from meshsplats.blender.launch import BlenderError, Progress
+
+__all__ = ["BlenderError", "Engine", "Ground", "LightOptions", "Progress", "SceneOptions", "draw"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "BlenderError":
-        from meshsplats.blender.launch import BlenderError
+    if name in ("BlenderError", "Progress"):
+        from meshsplats.blender import launch
 
-        return BlenderError
+        return getattr(launch, name)
     raise AttributeError(f"module 'meshsplats.blender' has no attribute {name!r}")
 
 
@@ -38,7 +41,8 @@ def draw(
     blend: str | os.PathLike[str] | None = None,
     options: SceneOptions | None = None,
     executable: str | os.PathLike[str] | None = None,
-    progress: Callable[[], object] | None = None,
+    announce: Callable[[dict[str, Any]], object] | None = None,
+    progress: Callable[[Progress], object] | None = None,
 ) -> dict[str, Any]:
     """Has Blender render ``mesh`` from ``cameras``, or save the scene, or both; existing files are replaced.
 
@@ -55,7 +59,9 @@ def draw(
         blend: Blender file to write: mesh, material, cameras, light, world, in named collections.
         options: how; unlit in Cycles by default.
         executable: an installed Blender, 4.2 or newer; the module bpy of this environment by default.
-        progress: called after each picture.
+        announce: called once before Blender starts, with what is ahead: ``{"triangles", "layers",
+            "bounce_limit", "samples" a pixel, "pixels" of all pictures, "mean_layers" of a pixel}``.
+        progress: called whenever Blender tells how far it is.
 
     Returns:
         ``{"blender": its version, "build_seconds": float, "picture_seconds": [float, ...], "layers": most
@@ -94,6 +100,18 @@ def draw(
     layers, limit = subject.count(mesh, cameras, options)
     if layers > MAX_LAYERS:
         _warn(mesh, cameras, layers, options)
+    if announce is not None:
+        samples = options.samples if options.light is not None else options.samples**2
+        announce(
+            {
+                "triangles": len(mesh.faces),
+                "layers": layers,
+                "bounce_limit": limit,
+                "samples": samples,
+                "pixels": sum(camera.width * camera.height for camera in cameras[: len(targets)]),
+                "mean_layers": subject.mean_layers(mesh, cameras, options.threads),
+            }
+        )
     arrays, facts = subject.prepare(mesh, cameras, options, layers)
     result = launch.run_job(
         arrays,

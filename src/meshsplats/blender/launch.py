@@ -12,17 +12,21 @@ import subprocess
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from meshsplats.blender import guard
 from meshsplats.blender.inside import MISSING, worker
 from meshsplats.blender.options import SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats.atomic import is_promised, temporary_beside
+from meshsplats.formats.locks import try_lock
 
 OLDEST = (4, 2)
 
@@ -33,6 +37,22 @@ _LIBRARIES = (
     if sys.platform.startswith("linux")
     else ""
 )
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far Blender is."""
+
+    done: int
+    """Pictures that are finished."""
+    pictures: int
+    """Those wanted."""
+    share: float
+    """Of the picture at hand, 0 to 1: the samples taken."""
+    stage: str
+    """What Blender is doing, in its words."""
+    left: str | None
+    """Time that Blender thinks the picture at hand still takes, where it knows."""
 
 
 class BlenderError(ChildProcessError):
@@ -63,7 +83,7 @@ def command(executable: Path | None) -> list[str]:
     if (int(version[1]), int(version[2])) < OLDEST:
         raise ValueError(f"{found}: Blender {version[1]}.{version[2]} is too old; 4.2 or newer is needed")
     flags = ["--background", "--factory-startup", "--python-exit-code", "1", "--python"]
-    return [found, *flags, str(Path(worker.__file__).resolve()), "--"]
+    return [str(found), *flags, str(Path(worker.__file__).resolve()), "--"]
 
 
 def run_job(
@@ -76,21 +96,23 @@ def run_job(
     pictures: Sequence[Path] = (),
     blend: Path | None = None,
     executable: Path | None = None,
-    progress: Callable[[], object] | None = None,
+    progress: Callable[[Progress], object] | None = None,
 ) -> dict[str, Any]:
     """Has Blender build the scene, save ``blend`` and render ``pictures``, one a camera.
 
-    ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called after each
-    picture. Returns ``{"blender": version, "build_seconds": s, "build_processor_seconds": s,
+    ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called as Blender
+    tells how far it is. Returns ``{"blender": version, "build_seconds": s, "build_processor_seconds": s,
     "picture_seconds": [s, ...], "picture_processor_seconds": [s, ...]}``.
 
     Raises BlenderError with Blender's own words if it fails, MissingDependencyError if the system lacks
-    libraries that it needs, besides what ``command`` raises. Ctrl-C ends Blender too.
+    libraries that it needs, besides what ``command`` raises, and OSError for an output that cannot be written
+    (a full disk; a name that another process has taken meanwhile). Blender ends with this process, however it
+    ends, and leaves nothing (``guard``).
     """
     start = command(executable)
     if options.engine == "eevee":
         _check_graphics()
-    with tempfile.TemporaryDirectory(prefix="meshsplats-blender-") as folder:
+    with _scratch() as (folder, lock):
         files = {}
         for name, array in arrays.items():
             files[name] = os.path.join(folder, f"{name}.npy")
@@ -104,14 +126,54 @@ def run_job(
             "blend": None if blend is None else os.path.abspath(blend),
             "pictures": [os.path.abspath(path) for path in pictures],
         }
-        path = Path(folder) / "job.json"
-        path.write_text(json.dumps(job), encoding="utf-8")
-        return _watch([*start, str(path)], options, progress)
+        outputs = [path for path in (*pictures, blend) if path is not None]
+        temporary = {os.path.abspath(path): str(temporary_beside(path)) for path in outputs}
+        job["temporary"] = temporary
+        job["new"] = [os.path.abspath(path) for path in outputs if is_promised(path)]
+        plan = {"command": [*start, str(folder / "job.json")], "remove": [*temporary.values(), str(folder)]}
+        try:
+            for name, content in (("job.json", job), ("plan.json", plan)):
+                (folder / name).write_text(json.dumps(content), encoding="utf-8")
+            return _watch(plan, folder, lock, options, len(pictures), progress)
+        finally:
+            for path in temporary.values():  # of a Blender that crashed
+                Path(path).unlink(missing_ok=True)
+
+
+@contextmanager
+def _scratch() -> Iterator[tuple[Path, int]]:
+    """A temporary folder and a descriptor of its lock, by which others know that it is in use. Those that
+    nobody uses any more, left by processes that were killed together with their guards, are removed."""
+    prefix = "meshsplats-blender-"
+    for old in Path(tempfile.gettempdir()).glob(f"{prefix}*/lock"):
+        with suppress(OSError):
+            descriptor = try_lock(old)
+            if descriptor is not None:
+                os.close(descriptor)
+                shutil.rmtree(old.parent, ignore_errors=True)
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=prefix))
+        descriptor = None
+        with suppress(FileNotFoundError):  # someone has just tidied up
+            descriptor = try_lock(folder / "lock")
+        if descriptor is not None:
+            break
+    try:
+        yield folder, descriptor
+    finally:
+        os.close(descriptor)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _watch(
-    arguments: list[str], options: SceneOptions, progress: Callable[[], object] | None
+    plan: dict[str, Any],
+    folder: Path,
+    lock: int,
+    options: SceneOptions,
+    pictures: int,
+    progress: Callable[[Progress], object] | None,
 ) -> dict[str, Any]:
+    arguments = plan["command"]
     environment = dict(os.environ)
     if arguments[1] == "-m":
         # The worker must be this very package, wherever this process found it.
@@ -119,18 +181,21 @@ def _watch(
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
     result: dict[str, Any] = {"picture_seconds": [], "picture_processor_seconds": []}
     said: deque[str] = deque(maxlen=40)
-    finished, failure, unloadable = False, None, None
+    finished, failure, unloadable, status = False, None, None, None
     process = subprocess.Popen(
-        arguments,
-        stdin=subprocess.DEVNULL,
+        [sys.executable, "-I", "-S", guard.__file__, str(folder / "plan.json")],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         env=environment,
         text=True,
         errors="replace",
+        start_new_session=True,  # what ends our group must leave the guard to tidy up
+        pass_fds=() if sys.platform == "win32" else (lock,),
     )
+    at = Progress(0, pictures, 0.0, "starting", None)
     try:
-        assert process.stdout is not None
+        assert process.stdin is not None and process.stdout is not None  # noqa: PT018
         for line in process.stdout:
             if not line.startswith(worker.MARK):
                 said.append(line.rstrip())
@@ -142,14 +207,19 @@ def _watch(
             elif "picture" in message:
                 result["picture_seconds"].append(message["seconds"])
                 result["picture_processor_seconds"].append(message["processor"])
-                if progress is not None:
-                    progress()
+                at = Progress(at.done + 1, pictures, 0.0, "", None)
+            elif "stage" in message:
+                at = replace(at, share=message["share"], stage=message["stage"], left=message["left"])
+            status = message.get("ended", status)
+            if progress is not None and ("picture" in message or "stage" in message):
+                progress(at)
             finished |= "done" in message
             failure = message.get("error", failure)
             unloadable = message.get("unloadable", unloadable)
-        status = process.wait()
+        ended = process.wait()
+        status = ended if status is None else status
     except BaseException:
-        process.terminate()
+        process.stdin.close()  # type: ignore[union-attr]
         try:
             process.wait(10)
         except subprocess.TimeoutExpired:
@@ -157,10 +227,14 @@ def _watch(
             process.wait()
         raise
     finally:
-        if process.stdout is not None:
-            process.stdout.close()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
     if unloadable is not None:
         raise MissingDependencyError(f"Blender's module bpy cannot be loaded: {unloadable}.{_LIBRARIES}")
+    if isinstance(failure, list):
+        raise OSError(*failure)
     if failure is not None:
         raise BlenderError(f"Blender stopped: {failure}")
     if not finished:

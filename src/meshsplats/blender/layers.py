@@ -13,7 +13,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 
 _PROBE = 2.0**-12
-_PROBE_SIDE = 192
+PROBE_SIDE = 192
 """Longer side in pixels of the pictures in which layers are counted: the count changes slowly over a
 picture."""
 
@@ -45,7 +45,7 @@ def most_layers(
     """
     if len(mesh.faces) == 0:
         return 0
-    probes = a_few(cameras or (), 8, _PROBE_SIDE)
+    probes = a_few(cameras or (), 8, PROBE_SIDE)
     bounds = scene_bounds(mesh)
     reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max()) or bounds.radius
     axes = front_axes(mesh.up.astype(np.float64))
@@ -59,8 +59,8 @@ def most_layers(
                 center,
                 bounds.center,
                 up=axes[1],
-                width=_PROBE_SIDE,
-                height=_PROBE_SIDE,
+                width=PROBE_SIDE,
+                height=PROBE_SIDE,
                 fov=max(angle, 1.0),
                 near=away / 100,
             )
@@ -79,7 +79,7 @@ def hidden_by_limit(
 ) -> float:
     """Share of the pixels (0 to 1) that change by more than half a step of 8 bits if only ``limit`` layers
     count."""
-    probe = camera.within(2 * _PROBE_SIDE)
+    probe = camera.within(2 * PROBE_SIDE)
     whole = render(mesh, probe, threads=threads).alpha
     cut = render(mesh, probe, max_layers=limit, threads=threads).alpha
     return float(np.mean(np.abs(whole - cut) > 0.5 / 255))

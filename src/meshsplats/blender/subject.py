@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.layers import bounce_limit, most_layers
+from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, a_few
 from meshsplats.colors import srgb_to_linear
 from meshsplats.framing import front_axes, scene_bounds, weighted_quantile
 from meshsplats.mesh import SplatMesh
@@ -37,6 +37,12 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
     layers = most_layers(mesh, cameras, directions, threads=options.threads)
     # An unlit picture is exact or it is not: a high limit costs nothing where there are no layers.
     return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
+
+
+def mean_layers(mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None = None) -> float:
+    """How many triangles lie behind each other in a pixel, on average over the pictures."""
+    some = a_few(cameras, 4, PROBE_SIDE)
+    return float(np.mean([count_layers(mesh, camera, threads=threads).mean() for camera in some] or [0.0]))
 
 
 def prepare(

@@ -35,6 +35,8 @@ COMMANDS = {
 """Name: where its dataclass is, and one line of help."""
 
 _TAKES_SIGN = ("--up", "--azimuth", "--elevation")
+_standard_input: str | None = None
+"""The file that holds what standard input had, where the command was given -."""
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -81,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except (KeyboardInterrupt, Terminated) as stop:
         number = getattr(stop, "number", signal.SIGINT)
-        _say(f"{_ENDINGS.get(number, 'ended')}; no file was left half-written")
+        say(f"{_ENDINGS.get(number, 'ended')}; no file was left half-written")
         return 128 + number
     except BrokenPipeError:
         _close_output()  # its reader has gone, `| head` say
@@ -94,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             error = OSError(error.errno, error.strerror, "standard output")
             _close_output()
         hint = f" (see meshsplats {name} --help)" if isinstance(error, UsageError) else ""
-        _say(f"error: {one_line(error)}{hint}")
+        say(f"error: {one_line(error)}{hint}")
         code = exit_code(error)
         if as_json:
             _tell_json(code, error)
@@ -162,23 +164,66 @@ def _signals_raise() -> Iterator[None]:
 
 def _run(name: str, arguments: list[str]) -> int:
     from meshsplats.errors import DataWarning
-    from meshsplats.formats.atomic import promises_kept
 
     warnings.simplefilter("always", DataWarning)
-    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {one_line(message)}")
+    warnings.showwarning = lambda message, *_, **__: say(f"warning: {one_line(message)}")
 
+    with _input_read(_joined(arguments)) as given:
+        return _command(name, given)
+
+
+def _command(name: str, arguments: list[str]) -> int:
     import tyro
+
+    from meshsplats.formats.atomic import promises_kept
 
     module, _, attribute = COMMANDS[name][0].partition(":")
     command = getattr(importlib.import_module(module), attribute)
     options = tyro.cli(
         command,
-        args=_joined(arguments),
+        args=arguments,
         prog=f"meshsplats {name}",
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
     with promises_kept():
         return options.run() or OK
+
+
+def shown_path(path: str | os.PathLike[str]) -> str:
+    """``path`` as it was given: - for standard input."""
+    return "-" if _standard_input is not None and os.fspath(path) == _standard_input else os.fspath(path)
+
+
+@contextmanager
+def _input_read(arguments: list[str]) -> Iterator[list[str]]:
+    """``arguments`` with the name of a file in place of -, which holds what standard input has: readers look
+    at their files several times."""
+    global _standard_input
+    _standard_input = None
+    places = [
+        i
+        for i, argument in enumerate(arguments)
+        if argument == "-" and (i == 0 or arguments[i - 1] not in ("-o", "--output"))
+    ]
+    if not places:
+        yield arguments
+        return
+    if len(places) > 1:
+        raise UsageError("- stands for standard input, which can be read once")
+    if sys.stdin is None or sys.stdin.isatty():
+        raise UsageError("- reads standard input: lead a file there, < scene.ply say")
+    import shutil
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
+        path = os.path.join(folder, "standard-input")
+        try:
+            with open(path, "wb") as file:
+                shutil.copyfileobj(sys.stdin.buffer, file, 1 << 20)
+        except OSError as error:
+            raise OSError(error.errno, f"standard input does not fit here: {error.strerror}", path) from None
+        _standard_input = path  # until the next command: errors are told when this one has ended
+        yield [*arguments[: places[0]], path, *arguments[places[0] + 1 :]]
 
 
 def _answer(name: str) -> int:
@@ -236,7 +281,7 @@ def _unknown(name: str) -> int:
 
     close = difflib.get_close_matches(name, COMMANDS, 1)
     hint = f"did you mean {close[0]!r}?" if close else f"commands: {', '.join(COMMANDS)}"
-    _say(f"error: there is no command {name!r}; {hint}")
+    say(f"error: there is no command {name!r}; {hint}")
     return USAGE
 
 
@@ -247,8 +292,10 @@ def one_line(error: object) -> str:
         text = str(error)
     if isinstance(error, MemoryError) and not text:
         text = "out of memory"
+    if _standard_input is not None:
+        text = text.replace(_standard_input, "standard input")
     return " ".join(text.split()) or type(error).__name__
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
     print(f"meshsplats: {text}", file=sys.stderr)

@@ -7,7 +7,8 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -17,7 +18,7 @@ import tyro
 
 from meshsplats.backgrounds import Background
 from meshsplats.camera import MAX_SIDE, Camera, dome, load_cameras, look_around, orbit
-from meshsplats.cli import UsageError
+from meshsplats.cli import UsageError, one_line, shown_path
 from meshsplats.dataset import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.recognition import identify
@@ -354,8 +355,31 @@ def configuration(command: str, options: Any) -> dict:
     return {
         "command": command,
         "meshsplats": meshsplats.__version__,
-        "options": {k: str(v) if isinstance(v, Path) else v for k, v in flat.items()},
+        "options": {k: _plain(v) for k, v in flat.items()},
     }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (tuple, list)):
+        return [_plain(part) for part in value]
+    return shown_path(value) if isinstance(value, Path) else value
+
+
+@contextmanager
+def warnings_kept() -> Iterator[list[str]]:
+    """The warnings given while the block runs, for JSON; they are shown as well."""
+    kept: list[str] = []
+    show = warnings.showwarning
+
+    def keep(message: Warning | str, *rest: Any, **more: Any) -> None:
+        kept.append(one_line(message))
+        show(message, *rest, **more)
+
+    warnings.showwarning = keep
+    try:
+        yield kept
+    finally:
+        warnings.showwarning = show
 
 
 def recorded_options(path: Path, command: str) -> dict[str, Any] | None:

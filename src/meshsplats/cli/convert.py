@@ -6,40 +6,57 @@ import json
 import shlex
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, load_cameras, orbit
-from meshsplats.cli import UsageError
+from meshsplats.camera import Camera, a_few, load_cameras, orbit
+from meshsplats.cli import (
+    FAILED,
+    NO_SPACE,
+    OK,
+    UsageError,
+    error_record,
+    exit_code,
+    one_line,
+    say,
+    shown_path,
+)
+from meshsplats.cli.batch import Job, check_file, check_folder, is_batch, jobs, sources
 from meshsplats.cli.common import (
+    Count,
     File,
     Folder,
     Output,
     SplatOptions,
     Text,
     cameras_beside,
-    check_mesh_suffix,
-    check_outputs,
     configuration,
     identify,
     parse_up,
-    recorded_options,
+    plural,
     size_of,
+    track,
+    warnings_kept,
     write_json,
 )
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.errors import FileFormatError
+from meshsplats.framing import unit_up
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 _CHOOSING = ("crop", "min_opacity", "max_splats")
 """Options of the conversion that choose splats, and so serve --as-splats too."""
-_OF_SPLATS = ("input", "output", "as_splats", "no_preview", "conversion", "reading", "json", "force")
+_OF_SPLATS = (
+    *("input", "output", "formats", "as_splats", "no_preview", "no_sidecar"),
+    *("conversion", "reading", "json", "force"),
+)
 """Options of the command that do."""
 
 
@@ -79,15 +96,20 @@ else:
 @dataclass(frozen=True)
 class Convert:
     """Turns splats into a mesh of translucent, vertex-coloured triangles: .glb, .ply or .npz by the name
-    given. With --as-splats, into a splat .ply: other formats made plain, or a part cut out.
+    given; several files or folders, into a folder. Meshes are written in the other format. With --as-splats,
+    into a splat .ply: other formats made plain, or a part cut out.
 
     Writes a preview picture and the configuration beside it.
     """
 
-    input: tyro.conf.Positional[Path]
-    """Splat file, or the folder of a trained model."""
+    input: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...")]]
+    """Splat file, the folder of a trained model, or a mesh; several of them; a folder that holds some; - for
+    standard input."""
     output: Output
-    """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj."""
+    """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or a
+    folder, for files named like the inputs."""
+    formats: tuple[Literal["glb", "npz", "ply", "usdc", "usda", "usd", "obj"], ...] = ()
+    """With a folder: the formats to write, one or several. Default: glb."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
     cameras: File = None
@@ -109,108 +131,81 @@ class Convert:
     as_splats: bool = False
     """Write splats, not a mesh: a float .ply as the 3DGS code lays it out, of all splats or of those that
     --crop, --min-opacity and --max-splats leave."""
+    fidelity: Count = None
+    """Compare the mesh with its splats from N of the cameras, or N places round it, and tell the PSNR and the
+    SSIM."""
     no_preview: bool = False
     """Draw no preview."""
+    no_sidecar: bool = False
+    """Write nothing beside the result: neither preview nor configuration."""
     conversion: _Options = field(default_factory=_Options)
     reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
-    """Print the result as JSON."""
+    """Print the results as JSON, a line for each input, errors too."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
-        from meshsplats.formats.meshes import save_mesh
+    def run(self) -> int:
+        if not self.input:
+            raise UsageError("give a splat file, a mesh or a folder to convert")
+        batch = is_batch(self.input)
+        folder = batch or bool(self.formats) or self.output.is_dir()
+        formats = self._formats(folder)
+        self._check(formats or [self.output.suffix.lower()[1:]])
+        found = sources(self.input)
+        todo = jobs(found, self.output, formats, preview=not self.no_preview, sidecars=not self.no_sidecar)
+        cameras = self._cameras()
+        if not folder:
+            self._tell(self._convert(todo[0], cameras), todo[0], cameras)
+            return OK
+        made = not self.output.exists()
+        if made:
+            self.output.mkdir()
+        try:
+            return self._all(todo, cameras)
+        finally:
+            if made:
+                with suppress(OSError):
+                    self.output.rmdir()  # where nothing was written
 
-        suffix = self.output.suffix.lower()
+    def _formats(self, folder: bool) -> Sequence[str]:
+        """Suffixes to write in a folder; none for a single file."""
+        if not folder:
+            if not self.as_splats:
+                check_file(self.output)
+            elif self.output.suffix.lower() != ".ply":
+                raise UsageError(f"--as-splats writes .ply, got {self.output.name!r}")
+            return ()
+        check_folder(self.output)
+        if not self.as_splats:
+            return self.formats or ("glb",)
+        if self.formats and self.formats != ("ply",):
+            raise UsageError(f"--as-splats writes .ply, got --formats {' '.join(self.formats)}")
+        return ("ply",)
+
+    def _check(self, kinds: Sequence[str]) -> None:
+        """UsageError or ValueError for options that contradict each other or would do nothing."""
+        if self.fidelity is not None and self.fidelity < 1:
+            raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
         if self.as_splats:
-            self._save_splats(suffix)
+            self._check_splat_options()
             return
-        check_mesh_suffix(self.output)
-        if self.lit and suffix != ".glb" and not suffix.startswith(".usd"):
-            raise UsageError(f"--lit is for .glb and .usd files: {suffix} has no material")
-        glb_only = (self.color_type, self.alpha, self.compression)
-        if suffix != ".glb" and glb_only != ("uint16", "blend", "none"):
+        glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
+        if self.lit and not (glb or usd):
+            raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
+        if not glb and (self.color_type, self.alpha, self.compression) != ("uint16", "blend", "none"):
             raise UsageError("--color-type, --alpha and --compression are for .glb files")
-        up = None if self.up is None else parse_up(self.up)
-        preview, config = self._records()
-        self._check_input()
-        if self.data is not None:
-            if self.cameras is not None:
-                raise UsageError("give --cameras or --data, not both")
-            from meshsplats.dataset import load_dataset
+        if self.data is not None and self.cameras is not None:
+            raise UsageError("give --cameras or --data, not both")
+        if self.up is not None:
+            parse_up(self.up)
+        # Mistakes are told before the work; cameras may lie beside an input.
+        self.conversion.resolved(self.preset, has_cameras=bool(self.cameras or self.data) or self._beside())
 
-            dataset = load_dataset(self.data)
-            cameras = [view.camera for view in dataset.train or dataset.views]
-        elif self.cameras is not None:
-            cameras = load_cameras(self.cameras)
-        else:
-            cameras = cameras_beside(self.input) or []
-        self.conversion.resolved(self.preset, has_cameras=bool(cameras))  # mistakes are told before the work
+    def _beside(self) -> bool:
+        return any((path / "cameras.json").is_file() for path in sources(self.input) if path.is_dir())
 
-        times = [time.perf_counter()]
-        cloud = self.reading.load(self.input)
-        times.append(time.perf_counter())
-        mesh = convert(cloud, preset=self.preset, cameras=cameras, up=up, **asdict(self.conversion))
-        times.append(time.perf_counter())
-        save_mesh(
-            mesh,
-            self.output,
-            lit=True if self.lit else None,
-            color_type=None if self.color_type == "uint16" else self.color_type,
-            alpha=None if self.alpha == "blend" else self.alpha,
-            compression=None if self.compression == "none" else self.compression,
-        )
-        times.append(time.perf_counter())
-        write_json(config, configuration("convert", self))
-        if preview:
-            _draw_preview(mesh, preview)
-        made_of = mesh.splat_count or 0
-        read, made, saved = np.diff(times).round(4).tolist()
-        if self.json:
-            result = {
-                "mesh": str(self.output),
-                "preview": str(preview) if preview else None,
-                "splats": len(cloud),
-                "converted": made_of,
-                "triangles": len(mesh.faces),
-                "vertices": len(mesh.vertices),
-                "bytes": self.output.stat().st_size,
-                "seconds": {"read": read, "convert": made, "save": saved},
-            }
-            print(json.dumps(result, indent=1))
-            return
-        kept = "" if made_of == len(cloud) else f", {made_of:,} of them converted"
-        print(
-            f"{len(cloud):,} splats{kept} -> {len(mesh.faces):,} triangles, {len(mesh.vertices):,} vertices"
-        )
-        timing = f"read {read:.2f} s, converted {made:.2f} s, saved {saved:.2f} s"
-        print(f"{self.output} ({size_of(self.output)}): {timing}")
-        if preview:
-            print(f"preview: {preview}")
-        if self.compression == "none":  # what is compressed is not read here
-            print(f"next: {self._next(cameras)}")
-
-    def _records(self) -> tuple[Path | None, Path]:
-        """Names of the preview and the configuration, checked with that of the mesh. Where the usual ones are
-        those of the same mesh in another format, names with all of the output's own."""
-        preview, config = _records_of(self.output.with_suffix(""))
-        other = (recorded_options(config, "convert") or {}).get("output")
-        if isinstance(other, str) and Path(other).name != self.output.name:
-            preview, config = _records_of(self.output)
-        wanted = [self.output, config] if self.no_preview else [self.output, preview, config]
-        check_outputs(wanted, self.force, inputs=[self.input])
-        return (None if self.no_preview else preview), config
-
-    def _check_input(self) -> None:
-        if identify(self.input) != "splats":
-            raise FileFormatError(f"{self.input}: not splats; convert needs a splat file or a model folder")
-
-    def _save_splats(self, suffix: str) -> None:
-        """The splats themselves, in the format that everything reads."""
-        from meshsplats.formats.splats import save_gaussians
-
-        if suffix != ".ply":
-            raise UsageError(f"--as-splats writes .ply, got {self.output.name!r}")
+    def _check_splat_options(self) -> None:
         standard = {f.name: f.default for f in fields(self) if f.name not in _OF_SPLATS}
         idle = [name for name, value in standard.items() if getattr(self, name) != value]
         given = asdict(self.conversion)
@@ -219,58 +214,222 @@ class Convert:
             flags = ", ".join("--" + name.replace("_", "-") for name in idle)
             raise UsageError(f"{flags}: for a mesh, no effect with --as-splats")
         self.conversion.resolved("paper", has_cameras=False)
-        preview, config = self._records()
-        self._check_input()
-        start = time.perf_counter()
-        cloud = self.reading.load(self.input)
-        kept = choose_splats(cloud, **{name: given[name] for name in _CHOOSING})
-        save_gaussians(kept, self.output)
-        seconds = time.perf_counter() - start
-        write_json(config, configuration("convert", self))
-        if preview:
-            _draw_preview(kept, preview)
-        if self.json:
-            result = {
-                "splats": str(self.output),
-                "preview": str(preview) if preview else None,
-                "read": len(cloud),
-                "written": len(kept),
-                "bytes": self.output.stat().st_size,
-                "seconds": round(seconds, 4),
-            }
-            print(json.dumps(result, indent=1))
-            return
-        print(f"{len(kept):,} of {len(cloud):,} splats in {seconds:.2f} s")
-        print(f"{self.output} ({size_of(self.output)})")
-        if preview:
-            print(f"preview: {preview}")
 
-    def _next(self, cameras: Sequence[Camera]) -> str:
+    def _cameras(self) -> list[Camera] | None:
+        """Those that were named; None: each input may have its own."""
+        if self.data is not None:
+            from meshsplats.dataset import load_dataset
+
+            dataset = load_dataset(self.data)
+            return [view.camera for view in dataset.train or dataset.views]
+        return None if self.cameras is None else load_cameras(self.cameras)
+
+    def _all(self, todo: Sequence[Job], cameras: list[Camera] | None) -> int:
+        """Every job, whatever becomes of the others; a full disk ends them. Returns the exit code: that of
+        the failures if they are all of one kind."""
+        codes = []
+        for job in track(todo, "converting", len(todo)):
+            try:
+                self._tell_line(self._convert(job, cameras), job)
+            except BrokenPipeError:
+                raise
+            except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
+                codes.append(exit_code(error))
+                say(f"error: {one_line(error)}")
+                if self.json:
+                    print(json.dumps({"input": job.shown, "error": error_record(error)}), flush=True)
+                if codes[-1] == NO_SPACE:
+                    break
+        if not self.json:
+            left = len(todo) - len(codes) if NO_SPACE not in codes else None
+            if left is not None:
+                print(f"{left} of {len(todo)} converted: {self.output}/")
+        return OK if not codes else codes[-1] if len(set(codes)) == 1 or codes[-1] == NO_SPACE else FAILED
+
+    def _convert(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
+        """Does ``job``; what is told of it, for JSON."""
+        import meshsplats
+
+        job.check(self.force)
+        with warnings_kept() as told:
+            kind = identify(job.source)
+            if kind == "cameras" or (kind == "mesh" and self.as_splats):
+                raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
+            if self.as_splats:
+                result = self._save_splats(job)
+            elif kind == "mesh":
+                result = self._save_again(job)
+            else:
+                result = self._save_mesh(job, cameras)
+            if job.config:
+                record = configuration("convert", self)
+                record["options"] |= {"input": job.shown, "output": str(job.outputs[0])}
+                write_json(job.config, record)
+        outputs = [{"path": str(path), "bytes": path.stat().st_size} for path in job.outputs]
+        begin = {"input": job.shown, "outputs": outputs, "preview": str(job.preview) if job.preview else None}
+        return begin | result | {"warnings": told, "meshsplats": meshsplats.__version__}
+
+    def _save_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
+        """The splats of ``job`` as a mesh."""
+        times = [time.perf_counter()]
+        cloud = self.reading.load(job.source)
+        if cameras is None:
+            cameras = cameras_beside(job.source) or []
+        times.append(time.perf_counter())
+        up = None if self.up is None else parse_up(self.up)
+        mesh = convert(cloud, preset=self.preset, cameras=cameras, up=up, **asdict(self.conversion))
+        times.append(time.perf_counter())
+        self._write(mesh, job)
+        times.append(time.perf_counter())
+        if job.preview:
+            _draw_preview(mesh, job.preview)
+        read, made, saved = np.diff(times).round(4).tolist()
+        return {
+            "splats": len(cloud),
+            "converted": mesh.splat_count or 0,
+            "triangles": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "seconds": {"read": read, "convert": made, "save": saved},
+            "fidelity": self._fidelity(cloud, mesh, cameras),
+        }
+
+    def _write(self, mesh: SplatMesh, job: Job) -> None:
+        from meshsplats.formats.meshes import save_mesh
+
+        for path in job.outputs:
+            glb = path.suffix.lower() == ".glb"
+            save_mesh(
+                mesh,
+                path,
+                lit=True if self.lit and (glb or path.suffix.lower().startswith(".usd")) else None,
+                color_type=self.color_type if glb and self.color_type != "uint16" else None,
+                alpha=self.alpha if glb and self.alpha != "blend" else None,
+                compression=self.compression if glb and self.compression != "none" else None,
+            )
+
+    def _fidelity(
+        self, cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera]
+    ) -> dict[str, Any] | None:
+        """How close the mesh comes to the splats that it was to show."""
+        if self.fidelity is None:
+            return None
+        from meshsplats.comparison import compare
+
+        if self.conversion.crop is not None:
+            cloud = choose_splats(cloud, crop=self.conversion.crop)
+        views = a_few(cameras, self.fidelity, 400) or orbit(
+            mesh, self.fidelity, elevation=15, width=400, height=400
+        )
+        mean = compare(cloud, mesh, views).to_dict()["mean"]
+        return {"views": len(views), "psnr": mean["psnr"], "ssim": mean["ssim"]}
+
+    def _save_again(self, job: Job) -> dict[str, Any]:
+        """The mesh of ``job`` in another format."""
+        from meshsplats.formats.meshes import load_mesh
+
+        idle = [name for name in ("cameras", "data", "fidelity") if getattr(self, name) is not None]
+        idle += ["preset"] if self.preset != "default" else []
+        idle += [name for name, value in asdict(self.conversion).items() if value is not None]
+        if idle:
+            flags = ", ".join("--" + name.replace("_", "-") for name in idle)
+            raise UsageError(f"{job.shown} is a mesh: {flags} would do nothing, as they are for splats")
+        times = [time.perf_counter()]
+        mesh = load_mesh(job.source)
+        if self.up is not None:
+            mesh = replace(mesh, up=unit_up(parse_up(self.up)))
+        times.append(time.perf_counter())
+        self._write(mesh, job)
+        times.append(time.perf_counter())
+        if job.preview:
+            _draw_preview(mesh, job.preview)
+        read, saved = np.diff(times).round(4).tolist()
+        return {
+            "triangles": len(mesh.faces),
+            "vertices": len(mesh.vertices),
+            "seconds": {"read": read, "save": saved},
+            "fidelity": None,
+        }
+
+    def _save_splats(self, job: Job) -> dict[str, Any]:
+        """The splats themselves, in the format that everything reads."""
+        from meshsplats.formats.splats import save_gaussians
+
+        start = time.perf_counter()
+        cloud = self.reading.load(job.source)
+        given = asdict(self.conversion)
+        kept = choose_splats(cloud, **{name: given[name] for name in _CHOOSING})
+        save_gaussians(kept, job.outputs[0])
+        seconds = time.perf_counter() - start
+        if job.preview:
+            _draw_preview(kept, job.preview)
+        return {"read": len(cloud), "written": len(kept), "seconds": round(seconds, 4)}
+
+    def _tell(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> None:
+        """What came of a single input."""
+        if self.json:
+            print(json.dumps(result))
+            return
+        if "written" in result:
+            print(f"{result['written']:,} of {result['read']:,} splats in {result['seconds']:.2f} s")
+            print(f"{self.output} ({size_of(self.output)})")
+        else:
+            print(_counts(result))
+            seconds = result["seconds"]
+            words = {"read": "read", "convert": "converted", "save": "saved"}
+            timing = ", ".join(f"{words[name]} {value:.2f} s" for name, value in seconds.items())
+            print(f"{self.output} ({size_of(self.output)}): {timing}")
+        if result["preview"]:
+            print(f"preview: {result['preview']}")
+        if result.get("converted") is not None and self.compression == "none":
+            print(f"next: {self._next(cameras or cameras_beside(job.source))}")
+
+    def _tell_line(self, result: dict[str, Any], job: Job) -> None:
+        """What came of one of several."""
+        if self.json:
+            print(json.dumps(result), flush=True)
+            return
+        what = f"{result['written']:,} splats" if "written" in result else _counts(result)
+        files = ", ".join(f"{path.name} ({size_of(path)})" for path in job.outputs)
+        print(f"{job.shown}: {what}: {files}", flush=True)
+
+    def _next(self, cameras: Sequence[Camera] | None) -> str:
         """The command that compares the mesh with the splats from where it was made for, or one that shows it
         where only a part of them was converted."""
-        folder = self.output.with_suffix("")
-        if self.conversion.crop is not None:
+        folder, source = self.output.with_suffix(""), shown_path(self.input[0])
+        if self.conversion.crop is not None or source == "-":
             return shlex.join(["meshsplats", "render", str(self.output), "-o", f"{folder}-pictures"])
-        words: list[str | Path] = ["meshsplats", "compare", self.input, self.output]
+        words: list[str | Path] = ["meshsplats", "compare", source, self.output]
         if self.data is not None:
             words += ["--data", self.data]
         elif cameras:
-            words += ["--cameras", self.input if self.cameras is None else self.cameras]
+            words += ["--cameras", source if self.cameras is None else self.cameras]
         return shlex.join(map(str, [*words, *self.reading.again(), "-o", f"{folder}-compare"]))
 
 
-def _records_of(name: Path) -> tuple[Path, Path]:
-    """Preview and configuration."""
-    return name.with_name(f"{name.name}.preview.png"), name.with_name(f"{name.name}.config.json")
+def _counts(result: dict[str, Any]) -> str:
+    """What a mesh was made of, and what it has."""
+    has = f"{result['triangles']:,} triangles, {result['vertices']:,} vertices"
+    if "splats" in result:
+        kept = (
+            "" if result["converted"] == result["splats"] else f", {result['converted']:,} of them converted"
+        )
+        has = f"{result['splats']:,} splats{kept} -> {has}"
+    fidelity = result["fidelity"]
+    if fidelity is None:
+        return has
+    psnr = "equal" if fidelity["psnr"] is None else f"{fidelity['psnr']:.2f} dB"
+    views = plural(fidelity["views"], "view")
+    return f"{has}; {psnr}, SSIM {fidelity['ssim']:.4f} against the splats, {views}"
 
 
 def _draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
+    from meshsplats.evaluation import mesh_picture
     from meshsplats.pictures import save_png
-    from meshsplats.rendering import render, render_splats
+    from meshsplats.rendering import render_splats
     from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
     if isinstance(scene, SplatMesh):
-        save_png(path, render(scene, camera, samples=needed_samples(scene, [camera])).color)
+        save_png(path, mesh_picture(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
     else:
         save_png(path, render_splats(scene, camera).color)

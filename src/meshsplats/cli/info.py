@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 
 from meshsplats.camera import Camera, load_cameras
+from meshsplats.cli import shown_path
 from meshsplats.cli.common import SplatOptions, cameras_beside, identify
 from meshsplats.formats.splats import splat_format
 from meshsplats.framing import guess_up, scene_bounds
@@ -45,7 +46,7 @@ class Info:
 def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
     """Findings about ``path``, ready for JSON. Lengths are in scene units."""
     kind = identify(path)
-    found: dict[str, Any] = {"path": str(path), "kind": kind}
+    found: dict[str, Any] = {"path": shown_path(path), "kind": kind}
     if path.is_file():
         found["bytes"] = path.stat().st_size
     if kind == "splats":

@@ -178,6 +178,25 @@ def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
     raise FileFormatError(f"{path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
 
 
+def subject_name(path: Path) -> str:
+    """What ``path`` holds, in a word: the name of the file without its suffix; that of the folder where the
+    file has a name that all have (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
+    if path.name in ("point_cloud.ply", "meta.json", "lod-meta.json"):
+        folder = path.absolute().parent
+        if re.fullmatch(r"iteration_[0-9]+", folder.name):
+            folder = folder.parent
+        if folder.name == "point_cloud":
+            folder = folder.parent
+        return folder.name or path.stem
+    if path.is_dir():
+        return path.absolute().name or "scene"
+    name = path.name
+    for suffix in (".compressed.ply", path.suffix):
+        if suffix and name.lower().endswith(suffix.lower()) and len(name) > len(suffix):
+            return name[: -len(suffix)]
+    return name
+
+
 def splat_file(path: Path) -> Path:
     """The file that ``path`` stands for: itself, or the newest one of a model folder."""
     if not path.exists():

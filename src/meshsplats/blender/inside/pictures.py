@@ -82,9 +82,10 @@ def _common(scene: Any, engine: str, view: str) -> None:
     scene.cycles.seed = 0
 
 
-def render_to(scene: Any, path: Path, factor: int = 1) -> None:
+def render_to(scene: Any, path: Path, factor: int = 1, *, scratch: Path | None = None) -> None:
     """Renders to ``path``, .png (8 bits) or .exr (32 bits). ``factor`` > 1: the mean of that many squared
-    pixels becomes one."""
+    pixels becomes one; the larger picture lies in the folder ``scratch`` meanwhile, by default beside
+    ``path``."""
     transparent = scene.render.film_transparent
     picture = scene.render.image_settings
     picture.color_mode = "RGBA" if transparent else "RGB"
@@ -92,7 +93,7 @@ def render_to(scene: Any, path: Path, factor: int = 1) -> None:
         _format(picture, path.suffix)
         _render(scene, path)
         return
-    large = path.with_name(f"{path.stem}.large.exr")
+    large = (scratch or path.parent) / f"{path.stem}.large.exr"
     try:
         _format(picture, ".exr")
         _render(scene, large)

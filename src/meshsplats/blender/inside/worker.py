@@ -5,7 +5,10 @@ result."""
 from __future__ import annotations
 
 import json
+import os
+import re
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -20,7 +23,37 @@ def tell(**message: object) -> None:
     print(MARK + json.dumps(message), flush=True)
 
 
+def end_with_parent() -> None:
+    """Blender ends when the process that started it does: at once where the kernel sees to it (Linux), else
+    as soon as Python gets its turn, by the pipe on standard input."""
+    if sys.platform.startswith("linux"):
+        import ctypes
+        import signal
+
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+
+    def watch() -> None:
+        if os.read(0, 1):  # else a script in front of Blender has not passed the pipe on
+            while os.read(0, 4096):
+                pass
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def tell_stage(text: str, *_: object) -> None:
+    """Passes on what Blender says of the picture at hand."""
+    sample = re.search(r"Sample (\d+)/(\d+)", text)
+    left = re.search(r"Remaining: ?([\d:.]+)", text)
+    share = int(sample[1]) / max(int(sample[2]), 1) if sample else 0.0
+    words = [part.strip() for part in text.split("|")]
+    stage = sample[0] if sample else words[-1]
+    if sample or "Updating" in stage or "Building" in stage:
+        tell(stage=stage[:60], share=share, left=left[1] if left else None)
+
+
 def main(job_path: str) -> None:
+    end_with_parent()
     import numpy as np
 
     try:
@@ -48,6 +81,7 @@ def main(job_path: str) -> None:
         light = LightOptions(**light)
     options = SceneOptions(light=light, **job["options"])
     cameras = [Camera(np.array(c.pop("world_to_camera")), **c) for c in job["cameras"]]
+    temporary, new = job["temporary"], job["new"]
     blend, targets = job["blend"], [Path(target) for target in job["pictures"]]
 
     start, processor = time.perf_counter(), time.process_time()
@@ -62,12 +96,11 @@ def main(job_path: str) -> None:
     )
     if blend:
         bpy.context.preferences.filepaths.save_version = 0
-        with atomic_path(blend) as temporary:
-            bpy.ops.wm.save_as_mainfile(
-                filepath=str(temporary), copy=True, compress=True, check_existing=False
-            )
+        with atomic_path(blend, temporary=Path(temporary[blend]), new=blend in new) as place:
+            bpy.ops.wm.save_as_mainfile(filepath=str(place), copy=True, compress=True, check_existing=False)
         tell(saved=blend)
     factor = options.samples if light is None else 1
+    bpy.app.handlers.render_stats.append(tell_stage)
     for i, target in enumerate(targets):
         camera, thing = cameras[i], built.cameras[i]
         if sort and i > 0:
@@ -76,8 +109,9 @@ def main(job_path: str) -> None:
         built.scene.frame_set(i)  # where the timeline puts camera i before the lens
         stage.aim(built.scene, camera, thing, factor)
         start, processor = time.perf_counter(), time.process_time()
-        with atomic_path(target) as temporary:
-            pictures.render_to(built.scene, temporary, factor)
+        name = str(target)
+        with atomic_path(target, temporary=Path(temporary[name]), new=name in new) as place:
+            pictures.render_to(built.scene, place, factor, scratch=Path(job_path).parent)
         tell(
             picture=str(target),
             seconds=round(time.perf_counter() - start, 3),
@@ -105,5 +139,8 @@ if __name__ == "__main__":
         import traceback
 
         traceback.print_exc()
+        if isinstance(error, OSError) and error.filename is not None:
+            tell(error=[error.errno, error.strerror, os.fsdecode(error.filename)])
+            sys.exit(1)
         tell(error=f"{type(error).__name__}: {error}")
         sys.exit(1)

@@ -1,0 +1,62 @@
+"""Runs Blender and ends it when its parent ends, however that comes about; then nothing of it is left.
+
+Run as a file, without this package: ``python guard.py plan.json``. The plan: ``command``, ``remove`` (files
+and folders). Standard input is a pipe from the parent that nothing is written to. It closes when the parent
+ends, by kill -9 too, or wants Blender to end; the group of processes that Blender leads is killed then.
+
+A process of its own, because threads of Blender's Python wait while Blender works: they would notice late.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+
+MARK = "@meshsplats "
+"""Begins the lines of output that are meant for the parent process; as in ``inside.worker``."""
+
+
+def main(plan_path: str) -> int:
+    with open(plan_path, encoding="utf-8") as file:
+        plan = json.load(file)
+    # Blender leads a group of its own, so that what a script in front of it has started ends with it.
+    process = subprocess.Popen(plan["command"], stdin=subprocess.PIPE, start_new_session=True)
+    assert process.stdin is not None
+    with contextlib.suppress(OSError):
+        process.stdin.write(b"\n")  # by which Blender knows that this pipe is ours
+        process.stdin.flush()
+    abandoned = threading.Event()
+
+    def watch() -> None:
+        while os.read(0, 4096):
+            pass
+        abandoned.set()
+        _kill(process)
+
+    threading.Thread(target=watch, daemon=True).start()
+    status = process.wait()
+    if abandoned.is_set():
+        for path in plan["remove"]:
+            if os.path.isdir(path):
+                shutil.rmtree(path, ignore_errors=True)
+            elif os.path.exists(path):
+                os.unlink(path)
+        return 1
+    print(MARK + json.dumps({"ended": status}), flush=True)
+    return 0
+
+
+def _kill(process: "subprocess.Popen[bytes]") -> None:
+    with contextlib.suppress(OSError):  # it may have ended meanwhile
+        if sys.platform == "win32":
+            process.kill()
+        else:
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))
