@@ -31,6 +31,7 @@ _HOME = {
     "load_mesh": "meshsplats.formats.meshes",
     "save_mesh": "meshsplats.formats.meshes",
     "convert": "meshsplats.conversion",
+    "simplify": "meshsplats.conversion",
     "render": "meshsplats.rendering",
     "render_splats": "meshsplats.rendering",
     "Rendering": "meshsplats.rendering",

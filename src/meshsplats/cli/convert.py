@@ -32,15 +32,18 @@ from meshsplats.cli.common import (
     size_of,
     write_json,
 )
-from meshsplats.conversion import ConversionOptions, convert
+from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-_CHOOSING = ("crop", "min_opacity", "max_splats")
+_CHOOSING = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that choose splats, and so serve --as-splats too."""
-_OF_SPLATS = ("input", "output", "as_splats", "no_preview", "conversion", "reading", "json", "force")
+_OF_SPLATS = (
+    *("input", "output", "cameras", "data", "as_splats", "no_preview", "conversion", "reading", "json"),
+    "force",
+)
 """Options of the command that do."""
 
 
@@ -98,8 +101,8 @@ class Convert:
     compression: Literal["none", "meshopt"] = "none"
     """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
-    """Write splats, not a mesh: a float .ply as the 3DGS code lays it out, of all splats or of those that
-    --crop, --min-opacity and --max-splats leave."""
+    """Write splats, not a mesh: a float .ply as the 3DGS code lays it out, of all splats or of what --crop,
+    --min-opacity and --max-splats leave."""
     no_preview: bool = False
     """Draw no preview."""
     conversion: _Options = field(default_factory=_Options)
@@ -125,14 +128,7 @@ class Convert:
         up = None if self.up is None else parse_up(self.up)
         preview, config = self._records()
         self._check_input()
-        if self.data is not None:
-            if self.cameras is not None:
-                raise UsageError("give --cameras or --data, not both")
-            cameras = data_cameras(self.data, "train")
-        elif self.cameras is not None:
-            cameras = load_cameras(self.cameras)
-        else:
-            cameras = cameras_beside(self.input) or []
+        cameras = self._cameras()
         self.conversion.resolved(self.preset, has_cameras=bool(cameras))  # mistakes are told before the work
 
         times = [time.perf_counter()]
@@ -151,7 +147,7 @@ class Convert:
         times.append(time.perf_counter())
         write_json(config, configuration("convert", self))
         if preview:
-            _draw_preview(mesh, preview)
+            draw_preview(mesh, preview)
         made_of = mesh.splat_count or 0
         read, made, saved = np.diff(times).round(4).tolist()
         if self.json:
@@ -167,7 +163,7 @@ class Convert:
             }
             print(json.dumps(result, indent=1))
             return
-        kept = "" if made_of == len(cloud) else f", {made_of:,} of them converted"
+        kept = "" if made_of == len(cloud) else f", {self._kept(made_of, len(cloud))}"
         print(
             f"{len(cloud):,} splats{kept} -> {len(mesh.faces):,} triangles, {len(mesh.vertices):,} vertices"
         )
@@ -178,16 +174,34 @@ class Convert:
         if self.compression == "none":  # what is compressed is not read here
             print(f"next: {self._next(cameras)}")
 
+    def _kept(self, kept: int, of: int) -> str:
+        """What became of splats that are not all converted one by one."""
+        share = f" ({kept / of:.1%})"
+        if self.conversion.max_splats is None and self.conversion.max_triangles is None:
+            share = ""
+        elif self.conversion.budget != "drop":
+            return f"merged into {kept:,}{share}"
+        return f"{kept:,} of them converted{share}"
+
     def _records(self) -> tuple[Path | None, Path]:
         """Names of the preview and the configuration, checked with that of the mesh. Where the usual ones are
         those of the same mesh in another format, names with all of the output's own."""
-        preview, config = _records_of(self.output.with_suffix(""))
+        preview, config = record_names(self.output.with_suffix(""))
         other = (recorded_options(config, "convert") or {}).get("output")
         if isinstance(other, str) and Path(other).name != self.output.name:
-            preview, config = _records_of(self.output)
+            preview, config = record_names(self.output)
         wanted = [self.output, config] if self.no_preview else [self.output, preview, config]
         check_outputs(wanted, self.force, inputs=[self.input])
         return (None if self.no_preview else preview), config
+
+    def _cameras(self) -> list[Camera]:
+        if self.data is not None:
+            if self.cameras is not None:
+                raise UsageError("give --cameras or --data, not both")
+            return data_cameras(self.data, "train")
+        if self.cameras is not None:
+            return load_cameras(self.cameras)
+        return cameras_beside(self.input) or []
 
     def _check_input(self) -> None:
         if identify(self.input) != "splats":
@@ -202,6 +216,9 @@ class Convert:
         standard = {f.name: f.default for f in fields(self) if f.name not in _OF_SPLATS}
         idle = [name for name, value in standard.items() if getattr(self, name) != value]
         given = asdict(self.conversion)
+        merging, count = self.conversion.budget != "drop", self.conversion.max_splats
+        if not merging or count is None:
+            idle += [name for name in ("cameras", "data") if getattr(self, name) is not None]
         idle += [name for name, value in given.items() if value is not None and name not in _CHOOSING]
         if idle:
             flags = ", ".join("--" + name.replace("_", "-") for name in idle)
@@ -209,14 +226,22 @@ class Convert:
         self.conversion.resolved("paper", has_cameras=False)
         preview, config = self._records()
         self._check_input()
+        cameras = self._cameras()
         start = time.perf_counter()
         cloud = self.reading.load(self.input)
-        kept = choose_splats(cloud, **{name: given[name] for name in _CHOOSING})
+        kept = choose_splats(
+            cloud,
+            crop=self.conversion.crop,
+            min_opacity=self.conversion.min_opacity,
+            max_splats=None if merging else count,
+        )
+        if merging and count is not None:
+            kept = simplify(kept, count, cameras=cameras)
         save_gaussians(kept, self.output)
         seconds = time.perf_counter() - start
         write_json(config, configuration("convert", self))
         if preview:
-            _draw_preview(kept, preview)
+            draw_preview(kept, preview)
         if self.json:
             result = {
                 "splats": str(self.output),
@@ -247,12 +272,12 @@ class Convert:
         return shlex.join(map(str, [*words, *self.reading.again(), "-o", f"{folder}-compare"]))
 
 
-def _records_of(name: Path) -> tuple[Path, Path]:
-    """Preview and configuration."""
+def record_names(name: Path) -> tuple[Path, Path]:
+    """Those of the preview and the configuration of the output ``name``, which has no suffix."""
     return name.with_name(f"{name.name}.preview.png"), name.with_name(f"{name.name}.config.json")
 
 
-def _draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
+def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
     from meshsplats.pictures import save_png
     from meshsplats.rendering import render, render_splats
 
