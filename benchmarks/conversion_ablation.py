@@ -70,7 +70,7 @@ VARIATIONS: list[tuple[str, dict]] = [
     ("scale_mul 2.8", dict(scale_mul=2.8)),
     ("scale_mul 3.2", dict(scale_mul=3.2)),
     ("opac_mul 0.05", dict(opac_mul=0.05)),
-    ("half the triangles, by importance", dict(max_triangles="half")),
+    ("half the triangles, by importance", dict(max_triangles="half", budget="drop")),
 ]
 GRID = dict(scale_mul=(2.0, 2.7, 3.3), no_triag=(4, 8), opac_mul=(0.0, 0.2), footprint=("none", "cameras"))
 

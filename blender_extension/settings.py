@@ -19,7 +19,7 @@ class Choices:
     )
     max_triangles: IntProperty(
         name="Max. Triangles",
-        description="Keep the most important splats, up to so many triangles; 0: all",
+        description="Merge splats that are alike until the mesh has at most so many triangles; 0: all",
         default=0,
         min=0,
         soft_max=10_000_000,

@@ -14,7 +14,7 @@ from PIL import Image
 import meshsplats
 from meshsplats.camera import load_cameras, orbit, save_cameras
 from meshsplats.cli import main
-from meshsplats.conversion import convert
+from meshsplats.conversion import convert, simplify
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
 from meshsplats.metrics import psnr
@@ -228,12 +228,29 @@ def test_splats_as_splats(splats, tmp_path, capsys):
     assert json.loads((tmp_path / "part.config.json").read_text())["options"]["as_splats"] is True
     with Image.open(tmp_path / "part.preview.png") as image:
         assert np.asarray(image)[300:500, 300:500].mean() < 250
-    assert run(splats, "-o", tmp_path / "few.ply", "--as-splats", "--max-splats", 5, "--no-preview") == 0
+    assert (
+        run(
+            splats,
+            "-o",
+            tmp_path / "few.ply",
+            "--as-splats",
+            "--max-splats",
+            5,
+            "--budget",
+            "drop",
+            "--no-preview",
+        )
+        == 0
+    )
     few = load_gaussians(tmp_path / "few.ply")
     importance = cloud.opacities * np.sqrt(np.prod(cloud.scales.astype(float), axis=1)) ** (4 / 3)
     assert len(few) == 5
     ranks = np.argsort(np.argsort(-importance))[np.isin(cloud.means[:, 0], few.means[:, 0])]
     assert ranks.max() < 12  # a rough measure of size agrees roughly
+    assert run(splats, "-o", tmp_path / "merged.ply", "--as-splats", "--max-splats", 5, "--no-preview") == 0
+    np.testing.assert_allclose(
+        load_gaussians(tmp_path / "merged.ply").means, simplify(cloud, 5).means, rtol=1e-6, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize(
@@ -241,6 +258,8 @@ def test_splats_as_splats(splats, tmp_path, capsys):
     [
         ("a.glb", [], "--as-splats writes .ply"),
         ("a.ply", ["--lit"], "--lit: for a mesh"),
+        ("a.ply", ["--data", "nowhere"], "--data: for a mesh"),
+        ("a.ply", ["--data", "nowhere", "--max-splats", "3", "--budget", "drop"], "--data: for a mesh"),
         ("a.ply", ["--preset", "paper", "--rings", "2"], "--preset, --rings: for a mesh"),
     ],
 )

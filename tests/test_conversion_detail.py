@@ -181,6 +181,10 @@ def test_a_splat_has_the_fan_of_its_level():
 
 def test_max_triangles_is_kept():
     cloud, views = scene(4), cameras()
-    mesh = convert(cloud, cameras=views, detail="cameras", max_triangles=200)
+    options = dict(cameras=views, detail="cameras", max_triangles=200)
+    mesh = convert(cloud, **options, no_triag=8)
     assert 150 < len(mesh.faces) <= 200
     assert mesh.splat_count == 25
+    finer = convert(cloud, **options)
+    assert 150 < len(finer.faces) <= 200
+    assert finer.splat_count == 50  # of 4 triangles in the mean

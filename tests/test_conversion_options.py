@@ -65,40 +65,41 @@ class TestSelection:
     def test_max_splats_by_opacity_times_area(self):
         # opacity x scale^2: 0.9, 0.4 x 4 = 1.6, 0.1 x 9 = 0.9 (tie: the first), 0.5, 1.0
         cloud = row_of([0.9, 0.4, 0.1, 0.5, 1.0], [1, 2, 3, 1, 1])
-        options = dict(footprint="none", shrink_faint=False)
+        options = dict(footprint="none", shrink_faint=False, budget="drop")
         assert kept(convert(cloud, **options, max_splats=1)) == [1]
         assert kept(convert(cloud, **options, max_splats=2)) == [1, 4]
         assert kept(convert(cloud, **options, max_splats=3)) in ([0, 1, 4], [1, 2, 4])
         assert kept(convert(cloud, **options, max_splats=99)) == [0, 1, 2, 3, 4]
 
     def test_ties_keep_the_first(self):
-        assert kept(convert(row_of([0.5] * 9), max_splats=4, footprint="none")) == [0, 1, 2, 3]
+        assert kept(convert(row_of([0.5] * 9), max_splats=4, footprint="none", budget="drop")) == [0, 1, 2, 3]
 
     def test_visible_area_is_that_on_the_picture(self):
         cloud = row_of([0.5, 0.5], [0.1, 0.11], positions=[0, 0])
         cloud = replace(cloud, means=[[0, 0, 5], [0, 0, 10]])
-        assert kept(convert(cloud, cameras=[CAMERA], max_splats=1)) == [0]
-        assert kept(convert(cloud, footprint="none", max_splats=1)) == [1]
+        assert kept(convert(cloud, cameras=[CAMERA], max_splats=1, budget="drop")) == [0]
+        assert kept(convert(cloud, footprint="none", max_splats=1, budget="drop")) == [1]
 
     def test_splats_that_no_camera_sees_count_as_at_the_median_distance(self):
         # Seen at 5, 10 and 20, and one behind the camera as if at 10: 4, 1.1, 1/4 and 1 times its area.
         cloud = row_of([0.5, 0.55, 0.5, 0.5])
         cloud = replace(cloud, means=[[0, 0, 5], [0, 0, 10], [0, 0, 20], [0, 0, -50]])
-        options = dict(cameras=[CAMERA], footprint_px2=0)
+        options = dict(cameras=[CAMERA], footprint_px2=0, budget="drop")
         assert kept(convert(cloud, **options, max_splats=2)) == [0, 1]
         assert kept(convert(cloud, **options, max_splats=3)) == [0, 1, 3]
 
     def test_max_triangles(self):
         cloud = row_of([0.2, 0.8, 0.6, 0.4])
-        assert kept(convert(cloud, max_triangles=31)) == [1, 2, 3]
-        assert kept(convert(cloud, max_triangles=32)) == [0, 1, 2, 3]
-        assert len(convert(cloud, max_triangles=16).faces) == 16
-        assert kept(convert(cloud, max_triangles=16, max_splats=1)) == [1]
+        options = dict(budget="drop", no_triag=4)
+        assert kept(convert(cloud, max_triangles=31, **options)) == [1, 2, 3]
+        assert kept(convert(cloud, max_triangles=32, **options)) == [0, 1, 2, 3]
+        assert len(convert(cloud, max_triangles=16, **options).faces) == 16
+        assert kept(convert(cloud, max_triangles=16, max_splats=1, **options)) == [1]
         with pytest.raises(ValueError, match="max_triangles must be at least 8, one splat's, got 7"):
-            convert(cloud, max_triangles=7)
+            convert(cloud, max_triangles=7, **options)
 
     def test_limits_keep_rows_of_the_cloud(self):
-        mesh = convert(row_of([0.001, 0.5, 0.9, 0.8]), max_splats=2, footprint="none")
+        mesh = convert(row_of([0.001, 0.5, 0.9, 0.8]), max_splats=2, footprint="none", budget="drop")
         np.testing.assert_array_equal(mesh.face_splat, np.repeat([2, 3], 8))
         assert mesh.vertices[mesh.faces[0, 0]].tolist() == [2, 0, 10]
 
@@ -207,6 +208,7 @@ def test_every_option_does_something():
         crop=(-1, -1, 7, 1, 1, 9),
         max_splats=9,
         max_triangles=99,
+        budget="drop",
         colors="cameras",
     )
     assert set(other) == {f.name for f in fields(ConversionOptions)}
@@ -214,6 +216,8 @@ def test_every_option_does_something():
         base = dict(cameras=[CAMERA])
         if name == "focal":
             base["viewing_distance"] = 3.0
+        if name == "budget":
+            base["max_splats"] = 9
         a, b = convert(cloud, **base), convert(cloud, **base, **{name: value})
         same = (
             a.vertices.shape == b.vertices.shape

@@ -80,7 +80,7 @@ def test_more_triangles_help(scene):
 
 def test_limits_leave_out_what_shows_least(scene):
     cloud, close, _ = scene
-    best = convert(cloud, cameras=close, max_splats=len(cloud) // 2)
+    best = convert(cloud, cameras=close, max_splats=len(cloud) // 2, budget="drop")
     rest = np.setdiff1d(np.arange(len(cloud)), best.face_splat)
     worst = convert(cloud.select(rest), cameras=close)
     assert likeness(best, cloud, close) > likeness(worst, cloud, close) + 3

@@ -32,6 +32,7 @@ _HOME = {
     "save_mesh": "meshsplats.formats.meshes",
     "convert": "meshsplats.conversion",
     "bake_filter": "meshsplats.conversion",
+    "simplify": "meshsplats.conversion",
     "render": "meshsplats.rendering",
     "render_splats": "meshsplats.rendering",
     "Rendering": "meshsplats.rendering",

@@ -23,6 +23,7 @@ COMMANDS = {
     "render": ("meshsplats.cli.render:Render", "pictures of splats or a mesh, and a turntable"),
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, pictures side by side"),
     "finetune": ("meshsplats.cli.finetune:Finetune", "the mesh brought closer to splats or photographs"),
+    "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
     "bake": ("meshsplats.cli.bake:Bake", "the filter of a mesh made part of its triangles"),
     "base": ("meshsplats.cli.base:Base", "a classical mesh of the surface that splats form"),
     "prior": ("meshsplats.cli.prior:Prior", "splats on a classical mesh, trained and edited with it"),

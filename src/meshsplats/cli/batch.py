@@ -115,12 +115,13 @@ def _inside(folder: Path) -> list[Path]:
 def _records(base: Path, outputs: Sequence[Path]) -> tuple[Path, Path]:
     """Names of the preview and the configuration. Where the usual ones are those of the same mesh in another
     format, names with all of the output's own."""
-    preview, config = _records_of(base)
+    preview, config = record_names(base)
     other = (recorded_options(config, "convert") or {}).get("output")
     if isinstance(other, str) and Path(other).name not in [path.name for path in outputs]:
-        preview, config = _records_of(outputs[0])
+        preview, config = record_names(outputs[0])
     return preview, config
 
 
-def _records_of(name: Path) -> tuple[Path, Path]:
+def record_names(name: Path) -> tuple[Path, Path]:
+    """Those of the preview and the configuration of the output ``name``, which has no suffix."""
     return name.with_name(f"{name.name}.preview.png"), name.with_name(f"{name.name}.config.json")

@@ -44,17 +44,18 @@ from meshsplats.cli.common import (
     warnings_kept,
     write_json,
 )
-from meshsplats.conversion import ConversionOptions, convert
+from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.selection import choose_splats
+from meshsplats.dataset import load_dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.framing import unit_up
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-_CHOOSING = ("crop", "min_opacity", "max_splats")
+_CHOOSING = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that choose splats, and so serve --as-splats too."""
 _OF_SPLATS = (
-    *("input", "output", "formats", "as_splats", "no_preview", "no_sidecar"),
+    *("input", "output", "cameras", "data", "formats", "as_splats", "no_preview", "no_sidecar"),
     *("conversion", "reading", "json", "force"),
 )
 """Options of the command that do."""
@@ -129,8 +130,8 @@ class Convert:
     compression: Literal["none", "meshopt"] = "none"
     """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
-    """Write splats, not a mesh: a float .ply as the 3DGS code lays it out, of all splats or of those that
-    --crop, --min-opacity and --max-splats leave."""
+    """Write splats, not a mesh: a float .ply as the 3DGS code lays it out, of all splats or of what --crop,
+    --min-opacity and --max-splats leave."""
     fidelity: Count = None
     """Compare the mesh with its splats from N of the cameras, or N places round it, and tell the PSNR and the
     SSIM."""
@@ -209,6 +210,8 @@ class Convert:
         standard = {f.name: f.default for f in fields(self) if f.name not in _OF_SPLATS}
         idle = [name for name, value in standard.items() if getattr(self, name) != value]
         given = asdict(self.conversion)
+        if self.conversion.budget == "drop" or self.conversion.max_splats is None:
+            idle += [name for name in ("cameras", "data") if getattr(self, name) is not None]
         idle += [name for name, value in given.items() if value is not None and name not in _CHOOSING]
         if idle:
             flags = ", ".join("--" + name.replace("_", "-") for name in idle)
@@ -218,8 +221,6 @@ class Convert:
     def _cameras(self) -> list[Camera] | None:
         """Those that were named; None: each input may have its own."""
         if self.data is not None:
-            from meshsplats.dataset import load_dataset
-
             dataset = load_dataset(self.data)
             return [view.camera for view in dataset.train or dataset.views]
         return None if self.cameras is None else load_cameras(self.cameras)
@@ -256,7 +257,7 @@ class Convert:
             if kind == "cameras" or (kind == "mesh" and self.as_splats):
                 raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
             if self.as_splats:
-                result = self._save_splats(job)
+                result = self._save_splats(job, cameras)
             elif kind == "mesh":
                 result = self._save_again(job)
             else:
@@ -282,16 +283,22 @@ class Convert:
         self._write(mesh, job)
         times.append(time.perf_counter())
         if job.preview:
-            _draw_preview(mesh, job.preview)
+            draw_preview(mesh, job.preview)
         read, made, saved = np.diff(times).round(4).tolist()
         return {
             "splats": len(cloud),
             "converted": mesh.splat_count or 0,
+            "merged": self._merges(),
             "triangles": len(mesh.faces),
             "vertices": len(mesh.vertices),
             "seconds": {"read": read, "convert": made, "save": saved},
             "fidelity": self._fidelity(cloud, mesh, cameras),
         }
+
+    def _merges(self) -> bool:
+        """Whether a limit asks for splats to be merged."""
+        limits = (self.conversion.max_splats, self.conversion.max_triangles)
+        return self.conversion.budget != "drop" and any(limit is not None for limit in limits)
 
     def _write(self, mesh: SplatMesh, job: Job) -> None:
         from meshsplats.formats.meshes import save_mesh
@@ -341,7 +348,7 @@ class Convert:
         self._write(mesh, job)
         times.append(time.perf_counter())
         if job.preview:
-            _draw_preview(mesh, job.preview)
+            draw_preview(mesh, job.preview)
         read, saved = np.diff(times).round(4).tolist()
         return {
             "triangles": len(mesh.faces),
@@ -350,18 +357,26 @@ class Convert:
             "fidelity": None,
         }
 
-    def _save_splats(self, job: Job) -> dict[str, Any]:
+    def _save_splats(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """The splats themselves, in the format that everything reads."""
         from meshsplats.formats.splats import save_gaussians
 
         start = time.perf_counter()
         cloud = self.reading.load(job.source)
-        given = asdict(self.conversion)
-        kept = choose_splats(cloud, **{name: given[name] for name in _CHOOSING})
+        options = self.conversion
+        merging, count = options.budget != "drop", options.max_splats
+        kept = choose_splats(
+            cloud,
+            crop=options.crop,
+            min_opacity=options.min_opacity,
+            max_splats=None if merging else count,
+        )
+        if merging and count is not None:
+            kept = simplify(kept, count, cameras=cameras_beside(job.source) if cameras is None else cameras)
         save_gaussians(kept, job.outputs[0])
         seconds = time.perf_counter() - start
         if job.preview:
-            _draw_preview(kept, job.preview)
+            draw_preview(kept, job.preview)
         return {"read": len(cloud), "written": len(kept), "seconds": round(seconds, 4)}
 
     def _tell(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> None:
@@ -410,9 +425,12 @@ def _counts(result: dict[str, Any]) -> str:
     """What a mesh was made of, and what it has."""
     has = f"{result['triangles']:,} triangles, {result['vertices']:,} vertices"
     if "splats" in result:
-        kept = (
-            "" if result["converted"] == result["splats"] else f", {result['converted']:,} of them converted"
-        )
+        share = result["converted"] / result["splats"]
+        kept = f", merged into {result['converted']:,} ({share:.1%})"
+        if result["converted"] == result["splats"]:
+            kept = ""
+        elif not result["merged"]:
+            kept = f", {result['converted']:,} of them converted ({share:.1%})"
         has = f"{result['splats']:,} splats{kept} -> {has}"
     fidelity = result["fidelity"]
     if fidelity is None:
@@ -422,7 +440,7 @@ def _counts(result: dict[str, Any]) -> str:
     return f"{has}; {psnr}, SSIM {fidelity['ssim']:.4f} against the splats, {views}"
 
 
-def _draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
+def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
     from meshsplats.evaluation import mesh_picture
     from meshsplats.pictures import save_png
     from meshsplats.rendering import render_splats

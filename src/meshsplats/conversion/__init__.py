@@ -10,9 +10,11 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.conversion.baking import bake_filter
+from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, Views, pixel_sizes, widen
+from meshsplats.conversion.merging import simplify
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
 from meshsplats.conversion.selection import disc_areas, inside_box, mean_shadow, most_important
@@ -29,6 +31,7 @@ __all__ = [
     "convert",
     "fidelity",
     "fit_profile",
+    "simplify",
 ]
 
 CROSSED_REACH = 1.06
@@ -65,14 +68,16 @@ def convert(
 
     Returns:
         A mesh whose vertices are ordered by splat; within a splat the centre comes first, then ring by ring
-        in order round the ellipse. ``face_splat`` numbers rows of ``cloud``. Triangles that touch the centre
-        list it first, and all triangles of an ellipse wind the same way.
+        in order round the ellipse. ``face_splat`` numbers rows of ``cloud``; where a limit had splats merged
+        (``budget``), those of the merged splats, in the order of the first of each that they were made of.
+        Triangles that touch the centre list it first, and all triangles of an ellipse wind the same way.
 
     Raises:
         TypeError: an option that does not exist.
         ValueError: an option out of range, options that contradict each other, or nothing left to draw.
     """
-    chosen = make_options(options).resolved(preset, has_cameras=bool(cameras))
+    given = make_options(options)
+    chosen = given.resolved(preset, has_cameras=bool(cameras))
     filter_px2 = _filter_of(cloud, chosen)
     direction = guess_up(None, cameras) if up is None else unit_up(up)
     rows = _worth_drawing(cloud, chosen)
@@ -81,32 +86,34 @@ def convert(
         part = replace(part, sh=part.sh[:, :1])
     if len(rows) < len(cloud):
         part = part.select(rows)
+    chosen, count = within_limits(given, chosen, len(part))
+    whole = _Place(part, chosen, cameras, direction)
+    place = whole
+    if chosen.budget == "merge" and count < len(part):
+        place = _Place(simplify(part, count, low_pass=whole.low_pass), chosen, cameras, direction)
+        rows, cloud = np.arange(count, dtype=np.int32), place.cloud
+    part = place.cloud
 
-    views = None
-    if cameras and (chosen.footprint == "cameras" or chosen.colors == "cameras"):
-        views = Views(part.means, cameras)
-    pixel = pixel_sizes(part, chosen, views, direction)
     axes = _axis_order(part, chosen)
-    sigma, opacity = _drawn_gaussians(part, chosen, pixel, axes)
+    sigma, opacity = _drawn_gaussians(part, chosen, place.pixel, axes)
     areas = disc_areas(sigma)
     shadow = mean_shadow(areas)
     shapes, choice = _shapes(sigma, chosen)
-    triangles = len(shapes[0].pattern.faces)  # a splat, whatever its shape, or in the mean
 
     keep = areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(part), bool)
     if not keep.any():
         raise ValueError(f"none of the {len(part)} splats has a visible area")
-    if chosen.max_splats is not None or chosen.max_triangles is not None:
+    if count < len(part):
         importance = opacity * shadow
-        if chosen.footprint == "cameras" and pixel is not None:
-            importance = importance / np.square(pixel)
+        if chosen.footprint == "cameras" and place.pixel is not None:
+            importance = importance / np.square(place.pixel)
         # Splats without area last of all.
         importance[~keep] = -1
-        keep &= most_important(importance, triangles, chosen.max_splats, chosen.max_triangles)
+        keep &= most_important(importance, count)
 
     colors = part.colors
-    if chosen.colors == "cameras" and part.sh_degree > 0 and views is not None:
-        colors = views.mean_colors(part.sh)
+    if chosen.colors == "cameras" and part.sh_degree > 0 and place.views is not None:
+        colors = place.views.mean_colors(part.sh)
 
     def assembled(shapes: list[Shape], choice: np.ndarray, keep: np.ndarray) -> SplatMesh:
         drawn = opacity
@@ -132,10 +139,11 @@ def convert(
     mesh = assembled(shapes, choice, keep)
     if chosen.detail == "cameras":
         wanted: Look = "splats" if chosen.footprint == "filter" else chosen.look or "area"
-        seen = visibility(mesh, cloud.means, part, cameras or (), wanted)
+        seen = visibility(mesh, cloud.means, whole.cloud, cameras or (), wanted)
         visible = keep & ~seen.hidden[rows]
         keep = visible if visible.any() else keep
-        choice[keep] = choose_levels(seen.need[rows[keep]], len(mesh.faces))
+        budget = len(mesh.faces) if chosen.max_triangles is None else chosen.max_triangles
+        choice[keep] = choose_levels(seen.need[rows[keep]], budget)
         mesh = assembled([_ellipse(sides, rings, chosen) for sides, rings in LEVELS], choice, keep)
     return mesh
 
@@ -150,6 +158,34 @@ def _filter_of(cloud: GaussianCloud, options: ConversionOptions) -> float:
             " filters in another way: choose another footprint, or none"
         )
     return DRAWN_PX2 if options.footprint_px2 is None else float(options.footprint_px2)
+
+
+class _Place:
+    """Splats and how they are seen."""
+
+    def __init__(
+        self,
+        cloud: GaussianCloud,
+        options: ConversionOptions,
+        cameras: Sequence[Camera] | None,
+        up: np.ndarray,
+    ) -> None:
+        self.cloud = cloud
+        self.views = None
+        if cameras and "cameras" in (options.footprint, options.colors):
+            self.views = Views(cloud.means, cameras)
+        self.pixel = pixel_sizes(cloud, options, self.views, up)
+        """(n,) or None, as ``pixel_sizes`` has it."""
+        px2 = _filter_px2(cloud, options)
+        self.low_pass: float | np.ndarray = 0.0 if self.pixel is None else np.sqrt(px2) * self.pixel
+        """Standard deviation of the filter, scene units."""
+
+
+def _filter_px2(cloud: GaussianCloud, options: ConversionOptions) -> float:
+    """Variance of the filter, square pixels."""
+    if options.footprint_px2 is not None:
+        return options.footprint_px2
+    return FILTER_PX2[options.look or "area"][cloud.kernel]
 
 
 def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:
@@ -174,10 +210,8 @@ def _drawn_gaussians(
     cloud: GaussianCloud, options: ConversionOptions, pixel: np.ndarray | None, axes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) standard deviations along ``axes`` and (n,) opacities of the splats as a renderer draws them."""
-    px2 = options.footprint_px2
-    if px2 is None:
-        px2 = FILTER_PX2[options.look or "area"][cloud.kernel]
-    sigma = np.take_along_axis(widen(cloud.scales, pixel, px2, cloud.kernel), axes, axis=1)
+    widened = widen(cloud.scales, pixel, _filter_px2(cloud, options), cloud.kernel)
+    sigma = np.take_along_axis(widened, axes, axis=1)
     opacity = cloud.opacities
     if cloud.kernel == "antialiased" and pixel is not None:
         # That kernel lowers the opacity by as much as its filter widens the splat.

@@ -14,6 +14,7 @@ Mode = Literal["crossed", "flat", "3d"]
 Footprint = Literal["cameras", "framing", "distance", "density", "filter", "none"]
 Colors = Literal["degree0", "cameras"]
 Detail = Literal["even", "cameras"]
+Budget = Literal["merge", "drop"]
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,15 @@ class ConversionOptions:
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 in scene units: splats with their centre outside are left out."""
     max_splats: int | None = None
-    """Keep at most so many splats, the most important by opacity times visible area: that on the pictures of
-    the cameras where there are any (splats that none of them sees count as at the median distance), else that
-    in scene units."""
+    """At most so many splats: see ``budget``."""
     max_triangles: int | None = None
-    """Keep the most important splats whose triangles number at most so many."""
+    """At most so many triangles: see ``budget``. In mode 'flat', where neither ``no_triag`` nor the profile
+    is given, splats get fewer triangles each, 4 at least, before they get fewer."""
+    budget: Budget | None = None
+    """How max_splats and max_triangles are kept. merge: splats that are alike are merged. drop: only the most
+    important stay, by opacity times visible area: that on the pictures of the cameras where there are any
+    (splats that none of them sees count as at the median distance), else that in scene units; it tears
+    holes. Default and paper: merge."""
     colors: Colors | None = None
     """degree0: the view-independent part of the colour. cameras: the mean of the colours that the cameras
     see, where the splats have spherical harmonics."""
@@ -115,13 +120,7 @@ class ConversionOptions:
         return full
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
-        for name, kind in [
-            ("mode", Mode),
-            ("footprint", Footprint),
-            ("colors", Colors),
-            ("detail", Detail),
-            ("look", Look),
-        ]:
+        for name, kind in _KINDS.items():
             if getattr(self, name) not in get_args(kind):
                 raise ValueError(
                     f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}"
@@ -171,6 +170,15 @@ class ConversionOptions:
                 )
 
 
+_KINDS = {
+    "mode": Mode,
+    "look": Look,
+    "footprint": Footprint,
+    "colors": Colors,
+    "detail": Detail,
+    "budget": Budget,
+}
+
 _RANGES: list[tuple[str, float, float, bool]] = [
     ("scale_mul", 0.1, 10, False),
     ("no_triag", 3, 64, True),
@@ -199,6 +207,7 @@ PRESETS = {
         focal=1000.0,
         min_opacity=1 / 255,
         shrink_faint=True,
+        budget="merge",
         colors="degree0",
     ),
     "paper": ConversionOptions(
@@ -216,6 +225,7 @@ PRESETS = {
         focal=1000.0,
         min_opacity=0.0,
         shrink_faint=False,
+        budget="merge",
         colors="degree0",
     ),
 }

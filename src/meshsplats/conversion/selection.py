@@ -46,7 +46,7 @@ def choose_splats(
     rows = np.flatnonzero(keep)
     if max_splats is not None and max_splats < len(rows):
         importance = cloud.opacities[rows] * mean_shadow(disc_areas(cloud.scales[rows]))
-        rows = rows[most_important(importance, 1, max_splats, None)]
+        rows = rows[most_important(importance, max_splats)]
     if not len(rows):
         raise ValueError(f"none of the {len(cloud)} splats is left: all are fainter than {min_opacity:.4g}")
     return cloud.select(rows)
@@ -65,21 +65,10 @@ def inside_box(cloud: GaussianCloud, crop: tuple[float, ...]) -> np.ndarray:
     return inside
 
 
-def most_important(
-    importance: np.ndarray, triangles: int, max_splats: int | None, max_triangles: int | None
-) -> np.ndarray:
-    """(n,) bool: the splats of greatest ``importance`` (ties: lower number first) that both limits admit.
-
-    Each splat has ``triangles`` triangles. ValueError if not even one fits.
-    """
-    n = len(importance)
-    count = n if max_splats is None else min(n, max_splats)
-    if max_triangles is not None:
-        count = min(count, max_triangles // triangles)
-        if count == 0:
-            raise ValueError(f"max_triangles must be at least {triangles}, one splat's, got {max_triangles}")
-    keep = np.ones(n, bool)
-    if count < n:
+def most_important(importance: np.ndarray, count: int) -> np.ndarray:
+    """(n,) bool: the ``count`` splats of greatest ``importance`` (ties: lower number first)."""
+    keep = np.ones(len(importance), bool)
+    if count < len(importance):
         keep[np.argsort(-importance, kind="stable")[count:]] = False
     return keep
 

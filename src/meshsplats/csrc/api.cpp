@@ -5,6 +5,7 @@
 
 #include "adam.h"
 #include "gradient.h"
+#include "merging.h"
 #include "mesh_tile.h"
 #include "splats.h"
 #include "ssim.h"
@@ -222,6 +223,14 @@ MS_EXPORT int ms_compare_pictures(MsComparison *comparison, char *message, int m
 
 MS_EXPORT int ms_adam_rows(const MsAdam *adam, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::adam_rows(*adam); });
+}
+
+MS_EXPORT int ms_nearest(const MsNearest *points, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::find_nearest(*points); });
+}
+
+MS_EXPORT int ms_merge_pairs(MsMerging *merging, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::merge_pairs(*merging); });
 }
 
 }  // extern "C"

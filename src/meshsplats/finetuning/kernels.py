@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats.rendering.api import processors
-from meshsplats.rendering.core import load_core, pointer
+from meshsplats.rendering.core import pointer, run
 
 
 class ComparisonStruct(ctypes.Structure):
@@ -100,7 +100,7 @@ def compare_pictures(
         l1_rate=l1_rate,
         ssim_rate=ssim_rate,
     )
-    _call("ms_compare_pictures", comparison)
+    run("ms_compare_pictures", comparison)
     return Comparison(comparison.l1, comparison.ssim, result)
 
 
@@ -146,20 +146,4 @@ def adam_rows(
         low=bounds[0],
         high=bounds[1],
     )
-    _call("ms_adam_rows", adam)
-
-
-def _call(name: str, argument: ctypes.Structure) -> None:
-    message = ctypes.create_string_buffer(256)
-    try:
-        function = getattr(load_core(), name)
-    except AttributeError:
-        raise ImportError(
-            f"the compiled core has no {name}: it is older than the Python code, install the package again"
-        ) from None
-    status = function(ctypes.byref(argument), message, len(message))
-    text = message.value.decode()
-    if status == 1:
-        raise MemoryError(f"{name}: {text}")
-    if status:
-        raise ValueError(text)
+    run("ms_adam_rows", adam)

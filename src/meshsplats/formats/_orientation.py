@@ -62,13 +62,13 @@ def _mapped(cloud: GaussianCloud, a: np.ndarray) -> GaussianCloud:
     orthogonal = u @ vt
     proper = orthogonal * np.sign(np.linalg.det(orthogonal))  # a Gaussian does not know x from -x
     if stretch[0] <= stretch[2] * (1 + 1e-6):
-        quaternions = _product(_quaternions(proper[None])[0], cloud.quaternions.astype(np.float64))
+        quaternions = _product(quaternions_of(proper[None])[0], cloud.quaternions.astype(np.float64))
         scales = cloud.scales * np.float32(stretch.mean())
     else:
         # A R S = U D V^T: the new axes are the columns of U, the new scales D, largest first.
         axes, scales, _ = np.linalg.svd(a @ (cloud.rotations.astype(np.float64) * cloud.scales[:, None]))
         axes[:, :, 2] *= np.linalg.det(axes)[:, None]
-        quaternions = _quaternions(axes)
+        quaternions = quaternions_of(axes)
     sh = cloud.sh
     if sh.shape[1] > 1:
         sh = np.concatenate([sh[:, :1], harmonics_map(orthogonal, cloud.sh_degree) @ sh[:, 1:]], axis=1)
@@ -100,7 +100,7 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return q @ left.T
 
 
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
+def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     """(n, 4) unit quaternions w, x, y, z of proper rotation matrices (n, 3, 3)."""
     r = rotations
     trace = np.trace(r, axis1=1, axis2=2)

@@ -185,3 +185,21 @@ def call(name: str, *arguments) -> None:
         )
     if status:
         raise RuntimeError(f"{name}: {message.value.decode()}")
+
+
+def run(name: str, argument: ctypes.Structure) -> None:
+    """Runs a function of the core that takes one structure. Raises MemoryError, or ValueError with the core's
+    message; ImportError if the core does not have it."""
+    message = ctypes.create_string_buffer(256)
+    try:
+        function = getattr(load_core(), name)
+    except AttributeError:
+        raise ImportError(
+            f"the compiled core has no {name}: it is older than the Python code, install the package again"
+        ) from None
+    status = function(ctypes.byref(argument), message, len(message))
+    text = message.value.decode()
+    if status == 1:
+        raise MemoryError(f"{name}: {text}")
+    if status:
+        raise ValueError(text)

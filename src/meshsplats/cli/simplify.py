@@ -1,0 +1,121 @@
+"""``meshsplats simplify``: fewer splats."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from meshsplats.camera import Camera, load_cameras
+from meshsplats.cli import UsageError
+from meshsplats.cli.batch import record_names
+from meshsplats.cli.common import (
+    Count,
+    File,
+    Folder,
+    Number,
+    Output,
+    SplatOptions,
+    cameras_beside,
+    check_outputs,
+    configuration,
+    identify,
+    size_of,
+    write_json,
+)
+from meshsplats.cli.convert import draw_preview
+from meshsplats.dataset import load_dataset
+from meshsplats.errors import FileFormatError
+
+
+@dataclass(frozen=True)
+class Simplify:
+    """Fewer splats that look the same: those that are most alike are merged, none are dropped.
+
+    Writes a float .ply as the 3DGS code lays it out, with a preview picture and the configuration beside it.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Splat file, or the folder of a trained model."""
+    output: Output
+    """The splats: .ply."""
+    count: Count = None
+    """How many splats to keep."""
+    share: Number = None
+    """How many to keep as a share of all, above 0 to 1: 0.25 keeps a quarter."""
+    cameras: File = None
+    """Where the splats will be seen from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the
+    model folder that has one. Detail that is finer than their pixels goes first. Default: the cameras of the
+    input where it is a model folder, else pictures of 1000 pixels that hold the subject."""
+    data: Folder = None
+    """Data set of the photographs: the cameras of its training views."""
+    no_preview: bool = False
+    """Draw no preview."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """At most N threads. Default: all processors."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.conversion.merging import simplify
+        from meshsplats.formats.splats import save_gaussians
+
+        self._check()
+        preview, config = record_names(self.output.with_suffix(""))
+        outputs = [self.output, config] if self.no_preview else [self.output, preview, config]
+        check_outputs(outputs, self.force, inputs=[self.input])
+        if identify(self.input) != "splats":
+            raise FileFormatError(f"{self.input}: not splats; simplify needs a splat file or a model folder")
+        cameras = self._cameras()
+        cloud = self.reading.load(self.input)
+        start = time.perf_counter()
+        count = self.count if self.share is None else max(1, round(self.share * len(cloud)))
+        assert count is not None
+        kept = simplify(cloud, count, cameras=cameras, threads=self.threads)
+        seconds = time.perf_counter() - start
+        save_gaussians(kept, self.output)
+        write_json(config, configuration("simplify", self))
+        if not self.no_preview:
+            draw_preview(kept, preview)
+        if self.json:
+            result = {
+                "splats": str(self.output),
+                "preview": None if self.no_preview else str(preview),
+                "read": len(cloud),
+                "written": len(kept),
+                "bytes": self.output.stat().st_size,
+                "seconds": round(seconds, 4),
+            }
+            print(json.dumps(result, indent=1))
+            return
+        print(f"{len(cloud):,} splats -> {len(kept):,} ({len(kept) / len(cloud):.1%}) in {seconds:.2f} s")
+        print(f"{self.output} ({size_of(self.output)})")
+        if not self.no_preview:
+            print(f"preview: {preview}")
+
+    def _check(self) -> None:
+        """UsageError for options that contradict each other or are out of range."""
+        if self.output.suffix.lower() != ".ply":
+            raise UsageError(f"-o must end in .ply, got {self.output.name!r}")
+        if (self.count is None) == (self.share is None):
+            raise UsageError("give --count or --share, one of them")
+        if self.count is not None and self.count < 1:
+            raise UsageError(f"--count must be at least 1, got {self.count}")
+        if self.share is not None and not 0 < self.share <= 1:
+            raise UsageError(f"--share must be above 0 and at most 1, got {self.share}")
+        if self.cameras is not None and self.data is not None:
+            raise UsageError("give --cameras or --data, not both")
+
+    def _cameras(self) -> list[Camera] | None:
+        if self.data is not None:
+            dataset = load_dataset(self.data)
+            return [view.camera for view in dataset.train or dataset.views]
+        if self.cameras is not None:
+            return load_cameras(self.cameras)
+        return cameras_beside(self.input)

@@ -1,0 +1,458 @@
+"""simplify: moments by hand, laws of merging, the core's search and its greedy order against slow twins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import shared_data
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshsplats import GaussianCloud, convert, load_gaussians, orbit, psnr, render, render_splats, simplify
+from meshsplats.conversion import ConversionOptions, merging
+from meshsplats.conversion.budget import within_limits
+from meshsplats.conversion.merging import nearest, opacity_of, optical_depth
+from meshsplats.conversion.selection import disc_areas, mean_shadow
+from meshsplats.demo_scene import make_scene
+
+
+def random_cloud(n, seed=0, degree=0, kernel="3dgs"):
+    rng = np.random.default_rng(seed)
+    quaternions = rng.normal(size=(n, 4))
+    return GaussianCloud(
+        rng.normal(size=(n, 3)),
+        quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        np.exp(rng.normal(-2.5, 0.6, (n, 3))),
+        rng.uniform(0.05, 0.6, n),
+        rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.4,
+        kernel=kernel,
+    )
+
+
+def masses(cloud, low_pass=0.0):
+    widened = np.sqrt(cloud.scales.astype(np.float64) ** 2 + np.square(low_pass)[..., None])
+    return optical_depth(cloud.opacities) * mean_shadow(disc_areas(widened))
+
+
+def covariances(cloud):
+    axes = cloud.rotations.astype(np.float64) * cloud.scales[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def moments(cloud, low_pass=0.0):
+    """Mass, mean and covariance of a whole cloud."""
+    m = masses(cloud, low_pass)
+    mean = np.average(cloud.means.astype(np.float64), axis=0, weights=m)
+    apart = cloud.means - mean
+    spread = covariances(cloud) + apart[:, :, None] * apart[:, None, :]
+    return m.sum(), mean, np.average(spread, axis=0, weights=m)
+
+
+def pair(**changes):
+    """Two round splats on the x axis."""
+    fields = dict(
+        means=[[0, 0, 0], [3, 0, 0]],
+        quaternions=[[1, 0, 0, 0], [1, 0, 0, 0]],
+        scales=[[1, 1, 1], [2, 2, 2]],
+        opacities=[0.5, 0.125],
+        sh=[[[1, 0, 0]], [[0, 1, 0]]],
+    )
+    return GaussianCloud(**(fields | changes))
+
+
+class TestByHand:
+    def test_two_splats(self):
+        # Masses Li2(0.5) x 1 and Li2(0.125) x 4. Li2(1/2) = pi^2 / 12 - ln(2)^2 / 2.
+        a = np.pi**2 / 12 - np.log(2) ** 2 / 2
+        b = 4 * sum(0.125**k / k**2 for k in range(1, 30))
+        share = b / (a + b)
+        one = simplify(pair(), 1, low_pass=0)
+        assert len(one) == 1
+        np.testing.assert_allclose(one.means[0], [3 * share, 0, 0], rtol=1e-6)
+        np.testing.assert_allclose(one.sh[0, 0], [1 - share, share, 0], rtol=1e-6)
+        across = (1 - share) * 1 + share * 4
+        along = across + share * (1 - share) * 9
+        np.testing.assert_allclose(
+            covariances(one)[0], np.diag([along, across, across]), rtol=1e-5, atol=1e-6
+        )
+        area = mean_shadow(disc_areas(np.sqrt([[along, across, across]])))[0]
+        assert optical_depth(one.opacities)[0] * area == pytest.approx(a + b, rel=1e-4)
+
+    def test_the_low_pass_counts_as_area(self):
+        # 3DGS widens without dimming: what is drawn of the first is sqrt(1 + 3)^2 = 4 times as much.
+        cloud = pair(scales=[[1, 1, 1], [1, 1, 1]], opacities=[0.25, 0.25])
+        one = simplify(cloud, 1, low_pass=np.array([np.sqrt(3), 0]))
+        np.testing.assert_allclose(one.means[0, 0], 3 / 5, rtol=1e-6)
+        thin = replace(cloud, kernel="antialiased")  # that dims by as much
+        np.testing.assert_allclose(simplify(thin, 1, low_pass=np.array([9.0, 0])).means[0, 0], 1.5, rtol=1e-6)
+
+    def test_identical_splats_become_one(self):
+        cloud = random_cloud(1).select(np.zeros(7, int))
+        cloud = replace(cloud, opacities=np.full(7, 0.02))
+        one = simplify(cloud, 1, low_pass=0.1)
+        np.testing.assert_allclose(one.means, cloud.means[:1], rtol=1e-6)
+        np.testing.assert_allclose(np.sort(one.scales[0]), np.sort(cloud.scales[0]), rtol=1e-5)
+        np.testing.assert_allclose(covariances(one), covariances(cloud)[:1], rtol=1e-4, atol=1e-8)
+        # Seven layers, one behind the other.
+        assert one.opacities[0] == pytest.approx(opacity_of(7 * optical_depth(0.02)), rel=1e-5)
+        assert one.opacities[0] == pytest.approx(1 - (1 - 0.02) ** 7, rel=0.05)
+
+    def test_what_is_alike_goes_first(self):
+        # Three pairs: as near and of one colour, as near and of two, farther and of one.
+        cloud = GaussianCloud(
+            [[0, 0, 0], [0.5, 0, 0], [20, 0, 0], [20.5, 0, 0], [40, 0, 0], [41, 0, 0]],
+            [[1, 0, 0, 0]] * 6,
+            [[1, 1, 1]] * 6,
+            [0.5] * 6,
+            np.array([[1, 1, 1], [1, 1, 1], [1, 1, 1], [-1, 0, 1], [1, 1, 1], [1, 1, 1]])[:, None],
+        )
+        left = [simplify(cloud, n, low_pass=0).means[:, 0].round(2).tolist() for n in (5, 4, 3)]
+        assert left[0] == [0.25, 20, 20.5, 40, 41]
+        assert left[1] == [0.25, 20, 20.5, 40.5]
+        assert left[2] == [0.25, 20.25, 40.5]
+
+    def test_many_opaque_layers_are_one(self):
+        cloud = random_cloud(1).select(np.zeros(50, int))
+        one = simplify(replace(cloud, opacities=np.ones(50)), 1, low_pass=0)
+        assert one.opacities[0] == 1
+        np.testing.assert_allclose(one.means, cloud.means[:1], rtol=1e-6)
+
+    def test_what_is_never_drawn_has_no_mass(self):
+        cloud = pair(opacities=[0.5, 0.0039])
+        one = simplify(cloud, 1, low_pass=0.2)
+        np.testing.assert_allclose(one.means[0], 0, atol=1e-12)
+        assert one.opacities[0] == pytest.approx(0.5, abs=1e-5)
+
+    def test_surfels_stay_flat(self):
+        cloud = random_cloud(60, kernel="2dgs")
+        cloud = replace(cloud, scales=cloud.scales * np.array([1, 1, 0], np.float32))
+        few = simplify(cloud, 9, low_pass=0)
+        assert few.kernel == "2dgs"
+        assert not few.scales[:, 2].any()
+        assert (few.scales[:, 1] > 0).all()
+        # Two side by side in one plane are a longer one in it.
+        flat = pair(scales=[[1, 1, 0], [1, 1, 0]], opacities=[0.5, 0.5], kernel="2dgs")
+        one = simplify(flat, 1, low_pass=0)
+        np.testing.assert_allclose(one.scales[0], [np.sqrt(1 + 9 / 4), 1, 0], rtol=1e-6)
+        np.testing.assert_allclose(np.abs(one.rotations[0, :, 2]), [0, 0, 1], atol=1e-6)
+
+
+class TestLaws:
+    @given(st.integers(2, 60), st.integers(0, 10_000), st.floats(0, 0.5), st.integers(0, 3))
+    def test_mass_mean_covariance_and_colour_are_kept(self, n, seed, low_pass, degree):
+        cloud = random_cloud(n, seed, degree)
+        cloud = replace(cloud, opacities=cloud.opacities * np.float32(0.1) + np.float32(0.004))
+        count = 1 + seed % n
+        few = simplify(cloud, count, low_pass=low_pass)
+        assert len(few) == min(count, n)
+        assert few.sh_degree == degree
+        assert few.opacities.max() < 0.99  # nothing is lost in one that is opaque
+        for a, b in zip(moments(cloud, low_pass), moments(few, low_pass), strict=True):
+            np.testing.assert_allclose(b, a, rtol=2e-4, atol=2e-5)
+        before = np.average(cloud.sh.reshape(n, -1), axis=0, weights=masses(cloud, low_pass))
+        after = np.average(few.sh.reshape(len(few), -1), axis=0, weights=masses(few, low_pass))
+        np.testing.assert_allclose(after, before, rtol=2e-4, atol=2e-5)
+
+    @given(st.integers(0, 10_000))
+    def test_moved_turned_and_scaled_splats_give_moved_turned_and_scaled_results(self, seed):
+        from meshsplats.formats._orientation import transformed
+
+        rng = np.random.default_rng(seed)
+        cloud = random_cloud(40, seed)
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        turn *= np.sign(np.linalg.det(turn))
+        size, shift = float(np.exp(rng.normal())), rng.normal(size=3)
+        moved = transformed(cloud, turn)
+        moved = replace(moved, means=moved.means * size + shift, scales=moved.scales * size)
+        few = simplify(cloud, 12, low_pass=0.05)
+        same = simplify(moved, 12, low_pass=0.05 * size)
+        np.testing.assert_allclose(same.means, few.means @ turn.T * size + shift, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(same.opacities, few.opacities, rtol=1e-3)
+        expected = size**2 * (turn @ covariances(few) @ turn.T)
+        np.testing.assert_allclose(covariances(same), expected, rtol=1e-3, atol=1e-5 * expected.max())
+
+    @given(st.integers(0, 10_000))
+    def test_the_order_of_splats_does_not_matter(self, seed):
+        cloud = random_cloud(50, seed)
+        shuffled = np.random.default_rng(seed).permutation(50)
+        a, b = simplify(cloud, 15, low_pass=0.1), simplify(cloud.select(shuffled), 15, low_pass=0.1)
+        a, b = (c.select(np.lexsort(c.means.T)) for c in (a, b))
+        np.testing.assert_allclose(a.means, b.means, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(a.opacities, b.opacities, rtol=1e-5)
+
+    def test_the_same_bits_with_any_number_of_threads(self):
+        cloud = make_scene(6000)
+        one, more = (simplify(cloud, 1500, threads=n) for n in (1, 5))
+        for name in ("means", "quaternions", "scales", "opacities", "sh"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(more, name))
+
+    def test_what_was_not_merged_keeps_its_bits_and_the_order(self):
+        cloud = random_cloud(200, degree=1)
+        few = simplify(cloud, 150, low_pass=0.02)
+        rows = [np.flatnonzero((cloud.means == m).all(axis=1)) for m in few.means]
+        kept = np.array([i for i, found in enumerate(rows) if len(found)])
+        assert len(kept) >= 100
+        numbers = np.concatenate([rows[i] for i in kept])
+        assert (np.diff(numbers) > 0).all()
+        for name in ("quaternions", "scales", "opacities", "sh"):
+            np.testing.assert_array_equal(getattr(few, name)[kept], getattr(cloud, name)[numbers])
+
+    def test_as_many_as_there_are(self):
+        cloud = random_cloud(5)
+        assert simplify(cloud, 5) is cloud
+        assert simplify(cloud, 99) is cloud
+
+    @pytest.mark.parametrize("count", [1, 2, 3, 31])
+    def test_parts_that_are_no_neighbours_of_each_other(self, count):
+        clusters = [
+            replace(random_cloud(30, seed), means=random_cloud(30, seed).means + 1e4 * seed)
+            for seed in range(4)
+        ]
+        cloud = GaussianCloud(
+            *(
+                np.concatenate([getattr(c, n) for c in clusters])
+                for n in ("means", "quaternions", "scales", "opacities", "sh")
+            )
+        )
+        assert len(simplify(cloud, count, low_pass=0.01)) == count
+
+
+class TestTwins:
+    @given(st.integers(2, 80), st.integers(1, 12), st.integers(0, 10_000), st.booleans())
+    def test_nearest(self, n, count, seed, on_a_grid):
+        rng = np.random.default_rng(seed)
+        points = rng.normal(size=(n, 3)) * [1, 1e-3, 100]
+        if on_a_grid:  # many are as near, and some the same
+            points = rng.integers(0, 3, (n, 3)).astype(float)
+        count = min(count, n - 1)
+        order, found = nearest(points, count)
+        assert sorted(order) == list(range(n))
+        placed = points[order]
+        apart = ((placed[:, None] - placed[None]) ** 2).sum(axis=2)
+        np.fill_diagonal(apart, np.inf)
+        np.testing.assert_array_equal(found, np.argsort(apart, axis=1, kind="stable")[:, :count])
+
+    def test_nearest_of_many(self):
+        points = make_scene(20_000).means.astype(np.float64)
+        order, found = nearest(points, 8)
+        placed = points[order]
+        for row in range(0, len(points), 997):
+            apart = ((placed - placed[row]) ** 2).sum(axis=1)
+            apart[row] = np.inf
+            np.testing.assert_array_equal(apart[found[row]], np.sort(apart)[:8])
+
+    @pytest.mark.parametrize("seed", range(8))
+    def test_always_the_cheapest_pair(self, seed):
+        """Of nine splats, all are neighbours: the core against a search through all pairs."""
+        rng = np.random.default_rng(seed)
+        n = 9
+        half = rng.normal(size=(n, 3, 3)) * 0.3
+        means, spread = rng.normal(size=(n, 3)), half @ half.transpose(0, 2, 1) + 0.1 * np.eye(3)
+        mass, colors = rng.uniform(0.1, 2, n), rng.uniform(0, 1, (n, 3))
+        upper = spread[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        for wanted in (6, 3, 1):
+            group, left = merging._merge_neighbours(means, upper, mass, colors, wanted, 1)
+            assert left == wanted
+            members = {frozenset(np.flatnonzero(group == g)) for g in range(left)}
+            assert members == greedy(means, spread, mass, colors, wanted)
+
+    def test_neighbours_are_checked(self):
+        points = np.zeros((4, 3))
+        wrong = np.full((4, 2), 9, np.int32)
+        found = np.empty(4, np.int32)
+        zeros = np.zeros((4, 6))
+        with pytest.raises(ValueError, match="neighbour 9 of 0 is not another of 4"):
+            merging.run(
+                "ms_merge_pairs",
+                merging.MergingStruct(
+                    count=4,
+                    wanted=1,
+                    neighbours=2,
+                    threads=1,
+                    means=merging.pointer(points),
+                    covariances=merging.pointer(zeros),
+                    masses=merging.pointer(zeros),
+                    colors=merging.pointer(points),
+                    nearest=merging.pointer(wrong),
+                    color_weight=1.0,
+                    group=merging.pointer(found),
+                ),
+            )
+
+
+def greedy(means, spread, mass, colors, wanted):
+    """Sets of members after merging the pair of least cost, again and again."""
+    parts = [
+        (frozenset([i]), m, s, w, c)
+        for i, (m, s, w, c) in enumerate(zip(means, spread, mass, colors, strict=True))
+    ]
+
+    def together(a, b):
+        share = b[3] / (a[3] + b[3])
+        apart = b[1] - a[1]
+        s = (1 - share) * a[2] + share * b[2] + share * (1 - share) * np.outer(apart, apart)
+        return (a[0] | b[0], a[1] + share * apart, s, a[3] + b[3], (1 - share) * a[4] + share * b[4])
+
+    def log_area(s):
+        return 0.5 * np.log((np.trace(s) ** 2 - np.trace(s @ s)) / 2)
+
+    def cost(a, b):
+        c = together(a, b)
+        spent = c[3] * log_area(c[2]) - a[3] * log_area(a[2]) - b[3] * log_area(b[2])
+        return spent + a[3] * b[3] / c[3] * np.sum((a[4] - b[4]) ** 2)
+
+    while len(parts) > wanted:
+        pairs = [(cost(a, b), i, j) for i, a in enumerate(parts) for j, b in enumerate(parts[:i])]
+        _, i, j = min(pairs)
+        parts = [p for k, p in enumerate(parts) if k not in (i, j)] + [together(parts[i], parts[j])]
+    return {p[0] for p in parts}
+
+
+class TestHostile:
+    @given(st.integers(0, 10_000))
+    def test_any_valid_cloud(self, seed):
+        rng = np.random.default_rng(seed)
+        n = int(rng.integers(2, 40))
+        cloud = random_cloud(n, seed)
+        some = rng.random((4, n)) < 0.3
+        cloud = replace(
+            cloud,
+            scales=np.where(some[0][:, None], 0, cloud.scales) * np.where(some[1][:, None], [1, 1, 0], 1),
+            opacities=np.where(some[2], rng.integers(0, 2, n), cloud.opacities),
+            means=np.where(some[3][:, None], cloud.means[:1], cloud.means),
+        )
+        for low_pass in (None, 0, 0.1):
+            assert len(simplify(cloud, 1 + n // 3, low_pass=low_pass)) == 1 + n // 3
+
+    @pytest.mark.parametrize("size", [1e-12, 1e12])
+    @pytest.mark.parametrize("low_pass", [None, 0])
+    def test_tiny_and_huge_scenes(self, size, low_pass):
+        cloud = random_cloud(30)
+        other = replace(cloud, means=cloud.means * size, scales=cloud.scales * size)
+        few, same = (simplify(c, 7, low_pass=low_pass) for c in (cloud, other))
+        np.testing.assert_allclose(same.means / np.float32(size), few.means, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(same.opacities, few.opacities, rtol=1e-3)
+
+    def test_points_of_no_size(self):
+        cloud = replace(random_cloud(30), scales=np.zeros((30, 3)))
+        few = simplify(cloud, 4, low_pass=0)
+        assert len(few) == 4
+
+    @pytest.mark.parametrize("count", [0, -3, 2.5, True, "9"])
+    def test_count(self, count):
+        with pytest.raises(ValueError, match="count must be a whole number of splats"):
+            simplify(random_cloud(3), count)
+
+    @pytest.mark.parametrize("low_pass", [-1.0, np.nan, np.zeros(2), np.array([0.1, np.inf, 0])])
+    def test_low_pass(self, low_pass):
+        with pytest.raises(ValueError, match="low_pass must be one number >= 0, or one for each of the 3"):
+            simplify(random_cloud(3), 2, low_pass=low_pass)
+
+
+def test_dilogarithm():
+    """Special values, Euler's reflection, and the way back."""
+    assert optical_depth(0.0) == 0
+    assert optical_depth(1.0) == pytest.approx(np.pi**2 / 6, rel=1e-15)
+    golden = (np.sqrt(5) - 1) / 2
+    assert optical_depth(golden) == pytest.approx(np.pi**2 / 10 - np.log(golden) ** 2, rel=1e-14)
+    o = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(opacity_of(optical_depth(o)), o, atol=1e-5)
+    assert opacity_of(99.0) == 1
+    # The integral that it stands for: of -log(1 - o exp(-r^2 / 2)) r dr.
+    r = np.linspace(0, 9, 400_001)
+    for opacity in (0.1, 0.7, 0.99):
+        values = -np.log1p(-opacity * np.exp(-(r**2) / 2)) * r
+        integral = np.sum((values[1:] + values[:-1]) * np.diff(r)) / 2
+        assert optical_depth(opacity) == pytest.approx(integral, rel=1e-6)
+
+
+class TestPictures:
+    def test_far_better_than_dropping(self):
+        cloud = make_scene(8000)
+        cloud = replace(cloud, sh=cloud.sh[:, :1])
+        cameras = orbit(cloud, 3, width=200, height=200)
+        count = len(cloud) // 4
+        importance = cloud.opacities * mean_shadow(disc_areas(cloud.scales))
+        dropped = cloud.select(np.argsort(-importance)[:count])
+        merged = simplify(cloud, count, cameras=cameras)
+        assert likeness(merged, cloud, cameras) > likeness(dropped, cloud, cameras) + 5
+
+    @pytest.mark.parametrize(
+        ("name", "least"),
+        [("guitar_sh0.ply", 37.5), ("playbot_lod3_31k_sh2.ply", 26), ("monkey_0001.sog", 28.5)],
+    )
+    def test_real_files_at_a_quarter(self, name, least):
+        cloud = load_gaussians(shared_data(f"splats/{name}"))
+        cameras = orbit(cloud, 2, width=300, height=300)
+        few = simplify(cloud, len(cloud) // 4, cameras=cameras)
+        assert len(few) == len(cloud) // 4
+        assert likeness(few, cloud, cameras) > least
+
+
+def likeness(some, cloud, cameras):
+    return np.mean([psnr(render_splats(some, c).color, render_splats(cloud, c).color) for c in cameras])
+
+
+class TestLimits:
+    """Limits of convert that merge."""
+
+    cloud = replace(make_scene(3000), sh=make_scene(3000).sh[:, :1])
+    cameras = orbit(cloud, 3, width=200, height=200)
+
+    def test_max_splats_is_what_simplify_makes(self):
+        mesh = convert(self.cloud, max_splats=500, footprint="none", min_opacity=0)
+        same = convert(simplify(self.cloud, 500, low_pass=0), footprint="none", min_opacity=0)
+        np.testing.assert_array_equal(mesh.vertices, same.vertices)
+        np.testing.assert_array_equal(mesh.colors, same.colors)
+        np.testing.assert_array_equal(mesh.face_splat, same.face_splat)
+        assert mesh.splat_count <= 500
+
+    @pytest.mark.parametrize("detail", ["even", "cameras"])
+    @pytest.mark.parametrize("most", [8, 1000, 8000, 20_000])
+    def test_max_triangles_is_kept(self, most, detail):
+        mesh = convert(self.cloud, cameras=self.cameras, max_triangles=most, detail=detail)
+        assert 0.85 * most <= len(mesh.faces) <= most
+        assert mesh.face_splat[-1] < len(self.cloud)
+
+    def test_no_limit_is_felt(self):
+        free, wide = convert(self.cloud), convert(self.cloud, max_triangles=8 * len(self.cloud))
+        np.testing.assert_array_equal(free.vertices, wide.vertices)
+
+    def test_merged_is_far_better_than_dropped(self):
+        for limit in (dict(max_splats=600), dict(max_triangles=4800)):
+            merged, dropped = (
+                convert(self.cloud, cameras=self.cameras, budget=budget, **limit)
+                for budget in ("merge", "drop")
+            )
+            assert mesh_likeness(merged, self) > mesh_likeness(dropped, self) + 2
+
+    def test_what_was_asked_for_stays(self):
+        mesh = convert(self.cloud, max_triangles=700, mode="crossed", no_triag=6)
+        assert len(mesh.faces) == 700 // 12 * 12
+        assert len(convert(self.cloud, max_triangles=700, preset="paper").faces) == 700 // 8 * 8
+        with pytest.raises(ValueError, match="max_triangles must be at least 12, one splat's, got 11"):
+            convert(self.cloud, max_triangles=11, no_triag=6, mode="crossed")
+
+    @pytest.mark.parametrize(
+        ("most", "each", "count"),
+        [(100, 4, 25), (800, 4, 200), (2400, 4, 600), (4000, 6, 666), (6000, 8, 750), (8000, 8, 1000)],
+    )
+    def test_triangles_of_a_flat_splat(self, most, each, count):
+        given = ConversionOptions(mode="flat", max_triangles=most)
+        chosen, found = within_limits(given, given.resolved("default", has_cameras=False), 1000)
+        assert (chosen.no_triag, found) == (each, count)
+
+    @pytest.mark.parametrize("kernel", ["3dgs", "antialiased", "2dgs"])
+    def test_kernels(self, kernel):
+        cloud = replace(self.cloud, kernel=kernel)
+        mesh = convert(cloud, max_splats=700, cameras=self.cameras)
+        truth = [render_splats(cloud, c).color for c in self.cameras]
+        found = [render(mesh, c).color for c in self.cameras]
+        assert np.mean([psnr(a, b) for a, b in zip(found, truth, strict=True)]) > 20
+
+
+def mesh_likeness(mesh, scene):
+    truth = [render_splats(scene.cloud, c).color for c in scene.cameras]
+    return np.mean([psnr(render(mesh, c).color, t) for c, t in zip(scene.cameras, truth, strict=True)])
