@@ -97,6 +97,16 @@ def test_metadata_asks_for_little_and_caps_nothing():
     assert not [line for line in required if "<" in line or "==" in line]
 
 
+def test_the_lowest_versions_are_tested():
+    """The first line of a package in lowest-constraints.txt, which make test-lowest installs, is the lowest
+    version of it that the metadata allows."""
+    required = [line for line in metadata.requires("meshsplats") or [] if "extra" not in line]
+    allowed = dict(re.fullmatch(r"([\w-]+)>=([\d.]+)", line).groups() for line in required)  # type: ignore[union-attr]
+    text = (ROOT / "lowest-constraints.txt").read_text(encoding="utf-8")
+    tested = dict(reversed(re.findall(r"^([\w-]+)==([\d.]+)", text, re.MULTILINE)))
+    assert tested == allowed
+
+
 # ---- The documents
 
 

@@ -150,7 +150,7 @@ def test_strip():
 
 @pytest.mark.parametrize("name", ["load_default", "load_default_imagefont"])
 def test_captions_in_any_script(name, monkeypatch):
-    """Pillow's own font has Latin letters only where it was built without FreeType, or before 10.1."""
+    """Pillow without FreeType, or before version 10.1, has a font of Latin letters only."""
     if not hasattr(ImageFont, name):
         pytest.skip(f"this Pillow has no {name}")
     monkeypatch.setattr(ImageFont, "load_default", getattr(ImageFont, name))
