@@ -13,6 +13,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -111,6 +114,16 @@ def _alive(process: int) -> bool:
         return False
 
 
+@contextmanager
+def _killed(process: subprocess.Popen) -> Iterator[subprocess.Popen]:
+    """``process``, which does not outlive a failure of the test."""
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 @linux
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name)
 def test_blender_ends_with_the_command_and_leaves_nothing(program, tmp_path, number):
@@ -123,7 +136,11 @@ def test_blender_ends_with_the_command_and_leaves_nothing(program, tmp_path, num
     command = [sys.executable, "-m", "meshsplats", "blender", str(tmp_path / "mesh.npz")]
     command += ["-o", str(place / "a.png"), "--executable", str(program("Blender 5.0.1", line))]
     environment = os.environ | {"TMPDIR": str(scratch)}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) as process:
+    # Where the tests run in the background of a shell, it has SIGINT ignored.
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with _killed(
+        subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, preexec_fn=heed)
+    ) as process:
         assert _until(lambda: all((notes / name).exists() for name in ("child", "parent")), 300)
         assert _until(lambda: all((notes / name).read_text() for name in ("child", "parent")))
         assert len(os.listdir(place)) == len(os.listdir(scratch)) == 1
