@@ -1,4 +1,4 @@
-"""How close the mesh comes to the splats it was made from, for both presets.
+"""How close the mesh comes to the splats it was made from, for both presets and under both looks.
 
 python examples/03_compare.py [scene.ply]        Without a file: the demo scene.
 """
@@ -12,12 +12,20 @@ from meshsplats.demo_scene import make_scene
 
 cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()
 cameras = ms.dome(cloud, 6, width=240, height=240)
-# Degree 0 compares like with like: a mesh has one colour a vertex, whatever the view.
-splats = [ms.render_splats(cloud, camera, sh_degree=0).color.clip(0, 1) for camera in cameras]
+meshes = {
+    "paper": ms.convert(cloud, preset="paper"),
+    "default": ms.convert(cloud, cameras=cameras),
+    "look splats": ms.convert(cloud, cameras=cameras, look="splats"),
+    "filter": ms.convert(cloud, footprint="filter"),
+}
 
-for preset in ("paper", "default"):
-    mesh = ms.convert(cloud, preset=preset, cameras=cameras if preset == "default" else None)
-    pictures = [ms.render(mesh, camera, samples=2).color.clip(0, 1) for camera in cameras]
-    psnr = np.mean([ms.psnr(a, b) for a, b in zip(pictures, splats, strict=True)])
-    ssim = np.mean([ms.ssim(a, b) for a, b in zip(pictures, splats, strict=True)])
-    print(f"{preset:8}  {len(mesh.faces):8,} triangles  PSNR {psnr:.2f} dB  SSIM {ssim:.4f}")
+# area: the mean over each pixel's area, as programs show it that take several samples a pixel.
+# splats: what a splat viewer shows.
+for look, samples in (("area", 2), ("splats", 1)):
+    # Degree 0 compares like with like: a mesh has one colour a vertex, whatever the view.
+    splats = [ms.draw_splats(cloud, camera, look, sh_degree=0).color.clip(0, 1) for camera in cameras]
+    for name, mesh in meshes.items():
+        images = [ms.render(mesh, camera, samples=samples).color.clip(0, 1) for camera in cameras]
+        psnr = np.mean([ms.psnr(a, b) for a, b in zip(images, splats, strict=True)])
+        ssim = np.mean([ms.ssim(a, b) for a, b in zip(images, splats, strict=True)])
+        print(f"{look:7} {name:11} {len(mesh.faces):8,} triangles  PSNR {psnr:.2f} dB  SSIM {ssim:.4f}")
