@@ -253,7 +253,7 @@ class TestTwins:
         mass, colors = rng.uniform(0.1, 2, n), rng.uniform(0, 1, (n, 3))
         upper = spread[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         for wanted in (6, 3, 1):
-            group, left = merging._merge_neighbours(means, upper, mass, colors, wanted, 1)
+            group, left = merging._merge_neighbours(merging._Moments(means, upper, mass, colors), wanted, 1)
             assert left == wanted
             members = {frozenset(np.flatnonzero(group == g)) for g in range(left)}
             assert members == greedy(means, spread, mass, colors, wanted)

@@ -24,6 +24,7 @@ COMMANDS = {
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, pictures side by side"),
     "finetune": ("meshsplats.cli.finetune:Finetune", "the mesh brought closer to splats or photographs"),
     "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
+    "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for ever smaller sizes"),
     "bake": ("meshsplats.cli.bake:Bake", "the filter of a mesh made part of its triangles"),
     "base": ("meshsplats.cli.base:Base", "a classical mesh of the surface that splats form"),
     "prior": ("meshsplats.cli.prior:Prior", "splats on a classical mesh, trained and edited with it"),

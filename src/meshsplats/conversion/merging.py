@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from ctypes import c_double, c_int32, c_int64, c_void_p
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,9 +27,6 @@ from meshsplats.framing import guess_up
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.api import processors
 from meshsplats.rendering.core import pointer, run
-
-Moments = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Means (n, 3), covariances (n, 6), masses (n,) and colours (n, c)."""
 
 NEIGHBOURS = 8
 """Nearest splats that each may be merged with at first; a merged one has those of both. Of 16, in twice the
@@ -216,50 +214,66 @@ def _groups(
     # else it would cost endlessly much to merge what is flat or thin with anything at its side.
     covariances[:, [0, 3, 5]] += np.square(np.maximum(low_pass / unit, FINEST))[:, None]
     group = np.arange(len(cloud))
-    moments: Moments = (means, covariances, masses, colors)
+    all_moments = _Moments(means, covariances, masses, colors)
+    moments = all_moments
     while True:
-        part, left = _merge_neighbours(*moments, count, threads)
+        part, left = _merge_neighbours(moments, count, threads)
         group = part[group]
         if left <= count:
             return group
         # Parts of the scene that were no neighbours of each other are, now that few splats are left.
-        moments = _moments(means, covariances, masses, colors, group)
+        moments = all_moments.together(_Groups(group, masses))
 
 
-def _merge_neighbours(
-    means: np.ndarray,
-    covariances: np.ndarray,
-    masses: np.ndarray,
-    colors: np.ndarray,
-    count: int,
-    threads: int,
-) -> tuple[np.ndarray, int]:
+def _merge_neighbours(moments: _Moments, count: int, threads: int) -> tuple[np.ndarray, int]:
     """(n,) numbers of groups, in the order of their first members, and how many there are: ``count``, or more
     where neighbours ran out."""
-    neighbours = min(NEIGHBOURS, len(means) - 1)
-    order, near = nearest(means, neighbours, threads)
-    in_order = [np.take(a, order, axis=0) for a in (means, covariances, masses, colors)]
-    found = np.empty(len(means), np.int32)
+    n = len(moments.means)
+    neighbours = min(NEIGHBOURS, n - 1)
+    order, near = nearest(moments.means, neighbours, threads)
+    in_order = _Moments(*(np.take(values, order, axis=0) for values in moments))
+    found = np.empty(n, np.int32)
     merging = MergingStruct(
-        count=len(means),
+        count=n,
         wanted=count,
         neighbours=neighbours,
         threads=threads,
-        means=pointer(in_order[0]),
-        covariances=pointer(in_order[1]),
-        masses=pointer(in_order[2]),
-        colors=pointer(in_order[3]),
+        means=pointer(in_order.means),
+        covariances=pointer(in_order.covariances),
+        masses=pointer(in_order.masses),
+        colors=pointer(in_order.colors),
         nearest=pointer(near),
         color_weight=COLOR_WEIGHT,
         group=pointer(found),
     )
     run("ms_merge_pairs", merging)
-    group = np.empty(len(means), np.int64)
+    group = np.empty(n, np.int64)
     group[order] = found
     first, group = np.unique(group, return_index=True, return_inverse=True)[1:]
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return rank[group], merging.left
+
+
+class _Moments(NamedTuple):
+    """Of n splats or groups, float64."""
+
+    means: np.ndarray
+    """(n, 3)."""
+    covariances: np.ndarray
+    """(n, 6) xx, xy, xz, yy, yz, zz."""
+    masses: np.ndarray
+    """(n,)."""
+    colors: np.ndarray
+    """(n, 3) RGB."""
+
+    def together(self, groups: _Groups) -> _Moments:
+        """Those of all members of each group together."""
+        middle = groups.averages(self.means)
+        apart = self.means - middle[groups.group]
+        spread = apart[:, [0, 0, 0, 1, 1, 2]] * apart[:, [0, 1, 2, 1, 2, 2]]
+        spread += self.covariances
+        return _Moments(middle, groups.averages(spread), groups.masses, groups.averages(self.colors))
 
 
 class _Groups:
@@ -285,18 +299,6 @@ class _Groups:
         return self.sums(self.weights[:, None] * values)
 
 
-def _moments(
-    means: np.ndarray, covariances: np.ndarray, masses: np.ndarray, colors: np.ndarray, group: np.ndarray
-) -> Moments:
-    """Those of all members of each group together: means, covariances, masses and colours."""
-    groups = _Groups(group, masses)
-    middle = groups.averages(means)
-    apart = means - middle[group]
-    spread = apart[:, [0, 0, 0, 1, 1, 2]] * apart[:, [0, 1, 2, 1, 2, 2]]
-    spread += covariances
-    return middle, groups.averages(spread), groups.masses, groups.averages(colors)
-
-
 def _covariances(cloud: GaussianCloud) -> np.ndarray:
     """(n, 6) float64 xx, xy, xz, yy, yz, zz."""
     axes = cloud.rotations.astype(np.float64)
@@ -315,14 +317,13 @@ def _merged(
     result = cloud.select(first)
     changed = np.flatnonzero(sizes > 1)
     rows = np.flatnonzero(sizes[group] > 1)
-    part = cloud.select(rows)
+    part = replace(cloud, sh=cloud.sh[:, :1]).select(rows)
     number = np.zeros(len(sizes), np.int64)
     number[changed] = np.arange(len(changed))
     own = number[group[rows]]
-    means, covariances, mass, _ = _moments(
-        part.means.astype(np.float64), _covariances(part), masses[rows], part.colors, own
-    )
+    all_moments = _Moments(part.means.astype(np.float64), _covariances(part), masses[rows], part.colors)
     groups = _Groups(own, masses[rows])
+    means, covariances, mass, _ = all_moments.together(groups)
     width = groups.averages(low_pass[rows, None])[:, 0]
     matrices = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     variances, axes = np.linalg.eigh(matrices)
@@ -340,5 +341,6 @@ def _merged(
     fields["quaternions"][changed] = quaternions_of(axes)
     fields["scales"][changed] = scales
     fields["opacities"][changed] = opacity_of(depth)
-    fields["sh"][changed] = groups.averages(part.sh.reshape(len(part), -1)).reshape(-1, *cloud.sh.shape[1:])
+    for k in range(cloud.sh.shape[1]):
+        fields["sh"][changed, k] = groups.averages(cloud.sh[rows, k])
     return replace(result, **fields)

@@ -1,0 +1,223 @@
+"""``meshsplats levels``: a chain of meshes, from the finest to the coarsest."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from meshsplats.cli import UsageError
+from meshsplats.cli.common import (
+    Count,
+    Number,
+    Output,
+    SplatOptions,
+    Text,
+    check_outputs,
+    configuration,
+    identify,
+    parse_up,
+    size_of,
+    write_json,
+)
+from meshsplats.cli.training import need_torch, say, shown
+from meshsplats.errors import FileFormatError
+from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_config
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.levels import Level, level_targets, likeness, make_level, plan_levels
+
+TABLE = "levels.json"
+ASKED = "config.json"
+MINUTES = 2.0
+"""Fine-tuning of a level where nothing else is said."""
+_NOT_OF_THE_RESULT = ("output", "resume", "json", "force", "threads")
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of detail: a chain of meshes, each with a quarter (or half) of the triangles of the last, made
+    for pictures with a quarter (or half) of the pixels.
+
+    Alike splats are merged, never dropped, and each mesh is fine-tuned at the size at which it is seen. The
+    folder holds the meshes, level_0 being the finest, and levels.json: triangles, bytes, screen size, PSNR.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Splat file, or the folder of a trained model."""
+    output: Output
+    """Folder for the meshes; it appears when all of them are there."""
+    levels: int = 4
+    """How many meshes."""
+    factor: Literal[2, 4] = 4
+    """Each has this fraction of the splats of the last: 4, for half the size on the screen, or 2."""
+    width: int = 800
+    """Size of the finest on the screen: side in pixels of pictures that just hold the subject."""
+    max_splats: Count = None
+    """Splats of the finest at most. Default: all."""
+    format: Literal["glb", "npz", "ply", "usdc", "usda", "obj"] = "glb"
+    """File format of the meshes."""
+    no_tune: bool = False
+    """Convert only: seconds in place of minutes."""
+    minutes: Number = None
+    """Fine-tuning of each level. Default: 2."""
+    steps: Count = None
+    """Fine-tuning of each level, in steps."""
+    sh_degree: Count = None
+    """Draw the splats with spherical harmonics up to this degree. Default: all that are stored."""
+    up: Text = None
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: -y."""
+    resume: bool = False
+    """Go on with the levels that an interrupted run of the same command left in FOLDER.partial."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """At most N threads. Default: all processors."""
+    json: bool = False
+    """Print the table as JSON."""
+    force: bool = False
+    """Overwrite an older chain in the folder."""
+
+    def run(self) -> int:
+        config = self._configured()
+        self._check_output()
+        if identify(self.input) != "splats":
+            raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
+        if config is not None:
+            need_torch()
+        cloud = self.reading.load(self.input)
+        most = len(cloud) if self.max_splats is None else min(self.max_splats, len(cloud))
+        chain = plan_levels(most, self.levels, factor=self.factor, width=self.width)
+        folder = self._partial()
+        rows = []
+        for number, level in enumerate(chain):
+            done = folder / f"level_{number}.json"
+            if not done.is_file():
+                try:
+                    row = self._make(cloud, number, level, config, folder)
+                except Interrupted as stop:
+                    say(f"stopped in level {number}: the same command with --resume goes on with it")
+                    return 128 + (stop.signal or signal.SIGINT)
+                write_json(done, row)
+            rows.append(json.loads(done.read_text(encoding="utf-8")))
+        table = {"source": str(self.input), "splats": len(cloud), "factor": self.factor, "levels": rows}
+        self._finish(folder, table)
+        if self.json:
+            print(json.dumps(table | {"folder": str(self.output)}, indent=1))
+        else:
+            self._show(rows)
+        return 0
+
+    def _configured(self) -> FinetuneConfig | None:
+        """How levels are fine-tuned; UsageError for options that contradict each other."""
+        if self.levels < 1:
+            raise UsageError(f"--levels must be at least 1, got {self.levels}")
+        if self.max_splats is not None and self.max_splats < 1:
+            raise UsageError(f"--max-splats must be at least 1, got {self.max_splats}")
+        if self.no_tune and (self.minutes is not None or self.steps is not None):
+            raise UsageError("--minutes and --steps have no effect with --no-tune")
+        if self.minutes is not None and self.steps is not None:
+            raise UsageError("give --minutes or --steps, not both")
+        if self.resume and self.force:
+            raise UsageError("--resume goes on, --force begins anew: give one of them")
+        if self.up is not None:
+            parse_up(self.up)
+        if self.no_tune:
+            return None
+        if self.steps is not None:
+            return make_config("default", steps=self.steps)
+        return make_config("default", minutes=MINUTES if self.minutes is None else self.minutes)
+
+    @property
+    def _partial_folder(self) -> Path:
+        return self.output.with_name(f"{self.output.name}.partial")
+
+    def _check_output(self) -> None:
+        """OSError, before the work, if the folder cannot appear."""
+        if self.output.suffix:
+            raise UsageError(f"-o must name a folder, got {self.output.name!r}")
+        partial = self._partial_folder
+        check_outputs([self.output], self.force)
+        if self.output.exists() and not (self.output / TABLE).is_file():
+            raise FileExistsError(f"{self.output} is there and holds no {TABLE}: give another folder")
+        if self.resume and not (partial / ASKED).is_file():
+            raise FileNotFoundError(f"nothing to go on with in {partial}: leave out --resume to begin anew")
+        if partial.exists() and not self.resume and not self.force:
+            raise FileExistsError(
+                f"{partial} is left from an earlier run: --resume goes on with it, --force begins anew"
+            )
+
+    def _partial(self) -> Path:
+        """The folder in which levels gather; with --resume that of the same command, else an empty one."""
+        partial = self._partial_folder
+        asked = configuration("levels", self)
+        wanted = {k: v for k, v in asked["options"].items() if k not in _NOT_OF_THE_RESULT}
+        if self.resume:
+            found = json.loads((partial / ASKED).read_text(encoding="utf-8"))["options"]
+            for name, value in wanted.items():
+                if found.get(name) != value:
+                    flag = "--" + name.replace("_", "-")
+                    raise UsageError(f"{partial} was begun with {flag} {found.get(name)}, not {value}")
+            return partial
+        if partial.exists():
+            if not (partial / ASKED).is_file():
+                raise FileExistsError(f"{partial} is there and not of this command: remove it")
+            shutil.rmtree(partial)
+        partial.mkdir()
+        write_json(partial / ASKED, asked)
+        return partial
+
+    def _make(
+        self, cloud: GaussianCloud, number: int, level: Level, config: FinetuneConfig | None, folder: Path
+    ) -> dict[str, Any]:
+        """Writes the mesh of a level; returns its line of the table."""
+        from meshsplats.formats.meshes import save_mesh
+
+        began = time.perf_counter()
+        say(f"level {number}: {level.splats:,} splats for {level.width} pixels")
+        up = None if self.up is None else parse_up(self.up)
+        targets = level_targets(cloud, level, config, up=up, sh_degree=self.sh_degree, threads=self.threads)
+        run = RunOptions(threads=self.threads, spent=time.perf_counter() - began)
+        with shown() as show:
+            mesh = make_level(cloud, level, targets, config, run=run, on_progress=show, up=up)
+        path = folder / f"level_{number}.{self.format}"
+        save_mesh(mesh, path)
+        cameras = [view.camera for view in targets.test]
+        score = likeness(mesh, cloud, cameras, sh_degree=self.sh_degree, threads=self.threads)
+        return {
+            "file": path.name,
+            "splats": mesh.splat_count,
+            "triangles": len(mesh.faces),
+            "bytes": path.stat().st_size,
+            "screen_size": level.width,
+            "psnr": round(score, 3),
+            "seconds": round(time.perf_counter() - began, 2),
+        }
+
+    def _finish(self, folder: Path, table: dict[str, Any]) -> None:
+        """The finished folder under its name, in place of an older one."""
+        for number in range(self.levels):
+            (folder / f"level_{number}.json").unlink()
+        write_json(folder / TABLE, table)
+        if not self.output.exists():
+            os.rename(folder, self.output)
+            return
+        old = self.output.with_name(f".{self.output.name}.old")
+        os.rename(self.output, old)
+        os.rename(folder, self.output)
+        shutil.rmtree(old)
+
+    def _show(self, rows: list[dict[str, Any]]) -> None:
+        print(f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}")
+        for row in rows:
+            size = size_of(self.output / row["file"])
+            print(
+                f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{size:>10}"
+                f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
+            )
+        print(f"{self.output}/: {TABLE} has this table")

@@ -1,0 +1,119 @@
+"""Levels of detail: a chain of meshes of one scene, each with a fraction of the triangles of the last, made
+for the size at which it is seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.conversion import convert
+from meshsplats.dataset import Dataset
+from meshsplats.datasets.around import splat_dataset
+from meshsplats.finetuning import (
+    FinetuneConfig,
+    Progress,
+    RunOptions,
+    finetune,
+    starting_mesh,
+    worthwhile_views,
+)
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.metrics import psnr
+from meshsplats.rendering import render, render_splats
+
+SMALLEST = 16
+"""Pixels across, below which no level is made."""
+
+LARGER = 4
+"""The truth that a level is measured with is the mean of a picture so many times as large."""
+
+SAMPLES = 2
+"""Side of the grid of samples in each pixel, with which it is drawn then."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """What one mesh of a chain is made for."""
+
+    splats: int
+    """How many it has at most."""
+    width: int
+    """Side in pixels of the pictures, which just hold the subject, that it is made for."""
+
+
+def plan_levels(splats: int, count: int, *, factor: int = 4, width: int = 800) -> list[Level]:
+    """``count`` levels, the first of all ``splats`` for pictures ``width`` pixels wide.
+
+    Each has a ``factor``-th of the splats of the last, and its pictures a ``factor``-th of the pixels: so a
+    splat covers as many pixels on every level.
+
+    Raises ValueError if the last would have no splat or less than ``SMALLEST`` pixels.
+    """
+    if count < 1 or factor < 2 or splats < 1:
+        raise ValueError(f"there must be a splat, a level and a factor of 2, got {splats}, {count}, {factor}")
+    levels = [Level(splats // factor**i, round(width / math.sqrt(factor**i))) for i in range(count)]
+    if levels[-1].splats < 1 or levels[-1].width < SMALLEST:
+        fit = sum(level.splats >= 1 and level.width >= SMALLEST for level in levels)
+        raise ValueError(
+            f"{count} levels are too many for {splats} splats and pictures of {width} pixels: the last would"
+            f" have {levels[-1].splats} splats and {levels[-1].width} pixels; at most {fit} fit"
+        )
+    return levels
+
+
+def level_targets(
+    cloud: GaussianCloud, level: Level, config: FinetuneConfig | None = None, **options: Any
+) -> Dataset:
+    """Pictures of ``cloud`` of the size of ``level``, to learn from and to measure with; as many as a run of
+    ``config`` is worth. ``options`` are those of ``splat_dataset``."""
+    train = worthwhile_views(config) if config is not None else 1
+    return splat_dataset(cloud, train=train, width=level.width, **options)
+
+
+def make_level(
+    cloud: GaussianCloud,
+    level: Level,
+    targets: Dataset,
+    config: FinetuneConfig | None = None,
+    *,
+    run: RunOptions | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    **options: Any,
+) -> SplatMesh:
+    """The mesh of ``level``: splats merged to its number, converted, and fine-tuned on ``targets`` as
+    ``config`` says; without one, converted only.
+
+    ``options`` are those of ``convert``; ``run`` and ``on_progress`` those of ``finetune``.
+    """
+    if config is None:
+        cameras = [view.camera for view in targets.test]
+        return convert(cloud, cameras=cameras, max_splats=level.splats, **options)
+    cameras = [view.camera for view in targets.train]
+    mesh = starting_mesh(cloud, cameras, max_splats=level.splats, **options)
+    return finetune(mesh, targets, config, run=run, on_progress=on_progress)
+
+
+def likeness(
+    mesh: SplatMesh,
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera],
+    *,
+    sh_degree: int | None = None,
+    threads: int | None = None,
+) -> float:
+    """PSNR in dB, the mean over ``cameras``: the mesh drawn with 2 x 2 samples a pixel against the mean of
+    pictures of the splats four times as large, on white."""
+    scores = []
+    for camera in cameras:
+        large = render_splats(cloud, camera.scaled(LARGER), sh_degree=sh_degree, threads=threads)
+        shape = (camera.height, LARGER, camera.width, LARGER, 3)
+        truth = large.color.clip(0, 1).reshape(shape).mean(axis=(1, 3))
+        picture = render(mesh, camera, samples=SAMPLES, threads=threads).color.clip(0, 1)
+        scores.append(min(psnr(picture, truth), 200.0))
+    return float(np.mean(scores))
