@@ -62,17 +62,25 @@ int64_t draw_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &
         });
 }
 
+// What the way back needs.
+struct Record {
+    ms::PictureLog log;
+    std::unique_ptr<ms::FanFilter> filter;  // or none
+};
+
 // Goes back through all tiles: those with a log follow it, others are drawn once more.
-void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &options, const ms::PictureLog &log,
+void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &options, const Record &record,
              const MsPictureGradient &given, const MsVertexGradients &out) {
+    const ms::PictureLog &log = record.log;
+    const ms::FanFilter *filter = record.filter.get();
     const ms::Grid grid(camera, options.samples);
     const bool redraws = !log.complete();
-    const ms::Scene scene(mesh, camera, grid, options.threads, redraws);
+    const ms::Scene scene(mesh, camera, grid, options.threads, redraws, filter);
     const int threads = (int)std::min<int64_t>(options.threads, grid.tiles());
     const int channels = given.attributes ? mesh.attribute_count : 0;
     const MsPicture nothing{};  // what is drawn once more is only logged
-    std::vector<float> moved(scene.filter ? 3 * mesh.vertex_count : 0);
-    const MsVertexGradients of_drawn{scene.filter ? moved.data() : out.vertices, out.colors, out.attributes};
+    std::vector<float> moved(filter ? 3 * mesh.vertex_count : 0);
+    const MsVertexGradients of_drawn{filter ? moved.data() : out.vertices, out.colors, out.attributes};
     ms::VertexGradients sum(mesh, of_drawn, channels, threads);
 
     // Gradients of a few tiles at a time wait to be added in order: of so few that they need little memory, but enough for
@@ -129,7 +137,7 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
     } else {
         run(0, grid.tiles(), nullptr);
     }
-    if (scene.filter) scene.filter->back(scene.unfiltered, scene.vertices, moved.data(), out, options.threads);
+    if (filter) filter->back(moved.data(), out, options.threads);
 }
 
 template <class Body>
@@ -188,8 +196,9 @@ MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsO
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
-        auto kept = std::make_unique<ms::PictureLog>(grid.tiles(), budget);
-        picture->fragments = draw_mesh(scene, grid, *camera, *options, *picture, kept.get());
+        std::unique_ptr<Record> kept(new Record{{grid.tiles(), budget}, nullptr});
+        picture->fragments = draw_mesh(scene, grid, *camera, *options, *picture, &kept->log);
+        kept->filter = std::move(scene.filter);
         *log = kept.release();
     });
 }
@@ -198,10 +207,10 @@ MS_EXPORT int ms_rasterize_back(const MsMesh *mesh, const MsCamera *camera, cons
                                 const MsPictureGradient *given, const MsVertexGradients *out, char *message,
                                 int message_size) {
     return guarded(message, message_size,
-                   [&] { go_back(*mesh, *camera, *options, *(const ms::PictureLog *)log, *given, *out); });
+                   [&] { go_back(*mesh, *camera, *options, *(const Record *)log, *given, *out); });
 }
 
-MS_EXPORT void ms_forget(void *log) { delete (ms::PictureLog *)log; }
+MS_EXPORT void ms_forget(void *log) { delete (Record *)log; }
 
 MS_EXPORT int ms_render_splats(const MsSplats *splats, const MsCamera *camera, const MsOptions *options,
                                MsPicture *picture, char *message, int message_size) {

@@ -13,6 +13,7 @@
 // with a k that counts depth as SIDEWAYS of what it is in the plane of the picture.
 #pragma once
 
+#include <cstring>
 #include <stdexcept>
 
 #include "large.h"
@@ -27,62 +28,84 @@ struct SharedVertices : std::runtime_error {
 
 class FanFilter {
   public:
-    FanFilter(const MsMesh &mesh, const Projection &projection, int samples)
+    // Moves the projected vertices that triangles use. A fan that reaches nearer than the near plane or has no area stays as it
+    // is. Keeps what the way back needs; the arrays of the mesh must stay as they are. Throws SharedVertices.
+    FanFilter(const MsMesh &mesh, const Projection &projection, int samples, Large<Projected> &&plain, int threads)
         : mesh_(mesh), projection_(projection), variance_(mesh.filter_px2 * samples * samples),
-          depth_scale_(SIDEWAYS * std::sqrt(projection.fx * projection.fy)) {}
-
-    // Moves all vertices that triangles use. A fan that reaches nearer than the near plane or has no area stays as it is.
-    // Throws SharedVertices.
-    void apply(const Large<Projected> &from, Large<Projected> &to, int threads) {
-        owner_.resize(mesh_.vertex_count);
-        to.resize(mesh_.vertex_count);
-        each_fan(threads, [&](int64_t first) {
-            return each_corner(first, [&](int32_t v) { __atomic_store_n(&owner_[v], (int32_t)first, __ATOMIC_RELAXED); });
+          depth_scale_(SIDEWAYS * std::sqrt(projection.fx * projection.fy)), plain_(std::move(plain)),
+          moved_(mesh.vertex_count), owner_(mesh.vertex_count) {
+        for (int64_t i = 0; i < mesh.face_count; ++i)
+            if (i == 0 || mesh.face_splat[i] != mesh.face_splat[i - 1]) starts_.push_back((int32_t)i);
+        fans_.resize(starts_.size());
+        starts_.push_back((int32_t)mesh.face_count);
+        fan_blocks(threads, [&](int32_t begin, int32_t end, int) {
+            for (int32_t fan = begin; fan < end; ++fan)
+                each_corner(fan, [&](int32_t v) { __atomic_store_n(&owner_[v], fan, __ATOMIC_RELAXED); });
         });
         std::atomic<bool> shared{false};
-        each_fan(threads, [&](int64_t first) {
-            const Fan fan = measure(from, first);
-            return each_corner(first, [&](int32_t v) {
-                if (owner_[v] != (int32_t)first) {
-                    shared = true;
-                    return;
-                }
-                const Projected &p = from[v];
-                if (!fan.moves) {
-                    to[v] = p;
-                    return;
-                }
-                const double x = p.x - fan.x, y = p.y - fan.y;
-                to[v] = {fan.x + (fan.a[0] * x + fan.a[1] * y), fan.y + (fan.a[1] * x + fan.a[2] * y), p.w};
-            });
+        fan_blocks(threads, [&](int32_t begin, int32_t end, int) {
+            // One after the other, for each step of `solve` waits for the last, but not for other fans.
+            for (int32_t fan = begin; fan < end; ++fan) measure(fan);
+            for (int32_t fan = begin; fan < end; ++fan) solve(fans_[fan]);
+            bool clash = false;
+            for (int32_t number = begin; number < end; ++number) {
+                const Fan &fan = fans_[number];
+                each_corner(number, [&](int32_t v) {
+                    const Projected p = plain_[v];
+                    if (owner_[v] != number) {
+                        clash = true;
+                    } else if (!fan.moves) {
+                        moved_[v] = p;
+                    } else {
+                        const double x = p.x - fan.x, y = p.y - fan.y;
+                        moved_[v] = {fan.x + (fan.a[0] * x + fan.a[1] * y), fan.y + (fan.a[1] * x + fan.a[2] * y), p.w};
+                    }
+                });
+            }
+            if (clash) shared = true;
         });
         if (shared) throw SharedVertices();
     }
 
+    const Projected *moved() const { return moved_.data(); }
+
     // Adds to `out` the gradients of positions and opacities that follow from `towards`, those of the moved vertices in camera
-    // space. After `apply`.
-    void back(const Large<Projected> &from, const Large<Projected> &to, const float *towards, const MsVertexGradients &out,
-              int threads) {
-        pulled_.resize(mesh_.vertex_count);
-        each_fan(threads, [&](int64_t first) {
-            const Fan fan = measure(from, first);
-            if (!fan.moves) {
-                each_vertex(first, fan.end, (int32_t)first, [&](int32_t v) {
+    // space.
+    void back(const float *towards, const MsVertexGradients &out, int threads) const {
+        Large<int32_t> met(owner_);  // then: -1 - place of the vertex among its fan's
+        std::vector<std::vector<Pulled>> work(threads);
+        fan_blocks(threads, [&](int32_t begin, int32_t end, int thread) {
+            std::vector<Pulled> &pulled = work[thread];
+            for (int32_t number = begin; number < end; ++number) {
+                const Fan &fan = fans_[number];
+                const size_t most = 3 * (size_t)(starts_[number + 1] - starts_[number]);
+                if (pulled.size() < most) pulled.resize(most);
+                int count = 0;
+                bool any = false;
+                each_corner(number, [&](int32_t v) {
+                    if (met[v] != number) return;
+                    met[v] = -1 - count;
+                    pulled[count++].vertex = v;
                     const float *g = towards + 3 * (int64_t)v;
-                    add_position(v, g[0], g[1], g[2], out);
+                    any |= (g[0] != 0) | (g[1] != 0) | (g[2] != 0);
                 });
-                return fan.end;
+                if (!any) continue;
+                if (!fan.moves) {
+                    for (int i = 0; i < count; ++i) {
+                        const float *g = towards + 3 * (int64_t)pulled[i].vertex;
+                        add_position(pulled[i].vertex, g[0], g[1], g[2], out);
+                    }
+                    continue;
+                }
+                pull_density(number, pull_positions(fan, towards, pulled.data(), count), met.data(), pulled.data());
+                for (int i = 0; i < count; ++i) {
+                    const Pulled &g = pulled[i];
+                    const Projected &p = plain_[g.vertex];
+                    add_position(g.vertex, g.x * projection_.fx * p.w, g.y * projection_.fy * p.w,
+                                 g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w, out);
+                    out.colors[4 * (int64_t)g.vertex + 3] += (float)g.alpha;
+                }
             }
-            const Influence influence = pull_positions(fan, first, from, to, towards);
-            pull_density(fan, influence, first, from);
-            each_vertex(first, fan.end, ~(int32_t)first, [&](int32_t v) {
-                const Pulled &g = pulled_[v];
-                const Projected &p = from[v];
-                add_position(v, g.x * projection_.fx * p.w, g.y * projection_.fy * p.w,
-                             g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w, out);
-                out.colors[4 * (int64_t)v + 3] += (float)g.alpha;
-            });
-            return fan.end;
         });
     }
 
@@ -92,94 +115,96 @@ class FanFilter {
     static constexpr double FAINTEST = 1e-6;   // added to opacities, so that fans without any have a shape, too
 
     struct Fan {
-        int64_t end;
+        double share;         // 1 / (60 times the integral of opacity over twice the areas); before `solve`, without the 1 /
+        double x, y;          // mean; before, from the origin and over `share`
+        double m[3];          // covariance: xx, xy, yy; before, likewise
+        double x0, y0;        // origin
+        double k;             // of depths
+        double a[3];          // A
         bool moves;
-        double x, y;     // mean
-        double mass;     // 60 times the integral of opacity over twice the areas
-        double m[3];     // covariance: xx, xy, yy
-        double k;        // of depths
-        double a[3];     // A
     };
-    // How the loss changes with the density at q from the mean: (q^T h q + c . q - level) / mass.
+    // How the loss changes with the density at q from the mean: (q^T h q + c . q - level) times the fan's share.
     struct Influence {
         double h[3], c[2], level;
     };
+    // Gradients of a vertex.
     struct Pulled {
-        double x, y;  // on the picture
-        double z;     // camera depth
+        int32_t vertex;
+        double x, y;  // of its place on the picture
+        double z;     // of its camera depth
         double alpha;
     };
+    // Triangles are taken eight at a time. Lanes are summed in one order.
+    typedef double Eight __attribute__((vector_size(64)));
+    static constexpr int EIGHT = 8;
     struct Corners {
-        double x[3], y[3], w[3], a[3], sum;  // from an origin
-        double u[3], v[3], n[3];             // edges 0 to 1 and 0 to 2 in (x, y, k / z), and their product
-        double area;                         // twice
+        Eight x[3], y[3], w[3], a[3];  // from an origin; 0 in lanes without a triangle
+        Eight sum;                     // of opacities
+        Eight u[3], v[3], n[3];        // edges 0 to 1 and 0 to 2 in (x, y, k / z), and their product
+        Eight area;                    // twice
+        int held;
+        bool in_front;
     };
 
-    // Calls body(first triangle) for each fan; it returns the end of the fan.
     template <class Body>
-    void each_fan(int threads, Body body) const {
-        const int32_t *splat = mesh_.face_splat;
-        parallel_blocks(threads, mesh_.face_count, 1 << 13, [&](int64_t a, int64_t b, int) {
-            int64_t i = a;
-            while (i > 0 && i < b && splat[i] == splat[i - 1]) ++i;
-            while (i < b) i = body(i);
-        });
+    void fan_blocks(int threads, Body body) const {
+        parallel_blocks(threads, (int64_t)fans_.size(), 1 << 10,
+                        [&](int64_t begin, int64_t end, int thread) { body((int32_t)begin, (int32_t)end, thread); });
     }
+    // Calls body(vertex) for each vertex of a fan, for some more than once; for few where triangles list the same vertex first
+    // and go on where the last one ended.
     template <class Body>
-    int64_t each_corner(int64_t first, Body body) const {
-        int64_t i = first;
-        do {
+    __attribute__((always_inline)) void each_corner(int32_t fan, Body body) const {
+        int32_t head = -1, tail = -1;
+        for (int64_t i = starts_[fan]; i < starts_[fan + 1]; ++i) {
             const int32_t *f = mesh_.faces + 3 * i;
-            for (int k = 0; k < 3; ++k) body(f[k]);
-        } while (++i < mesh_.face_count && mesh_.face_splat[i] == mesh_.face_splat[first]);
-        return i;
-    }
-    // Calls body(vertex) once for each vertex of a fan; those with the mark have not been met.
-    template <class Body>
-    void each_vertex(int64_t first, int64_t end, int32_t mark, Body body) {
-        for (const int32_t *f = mesh_.faces + 3 * first; f < mesh_.faces + 3 * end; ++f) {
-            if (owner_[*f] != mark) continue;
-            owner_[*f] = ~mark;
-            body(*f);
+            if (f[0] != head) body(f[0]);
+            if (f[1] != tail) body(f[1]);
+            body(f[2]);
+            head = f[0], tail = f[2];
         }
     }
 
-    Corners corners(const Large<Projected> &from, const int32_t *face, double x0, double y0, double k) const {
-        Corners c;
-        for (int i = 0; i < 3; ++i) {
-            const Projected &p = from[face[i]];
-            c.x[i] = p.x - x0;
-            c.y[i] = p.y - y0;
-            c.w[i] = p.w;
-            c.a[i] = mesh_.colors[4 * (int64_t)face[i] + 3] + FAINTEST;
+    // Of up to eight triangles, from `i` on and before `end`.
+    __attribute__((always_inline)) void corners(int64_t i, int64_t end, double x0, double y0, double k, Corners &c) const {
+        c.in_front = true;
+        c.held = (int)std::min<int64_t>(EIGHT, end - i);
+        for (int j = 0; j < 3 && c.held < EIGHT; ++j) c.x[j] = c.y[j] = c.w[j] = c.a[j] = Eight{};
+        const int32_t *face = mesh_.faces + 3 * i;
+        for (int lane = 0; lane < c.held; ++lane) {
+            for (int j = 0; j < 3; ++j) {
+                const int64_t v = *face++;
+                const Projected &p = plain_[v];
+                c.x[j][lane] = p.x - x0;
+                c.y[j][lane] = p.y - y0;
+                c.w[j][lane] = p.w;
+                c.a[j][lane] = mesh_.colors[4 * v + 3] + FAINTEST;
+                c.in_front &= p.w > 0;
+            }
         }
         c.sum = c.a[0] + c.a[1] + c.a[2];
-        const double u[3] = {c.x[1] - c.x[0], c.y[1] - c.y[0], k * (c.w[1] - c.w[0])},
-                     v[3] = {c.x[2] - c.x[0], c.y[2] - c.y[0], k * (c.w[2] - c.w[0])};
-        cross(u, v, c.n);
-        for (int i = 0; i < 3; ++i) {
-            c.u[i] = u[i];
-            c.v[i] = v[i];
-        }
-        c.area = std::sqrt(c.n[0] * c.n[0] + c.n[1] * c.n[1] + c.n[2] * c.n[2]);
-        return c;
+        c.u[0] = c.x[1] - c.x[0], c.u[1] = c.y[1] - c.y[0], c.u[2] = k * (c.w[1] - c.w[0]);
+        c.v[0] = c.x[2] - c.x[0], c.v[1] = c.y[2] - c.y[0], c.v[2] = k * (c.w[2] - c.w[0]);
+        cross(c.u, c.v, c.n);
+        const Eight square = c.n[0] * c.n[0] + c.n[1] * c.n[1] + c.n[2] * c.n[2];
+        for (int lane = 0; lane < EIGHT; ++lane) c.area[lane] = std::sqrt(square[lane]);
     }
 
-    Fan measure(const Large<Projected> &from, int64_t first) const {
-        const int32_t *face = mesh_.faces + 3 * first;
-        const Projected &origin = from[face[0]];
-        Fan fan;
+    void measure(int32_t number) {
+        const int64_t first = starts_[number], end = starts_[number + 1];
+        const Projected &origin = plain_[mesh_.faces[3 * first]];
+        Fan &fan = fans_[number];
         fan.k = origin.w > 0 ? depth_scale_ / origin.w : 0;
         bool in_front = true;
-        double mass = 0, sx = 0, sy = 0, xx = 0, xy = 0, yy = 0;
-        int64_t i = first;
-        do {
-            const Corners c = corners(from, face, origin.x, origin.y, fan.k);
-            in_front &= (c.w[0] > 0) & (c.w[1] > 0) & (c.w[2] > 0);
-            const double x = c.x[0] + c.x[1] + c.x[2], y = c.y[0] + c.y[1] + c.y[2];
-            double bx = 0, by = 0, txx = 0, txy = 0, tyy = 0;
+        Corners c;
+        Eight mass = {}, sx = {}, sy = {}, xx = {}, xy = {}, yy = {};
+        for (int64_t i = first; i < end; i += EIGHT) {
+            corners(i, end, origin.x, origin.y, fan.k, c);
+            in_front &= c.in_front;
+            const Eight x = c.x[0] + c.x[1] + c.x[2], y = c.y[0] + c.y[1] + c.y[2];
+            Eight bx = {}, by = {}, txx = {}, txy = {}, tyy = {};
             for (int j = 0; j < 3; ++j) {
-                const double more = c.sum + 2 * c.a[j];
+                const Eight more = c.sum + 2 * c.a[j];
                 bx += c.a[j] * c.x[j];
                 by += c.a[j] * c.y[j];
                 txx += more * c.x[j] * c.x[j];
@@ -192,57 +217,67 @@ class FanFilter {
             xx += c.area * (txx + x * (c.sum * x + 2 * bx));
             xy += c.area * (txy + c.sum * x * y + bx * y + by * x);
             yy += c.area * (tyy + y * (c.sum * y + 2 * by));
-            face += 3;
-        } while (++i < mesh_.face_count && mesh_.face_splat[i] == mesh_.face_splat[first]);
-        fan.end = i;
-        fan.mass = mass;
-        const double x = sx / mass, y = sy / mass;
-        fan.x = origin.x + x;
-        fan.y = origin.y + y;
-        fan.m[0] = xx / mass - x * x;
-        fan.m[1] = xy / mass - x * y;
-        fan.m[2] = yy / mass - y * y;
+        }
+        fan.share = total(mass);
+        fan.x = total(sx);
+        fan.y = total(sy);
+        fan.m[0] = total(xx);
+        fan.m[1] = total(xy);
+        fan.m[2] = total(yy);
+        fan.x0 = origin.x;
+        fan.y0 = origin.y;
+        fan.moves = in_front;
+    }
+
+    void solve(Fan &fan) const {
+        const bool solid = fan.share > 0;
+        fan.share = 1 / fan.share;
+        const double x = fan.x * fan.share, y = fan.y * fan.share;
+        fan.x = fan.x0 + x;
+        fan.y = fan.y0 + y;
+        fan.m[0] = fan.m[0] * fan.share - x * x;
+        fan.m[1] = fan.m[1] * fan.share - x * y;
+        fan.m[2] = fan.m[2] * fan.share - y * y;
         const Inverse inverse = inverted(fan);
         const double s = variance_, b[3] = {1 + s * inverse.m[0], s * inverse.m[1], 1 + s * inverse.m[2]},
-                     root = std::sqrt(1 + s * (inverse.m[0] + inverse.m[2]) + s * s / inverse.det),
+                     root = std::sqrt(1 + s * (inverse.m[0] + inverse.m[2]) + s * s * inverse.share),
                      scale = 1 / std::sqrt(b[0] + b[2] + 2 * root);
         fan.a[0] = (b[0] + root) * scale;
         fan.a[1] = b[1] * scale;
         fan.a[2] = (b[2] + root) * scale;
-        fan.moves = in_front & (mass > 0) & (inverse.det > 0) & (fan.a[0] + std::fabs(fan.a[1]) + fan.a[2] < 1e30);
-        return fan;
+        fan.moves = fan.moves & solid & (inverse.share > 0) & (fan.a[0] + std::fabs(fan.a[1]) + fan.a[2] < 1e30);
     }
 
     // Of the covariance, no narrower than NARROWEST.
     struct Inverse {
-        double m[3], det;
+        double m[3], share;  // and 1 / determinant
     };
     Inverse inverted(const Fan &fan) const {
         const double least = NARROWEST * variance_, xx = fan.m[0] + least, xy = fan.m[1], yy = fan.m[2] + least,
-                     det = xx * yy - xy * xy;
-        return {{yy / det, -xy / det, xx / det}, det};
+                     share = 1 / (xx * yy - xy * xy);
+        return {{yy * share, -xy * share, xx * share}, share};
     }
 
     // The gradients of the places that vertices have with A and c as they are; and what that says of A and c.
-    Influence pull_positions(const Fan &fan, int64_t first, const Large<Projected> &from, const Large<Projected> &to,
-                             const float *towards) {
-        const double *a = fan.a;
+    Influence pull_positions(const Fan &fan, const float *towards, Pulled *pulled, int count) const {
+        const double *a = fan.a, unit_x = 1 / projection_.fx, unit_y = 1 / projection_.fy;
         double g[3] = {0, 0, 0};
         Influence found{};
-        each_vertex(first, fan.end, (int32_t)first, [&](int32_t v) {
-            const Projected &p = from[v], &q = to[v];
-            const float *t = towards + 3 * (int64_t)v;
-            const double x = t[0] / (projection_.fx * p.w), y = t[1] / (projection_.fy * p.w),
-                         z = t[2] + (x * (q.x - projection_.cx) + y * (q.y - projection_.cy)) * p.w,
-                         dx = p.x - fan.x, dy = p.y - fan.y;
+        for (int i = 0; i < count; ++i) {
+            Pulled &to = pulled[i];
+            const Projected &p = plain_[to.vertex], &q = moved_[to.vertex];
+            const float *t = towards + 3 * (int64_t)to.vertex;
+            const double z = 1 / p.w, x = t[0] * unit_x * z, y = t[1] * unit_y * z, dx = p.x - fan.x, dy = p.y - fan.y;
             g[0] += x * dx;
             g[1] += 0.5 * (x * dy + y * dx);
             g[2] += y * dy;
-            const Pulled pulled = {a[0] * x + a[1] * y, a[1] * x + a[2] * y, z, 0};
-            found.c[0] += x - pulled.x;
-            found.c[1] += y - pulled.y;
-            pulled_[v] = pulled;
-        });
+            to.x = a[0] * x + a[1] * y;
+            to.y = a[1] * x + a[2] * y;
+            to.z = t[2] + (x * (q.x - projection_.cx) + y * (q.y - projection_.cy)) * p.w;
+            found.c[0] += x - to.x;
+            found.c[1] += y - to.y;
+            to.alpha = 0;
+        }
         // A A = I + s M^-1: A X + X A = g has X = (det A g + adj A g adj A) / (2 tr A det A), and h = -s M^-1 X M^-1.
         const double det = a[0] * a[2] - a[1] * a[1], share = 1 / (2 * (a[0] + a[2]) * det), adjoint[3] = {a[2], -a[1], a[0]};
         double x[3], around[3];
@@ -256,41 +291,43 @@ class FanFilter {
     }
 
     // Adds the gradients by way of the density, whose moments A and c are.
-    void pull_density(const Fan &fan, const Influence &influence, int64_t first, const Large<Projected> &from) {
+    void pull_density(int32_t number, const Influence &influence, const int32_t *place, Pulled *pulled) const {
+        const Fan &fan = fans_[number];
         const double *h = influence.h, *c = influence.c;
-        const int32_t root = mesh_.faces[3 * first];
+        const int64_t first = starts_[number], end = starts_[number + 1];
         double to_k = 0;
-        for (int64_t i = first; i < fan.end; ++i) {
-            const int32_t *face = mesh_.faces + 3 * i;
-            const Corners t = corners(from, face, fan.x, fan.y, fan.k);
-            if (!(t.area > 0)) continue;
-            double hx[3], hy[3], square[3], straight[3];
+        Corners t;
+        for (int64_t i = first; i < end; i += EIGHT) {
+            corners(i, end, fan.x, fan.y, fan.k, t);
+            Eight hx[3], hy[3], square[3], straight[3];
             for (int j = 0; j < 3; ++j) {
                 hx[j] = h[0] * t.x[j] + h[1] * t.y[j];
                 hy[j] = h[1] * t.x[j] + h[2] * t.y[j];
                 square[j] = hx[j] * t.x[j] + hy[j] * t.y[j];
                 straight[j] = c[0] * t.x[j] + c[1] * t.y[j];
             }
-            const double qx = t.x[0] + t.x[1] + t.x[2], qy = t.y[0] + t.y[1] + t.y[2], hqx = hx[0] + hx[1] + hx[2],
-                         hqy = hy[0] + hy[1] + hy[2], whole = qx * hqx + qy * hqy, squares = square[0] + square[1] + square[2],
-                         lines = straight[0] + straight[1] + straight[2];
-            const double hbx = t.a[0] * hx[0] + t.a[1] * hx[1] + t.a[2] * hx[2],
-                         hby = t.a[0] * hy[0] + t.a[1] * hy[1] + t.a[2] * hy[2];
-            const double share = t.area / fan.mass;
-            double value = 0, to[3][3];
+            const Eight qx = t.x[0] + t.x[1] + t.x[2], qy = t.y[0] + t.y[1] + t.y[2], hqx = hx[0] + hx[1] + hx[2],
+                        hqy = hy[0] + hy[1] + hy[2], whole = qx * hqx + qy * hqy, squares = square[0] + square[1] + square[2],
+                        lines = straight[0] + straight[1] + straight[2];
+            const Eight hbx = t.a[0] * hx[0] + t.a[1] * hx[1] + t.a[2] * hx[2],
+                        hby = t.a[0] * hy[0] + t.a[1] * hy[1] + t.a[2] * hy[2];
+            const Eight share = t.area * fan.share;
+            Eight value = {}, to[3][3], to_alpha[3];
             for (int j = 0; j < 3; ++j) {
-                const double by_alpha = whole + 2 * (t.x[j] * hqx + t.y[j] * hqy) + squares + 2 * square[j] +
-                                        5 * (lines + straight[j]) - 20 * influence.level;
-                pulled_[face[j]].alpha += share * by_alpha;
+                const Eight by_alpha = whole + 2 * (t.x[j] * hqx + t.y[j] * hqy) + squares + 2 * square[j] +
+                                       5 * (lines + straight[j]) - 20 * influence.level;
+                to_alpha[j] = share * by_alpha;
                 value += t.a[j] * by_alpha;
-                const double one = 2 * (t.sum + t.a[j]), two = 2 * (t.sum + 2 * t.a[j]), five = 5 * (t.sum + t.a[j]);
+                const Eight one = 2 * (t.sum + t.a[j]), two = 2 * (t.sum + 2 * t.a[j]), five = 5 * (t.sum + t.a[j]);
                 to[j][0] = share * (one * hqx + 2 * hbx + two * hx[j] + five * c[0]);
                 to[j][1] = share * (one * hqy + 2 * hby + two * hy[j] + five * c[1]);
-                to[j][2] = 0;
+                to[j][2] = Eight{};
             }
             // By the triangle's area: its integral, linear in the opacities, is `value` times it.
-            double of_n[3], of_u[3], of_v[3];
-            for (int j = 0; j < 3; ++j) of_n[j] = value / fan.mass * t.n[j] / t.area;
+            Eight of_n[3], of_u[3], of_v[3];
+            Eight area = t.area;
+            for (int lane = 0; lane < EIGHT; ++lane) area[lane] = area[lane] > 0 ? area[lane] : 1;  // its product is 0, too
+            for (int j = 0; j < 3; ++j) of_n[j] = value * fan.share / area * t.n[j];
             cross(t.v, of_n, of_u);
             cross(of_n, t.u, of_v);
             for (int j = 0; j < 3; ++j) {
@@ -299,14 +336,19 @@ class FanFilter {
                 to[2][j] += of_v[j];
             }
             for (int j = 0; j < 3; ++j) {
-                Pulled &pulled = pulled_[face[j]];
-                pulled.x += to[j][0];
-                pulled.y += to[j][1];
-                pulled.z -= to[j][2] * fan.k * t.w[j] * t.w[j];
-                to_k += to[j][2] * t.w[j];
+                const Eight along = to[j][2] * t.w[j], depth = fan.k * along * t.w[j];
+                to_k += total(along);
+                const int32_t *vertex = mesh_.faces + 3 * i + j;
+                for (int lane = 0; lane < t.held; ++lane) {
+                    Pulled &sum = pulled[-1 - place[vertex[3 * lane]]];
+                    sum.x += to[j][0][lane];
+                    sum.y += to[j][1][lane];
+                    sum.z -= depth[lane];
+                    sum.alpha += to_alpha[j][lane];
+                }
             }
         }
-        pulled_[root].z += to_k * fan.k * from[root].w;  // k is in proportion to its depth
+        pulled[0].z += to_k * fan.k * plain_[pulled[0].vertex].w;  // k is in proportion to its depth
     }
 
     void add_position(int32_t v, double x, double y, double z, const MsVertexGradients &out) const {
@@ -314,7 +356,12 @@ class FanFilter {
         for (int j = 0; j < 3; ++j) out.vertices[3 * (int64_t)v + j] += (float)(m[j] * x + m[4 + j] * y + m[8 + j] * z);
     }
 
-    static void cross(const double a[3], const double b[3], double out[3]) {
+    static double total(const Eight &lanes) {
+        double a[EIGHT];
+        std::memcpy(a, &lanes, sizeof a);
+        return ((a[0] + a[4]) + (a[2] + a[6])) + ((a[1] + a[5]) + (a[3] + a[7]));
+    }
+    static void cross(const Eight a[3], const Eight b[3], Eight out[3]) {
         out[0] = a[1] * b[2] - a[2] * b[1];
         out[1] = a[2] * b[0] - a[0] * b[2];
         out[2] = a[0] * b[1] - a[1] * b[0];
@@ -328,12 +375,15 @@ class FanFilter {
         out[2] = r * a[1] + t * a[2];
     }
 
-    const MsMesh &mesh_;
-    const Projection &projection_;
+    const MsMesh mesh_;
+    const Projection projection_;
     const double variance_;     // square samples
     const double depth_scale_;  // k for a fan at depth 1
-    Large<int32_t> owner_;      // first triangle of the fan that has the vertex
-    Large<Pulled> pulled_;
+    const Large<Projected> plain_;
+    Large<Projected> moved_;
+    Large<int32_t> owner_;         // fan that has the vertex
+    std::vector<int32_t> starts_;  // fan g has the triangles [starts_[g], starts_[g + 1])
+    Large<Fan> fans_;
 };
 
 }  // namespace ms

@@ -44,7 +44,7 @@ class GradientTile {
         // A filter goes on from gradients in camera space.
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
-                rotation_[3 * i + j] = scene.filter ? (float)(i == j) : (float)scene.projection.m[4 * i + j];
+                rotation_[3 * i + j] = scene.filtered ? (float)(i == j) : (float)scene.projection.m[4 * i + j];
     }
 
     void run(int tile_x, int tile_y, const PackedLog &log, TileGradients &out) {

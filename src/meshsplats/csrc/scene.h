@@ -47,25 +47,29 @@ struct Scene {
     const MsMesh &mesh;
     const Grid &grid;
     Projection projection;
-    Large<Projected> vertices;
-    std::unique_ptr<FanFilter> filter;  // or none
-    Large<Projected> unfiltered;        // vertices before it, if there is one
+    const Projected *vertices;
+    std::unique_ptr<FanFilter> filter;  // if it was made for this scene
+    bool filtered;
     std::vector<int32_t> group_start;  // triangles [group_start[g], group_start[g + 1]) are one group
     std::vector<DepthPlane> planes;    // by depth group
     Large<TileBox> boxes;        // by triangle
     std::vector<Item> items;           // groups that may cover samples, nearest first
 
-    // Items are needed to draw; without, just to follow a log.
-    Scene(const MsMesh &mesh, const MsCamera &camera, const Grid &grid, int threads, bool with_items = true)
-        : mesh(mesh), grid(grid), projection(camera, grid.samples), vertices(mesh.vertex_count) {
-        parallel_blocks(threads, mesh.vertex_count, 1 << 16, [&](int64_t a, int64_t b, int) {
-            for (int64_t i = a; i < b; ++i) vertices[i] = projection.project(projection.to_camera(mesh.vertices + 3 * i));
-        });
-        if (mesh.filter_px2 > 0) {
-            filter = std::make_unique<FanFilter>(mesh, projection, grid.samples);
-            unfiltered.swap(vertices);
-            filter->apply(unfiltered, vertices, threads);
+    // Items are needed to draw; without, just to follow a log. `known` is the filter of the same picture.
+    Scene(const MsMesh &mesh, const MsCamera &camera, const Grid &grid, int threads, bool with_items = true,
+          const FanFilter *known = nullptr)
+        : mesh(mesh), grid(grid), projection(camera, grid.samples), filtered(mesh.filter_px2 > 0) {
+        if (!known) {
+            projected_.resize(mesh.vertex_count);
+            parallel_blocks(threads, mesh.vertex_count, 1 << 16, [&](int64_t a, int64_t b, int) {
+                for (int64_t i = a; i < b; ++i) projected_[i] = projection.project(projection.to_camera(mesh.vertices + 3 * i));
+            });
+            if (filtered) {
+                filter = std::make_unique<FanFilter>(mesh, projection, grid.samples, std::move(projected_), threads);
+                known = filter.get();
+            }
         }
+        vertices = known ? known->moved() : projected_.data();
         if (!with_items) return;
         find_groups();
         if (mesh.depth_group) find_planes();
@@ -76,7 +80,7 @@ struct Scene {
     void homogeneous(const int32_t *face, double x0, double y0, Vec3 out[3]) const {
         for (int k = 0; k < 3; ++k) {
             const Projected &p = vertices[face[k]];
-            if (filter && p.w > 0) {
+            if (filtered && p.w > 0) {
                 out[k] = {(p.x - x0) / p.w, (p.y - y0) / p.w, 1 / p.w};
                 continue;
             }
@@ -87,6 +91,8 @@ struct Scene {
     }
 
   private:
+    Large<Projected> projected_;
+
     // Triangles are binned and sorted by the group: a run that belongs to one splat or hangs together.
     void find_groups() {
         constexpr int longest = 64, longest_strip = 16;

@@ -13,6 +13,8 @@ VERTEX_BYTES = 7 * 4 * 6 + 4
 the size of the vertex' splat."""
 BOUND_BYTES = 36 + 12 * 4
 """More for a vertex that is bound to a base mesh: corners, weights and their copies."""
+FILTER_BYTES = 2 * 24 + 4 + 4 + 12
+"""More for a vertex that is drawn with a filter: where it is before and after, its splat, and its gradient."""
 FACE_BYTES = 12 + 4 + 4 + 64
 """A triangle, its splat and depth group, and the renderer's lists of them."""
 PIXEL_BYTES = 12 * 12 + 64
@@ -24,10 +26,12 @@ BASE_BYTES = 300 << 20
 def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BYTES) -> int:
     """Bytes that fine-tuning ``mesh`` on ``dataset`` takes, estimated from sizes alone."""
     views = dataset.views
+    vertex = VERTEX_BYTES + (BOUND_BYTES if mesh.binding is not None else 0)
+    vertex += FILTER_BYTES if mesh.filter_px2 else 0
     pixels = max((view.camera.width * view.camera.height for view in views), default=0)
     return (
         BASE_BYTES
-        + len(mesh.vertices) * (VERTEX_BYTES + (BOUND_BYTES if mesh.binding is not None else 0))
+        + len(mesh.vertices) * vertex
         + len(mesh.faces) * FACE_BYTES
         + pixels * PIXEL_BYTES
         + min(dataset.memory, cache_bytes)
