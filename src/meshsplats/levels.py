@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.comparison import compare
 from meshsplats.conversion import convert
 from meshsplats.dataset import Dataset
 from meshsplats.datasets.around import splat_dataset
@@ -24,17 +25,12 @@ from meshsplats.finetuning import (
 )
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.metrics import psnr
-from meshsplats.rendering import render, render_splats
 
 SMALLEST = 16
 """Pixels across, below which no level is made."""
 
-LARGER = 4
-"""The truth that a level is measured with is the mean of a picture so many times as large."""
-
 SAMPLES = 2
-"""Side of the grid of samples in each pixel, with which it is drawn then."""
+"""Side of the grid of samples in each pixel, with which a level is measured."""
 
 
 @dataclass(frozen=True)
@@ -107,13 +103,7 @@ def likeness(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> float:
-    """PSNR in dB, the mean over ``cameras``: the mesh drawn with 2 x 2 samples a pixel against the mean of
-    pictures of the splats four times as large, on white."""
-    scores = []
-    for camera in cameras:
-        large = render_splats(cloud, camera.scaled(LARGER), sh_degree=sh_degree, threads=threads)
-        shape = (camera.height, LARGER, camera.width, LARGER, 3)
-        truth = large.color.clip(0, 1).reshape(shape).mean(axis=(1, 3))
-        picture = render(mesh, camera, samples=SAMPLES, threads=threads).color.clip(0, 1)
-        scores.append(min(psnr(picture, truth), 200.0))
-    return float(np.mean(scores))
+    """PSNR in dB, the mean over ``cameras``: the mesh drawn with 2 x 2 samples a pixel against the splats in
+    the look 'area', on white."""
+    found = compare(cloud, mesh, cameras, samples=SAMPLES, sh_degree=sh_degree, threads=threads)
+    return float(np.mean([min(view.psnr, 200.0) for view in found.views]))

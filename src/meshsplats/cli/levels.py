@@ -27,7 +27,7 @@ from meshsplats.cli.common import (
     size_of,
     write_json,
 )
-from meshsplats.cli.training import need_torch, say, shown
+from meshsplats.cli.training import say, shown
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_config
 from meshsplats.gaussians import GaussianCloud
@@ -88,8 +88,6 @@ class Levels:
         self._check_output()
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
-        if config is not None:
-            need_torch()
         cloud = self.reading.load(self.input)
         most = len(cloud) if self.max_splats is None else min(self.max_splats, len(cloud))
         chain = plan_levels(most, self.levels, factor=self.factor, width=self.width)
