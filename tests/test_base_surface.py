@@ -159,7 +159,7 @@ def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     assert np.abs(np.linalg.norm(base.vertices, axis=1) - 1).max() < 0.15
     assert open_edges(base.faces) == 0
     assert len(base.faces) == pytest.approx(600, abs=2)
-    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out)]) == 1
+    assert main(["base", str(tmp_path / "scene.ply"), "-o", str(out)]) == 3
     assert main(["base", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
     assert main(["base", str(out), "-o", str(out), "--force"]) == 2
     assert "is read by this command" in capsys.readouterr().err

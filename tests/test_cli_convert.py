@@ -18,7 +18,9 @@ from meshsplats.conversion import convert, simplify
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
 from meshsplats.metrics import psnr
-from meshsplats.rendering import render, render_splats
+from meshsplats.rendering import render
+from meshsplats.rendering.looks import draw_splats
+from meshsplats.rendering.samples import needed_samples
 
 
 @pytest.fixture
@@ -167,8 +169,8 @@ def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, optio
         assert [c.world_to_camera.tolist() for c in cameras] == [
             c.world_to_camera.tolist() for c in load_cameras(tmp_path / "cameras.json")
         ]
-    drawn = render(mesh, cameras[0], samples=2).color
-    wanted = psnr(drawn, render_splats(cloud, cameras[0]).color)
+    drawn = render(mesh, cameras[0], samples=needed_samples(mesh, cameras)).color
+    wanted = psnr(drawn, draw_splats(cloud, cameras[0]).color)
     assert told["views"][0]["psnr"] == pytest.approx(wanted, abs=0.01)
 
 
@@ -177,7 +179,7 @@ def test_a_part_is_shown_not_compared_with_the_whole(splats, tmp_path, capsys):
     assert run(splats, "-o", tmp_path / "part.npz", *box) == 0
     out = capsys.readouterr().out
     part = load_mesh(tmp_path / "part.npz").splat_count
-    assert f"40 splats, {part} of them converted -> " in out
+    assert f"40 splats, {part} of them converted ({part / 40:.1%}) -> " in out
     assert "next: meshsplats render" in out
 
 

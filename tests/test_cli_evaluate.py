@@ -22,6 +22,7 @@ from meshsplats.formats.splats import load_gaussians, save_gaussians
 from meshsplats.metrics import psnr
 from meshsplats.pictures import save_png
 from meshsplats.rendering import render, render_splats
+from meshsplats.rendering.looks import draw_splats
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +49,7 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     splats = ("--splats", scene / "scene.ply", "--cameras", scene / "cameras.json", "--sh-degree", "0")
     before = ("--before", scene / "mesh.npz")
     pictures = ("--pictures", scene / "pictures")
-    options = (*splats, *before, *pictures, "--strips", "2", "--fit-exposure", "--json")
+    options = (*splats, *before, *pictures, "--strips", "2", "--fit-exposure", "--samples", "1", "--json")
     assert run(scene / "mesh.npz", "-o", out, *options) == 0
     printed = json.loads(capsys.readouterr().out)["scenes"][0]
     results = json.loads((out / "results.json").read_text())
@@ -82,7 +83,7 @@ def test_what_degree_0_shows_of_splats_with_more_is_scored_beside_a_mesh(scene, 
     report = json.loads(capsys.readouterr().out)["scenes"][0]
     assert set(report["methods"]) == {"mesh", "splats_sh0"}
     camera = load_cameras(scene / "cameras.json")[0]
-    both = [render_splats(replace(cloud, sh=sh), camera, sh_degree=d).color for d in (0, None)]
+    both = [draw_splats(replace(cloud, sh=sh), camera, sh_degree=d).color for d in (0, None)]
     told = report["methods"]["splats_sh0"]["views"][0]["psnr"]
     assert told == pytest.approx(psnr(*(np.clip(p, 0, 1) for p in both)), abs=0.01)
     assert report["held_out"] is None  # given cameras may have been trained on

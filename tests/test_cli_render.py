@@ -171,7 +171,7 @@ def test_nothing_is_overwritten(triangle, tmp_path, capsys):
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "view_0000.png").write_bytes(b"mine")
-    assert run(triangle, "-o", folder, "--cameras", tmp_path / "one.json") == 1
+    assert run(triangle, "-o", folder, "--cameras", tmp_path / "one.json") == 3
     assert [p.name for p in folder.iterdir()] == ["view_0000.png"]
 
 

@@ -83,5 +83,5 @@ def test_outputs_and_inputs(splats, tmp_path, capsys):
     assert run(splats, "-o", splats, "--count", 3, "--force") == 2
     assert "is read by this command" in capsys.readouterr().err
     (tmp_path / "small.config.json").write_text("mine")
-    assert run(splats, "-o", tmp_path / "small.ply", "--count", 3) == 1
+    assert run(splats, "-o", tmp_path / "small.ply", "--count", 3) == 3
     assert (tmp_path / "small.config.json").read_text() == "mine"

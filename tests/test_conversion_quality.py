@@ -15,7 +15,8 @@ from meshsplats.formats.splats import load_gaussians
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.metrics import psnr
-from meshsplats.rendering import render, render_splats
+from meshsplats.rendering import render
+from meshsplats.rendering.looks import draw_splats
 
 MARGIN_WITHOUT = 1.5
 """How much better the default must be than paper where no cameras are known, dB."""
@@ -26,11 +27,11 @@ def one_color_each(cloud: GaussianCloud) -> GaussianCloud:
     return replace(cloud, sh=cloud.sh[:, :1])
 
 
-def likeness(mesh: SplatMesh, cloud: GaussianCloud, cameras: list[Camera]) -> float:
+def likeness(mesh: SplatMesh, cloud: GaussianCloud, cameras: list[Camera], look: str = "area") -> float:
     """Mean PSNR in dB, 2 x 2 samples a pixel on white."""
-    return float(
-        np.mean([psnr(render(mesh, c, samples=2).color, render_splats(cloud, c).color) for c in cameras])
-    )
+    images = [render(mesh, camera, samples=2).color for camera in cameras]
+    truths = [draw_splats(cloud, camera, look).color for camera in cameras]
+    return float(np.mean([psnr(a, b) for a, b in zip(images, truths, strict=True)]))
 
 
 @pytest.fixture(scope="module")
@@ -40,24 +41,29 @@ def scene() -> tuple[GaussianCloud, list[Camera], list[Camera]]:
     return cloud, close, mid
 
 
-def test_default_beats_paper_at_no_more_triangles(scene):
+@pytest.mark.parametrize("look", ["area", "splats"])
+def test_default_beats_paper_at_no_more_triangles(scene, look):
     cloud, close, mid = scene
-    paper, default = convert(cloud, preset="paper"), convert(cloud, cameras=close)
+    paper, default = convert(cloud, preset="paper"), convert(cloud, cameras=close, look=look)
     assert len(default.faces) <= 8 * len(cloud)
-    assert likeness(default, cloud, close) > likeness(paper, cloud, close) + 2
-    assert likeness(default, cloud, mid) > likeness(paper, cloud, mid) + 1.5
+    assert likeness(default, cloud, close, look) > likeness(paper, cloud, close, look) + 2
+    assert likeness(default, cloud, mid, look) > likeness(paper, cloud, mid, look) + 1.5
+
+
+def test_each_look_is_what_its_conversion_is_best_at(scene):
+    cloud, close, _ = scene
+    area, viewer = (convert(cloud, cameras=close, look=look) for look in ("area", "splats"))
+    assert likeness(area, cloud, close, "area") > likeness(viewer, cloud, close, "area") + 2
+    assert likeness(viewer, cloud, close, "splats") > likeness(area, cloud, close, "splats") + 2
 
 
 def test_each_ingredient_helps(scene):
     cloud, close, _ = scene
     full = likeness(convert(cloud, cameras=close), cloud, close)
-    for options in (
-        dict(footprint="none"),
-        dict(cameras=close, mode="flat"),
-        dict(cameras=close, opac_mul=0.2),
-        dict(cameras=close, scale_mul=2.0),
-    ):
-        assert likeness(convert(cloud, **options), cloud, close) < full - 0.3, options
+    for options in (dict(mode="flat"), dict(opac_mul=0.2), dict(scale_mul=2.0)):
+        assert likeness(convert(cloud, cameras=close, **options), cloud, close) < full - 0.3, options
+    wide = likeness(convert(cloud, cameras=close, look="splats"), cloud, close, "splats")
+    assert likeness(convert(cloud, footprint="none"), cloud, close, "splats") < wide - 0.3
 
 
 @pytest.mark.parametrize("count", [300, 8000])
@@ -90,16 +96,17 @@ def test_kernels():
     """Each kernel's own picture, with meshes made for it and for the plain kernel."""
     cloud = one_color_each(make_scene(8000))
     cameras = orbit(cloud, 2, azimuth=20, width=240, height=240, distance=1.2)
+    options = dict(cameras=cameras, look="splats")
     thin = replace(cloud, kernel="antialiased", scales=cloud.scales * np.float32(0.4))
-    right = likeness(convert(thin, cameras=cameras), thin, cameras)
-    wrong = likeness(convert(replace(thin, kernel="3dgs"), cameras=cameras), thin, cameras)
+    right = likeness(convert(thin, **options), thin, cameras, "splats")
+    wrong = likeness(convert(replace(thin, kernel="3dgs"), **options), thin, cameras, "splats")
     assert right > wrong + 3
     flat = np.take_along_axis(cloud.scales, np.argsort(-cloud.scales, axis=1), axis=1)
     order = cloud.scales[:, 2] <= cloud.scales[:, :2].min(axis=1)
     surfels = replace(cloud, scales=flat * [1, 1, 0], kernel="2dgs").select(order)
     assert len(surfels) > 1000
-    filtered = likeness(convert(surfels, cameras=cameras), surfels, cameras)
-    assert filtered > likeness(convert(surfels, preset="paper"), surfels, cameras) + 1
+    filtered = likeness(convert(surfels, **options), surfels, cameras, "splats")
+    assert filtered > likeness(convert(surfels, preset="paper"), surfels, cameras, "splats") + 1
 
 
 def test_real_splats():
@@ -108,9 +115,11 @@ def test_real_splats():
     close, mid, far = (
         load_cameras(shared_data(f"cameras/playbot_{d}.json")) for d in ("close", "mid", "far")
     )
-    paper, default = convert(cloud, preset="paper"), convert(cloud, cameras=close)
-    measured = likeness(paper, cloud, mid), likeness(paper, cloud, far)
+    paper, wide = convert(cloud, preset="paper"), convert(cloud, cameras=close, look="splats")
+    measured = likeness(paper, cloud, mid, "splats"), likeness(paper, cloud, far, "splats")
     assert measured == pytest.approx((26.49, 29.71), abs=0.1)
-    assert likeness(default, cloud, mid) > measured[0] + 1.5
-    assert likeness(default, cloud, far) > measured[1] - 0.1
-    assert likeness(default, cloud, close[:2]) > likeness(paper, cloud, close[:2]) + 2
+    assert likeness(wide, cloud, mid, "splats") > measured[0] + 1.5
+    assert likeness(wide, cloud, far, "splats") > measured[1] - 0.1
+    near = close[:2]
+    assert likeness(wide, cloud, near, "splats") > likeness(paper, cloud, near, "splats") + 2
+    assert likeness(convert(cloud, cameras=close), cloud, near) > likeness(paper, cloud, near) + 2

@@ -89,7 +89,7 @@ def test_a_chain(splats, tmp_path, capsys):
         assert row["psnr"] > 15
     assert not (tmp_path / "chain.partial").exists()
 
-    assert run(splats, "-o", out, *QUICK) == 1  # not overwritten
+    assert run(splats, "-o", out, *QUICK) == 3  # not overwritten
     assert (out / "level_0.npz").exists()
     assert run(splats, "-o", out, *QUICK, "--force", "--format", "ply", "--max-splats", 300) == 0
     shown = capsys.readouterr().out
@@ -117,7 +117,7 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
     assert "--resume goes on" in capsys.readouterr().err
     assert not out.exists()
     first = (tmp_path / "chain.partial" / "level_0.glb").stat().st_mtime_ns
-    assert run(splats, "-o", out, *QUICK) == 1
+    assert run(splats, "-o", out, *QUICK) == 3
     assert "--resume goes on with it, --force begins anew" in capsys.readouterr().err
     assert run(splats, "-o", out, "--no-tune", "--width", 80, "--levels", 2, "--resume") == 2
     assert "was begun with --width 64, not 80" in capsys.readouterr().err
@@ -146,7 +146,7 @@ def test_folders_that_are_in_the_way(splats, tmp_path, capsys):
     out = tmp_path / "mine"
     out.mkdir()
     (out / "diary.txt").write_text("dear diary")
-    assert run(splats, "-o", out, *QUICK, "--force") == 1
+    assert run(splats, "-o", out, *QUICK, "--force") == 3
     assert "holds no levels.json" in capsys.readouterr().err
     assert run(splats, "-o", tmp_path / "new", *QUICK, "--resume") == 1
     assert "nothing to go on with" in capsys.readouterr().err

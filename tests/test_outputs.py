@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -256,7 +257,10 @@ sys.exit(meshsplats.cli.main(["hang"]))
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT], ids=lambda n: n.name)
 def test_signals_leave_nothing(tmp_path, number):
     command = [sys.executable, "-c", _HANGING, str(tmp_path / "mesh.glb")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    # Where the tests run in the background of a shell, it may have signals ignored.
+    heed = partial(signal.signal, number, signal.SIG_DFL)
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with subprocess.Popen(command, preexec_fn=heed, **pipes) as process:
         assert process.stdout.readline() == "writing\n"
         assert len(_temporaries(tmp_path)) == 1
         process.send_signal(number)

@@ -81,7 +81,7 @@ class Compare:
         if self.mesh is None:
             from meshsplats.conversion import convert
 
-            mesh = convert(cloud, preset=self.preset, cameras=cameras)
+            mesh = convert(cloud, preset=self.preset, cameras=cameras, look=self.look)
         else:
             from meshsplats.formats.meshes import load_mesh
 

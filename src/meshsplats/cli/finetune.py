@@ -50,6 +50,7 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
+from meshsplats.finetuning.tuning import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -176,6 +177,7 @@ class Finetune:
             words += ["--background", background.name]
         elif config.background == "black":
             words += ["--background", "black"]
+        words += ["--samples", samples_of(dataset.train[0], config)]
         words += ["-o", f"{folder}-evaluation"]
         return shlex.join(map(str, words))
 

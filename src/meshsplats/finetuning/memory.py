@@ -14,7 +14,7 @@ the size of the vertex' splat."""
 BOUND_BYTES = 36 + 12 * 4
 """More for a vertex that is bound to a base mesh: corners, weights and their copies."""
 FILTER_BYTES = 2 * 24 + 4 + 4 + 12
-"""More for a vertex that is drawn with a filter: where it is before and after, its splat, and its gradient."""
+"""More for a vertex drawn with a filter: where it is before and after, its splat, and its gradient."""
 FACE_BYTES = 12 + 4 + 4 + 64
 """A triangle, its splat and depth group, and the renderer's lists of them."""
 PIXEL_BYTES = 12 * 12 + 64

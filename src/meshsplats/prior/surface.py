@@ -77,7 +77,8 @@ def base_surface(
     if isinstance(mesh, GaussianCloud):
         from meshsplats.conversion import convert
 
-        mesh = convert(mesh, cameras=placed)
+        # As wide as a viewer draws them: gaps between splats would be holes in the surface.
+        mesh = convert(mesh, cameras=placed, look="splats")
     low, voxel, shape = _grid(scene, resolution)
     total, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     views = []
