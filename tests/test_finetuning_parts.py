@@ -239,11 +239,13 @@ def test_each_preset_begins_with_its_conversion():
     cameras = orbit(cloud, 3, width=40, height=40)
     mesh = starting_mesh(cloud, cameras)
     assert 8 * 190 < len(mesh.faces) <= 8 * 200
-    assert np.array_equal(
-        mesh.vertices, convert(cloud, detail="cameras", cameras=cameras, footprint="none").vertices
-    )
+    bare = dict(cameras=cameras, footprint="none")
+    assert np.array_equal(mesh.vertices, convert(cloud, detail="cameras", **bare).vertices)
     even = starting_mesh(cloud, cameras, detail="even")
-    assert np.array_equal(even.vertices, convert(cloud, mode="flat", **options).vertices)
+    assert np.array_equal(even.vertices, convert(cloud, mode="flat", **bare).vertices)
+    filtered = starting_mesh(cloud, cameras, look="splats", detail="even")
+    assert np.array_equal(filtered.vertices, even.vertices)
+    assert (even.filter_px2, filtered.filter_px2) == (0, pytest.approx(0.3))
     assert len(starting_mesh(cloud, cameras, mode="flat", no_triag=4).faces) == 4 * 200
     assert len(starting_mesh(cloud, cameras, no_triag=3).faces) == 3 * 200
     assert len(starting_mesh(cloud, cameras, rings=2).faces) == 24 * 200

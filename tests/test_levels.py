@@ -152,7 +152,7 @@ def test_folders_that_are_in_the_way(splats, tmp_path, capsys):
     assert "nothing to go on with" in capsys.readouterr().err
     partial = tmp_path / "other.partial"
     partial.mkdir()
-    assert run(splats, "-o", tmp_path / "other", *QUICK, "--force") == 1
+    assert run(splats, "-o", tmp_path / "other", *QUICK, "--force") == 3
     assert "not of this command" in capsys.readouterr().err
     assert run(splats, "-o", tmp_path / "chain", *QUICK, "--levels", 5) == 1
     assert "5 levels are too many" in capsys.readouterr().err
