@@ -175,6 +175,8 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
             at = command.index("--minutes")
             command[at : at + 2] = []
             small = ["--width", "48", "--views", "3", "--held-out", "1", "--steps", "2"]
+        if command[1] == "levels":
+            small = ["--no-tune", "--width", "48", "--levels", "2"]
         if command[1] == "base":
             small = ["--resolution", "16", "--views", "6"]
         if command[1] == "deform":

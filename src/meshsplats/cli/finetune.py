@@ -126,7 +126,10 @@ class Finetune:
                 _warn_of_the_rest(dataset.train[0].picture)
             dataset, background = behind(dataset, scene, config, self.input, self.threads, whole=whole)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
-        announce(f"{len(mesh.faces):,} triangles", mesh, dataset, self.target.cache_bytes)
+        what = f"{len(mesh.faces):,} triangles"
+        if isinstance(scene, GaussianCloud) and (mesh.splat_count or 0) < len(scene):
+            what += f" of {mesh.splat_count:,} splats, {len(scene):,} before"
+        announce(what, mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
         try:
             with files.claimed([self.input], resume=self.resume, force=self.force), shown() as show:

@@ -346,9 +346,9 @@ class Merging {
             around_.resize(MOST);
         }
         keep_list(a, b);
+        // A pair of it that is cheaper than its neighbour's best is found from this side.
         Best best{std::numeric_limits<double>::infinity(), -1, 0, 0};
         for (const auto &[price, other] : around_) {
-            if (price < best_[other].cost) set_best(other, {price, a, merged, 0});
             if (price < best.cost || (price == best.cost && other < best.partner))
                 best = {price, other, splats_[other].merged, 0};
         }
