@@ -191,7 +191,7 @@ def _watch(
         text=True,
         errors="replace",
         start_new_session=True,  # what ends our group must leave the guard to tidy up
-        **({} if sys.platform == "win32" else {"pass_fds": [lock]}),
+        pass_fds=() if sys.platform == "win32" else [lock],
     )
     at = Progress(0, pictures, 0.0, "starting", None)
     try:

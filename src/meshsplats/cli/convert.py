@@ -54,8 +54,10 @@ from meshsplats.mesh import SplatMesh
 
 _CHOOSING = ("crop", "min_opacity", "max_splats")
 """Options of the conversion that choose splats, and so serve --as-splats too."""
-_OF_SPLATS = ("input", "output", "formats", "as_splats", "no_preview", "no_sidecar")
-_OF_SPLATS += ("conversion", "reading", "json", "force")
+_OF_SPLATS = (
+    *("input", "output", "formats", "as_splats", "no_preview", "no_sidecar"),
+    *("conversion", "reading", "json", "force"),
+)
 """Options of the command that do."""
 
 

@@ -17,6 +17,7 @@ from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     DrawOptions,
     Output,
+    PartOptions,
     SplatOptions,
     ViewOptions,
     check_outputs,
@@ -68,6 +69,7 @@ class Render:
     views: ViewOptions = field(default_factory=ViewOptions)
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
+    part: PartOptions = field(default_factory=PartOptions)
     transparent: bool = False
     """No background: pictures with an alpha channel."""
     depth: Literal["none", "png", "npy"] = "none"
@@ -86,7 +88,7 @@ class Render:
         single = self.output.suffix.lower() == ".png"
         self._check(single)
         start = time.perf_counter()
-        scene = load_scene(self.input, self.reading)
+        scene = self.part.of(load_scene(self.input, self.reading))
         self._check_scene(scene)
         cameras = self.views.make(scene, self.input, count=1 if single else 60, side=800)
         if single and len(cameras) > 1:
