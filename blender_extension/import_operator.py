@@ -29,6 +29,13 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
         default=True,
     )
 
+    at_origin: BoolProperty(
+        name="Move to World Origin",
+        description="Stand it on the middle of the grid. Without, it lies where its file has it, with others"
+        " of the same capture",
+        default=False,
+    )
+
     def invoke(self, context, event):
         if self.files and self.directory:  # dropped
             return context.window_manager.invoke_props_dialog(self)
@@ -38,6 +45,7 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
         layout = self.layout
         layout.use_property_split = True
         draw_choices(self, layout)
+        layout.prop(self, "at_origin")
         layout.prop(self, "set_up_scene")
 
     def execute(self, context):
@@ -46,12 +54,17 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
         return self.begin(context, Work(paths, {name: getattr(self, name) for name in CHOICES}))
 
     def done(self, context, work):
+        from pathlib import Path
+
         from meshsplats.blender.inside import objects
+        from meshsplats.formats.splats import subject_name
 
         things = []
         for path, prepared in work.results:
-            name = os.path.splitext(os.path.basename(path))[0]
+            name = subject_name(Path(path))
             thing = objects.add(prepared, name, context.collection)
+            if self.at_origin:
+                thing.location = (0, 0, 0)
             thing.meshsplats.path = path
             copy_choices(thing.meshsplats, self)
             things.append(thing)

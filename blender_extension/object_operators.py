@@ -3,7 +3,7 @@
 settings."""
 
 import bpy
-from bpy.props import EnumProperty
+from bpy.props import BoolProperty, EnumProperty
 
 from .settings import CHOICES
 from .work import Modal, Work
@@ -106,6 +106,46 @@ class SetUpRender(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class SetUpStage(bpy.types.Operator):
+    """Sun, sky, ground and a camera round the splat meshes; what an earlier click made is replaced"""
+
+    bl_idname = "scene.meshsplats_stage"
+    bl_label = "Set up Light and Camera"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    lights: EnumProperty(
+        name="Light",
+        items=[
+            ("sun", "Sun", "An afternoon's sun and an even sky"),
+            ("noon", "Noon", "The sun high in a clear sky"),
+            ("overcast", "Overcast", "Clouds: no shadows with edges"),
+            ("studio", "Studio", "A large lamp on the left, a weaker one on the right"),
+        ],
+        default="sun",
+    )
+    camera: BoolProperty(name="Camera", description="A camera that sees all of it", default=True)
+    make_lit: BoolProperty(
+        name="Make Lit",
+        description="Give unlit splat meshes the lit material, which light acts on",
+        default=True,
+    )
+
+    def execute(self, context):
+        from meshsplats.blender.inside import objects, setting
+
+        every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
+        try:
+            for thing in every if self.make_lit else []:
+                if not thing.data[objects.LIT]:
+                    objects.replace_mesh(thing, objects.prepare(objects.as_splat_mesh(thing), True))
+                    thing.meshsplats.shading = "lit"
+            setting.set_up(context.scene, every, self.lights, camera=self.camera)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
 class FollowBase(bpy.types.Operator):
     """Move the splats to where their base is now; after edits and on each frame this happens by itself"""
 
@@ -126,7 +166,7 @@ class FollowBase(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (ConvertAgain, SetShading, SetUpRender, FollowBase)
+CLASSES = (ConvertAgain, SetShading, SetUpRender, SetUpStage, FollowBase)
 
 
 def register():

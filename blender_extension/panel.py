@@ -4,7 +4,7 @@
 import bpy
 
 from .import_operator import ImportMeshSplats
-from .object_operators import ConvertAgain, FollowBase, SetShading, SetUpRender
+from .object_operators import ConvertAgain, FollowBase, SetShading, SetUpRender, SetUpStage
 from .settings import draw_choices
 
 
@@ -22,6 +22,10 @@ class MeshSplatsPanel(bpy.types.Panel):
         if thing is not None and thing.type == "MESH":
             self._object(layout, thing)
         layout.separator()
+        layout.label(text="Light, ground and camera")
+        row = layout.row(align=True)
+        for lights in ("sun", "noon", "overcast", "studio"):
+            row.operator(SetUpStage.bl_idname, text=lights.capitalize()).lights = lights
         layout.label(text="Render settings")
         row = layout.row(align=True)
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"

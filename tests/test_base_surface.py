@@ -81,7 +81,7 @@ def test_as_many_faces_as_asked_for():
 def test_without_the_extra_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
     monkeypatch.setattr("meshsplats.prior.surface.render", None)  # told before the work
-    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[base\]'"):
+    with pytest.raises(MissingDependencyError, match=r"extra 'base': pip install scikit-image"):
         base_surface(ball(), resolution=8, cameras=4)
 
 

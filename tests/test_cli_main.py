@@ -216,7 +216,7 @@ def test_doctor(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_draws", lambda: False)
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
-    assert "pip install 'meshsplats[blender]'" in out
+    assert "pip install 'no-such-thing>=1'" in out
     assert "DOES NOT WORK" in out
 
 

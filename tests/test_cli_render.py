@@ -231,3 +231,36 @@ def test_outputs_and_inputs_that_cannot_be(splats, triangle, tmp_path, capsys):
         ["end in .png", "do not fit", "is a mesh", "no: this folder", "JSON"], errors, strict=True
     ):
         assert words in line
+
+
+def test_a_part_is_drawn(splats, tmp_path):
+    """Of splats and of their mesh: what is outside of the box is not there."""
+    cloud = load_gaussians(splats)
+    box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
+    inside = np.all((cloud.means >= box[:3]) & (cloud.means <= box[3:]), axis=1)
+    camera = orbit(cloud, 1, width=40, height=40)[0]
+    save_cameras([camera], tmp_path / "camera.json")
+    options = ["--cameras", tmp_path / "camera.json", "--crop", *box, "--as-splats"]
+    assert run(splats, "-o", tmp_path / "part.png", *options) == 0
+    part = cloud.select(np.flatnonzero(inside))
+    drawn = render_splats(part, camera, background=(1, 1, 1)).color
+    with Image.open(tmp_path / "part.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), to_bytes(drawn))
+    assert 0 < inside.sum() < len(cloud)
+
+
+def test_aim_and_lens(splats, tmp_path):
+    cloud = load_gaussians(splats)
+    size = ["--width", 60, "--height", 40]
+    aimed = ["--look-at", -1, 0.5, 2, "--focal-length", 50]
+    assert run(splats, "-o", tmp_path / "a.png", "--as-splats", *size, *aimed) == 0
+    (camera,) = load_cameras(tmp_path / "a.png.cameras.json")
+    x, y, z = camera.world_to_camera[:3] @ [-1, 0.5, 2, 1]
+    assert (x, y) == (pytest.approx(0, abs=1e-6), pytest.approx(0, abs=1e-6))
+    assert camera.fx == pytest.approx(50 / 36 * 60)
+    own = orbit(cloud, 1, elevation=15, width=60, height=40, fov=2 * np.degrees(np.arctan(12 / 50)))[0]
+    assert z == pytest.approx(np.linalg.norm(camera.center - [-1, 0.5, 2]))
+    np.testing.assert_allclose(own.world_to_camera[:3, :3], camera.world_to_camera[:3, :3], atol=1e-9)
+    for mistake in (["--fov", "30"], ["--look-around", "3"]):
+        assert run(splats, "-o", tmp_path / "b", *aimed, *mistake) == 2
+    assert run(splats, "-o", tmp_path / "b.png", "--focal-length", 0) == 1

@@ -103,7 +103,7 @@ def test_without_usd_core_the_error_names_the_extra(tmp_path, monkeypatch):
 
     importer = builtins.__import__
     monkeypatch.setattr(builtins, "__import__", no_pxr)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[usd\]'"):
+    with pytest.raises(MissingDependencyError, match=r"extra 'usd': pip install usd-core"):
         save_mesh(MESH, tmp_path / "m.usdc")
     assert os.listdir(tmp_path) == []
 

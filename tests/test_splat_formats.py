@@ -213,7 +213,7 @@ def test_spz_version_4_without_zstandard(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "zstandard", None)
     monkeypatch.setitem(__import__("sys").modules, "compression.zstd", None)
     (tmp_path / "a.spz").write_bytes(encode.spz4(some_splats(), lambda raw: raw))
-    with pytest.raises(MissingDependencyError, match=r"meshsplats\[formats\]"):
+    with pytest.raises(MissingDependencyError, match=r"extra 'formats': pip install zstandard"):
         load_gaussians(tmp_path / "a.spz")
 
 

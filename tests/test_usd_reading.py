@@ -238,7 +238,7 @@ def test_instances_of_instances_do_not_eat_memory(tmp_path):
 def test_without_usd_core_the_error_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr(usd_reader.importlib.util, "find_spec", lambda name: None)
     (tmp_path / "m.usd").write_bytes(b"PXR-USDC\0\0")
-    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[usd\]'"):
+    with pytest.raises(MissingDependencyError, match=r"extra 'usd': pip install usd-core"):
         load_mesh(tmp_path / "m.usd")
 
 

@@ -4,7 +4,7 @@ blender-env/bin/python examples/blender/falling.py [--width 320] [--samples 24] 
 
 Each object of the demo scene becomes a mesh of its own; the hull of its solid splats collides, and the splats
 follow. Blender's rigid bodies move them, and shadows move along. Writes example-output/falling.png (four
-moments) and falling.blend, to play in Blender. Needs Blender's module bpy: pip install 'meshsplats[blender]'.
+moments) and falling.blend, to play in Blender. Needs Blender's module bpy (docs/blender.md).
 """
 
 import argparse

@@ -182,6 +182,7 @@ def orbit(
     height: int = 800,
     fov: float = 45.0,
     distance: float = 1.0,
+    target: Sequence[float] | np.ndarray | None = None,
 ) -> list[Camera]:
     """``count`` cameras evenly spaced on a circle round the subject of ``scene``, all looking at its middle.
 
@@ -194,13 +195,14 @@ def orbit(
     up: (3,) direction; None: ``framing.guess_up``.
     fov: angle in degrees, 1 to 170, that the shorter side of the picture spans.
     distance: multiple of the distance at which the subject just fits the picture in every view.
+    target: (3,) point to look at and to go round, from as far away; None: the subject's middle.
 
     Raises ValueError for an empty scene or a value out of range.
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
-    return round_subject(scene, angles, up, width, height, fov, distance)
+    return round_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def dome(
@@ -213,6 +215,7 @@ def dome(
     height: int = 800,
     fov: float = 45.0,
     distance: float = 1.0,
+    target: Sequence[float] | np.ndarray | None = None,
 ) -> list[Camera]:
     """``count`` cameras spread evenly over the upper half of a sphere round the subject, or all of it.
 
@@ -225,7 +228,7 @@ def dome(
     lowest = -1.0 if whole else 0.0
     heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     angles = [(i * golden % 360, float(np.degrees(np.arcsin(h)))) for i, h in enumerate(heights)]
-    return round_subject(scene, angles, up, width, height, fov, distance)
+    return round_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def look_around(
@@ -273,6 +276,7 @@ def round_subject(
     height: int,
     fov: float,
     distance: float,
+    aim: Sequence[float] | np.ndarray | None = None,
 ) -> list[Camera]:
     """Cameras at (azimuth, elevation) degrees, at the distance from which every picture shows the subject."""
     if not (np.isfinite(distance) and distance > 0):
@@ -288,6 +292,10 @@ def round_subject(
     rotations = [camera.world_to_camera[:3, :3] for camera in around]
     slopes = (width / 2 / around[0].fx, height / 2 / around[0].fy)
     target, fit = fit_pictures(bounds, target, rotations, slopes)
+    if aim is not None:
+        target = np.asarray(aim, np.float64)
+        if target.shape != (3,) or not np.isfinite(target).all():
+            raise ValueError(f"the target must be three finite numbers, got {aim!r}")
     away = distance * fit
     return [
         look_at(target + away * d, target, near=away * NEAR_SHARE, name=f"view_{i:04d}", **lens)

@@ -12,6 +12,7 @@ import numpy as np
 from meshsplats._arrays import evenly
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.parts import Cells
 
 if TYPE_CHECKING:
     from meshsplats.camera import Camera
@@ -25,6 +26,12 @@ SURROUNDINGS = 4.0
 an object on its own reach about 2 (a ball's surface: 1; a filled ball: 1.26; the longest object measured:
 3.9)."""
 
+APART = 0.15
+"""Parts of the subject that are farther than this many radii from the rest stand apart..."""
+FLOATER = 0.01
+"""... and are floaters if they have less than this share of its opacity,"""
+FLOATERS = 0.1
+"""and all such together less than this."""
 COVERED = 0.995
 """Share of the subject's opacity that must be on the picture."""
 MARGIN = 1.08
@@ -42,7 +49,7 @@ class Bounds:
     radius: float
     """Distance from ``center`` within which 90 % of the weight lies, > 0."""
     points: np.ndarray
-    """(k, 3) float64 points of the subject: a sample, without the surroundings."""
+    """(k, 3) float64 points of the subject: a sample, without the surroundings and without floaters."""
     weights: np.ndarray
     """(k,) float64 their weights, >= 0: opacity."""
     sizes: np.ndarray
@@ -90,7 +97,17 @@ def scene_bounds(scene: Scene) -> Bounds:
         radius = float(sizes.max()) or 1.0
     limit = SURROUNDINGS * weighted_quantile(distance, weights, 0.5)
     subject = distance <= limit if limit > 0 else np.ones(len(points), bool)
+    subject[subject] = _without_floaters(points[subject], weights[subject], APART * radius)
     return Bounds(center, radius, points[subject], weights[subject], sizes[subject])
+
+
+def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np.ndarray:
+    """(k,) bool: the points but those of parts that stand apart and weigh little. All, where the parts that
+    weigh something are not nearly everything: then the scene is a scatter of small things."""
+    part = Cells(points, gap).parts()
+    held = np.bincount(part, weights)
+    keep = (held >= FLOATER * held.sum())[part]
+    return keep if weights[keep].sum() >= (1 - FLOATERS) * weights.sum() else np.ones(len(points), bool)
 
 
 def guess_up(scene: Scene | None = None, cameras: Sequence[Camera] | None = None) -> np.ndarray:

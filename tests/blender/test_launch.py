@@ -45,7 +45,7 @@ def program(tmp_path):
 def test_missing_bpy_names_the_extra_and_the_environment(monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bpy" else real(name))
-    with pytest.raises(MissingDependencyError, match=r"pip install 'meshsplats\[blender\]'.*--executable"):
+    with pytest.raises(MissingDependencyError, match=r"pip install '\.\[blender\]'.*--executable"):
         draw(random_mesh(3), cameras()[:1], pictures=["a.png"])
 
 
@@ -297,7 +297,8 @@ def test_missing_system_libraries_are_named(monkeypatch, tmp_path):
     [
         (["-o", "a.jpg"], "must end in .png, .exr, .blend"),
         (["-o", "a.png", "--mirror"], "the options of light need --lit"),
-        (["-o", "a.png", "--denoise"], "--denoise needs --lit"),
+        (["-o", "a.png", "--no-denoise"], "--no-denoise is for --lit"),
+        (["-o", "a.png", "--lit", "--engine", "eevee", "--no-denoise"], "--no-denoise is for --lit"),
         (["-o", "a.png", "--transparent", "--background", "black"], "exclude each other"),
         (["-o", "a.png", "--orbit", "3"], "3 views do not fit one .png"),
         (["-o", "a.blend", "--samples", "2"], "one sample a pixel"),

@@ -146,6 +146,8 @@ def _warn(mesh: SplatMesh, cameras: Sequence[Camera], layers: int, options: Scen
 
     shares = [hidden_by_limit(mesh, camera, threads=options.threads) for camera in cameras[:8]]
     share = float(np.max(shares)) if shares else 0.0
+    if share < 5e-5:  # told as 0.00 %
+        return
     warnings.warn(
         f"up to {layers} triangles lie behind each other, and Cycles follows a ray through {MAX_LAYERS}:"
         f" beyond, it is black ({share:.2%} of the pixels of a view are touched); draw fewer, with"

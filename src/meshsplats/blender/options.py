@@ -28,8 +28,12 @@ class LightOptions:
     """Degrees that the sun's disc spans: the larger, the softer shadows are."""
     sun_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
     """Colour of sunlight: linear R G B, 0 to 1; --sun-strength is multiplied by it."""
+    fill: float = 0.0
+    """Irradiance of a second, soft sun that stands low on the other side, W/m^2. 0: there is none."""
     sky: float = 0.35
-    """Radiance of the even white sky; not used with --hdri."""
+    """Radiance of the even sky; not used with --hdri."""
+    sky_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
+    """Colour of that sky: linear R G B, 0 to 1; --sky is multiplied by it."""
     hdri: Path | None = None
     """Environment picture (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
     hdri_strength: float = 1.0
@@ -37,8 +41,11 @@ class LightOptions:
     hdri_rotation: float = 0.0
     """Degrees that the environment is turned round the up direction."""
     ground: Ground = "plane"
-    """What the subject stands on: a grey plane; a catcher, seen only where shadows fall (Cycles); or
-    nothing."""
+    """What the subject stands on: a grey plane that fades into the background; a catcher, seen only where
+    shadows fall (Cycles); or nothing."""
+    exposure: float = 0.35
+    """How much brighter pictures are shown, in stops, -20 to 20: with 0.35, white that the light meets as it
+    meets what faces the viewer looks white. The values of an .exr do not change, nor does the background."""
     mirror: bool = False
     """A mirror behind the subject."""
     glass: bool = False
@@ -51,6 +58,11 @@ class LightOptions:
     bounces: int = 4
     """How often light is scattered on its way, 0 to 64; layers that it passes through are not counted."""
 
+    @property
+    def fill_direction(self) -> tuple[float, float]:
+        """Where the second sun stands, as ``sun``."""
+        return (-self.sun[0], 20.0)
+
     def check(self) -> None:
         """Raises ValueError for a value out of range, FileNotFoundError for a missing environment picture."""
         azimuth, elevation = self.sun
@@ -59,7 +71,9 @@ class LightOptions:
         for name, low, high in [
             ("sun_strength", 0, 1e6),
             ("sun_size", 0, 180),
+            ("fill", 0, 1e6),
             ("sky", 0, 1e6),
+            ("exposure", -20, 20),
             ("hdri_strength", 0, 1e6),
             ("hdri_rotation", -1e6, 1e6),
             ("roughness", 0, 1),
@@ -69,12 +83,30 @@ class LightOptions:
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {value}")
-        if not all(0 <= value <= 1 for value in self.sun_color):
-            raise ValueError(f"sun_color must be linear RGB in [0, 1], got {self.sun_color}")
+        for name in ("sun_color", "sky_color"):
+            if not all(0 <= value <= 1 for value in getattr(self, name)):
+                raise ValueError(f"{name} must be linear RGB in [0, 1], got {getattr(self, name)}")
         if self.ground not in get_args(Ground):
             raise ValueError(f"ground must be one of {', '.join(get_args(Ground))}, got {self.ground!r}")
         if self.hdri is not None:
             check_environment(self.hdri)
+
+
+LIGHTS = {
+    "sun": LightOptions(),
+    "noon": LightOptions(
+        sun=(-30.0, 70.0),
+        sun_strength=2.9,
+        sun_size=0.6,
+        sun_color=(1.0, 0.96, 0.9),
+        sky=0.45,
+        sky_color=(0.8, 0.9, 1.0),
+    ),
+    "overcast": LightOptions(sun_strength=0.0, sky=0.9),
+    "studio": LightOptions(sun=(-45.0, 40.0), sun_strength=1.7, sun_size=35.0, fill=0.6, sky=0.3),
+}
+"""Lights by name: an afternoon's sun; the sun high in a clear sky; clouds, no shadows with edges; a large
+lamp on the left, a weaker one on the right."""
 
 
 @dataclass(frozen=True)

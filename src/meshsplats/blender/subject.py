@@ -12,7 +12,7 @@ from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
 from meshsplats.camera import Camera, a_few
 from meshsplats.colors import srgb_to_linear
-from meshsplats.framing import front_axes, scene_bounds, weighted_quantile
+from meshsplats.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.mesh import SplatMesh
 
 _FLOOR = 0.002
@@ -34,6 +34,8 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
     directions = []
     if options.light is not None:
         directions.append(_world_direction(axes, *options.light.sun))
+        if options.light.fill > 0:
+            directions.append(_world_direction(axes, *options.light.fill_direction))
     layers = most_layers(mesh, cameras, directions, threads=options.threads)
     # An unlit picture is exact or it is not: a high limit costs nothing where there are no layers.
     return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
@@ -51,12 +53,9 @@ def prepare(
     """Arrays and facts: the fields of ``inside.scene.Subject``."""
     bounds = scene_bounds(mesh)
     up = mesh.up.astype(np.float64)
-    heights = bounds.points @ up
-    weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(heights))
-    low = np.minimum(heights.min(), 0) if len(heights) == 0 else weighted_quantile(heights, weights, _FLOOR)
     facts = {
         "radius": float(bounds.radius),
-        "floor": float(low),
+        "floor": lowest(bounds, up),
         "reach": float(np.linalg.norm(mesh.vertices - bounds.center, axis=1).max()),
         "layers": layers,
         "self_shadow": 0.0,
@@ -77,6 +76,13 @@ def prepare(
         if options.engine == "eevee":
             arrays |= _caster(mesh, lit["normals"], facts["self_shadow"] * _SUNK / SELF_SHADOW)
     return arrays, facts
+
+
+def lowest(bounds: Bounds, up: np.ndarray) -> float:
+    """Height along the unit ``up`` of the lowest part of a subject, but for strays; scene units."""
+    heights = bounds.points @ up
+    weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(heights))
+    return weighted_quantile(heights, weights, _FLOOR)
 
 
 def lit_arrays(

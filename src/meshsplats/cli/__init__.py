@@ -20,6 +20,7 @@ from typing import Any
 
 COMMANDS = {
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
+    "clean": ("meshsplats.cli.clean:Clean", "splats or a mesh without its floaters"),
     "render": ("meshsplats.cli.render:Render", "pictures of splats or a mesh, and a turntable"),
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, pictures side by side"),
     "finetune": ("meshsplats.cli.finetune:Finetune", "the mesh brought closer to splats or photographs"),

@@ -27,12 +27,18 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 T = TypeVar("T")
+Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
 # Options that may be left out. Their help says what happens then, instead of "(default: None)".
 Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
 Folder = Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")]
+Point = Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z", help_behavior_hint="")]
+Box = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
+]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 NAMED_COLORS: dict[str, tuple[float, float, float]] = {
@@ -92,8 +98,13 @@ class ViewOptions:
     """Degrees of the first view: 0 from the front, 90 from the subject's right-hand side in that view."""
     distance: float = 1.0
     """Multiple of the distance from which the subject just fits the picture."""
+    look_at: Point = None
+    """Point to look at and to go round, in the coordinates of the file. Default: the subject's middle."""
     fov: Number = None
     """Degrees that the picture's shorter side spans. Default: 45; 75 with --look-around."""
+    focal_length: Number = None
+    """Millimetres of a lens on 35 mm film, whose 36 mm span the picture's width: 50 is normal, 85 for
+    portraits, 24 wide. In place of --fov."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
     folder, of the mesh, else -y, as COLMAP's scenes have it."""
@@ -143,12 +154,18 @@ class ViewOptions:
         width = next(v for v in (self.width, self.height, side) if v is not None)
         lens: dict[str, Any] = {"width": width, "height": width if self.height is None else self.height}
         lens["up"] = parse_up(self.up) if self.up is not None else guess_up(scene, cameras_beside(source))
+        fov = self.fov
+        if self.focal_length is not None:
+            if not 1 <= self.focal_length <= 2000:
+                raise ValueError(f"--focal-length must lie between 1 and 2000 mm, got {self.focal_length}")
+            shorter = 36 * min(1.0, lens["height"] / lens["width"])
+            fov = float(np.degrees(2 * np.arctan(shorter / (2 * self.focal_length))))
         if self.look_around is not None:
             lens["elevation"] = 0.0 if self.elevation is None else self.elevation
-            lens["fov"] = 75.0 if self.fov is None else self.fov
+            lens["fov"] = 75.0 if fov is None else fov
             return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
-        lens["fov"] = 45.0 if self.fov is None else self.fov
-        lens["distance"] = self.distance
+        lens["fov"] = 45.0 if fov is None else fov
+        lens |= {"distance": self.distance, "target": self.look_at}
         if self.dome is not None:
             return dome(scene, self.dome, **lens)
         lens["elevation"] = 15.0 if self.elevation is None else self.elevation
@@ -169,11 +186,14 @@ class ViewOptions:
         ]
         if len(modes) > 1:
             raise UsageError(f"give one of {', '.join(map(_flag, modes))}, not several")
+        if self.fov is not None and self.focal_length is not None:
+            raise UsageError("give --fov or --focal-length, not both")
+        placing = ("elevation", "azimuth", "distance", "look_at", "fov", "focal_length", "up", "height")
         without_effect = {
             "dome": ("elevation", "azimuth"),
-            "look_around": ("distance",),
-            "cameras": ("elevation", "azimuth", "distance", "fov", "up", "height"),
-            "data": ("elevation", "azimuth", "distance", "fov", "up", "height"),
+            "look_around": ("distance", "look_at"),
+            "cameras": placing,
+            "data": placing,
         }
         for mode in modes:
             for name in without_effect.get(mode, ()):
@@ -198,6 +218,20 @@ class DrawOptions:
     all."""
     threads: Count = None
     """At most N threads. Default: all processors."""
+
+
+@dataclass(frozen=True)
+class PartOptions:
+    """What is shown."""
+
+    crop: Box = None
+    """Only splats whose centre is in this box, in the coordinates of the file; 'info' tells its extent."""
+
+    def of(self, scene: Scene) -> Scene:
+        """That part of ``scene``."""
+        from meshsplats.cleaning import cropped
+
+        return cropped(scene, self.crop)
 
 
 def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:

@@ -15,6 +15,7 @@ from meshsplats.cli.common import (
     DrawOptions,
     File,
     Output,
+    PartOptions,
     SplatOptions,
     ViewOptions,
     check_outputs,
@@ -57,6 +58,8 @@ class Compare:
     """8 views of an orbit, 400 pixels wide, where nothing else is asked for."""
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
+    part: PartOptions = field(default_factory=PartOptions)
+    """Of the splats and of the mesh."""
     amplify: float = 4.0
     """Factor that makes the error visible in the strips."""
     json: bool = False
@@ -72,7 +75,7 @@ class Compare:
         if self.draw.background is not None:
             parse_color(self.draw.background)
         self.views.check()
-        cloud = self.reading.load(self.splats)
+        cloud = self.part.of(self.reading.load(self.splats))
         photographs = self.views.photographs()
         cameras = self.views.make(cloud, self.splats, count=8, side=400, photographs=photographs)
         strips = view_names(len(cameras))
@@ -87,7 +90,7 @@ class Compare:
 
             if identify(self.mesh) != "mesh":
                 raise FileFormatError(f"{self.mesh}: not a mesh; give splats first, then the mesh")
-            mesh = load_mesh(self.mesh)
+            mesh = self.part.of(load_mesh(self.mesh))
         start = time.perf_counter()
         background = chosen_background(
             self.draw.background, photographs, {"splats": cloud}, self.splats, self.draw.threads

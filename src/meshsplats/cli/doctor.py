@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import re
+import shlex
 from dataclasses import dataclass
 from importlib import metadata
 
@@ -33,7 +34,8 @@ def examine() -> dict:
     import meshsplats
     from meshsplats.rendering.api import processors
 
-    libraries = {e: {name: _version(name) for name in names} for e, names in _requirements().items()}
+    needed = _requirements()
+    libraries = {e: {name: _version(name) for name in names} for e, names in needed.items()}
     return {
         "meshsplats": meshsplats.__version__,
         "python": platform.python_version(),
@@ -42,6 +44,13 @@ def examine() -> dict:
         "core": _core(),
         "required": libraries.pop("", {}),
         "extras": libraries,
+        "to_install": {
+            extra: " ".join(
+                shlex.quote(needed[extra][name]) for name, version in found.items() if not version
+            )
+            for extra, found in libraries.items()
+            if None in found.values()
+        },
     }
 
 
@@ -73,18 +82,20 @@ def _draws() -> bool:
     return bool(abs(middle - [0.5, 0.25, 0.5]).max() < 1e-5)
 
 
-def _requirements() -> dict[str, list[str]]:
-    """Names of the libraries that the package asks for, by extra; those always needed under ''."""
+def _requirements() -> dict[str, dict[str, str]]:
+    """The libraries that the package asks for, by extra and name, as pip takes them; those always needed
+    under ''."""
     try:
         lines = metadata.requires("meshsplats") or []
     except metadata.PackageNotFoundError:
         lines = []
-    found: dict[str, list[str]] = {"": []}
+    found: dict[str, dict[str, str]] = {"": {}}
     for line in lines:
         name = re.match(r"[A-Za-z0-9._-]+", line)
         extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)['\"]", line)
         if name:
-            found.setdefault(extra[1] if extra else "", []).append(name[0])
+            wanted = found.setdefault(extra[1] if extra else "", {})
+            wanted[name[0]] = line.partition(";")[0].strip()
     return found
 
 
@@ -110,8 +121,10 @@ def _text(findings: dict) -> str:
         lines.append(f"core: DOES NOT WORK: {core['problem']}")
     lines.append("libraries: " + _listed(findings["required"]))
     for extra, libraries in findings["extras"].items():
-        missing = [name for name, version in libraries.items() if version is None]
-        advice = f"; to install: pip install 'meshsplats[{extra}]'" if missing else ""
+        missing = findings["to_install"].get(extra)
+        advice = f"; to install: pip install {missing}" if missing else ""
+        if missing and extra == "blender":
+            advice = f"; to install, in an environment of its own with Python 3.11: pip install {missing}"
         lines.append(f"extra {extra!r}: {_listed(libraries)}{advice}")
     return "\n".join(lines)
 

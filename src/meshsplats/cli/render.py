@@ -17,6 +17,7 @@ from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     DrawOptions,
     Output,
+    PartOptions,
     SplatOptions,
     ViewOptions,
     check_outputs,
@@ -69,6 +70,7 @@ class Render:
     views: ViewOptions = field(default_factory=ViewOptions)
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
+    part: PartOptions = field(default_factory=PartOptions)
     transparent: bool = False
     """No background: pictures with an alpha channel."""
     depth: Literal["none", "png", "npy"] = "none"
@@ -87,7 +89,7 @@ class Render:
         single = self.output.suffix.lower() == ".png"
         self._check(single)
         start = time.perf_counter()
-        scene = load_scene(self.input, self.reading)
+        scene = self.part.of(load_scene(self.input, self.reading))
         self._check_scene(scene)
         photographs = self.views.photographs()
         count = 1 if single else 60

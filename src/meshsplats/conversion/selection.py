@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from meshsplats.gaussians import GaussianCloud
@@ -55,14 +57,20 @@ def choose_splats(
 def inside_box(cloud: GaussianCloud, crop: tuple[float, ...]) -> np.ndarray:
     """(n,) bool: centres inside the box x0 y0 z0 x1 y1 z1, borders included. ValueError if there are none."""
     box = np.asarray(crop, np.float64)
-    inside = np.all((cloud.means >= box[:3]) & (cloud.means <= box[3:]), axis=1)
-    if not inside.any():
+    found = inside(cloud.means, crop)
+    if not found.any():
         low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
         raise ValueError(
             f"the crop box {_point(box[:3])} to {_point(box[3:])} holds none of the {len(cloud)} splats:"
             f" their centres lie in {_point(low)} to {_point(high)}"
         )
-    return inside
+    return found
+
+
+def inside(points: np.ndarray, box: Sequence[float]) -> np.ndarray:
+    """(n,) bool: ``points`` (n, 3) inside the ``box`` x0 y0 z0 x1 y1 z1, borders included."""
+    corners = np.asarray(box, np.float64)
+    return np.all((points >= corners[:3]) & (points <= corners[3:]), axis=1)
 
 
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:

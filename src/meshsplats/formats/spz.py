@@ -208,7 +208,7 @@ def _unzstd(packed: bytes, size: int, name: str, where: object) -> bytes:
             zstandard = importlib.import_module("zstandard")
         except ImportError:
             raise MissingDependencyError(
-                f"{where}: SPZ version 4 needs Zstandard: install it with pip install 'meshsplats[formats]'"
+                f"{where}: SPZ version 4 needs the extra 'formats': pip install zstandard"
             ) from None
         error_type = zstandard.ZstdError
         reader = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed)

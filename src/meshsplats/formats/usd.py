@@ -33,9 +33,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     try:
         from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, Vt
     except ImportError as error:
-        raise MissingDependencyError(
-            "writing USD needs the package usd-core: pip install 'meshsplats[usd]'"
-        ) from error
+        raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
     check_attribute_names(mesh)
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)

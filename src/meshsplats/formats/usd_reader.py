@@ -48,9 +48,7 @@ def read_usd(path: Path) -> SplatMesh:
     which are not opened.
     """
     if importlib.util.find_spec("pxr") is None:
-        raise MissingDependencyError(
-            f"{path}: reading USD needs the package usd-core: pip install 'meshsplats[usd]'"
-        )
+        raise MissingDependencyError(f"{path}: reading USD needs the extra 'usd': pip install usd-core")
     budget = Budget(path)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         result = Path(folder) / "mesh.npz"

@@ -133,7 +133,7 @@ def _libraries() -> tuple[Callable[..., Any], ...]:
         from skimage.measure import label, marching_cubes
     except ImportError as error:
         raise MissingDependencyError(
-            "a base from splats needs scikit-image and fast-simplification: pip install 'meshsplats[base]'"
+            "a base from splats needs the extra 'base': pip install scikit-image fast-simplification"
         ) from error
     return label, marching_cubes, simplify
 

@@ -11,7 +11,6 @@ _HERE = "" if sys.version_info[:2] == (3, 11) else f" (this is {sys.version_info
 MISSING = (
     "Blender's Python module bpy is not installed in this environment. Make one for it, as it needs Python"
     f" 3.11{_HERE} and a NumPy of its own: python3.11 -m venv blender-env && blender-env/bin/pip install"
-    " 'meshsplats[blender]' (in a copy of the sources '.[blender]'); or name an installed Blender:"
-    " --executable /path/to/blender"
+    " '.[blender]', in the folder of the sources; or name an installed Blender: --executable /path/to/blender"
 )
 """Said where bpy is needed and not there."""

@@ -131,6 +131,30 @@ def plain(name: str, color: tuple[float, float, float]) -> Any:
     return material
 
 
+def fading(name: str, color: tuple[float, float, float], inner: float, outer: float) -> Any:
+    """A matt surface of linear ``color`` that can be seen through the more, the farther from the object's
+    origin it is: not at all up to ``inner``, wholly from ``outer`` on, scene units."""
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    place = tree.node("ShaderNodeTexCoord", 0, 2)
+    away = tree.node("ShaderNodeVectorMath", 1, 2, operation="LENGTH")
+    tree.link(place.outputs["Object"], away.inputs[0])
+    share = tree.node("ShaderNodeMapRange", 2, 2, interpolation_type="SMOOTHSTEP")
+    tree.link(away.outputs["Value"], share.inputs["Value"])
+    share.inputs["From Min"].default_value = inner
+    share.inputs["From Max"].default_value = outer
+    surface = tree.node("ShaderNodeBsdfDiffuse", 2)
+    surface.inputs["Color"].default_value = (*color, 1)
+    clear = tree.node("ShaderNodeBsdfTransparent", 2, 1)
+    mix = tree.node("ShaderNodeMixShader", 3)
+    tree.link(share.outputs[0], versions.socket(mix.inputs, "Fac", "Factor"))
+    tree.link(surface.outputs[0], mix.inputs[1])
+    tree.link(clear.outputs[0], mix.inputs[2])
+    out = tree.node("ShaderNodeOutputMaterial", 4)
+    tree.link(mix.outputs[0], out.inputs["Surface"])
+    return material
+
+
 def mirror(name: str = "Mirror") -> Any:
     """A perfect mirror that keeps 95 % of the light."""
     material = bpy.data.materials.new(name)

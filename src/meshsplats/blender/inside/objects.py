@@ -10,8 +10,10 @@ import numpy as np
 from meshsplats.blender.inside import foreign, frame, materials, meshes, pictures, priors, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
-from meshsplats.blender.subject import lit_arrays
+from meshsplats.blender.options import LightOptions
+from meshsplats.blender.subject import lit_arrays, lowest
 from meshsplats.conversion.baking import bake_filter
+from meshsplats.framing import scene_bounds
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.prior.model import MeshPrior
 
@@ -21,6 +23,8 @@ LINEAR = "meshsplats_linear"
 """Property of the mesh data: whether the mesh was made for blending in linear light."""
 UP = "meshsplats_up"
 """Property of the mesh data: what points up in its own frame."""
+ORIGIN = "meshsplats_origin"
+"""Property of the mesh data: where the object's origin lies in the mesh's own frame: under the subject."""
 LAYERS = "meshsplats_layers"
 """Property of the mesh data: most layers behind each other."""
 
@@ -38,13 +42,24 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
     if lit:
         made, arrays["self_shadow"] = lit_arrays(mesh)
         arrays |= made
-    return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh)}
+    # What hangs on a base keeps the base's frame.
+    origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
+    return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh), "origin": origin}
+
+
+def foot(mesh: SplatMesh) -> np.ndarray:
+    """(3,) float64 the point under the middle of the subject of ``mesh``, at the height of its lowest part;
+    frame of the mesh."""
+    bounds, up = scene_bounds(mesh), mesh.up.astype(np.float64)
+    return bounds.center + (lowest(bounds, up) - bounds.center @ up) * up
 
 
 def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
     """A new object in ``collection``, upright in Blender's frame, with its material; that of a mesh prior
-    hangs on an object of its base, which it follows."""
-    thing = meshes.make_object(_data(prepared, name), name, frame.to_blender(prepared["mesh"].up), collection)
+    hangs on an object of its base, which it follows. The object's origin lies under the subject."""
+    rotation = frame.to_blender(prepared["mesh"].up)
+    thing = meshes.make_object(_data(prepared, name), name, rotation, collection)
+    thing.location = (rotation @ prepared["origin"]).tolist()  # where the file has it
     if prepared["mesh"].binding is not None:
         priors.give_base(thing, prepared["mesh"].binding, collection)
     bpy.context.view_layer.objects.active = thing
@@ -54,7 +69,7 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
 def replace_mesh(thing: Any, prepared: dict[str, Any]) -> None:
     """Gives ``thing`` another mesh and material; its place, parent, modifiers and name stay."""
     old = thing.data
-    thing.data = _data(prepared, old.name)
+    thing.data = _data(prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}, old.name)
     if old.users == 0:
         bpy.data.meshes.remove(old)
 
@@ -63,7 +78,7 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
     mesh: SplatMesh = prepared["mesh"]
     data = meshes.make_mesh(
         name,
-        mesh.vertices,
+        mesh.vertices - prepared["origin"].astype(np.float32),
         prepared["faces"],
         prepared["colors"],
         normals=prepared["normals"],
@@ -76,6 +91,7 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
     else:
         data.materials.append(materials.unlit())
     data[UP] = mesh.up.tolist()
+    data[ORIGIN] = prepared["origin"].tolist()
     data[LIT] = prepared["lit"]
     data[LINEAR] = mesh.blending == "linear"
     data[LAYERS] = prepared["layers"]
@@ -111,8 +127,14 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
             owner = None
     up = np.array(data[UP])
     blending: Blending = "linear" if data[LINEAR] else "display"
+    origin = np.array(data.get(ORIGIN, (0, 0, 0)), np.float32)
     found = SplatMesh(
-        vertices.reshape(-1, 3), faces.reshape(-1, 3), colors, face_splat=owner, up=up, blending=blending
+        vertices.reshape(-1, 3) + origin,
+        faces.reshape(-1, 3),
+        colors,
+        face_splat=owner,
+        up=up,
+        blending=blending,
     )
     if priors.base_of(thing) is None:
         return found
@@ -120,18 +142,19 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
     return replace(found, vertices=binding.positions(), normals=binding.normals(), binding=binding)
 
 
-def render_settings(scene: Any, things: list[Any], lit: bool) -> int:
+def render_settings(scene: Any, things: list[Any], lit: bool, light: LightOptions | None = None) -> int:
     """Sets the scene up for ``things``: engine settings, colour management and the limit on transparent
     bounces, which is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor
     EEVEE). One scene cannot be right for both unlit meshes of display and of linear blending: where there are
-    both, it is for the former."""
+    both, it is for the former. Lit pictures are denoised, and shown as ``light`` exposes them."""
+    light = light or LightOptions(exposure=0.0)
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
     layers = sum(int(thing.data.get(LAYERS, 256)) for thing in things)
     linear = bool(things) and all(thing.data.get(LINEAR) for thing in things)
     limit = bounce_limit(layers)
     if lit:
-        pictures.lit_settings(scene, engine, limit=limit)
+        pictures.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)
     else:
         pictures.exact_settings(scene, engine, linear=linear)
         limit = 1024

@@ -32,15 +32,17 @@ def lit_settings(
     scene: Any,
     engine: str,
     *,
-    samples: int = 64,
+    samples: int = 16,
     limit: int = 1024,
     bounces: int = 4,
     denoise: bool = False,
     raytracing: bool = False,
+    exposure: float = 0.0,
 ) -> None:
-    """Linear light, shown with the view transform Standard (sRGB); ``limit`` layers may lie behind each
-    other. ``raytracing``: EEVEE traces what mirrors and glass show."""
+    """Linear light, shown with the view transform Standard (sRGB) and ``exposure`` in stops; ``limit`` layers
+    may lie behind each other. ``raytracing``: EEVEE traces what mirrors and glass show."""
     _common(scene, engine, "Standard")
+    scene.view_settings.exposure = exposure
     cycles = scene.cycles
     cycles.samples = samples
     cycles.use_adaptive_sampling = False

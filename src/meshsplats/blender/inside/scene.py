@@ -120,7 +120,9 @@ def build(
             stand_in.parent = thing
             stand_in.matrix_parent_inverse = thing.matrix_world.inverted()
             thing.visible_shadow = False
-        _light(subject, light, center, made[0].matrix_world.translation if made else None, options)
+        viewer = np.array(made[0].matrix_world.translation) if made else None
+        floor = np.array([center[0], center[1], subject.floor])
+        surround(floor, subject.radius, light, viewer, options.background)
         pictures.lit_settings(
             scene,
             options.engine,
@@ -129,6 +131,7 @@ def build(
             bounces=light.bounces,
             denoise=options.denoise,
             raytracing=light.mirror or light.glass,
+            exposure=light.exposure,
         )
     catcher = light is not None and light.ground == "catcher"
     scene.render.film_transparent = options.background is None or catcher
@@ -142,27 +145,37 @@ def build(
     return Built(scene, thing, made, rotation)
 
 
-def _light(
-    subject: Subject, light: LightOptions, center: np.ndarray, viewer: Any, options: SceneOptions
+def surround(
+    floor: np.ndarray,
+    radius: float,
+    light: LightOptions,
+    viewer: np.ndarray | None,
+    background: Sequence[float] | None,
 ) -> None:
-    """Sun, world, ground, mirror and glass round the subject, placed for someone at ``viewer``."""
-    radius = subject.radius
+    """Sun, world, ground, mirror and glass round a subject of this ``radius`` that stands at ``floor`` (3,),
+    placed for someone at ``viewer`` (3,); Blender's frame. ``background``: display RGB that cameras see."""
     if light.sun_strength > 0:
         direction = frame.sun_direction(*light.sun)
         home = stage.collection("Lights")
         stage.add_sun(direction, light.sun_strength, light.sun_size, 0.004 * radius, home, light.sun_color)
+    if light.fill > 0:
+        home = stage.collection("Lights") if light.sun_strength <= 0 else home
+        direction = frame.sun_direction(*light.fill_direction)
+        stage.add_sun(direction, light.fill, 60.0, 0.004 * radius, home, name="Fill")
     if light.hdri is not None:
         stage.environment_world(str(light.hdri), light.hdri_strength, light.hdri_rotation)
     else:
-        seen = None if options.background is None else srgb_to_linear(np.array(options.background)).tolist()
-        stage.even_world((light.sky,) * 3, seen)
+        seen = None
+        if background is not None:
+            # The background is shown as it was asked for, however pictures are exposed.
+            seen = (srgb_to_linear(np.array(background)) / 2**light.exposure).tolist()
+        stage.even_world([light.sky * part for part in light.sky_color], seen)
     home = stage.collection("Surroundings")
-    floor = np.array([center[0], center[1], subject.floor])
     if light.ground != "none":
-        stage.add_ground(floor, 100 * radius, light.ground == "catcher", home)
+        stage.add_ground(floor, radius, light.ground == "catcher", home)
     towards = np.array([0.0, -1.0, 0.0])
     if viewer is not None:
-        level = np.array([viewer[0] - center[0], viewer[1] - center[1], 0.0])
+        level = np.array([viewer[0] - floor[0], viewer[1] - floor[1], 0.0])
         if np.linalg.norm(level) > 1e-6 * radius:
             towards = level / np.linalg.norm(level)
     right = np.array([-towards[1], towards[0], 0.0])

@@ -14,13 +14,26 @@ from meshsplats.camera import Camera
 
 GREY = (0.6, 0.6, 0.6)
 """Linear colour of the ground."""
+MADE = "meshsplats_stage"
+"""Property of the collections that were made here."""
+FADES = (1.5, 10.0)
+"""From where to where the ground fades, in radii of the subject."""
 
 
 def collection(name: str) -> Any:
-    """A new collection in the scene."""
+    """A new collection in the scene, marked as made here (``clear``)."""
     made = bpy.data.collections.new(name)
+    made[MADE] = True
     bpy.context.scene.collection.children.link(made)
     return made
+
+
+def clear() -> None:
+    """Removes the collections that were made here from the scene, with all that is in them."""
+    for old in [c for c in bpy.context.scene.collection.children_recursive if c.get(MADE)]:
+        for thing in list(old.objects):
+            bpy.data.objects.remove(thing)
+        bpy.data.collections.remove(old)
 
 
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
@@ -60,17 +73,19 @@ def add_sun(
     detail: float,
     home: Any,
     color: Sequence[float] = (1.0, 1.0, 1.0),
+    *,
+    name: str = "Sun",
 ) -> Any:
     """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees, linear ``color``.
     ``detail``: smallest thing that EEVEE's shadow maps resolve, scene units."""
     from mathutils import Vector
 
-    data = bpy.data.lights.new("Sun", "SUN")
+    data = bpy.data.lights.new(name, "SUN")
     data.energy = strength
     data.color = tuple(color)
     data.angle = float(np.radians(size))
     versions.set_if_there(data, use_shadow=True, shadow_maximum_resolution=detail)
-    thing = bpy.data.objects.new("Sun", data)
+    thing = bpy.data.objects.new(name, data)
     thing.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
     thing.location = (direction * 5).tolist()
     home.objects.link(thing)
@@ -128,11 +143,19 @@ def environment_world(path: str, strength: float, rotation: float) -> Any:
 
 
 def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> Any:
-    """A level square at ``center`` (3,) that reaches ``radius`` in each direction."""
-    corners = [(-radius, -radius, 0), (radius, -radius, 0), (radius, radius, 0), (-radius, radius, 0)]
+    """A level square at ``center`` (3,) under a subject of this ``radius``, a hundred times as large. It
+    fades into what is behind it, so that no horizon is seen; a ``catcher`` is seen only where shadows
+    fall."""
+    reach = 100 * radius
+    corners = [(-reach, -reach, 0), (reach, -reach, 0), (reach, reach, 0), (-reach, reach, 0)]
     thing = _faces("Ground", corners, [(0, 1, 2, 3)], home)
     thing.location = center.tolist()
-    thing.data.materials.append(materials.plain("Ground", GREY))
+    material = (
+        materials.plain("Ground", GREY)
+        if catcher
+        else materials.fading("Ground", GREY, FADES[0] * radius, FADES[1] * radius)
+    )
+    thing.data.materials.append(material)
     thing.is_shadow_catcher = catcher
     return thing
 

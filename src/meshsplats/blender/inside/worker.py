@@ -10,6 +10,7 @@ import re
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 if __package__ in (None, ""):  # run as a file by Blender, whose Python does not know this package
@@ -80,6 +81,13 @@ def main(job_path: str) -> None:
         light["hdri"] = Path(light["hdri"]) if light["hdri"] else None
         light = LightOptions(**light)
     options = SceneOptions(light=light, **job["options"])
+    if (
+        light is not None
+        and job["pictures"]
+        and all(path.lower().endswith(".exr") for path in job["pictures"])
+    ):
+        # Values of light: nothing is shown, and the background is one of them.
+        options = replace(options, light=replace(light, exposure=0.0))
     cameras = [Camera(np.array(c.pop("world_to_camera")), **c) for c in job["cameras"]]
     temporary, new = job["temporary"], job["new"]
     blend, targets = job["blend"], [Path(target) for target in job["pictures"]]
@@ -122,8 +130,6 @@ def main(job_path: str) -> None:
 
 def _for_painter(subject, camera):
     """``subject`` with its faces in the order in which EEVEE has to draw them for ``camera``."""
-    from dataclasses import replace
-
     from meshsplats.blender.inside.meshes import far_to_near
 
     order = far_to_near(subject.vertices, subject.faces, camera.world_to_camera)

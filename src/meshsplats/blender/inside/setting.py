@@ -1,0 +1,59 @@
+"""Sun, sky, ground and a camera round splat meshes in an open Blender file, as the command line sets them
+up."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.inside import meshes, objects, scene, stage
+from meshsplats.blender.options import LIGHTS, LightOptions
+from meshsplats.camera import orbit
+from meshsplats.framing import SAMPLE, scene_bounds, weighted_quantile
+
+_SEEN = 0.1
+"""Opacity from which a vertex counts."""
+_FLOOR = 0.002
+"""Share of the vertices that may lie below the ground."""
+UP = (0.0, 0.0, 1.0)
+
+
+def set_up(view: Any, things: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
+    """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``things`` and, with ``camera``, a
+    camera that sees all of them at the scene's resolution; in place of what an earlier call made. Returns the
+    light. ValueError if ``things`` have no vertices that can be seen."""
+    points = np.concatenate([world_points(thing) for thing in things] or [np.zeros((0, 3))])
+    if not len(points):
+        raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
+    light, bounds = LIGHTS[lights], scene_bounds(points)
+    low = weighted_quantile(bounds.points[:, 2], bounds.weights, _FLOOR)
+    stage.clear()
+    viewer = None
+    if camera:
+        width, height = view.render.resolution_x, view.render.resolution_y
+        seen = orbit(points, 1, elevation=15, azimuth=20, up=UP, width=width, height=height)[0]
+        home = stage.collection("Cameras")
+        away = float(np.linalg.norm(seen.center - bounds.center))
+        view.camera = stage.add_camera(seen, "Camera", np.eye(3), 2 * away + 1000 * bounds.radius, home)
+        view.render.pixel_aspect_x = view.render.pixel_aspect_y = 1
+        viewer = seen.center
+    floor = np.array([bounds.center[0], bounds.center[1], low])
+    scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
+    objects.render_settings(view, things, True, light)
+    return light
+
+
+def world_points(thing: Any) -> np.ndarray:
+    """(k, 3) float64 some of the vertices of ``thing`` that can be seen, in Blender's world."""
+    data = thing.data
+    vertices = np.empty(3 * len(data.vertices), np.float32)
+    data.vertices.foreach_get("co", vertices)
+    points = vertices.reshape(-1, 3).astype(np.float64)
+    if meshes.COLOR in data.attributes and len(points):
+        colors = np.empty(4 * len(points), np.float32)
+        data.attributes[meshes.COLOR].data.foreach_get("color", colors)
+        points = points[colors[3::4] > _SEEN]
+    points = points[:: -(-max(len(points), 1) // SAMPLE)]
+    world = np.array(thing.matrix_world)
+    return points @ world[:3, :3].T + world[:3, 3]

@@ -1,0 +1,178 @@
+"""``meshsplats clean``: splats or a mesh without its floaters."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import numpy as np
+import tyro
+
+from meshsplats.camera import Camera, orbit
+from meshsplats.cleaning import FLOATERS, CleaningRules, Findings, find, take_away
+from meshsplats.cli import UsageError, shown_path
+from meshsplats.cli.common import (
+    Output,
+    SplatOptions,
+    check_mesh_suffix,
+    check_outputs,
+    load_scene,
+    size_of,
+)
+from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+_RULES = {
+    "crop": "outside the box",
+    "min_opacity": "fainter than {:g}",
+    "max_distance": "farther than {:g} radii",
+    "sparse": "fewer than {:.1%} of the usual neighbours",
+    "min_part": "in parts below {:.1%} of all opacity",
+}
+"""What a rule is called in the table."""
+_SIDE = 480
+
+
+def _described(rules: type[CleaningRules]) -> type[CleaningRules]:
+    """The rules as options that may be left out; their docstrings are the help."""
+    metavars = {"crop": "X0 Y0 Z0 X1 Y1 Z1"}
+    typed = {
+        name: Annotated[hint, tyro.conf.arg(metavar=metavars.get(name, "X"), help_behavior_hint="")]  # type: ignore[valid-type]
+        for name, hint in get_type_hints(rules).items()
+    }
+    about = f"What goes. Without any of these: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}."
+    return dataclass(frozen=True)(
+        type(rules.__name__, (rules,), {"__annotations__": typed, "__doc__": about, **dict.fromkeys(typed)})
+    )
+
+
+if TYPE_CHECKING:
+    _Rules = CleaningRules
+else:
+    _Rules = _described(CleaningRules)
+
+
+@dataclass(frozen=True)
+class Clean:
+    """Takes floaters away: what is faint, far off, alone, or in the air, by the rules given.
+
+    Says what each rule takes, and draws before | what goes, in red | after in NAME.preview.png beside the
+    result.
+    """
+
+    input: tyro.conf.Positional[Path]
+    """Splats, a model folder, or a mesh."""
+    output: Output
+    """What is left: splats as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
+    rules: _Rules = field(default_factory=_Rules)
+    preview_only: bool = False
+    """Say what would go and draw the picture, but write no result."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    def run(self) -> None:
+        from meshsplats.formats.meshes import save_mesh
+        from meshsplats.formats.splats import save_gaussians
+
+        start = time.perf_counter()
+        preview = self.output.with_suffix(".preview.png")
+        check_mesh_suffix(self.output)
+        outputs = [preview] if self.preview_only else [self.output, preview]
+        check_outputs(outputs, self.force, inputs=[self.input])
+        given = any(value is not None for value in vars(self.rules).values())
+        rules = self.rules if given else FLOATERS
+        scene = load_scene(self.input, self.reading)
+        if isinstance(scene, GaussianCloud) and self.output.suffix.lower() != ".ply":
+            raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
+        found = find(scene, rules)
+        left = take_away(scene, found)
+        if not self.preview_only:
+            if isinstance(left, SplatMesh):
+                save_mesh(left, self.output)
+            else:
+                save_gaussians(left, self.output)
+        _draw(scene, left, found, preview)
+        self._tell(rules, found, left, preview, time.perf_counter() - start)
+
+    def _tell(
+        self,
+        rules: CleaningRules,
+        found: Findings,
+        left: GaussianCloud | SplatMesh,
+        preview: Path,
+        seconds: float,
+    ) -> None:
+        counts, total = found.counts(), len(found.opacities)
+        places = left.means if isinstance(left, GaussianCloud) else left.vertices
+        lower, upper = (
+            [round(float(v), 4) for v in side] for side in (places.min(axis=0), places.max(axis=0))
+        )
+        if self.json:
+            result = {
+                "input": shown_path(self.input),
+                "output": None if self.preview_only else str(self.output),
+                "preview": str(preview),
+                "splats": total,
+                "kept": int(found.kept.sum()),
+                "gone": counts,
+                "lower": lower,
+                "upper": upper,
+                "seconds": round(seconds, 3),
+            }
+            print(json.dumps(result))
+            return
+        named = {"all": "together"}
+        named |= {n: _RULES[n].format(getattr(rules, n)) if n != "crop" else _RULES[n] for n in found.gone}
+        if len(counts) == 2:
+            del counts["all"]
+        width = max(len(named[name]) for name in counts)
+        for name, count in counts.items():
+            told = f"{count['splats']:>9,} of {total:,} splats, {count['opacity']:.2%} of the opacity"
+            print(f"{named[name]:<{width}}  {told}")
+        print(f"left: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
+        if not self.preview_only:
+            print(f"{self.output} ({size_of(self.output)})")
+        print(f"preview, before | what goes, in red | after: {preview}")
+
+
+def _draw(
+    scene: GaussianCloud | SplatMesh, left: GaussianCloud | SplatMesh, found: Findings, path: Path
+) -> None:
+    """The strip of three pictures; the first two from where all is seen, the third from where the rest is."""
+    from meshsplats.pictures import save_png, strip
+
+    lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
+    whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
+    pictures = [_picture(scene, whole), _picture(_marked(scene, found), whole), _picture(left, rest)]
+    save_png(path, strip(pictures, ("before", "what goes", "after")))
+
+
+def _picture(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
+    from meshsplats.evaluation import mesh_picture
+    from meshsplats.rendering import render_splats
+
+    white: Sequence[float] = (1.0, 1.0, 1.0)
+    if isinstance(scene, SplatMesh):
+        return np.clip(mesh_picture(scene, camera, white, samples=2)[0], 0, 1)
+    return np.clip(render_splats(scene, camera, background=white).color, 0, 1)
+
+
+def _marked(scene: GaussianCloud | SplatMesh, found: Findings) -> GaussianCloud | SplatMesh:
+    """What goes in red, the rest in dull colours."""
+    red = np.array([0.95, 0.05, 0.05], np.float32)
+    if isinstance(scene, GaussianCloud):
+        plain = scene.sh[:, :1] * np.float32(0.4)
+        plain[~found.kept] = ((red - 0.5) / SH_C0)[None, None]
+        return replace(scene, sh=plain)
+    colors = scene.colors.copy()
+    colors[:, :3] = 0.5 + 0.4 * (colors[:, :3] - 0.5)
+    gone = scene.faces[~found.kept[found.owner]]
+    colors[gone.ravel(), :3] = red
+    return replace(scene, colors=colors)

@@ -1,0 +1,63 @@
+"""Points sorted into cells: how many lie near each other, and which parts they form."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_STEPS = [(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
+"""From a cell's key to those of the 27 cells round it and its own."""
+
+
+class Cells:
+    """The points (n, 3) in cubic cells of this ``side``, > 0, in their units."""
+
+    def __init__(self, points: np.ndarray, side: float) -> None:
+        low = points.min(axis=0)
+        # Strays far away must not make so many cells that their numbers overflow.
+        steps = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64) + 1
+        keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
+        self._cells, of = np.unique(keys, return_inverse=True)
+        self._of = of.reshape(-1)
+
+    def near(self) -> np.ndarray:
+        """(n,) int64: how many points lie in the cell of each point and the 26 round it, itself too."""
+        held = np.bincount(self._of, minlength=len(self._cells))
+        total = np.zeros(len(self._cells), np.int64)
+        for step in _STEPS:
+            row, found = self._beside(step)
+            total[row] += held[found]
+        return total[self._of]
+
+    def parts(self, group: np.ndarray | None = None) -> np.ndarray:
+        """(n,) int64 numbers from 0 of the parts that the points form; points in cells that touch, by a
+        corner at least, are of one part, and so are those of one ``group`` (n,), ascending."""
+        label = np.arange(len(self._cells))
+        pairs = [self._beside(step) for step in _STEPS if step > 0]
+        if group is not None:
+            same = group[1:] == group[:-1]
+            pairs.append((self._of[1:][same], self._of[:-1][same]))
+        while True:
+            before = label
+            for row, found in pairs:
+                least = np.minimum(label[row], label[found])
+                label = label.copy()
+                np.minimum.at(label, row, least)
+                np.minimum.at(label, found, least)
+                # Roots too, so that whole parts take the lower number at once.
+                np.minimum.at(label, before[row], least)
+                np.minimum.at(label, before[found], least)
+            while True:
+                further = label[label]
+                if np.array_equal(further, label):
+                    break
+                label = further
+            if np.array_equal(label, before):
+                break
+        return np.unique(label, return_inverse=True)[1].reshape(-1)[self._of]
+
+    def _beside(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """Cells that have another ``step`` away, and the numbers of those."""
+        keys = self._cells + step
+        found = np.minimum(np.searchsorted(self._cells, keys), len(self._cells) - 1)
+        row = np.flatnonzero(self._cells[found] == keys)
+        return row, found[row]

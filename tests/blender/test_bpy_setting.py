@@ -1,0 +1,132 @@
+# ruff: noqa: E402
+"""Light, ground and camera round objects of an open file, and where imported objects have their origin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
+
+from _blender_scenes import ball_splats
+
+from meshsplats import SplatMesh, convert
+from meshsplats.blender import LightOptions, SceneOptions, draw
+from meshsplats.blender.inside import objects, pictures, setting, versions
+from meshsplats.blender.options import LIGHTS
+from meshsplats.camera import look_at
+from meshsplats.pictures import load_png
+
+
+@pytest.fixture
+def empty():
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    versions.enable_cycles()
+    return bpy.context.scene
+
+
+def ball():
+    mesh = convert(ball_splats(600)[0], mode="flat")
+    return objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
+
+
+def corners(thing):
+    places = np.array([vertex.co for vertex in thing.data.vertices])
+    world = np.array(thing.matrix_world)
+    return places @ world[:3, :3].T + world[:3, 3]
+
+
+def test_the_origin_lies_under_the_subject(empty):
+    """And the object where its file has it, upright, also after another shading and another conversion."""
+    cloud, _ = ball_splats(600)
+    mesh = convert(cloud, mode="flat")
+    thing = objects.add(objects.prepare(mesh, False), "ball", bpy.context.collection)
+    bpy.context.view_layer.update()
+    np.testing.assert_allclose(thing.location, (0, 0, -1), atol=0.12)
+    before = corners(thing)
+    # y down and z forward in the file are z up and y back here.
+    np.testing.assert_allclose(before, mesh.vertices[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+    again = objects.as_splat_mesh(thing)
+    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-5)
+    thing.location = (5, 6, 7)
+    objects.replace_mesh(thing, objects.prepare(again, True))
+    bpy.context.view_layer.update()
+    assert tuple(thing.location) == (5, 6, 7)
+    np.testing.assert_allclose(corners(thing)[:, 2].min(), 7, atol=0.12)
+
+
+@pytest.mark.parametrize("lights", LIGHTS)
+def test_one_click_sets_everything_up(empty, lights):
+    thing = ball()
+    thing.location = (10, -3, 2)
+    bpy.context.view_layer.update()
+    for _ in range(2):  # a second click replaces what the first made
+        setting.set_up(empty, [thing], lights)
+    names = sorted(o.name for o in empty.objects)
+    lamps = {"sun": ["Sun"], "noon": ["Sun"], "overcast": [], "studio": ["Fill", "Sun"]}[lights]
+    assert names == sorted(["ball", "Camera", "Ground", *lamps])
+    ground = empty.objects["Ground"]
+    np.testing.assert_allclose(ground.location, (10, -3, 2), atol=0.12)
+    assert empty.camera is empty.objects["Camera"]
+    from bpy_extras.object_utils import world_to_camera_view
+
+    bpy.context.view_layer.update()
+    places = [thing.matrix_world @ vertex.co for vertex in list(thing.data.vertices)[::20]]
+    seen = np.array([world_to_camera_view(empty, empty.camera, place) for place in places])
+    assert (seen[:, :2] > 0).all()
+    assert (seen[:, :2] < 1).all()
+    assert np.ptp(seen[:, 1]) > 0.6, "it fills the picture"
+    assert empty.cycles.use_denoising
+    assert empty.view_settings.exposure == pytest.approx(LIGHTS[lights].exposure)
+
+
+def test_without_splats_it_says_so(empty):
+    with pytest.raises(ValueError, match="no splat mesh in the scene"):
+        setting.set_up(empty, [])
+
+
+def plate(value: float) -> tuple[SplatMesh, object]:
+    """An upright white plate that faces the viewer, and a camera before it."""
+    square = np.array([[-1.0, -2, 0], [1, -2, 0], [1, 0, 0], [-1, 0, 0]])
+    colors = np.array([[value, value, value, 1.0]] * 4)
+    normals = np.tile([0.0, 0, -1], (4, 1))
+    mesh = SplatMesh(square, np.array([[0, 1, 2], [0, 2, 3]]), colors, normals=normals)
+    return mesh, look_at((0, -1.4, -5), (0, -0.9, 0), width=48, height=36)
+
+
+@pytest.mark.parametrize("lights", LIGHTS)
+def test_white_looks_white(tmp_path, lights):
+    """A white plate (display value 0.95) under each named light, shown by the default exposure."""
+    mesh, camera = plate(0.95)
+    options = SceneOptions(light=LIGHTS[lights], samples=32, denoise=True)
+    draw(mesh, [camera], pictures=[tmp_path / "a.png"], options=options)
+    picture = load_png(tmp_path / "a.png")
+    middle = picture[14:22, 20:28].mean()
+    assert 0.88 * 255 < middle < 254, middle
+
+
+@pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.2, 0.3, 0.5)])
+def test_the_ground_fades_into_the_background(tmp_path, background):
+    """No hard horizon: from the ground's colour to the background's it takes many rows, in small steps."""
+    mesh, _ = plate(0.5)
+    small = SplatMesh(mesh.vertices * 0.3, mesh.faces, mesh.colors, normals=mesh.normals)
+    camera = look_at((0, -0.5, -3), (-0.7, -0.3, 0), width=16, height=160, fov=6.6)  # 60 degrees high
+    options = SceneOptions(light=LightOptions(), samples=32, background=background, denoise=True)
+    draw(small, [camera], pictures=[tmp_path / "a.png"], options=options)
+    column = load_png(tmp_path / "a.png").mean(axis=(1, 2))
+    np.testing.assert_allclose(column[0], 255 * np.mean(background), atol=2)
+    change = column[-1] - column[0]
+    assert abs(change) > 20, "there is a ground"
+    share = (column - column[0]) / change
+    assert ((share > 0.1) & (share < 0.9)).sum() >= 5
+    assert abs(np.diff(share)).max() < 0.35
+
+
+def test_values_of_light_do_not_change_with_exposure(tmp_path):
+    mesh, camera = plate(0.5)
+    values = []
+    for exposure in (0.0, 2.0):
+        options = SceneOptions(light=LightOptions(exposure=exposure), samples=4)
+        draw(mesh, [camera], pictures=[tmp_path / "a.exr"], options=options)
+        values.append(pictures.read_pixels(tmp_path / "a.exr"))
+    np.testing.assert_array_equal(*values)
