@@ -246,8 +246,8 @@ def test_each_preset_begins_with_its_conversion():
     filtered = starting_mesh(cloud, cameras, look="splats", detail="even")
     assert np.array_equal(filtered.vertices, even.vertices)
     assert (even.filter_px2, filtered.filter_px2) == (0, pytest.approx(0.3))
-    assert len(starting_mesh(cloud, cameras, mode="flat", no_triag=4).faces) == 4 * 200
-    assert len(starting_mesh(cloud, cameras, no_triag=3).faces) == 3 * 200
+    assert 4 * 190 < len(starting_mesh(cloud, cameras, mode="flat", no_triag=4).faces) <= 4 * 200
+    assert 3 * 190 < len(starting_mesh(cloud, cameras, no_triag=3).faces) <= 3 * 200
     assert len(starting_mesh(cloud, cameras, rings=2).faces) == 24 * 200
     assert len(starting_mesh(cloud, cameras, mode="3d", no_triag=4).faces) == 12 * 200
     for preset in ("paper", "published"):

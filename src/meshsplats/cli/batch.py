@@ -113,10 +113,10 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _records(base: Path, outputs: Sequence[Path]) -> tuple[Path, Path]:
-    """Names of the preview and the configuration. Where the usual ones are those of the same mesh in another
-    format, names with all of the output's own."""
+    """Names of the preview and the configuration. Where the usual ones are those of another mesh, the same in
+    another format say, names with all of the output's own."""
     preview, config = record_names(base)
-    other = (recorded_options(config, "convert") or {}).get("output")
+    other = (recorded_options(config) or {}).get("output")
     if isinstance(other, str) and Path(other).name not in [path.name for path in outputs]:
         preview, config = record_names(outputs[0])
     return preview, config

@@ -416,12 +416,12 @@ def warnings_kept() -> Iterator[list[str]]:
         warnings.showwarning = show
 
 
-def recorded_options(path: Path, command: str) -> dict[str, Any] | None:
-    """The options in the file at ``path`` that ``configuration`` made for ``command``; None if it is no such
-    file."""
+def recorded_options(path: Path, command: str | None = None) -> dict[str, Any] | None:
+    """The options in the file at ``path`` that ``configuration`` made for ``command``, or for any; None if it
+    is no such file."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        return dict(record["options"]) if record["command"] == command else None
+        return dict(record["options"]) if command in (None, record["command"]) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
