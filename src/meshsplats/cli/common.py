@@ -356,8 +356,15 @@ def configuration(command: str, options: Any) -> dict:
     return {
         "command": command,
         "meshsplats": meshsplats.__version__,
-        "options": {k: str(v) if isinstance(v, Path) else v for k, v in flat.items()},
+        "options": {k: _plain(v) for k, v in flat.items()},
     }
+
+
+def _plain(value: Any) -> Any:
+    """An option's value for JSON, which knows no paths."""
+    if isinstance(value, (tuple, list)):
+        return [_plain(part) for part in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def recorded_options(path: Path, command: str) -> dict[str, Any] | None:
