@@ -1,6 +1,6 @@
 """A mesh prior: splats on a base mesh, trained, bent and lit anew. The picture of docs/mesh-prior.md.
 
-python examples/06_mesh_prior.py [steps]      Needs the extras finetune and base. Writes into example-output/.
+python examples/06_mesh_prior.py [steps]      Needs the extra base. Writes into example-output/.
 """
 
 import sys

@@ -89,6 +89,25 @@ def test_what_degree_0_shows_of_splats_with_more_is_scored_beside_a_mesh(scene, 
     assert report["held_out"] is None  # given cameras may have been trained on
 
 
+def test_several_meshes_in_one_table(scene, tmp_path, capsys):
+    (tmp_path / "other").mkdir()
+    for copy in ("first.npz", "other/first.npz"):
+        (tmp_path / copy).write_bytes((scene / "mesh.npz").read_bytes())
+    options = ("--splats", scene / "scene.ply", "--cameras", scene / "cameras.json", "--strips", "0")
+    meshes = (scene / "mesh.npz", tmp_path / "first.npz")
+    assert run(*meshes, *options, "-o", tmp_path / "a") == 0
+    assert set(json.loads((tmp_path / "a" / "results.json").read_text())) == {"mesh", "first", "splats_sh0"}
+    told = capsys.readouterr().out
+    assert "LPIPS" not in told
+    assert "fitted" not in told
+    meshes = (tmp_path / "first.npz", tmp_path / "other" / "first.npz")
+    assert run(*meshes, *options, "-o", tmp_path / "b") == 0
+    names = {f"{tmp_path.name}/first.npz", "other/first.npz"}
+    assert set(json.loads((tmp_path / "b" / "results.json").read_text())) == {*names, "splats_sh0"}
+    assert run(meshes[0], meshes[0], *options, "-o", tmp_path / "c") == 2
+    assert "given twice" in capsys.readouterr().err
+
+
 def test_against_photographs(scene, tmp_path, capsys):
     data = simple_colmap(tmp_path / "data", count=5)
     out = tmp_path / "out"

@@ -202,9 +202,9 @@ def test_without_views_held_out_the_next_command_shows_the_mesh(splats, tmp_path
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--sh-degree", "0"], "pictures of other splats"),
-        (["--held-out", "1"], "other views"),
-        (["--axes", "y-up"], "another mesh.*options of reading it"),
+        (["--sh-degree", "0"], "pictures of other splats.*--sh-degree was not given and is 0"),
+        (["--held-out", "1"], "other views.*--held-out was 2 and is 1"),
+        (["--axes", "y-up"], "another mesh.*options of reading it.*--axes was auto and is y-up"),
     ],
 )
 def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
@@ -214,6 +214,23 @@ def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
     assert run(*arguments, *options, "--resume", "--force") == 1
     assert re.search(message, capsys.readouterr().err)
     assert run(*arguments, "--resume", "--force") == 0
+    save_gaussians(make_scene(301), tmp_path / "scene.ply")
+    assert run(*arguments, "--resume", "--force") == 1
+    assert "No option differs, so the files themselves have changed" in capsys.readouterr().err
+
+
+def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
+    """Its views stay, though so long a run would have more; its time counts, too."""
+    arguments = [splats, "-o", tmp_path / "t.npz", "--held-out", "2", "--width", "8", "--json"]
+    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: 4)
+    assert run(*arguments, "--steps", "3") == 0
+    first = json.loads(capsys.readouterr().out)
+    assert first["seconds_since_resumed"] is None
+    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: 5)
+    assert run(*arguments, "--steps", "6", "--resume", "--force") == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["steps"] == 6
+    assert second["seconds"] == pytest.approx(first["seconds"] + second["seconds_since_resumed"], abs=2)
 
 
 def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):

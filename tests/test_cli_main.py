@@ -7,15 +7,19 @@ import subprocess
 import sys
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
+from _datasets import simple_colmap
+from _photographs import write_photographs
 
 import meshsplats
 from meshsplats.camera import orbit, save_cameras
 from meshsplats.cli import COMMANDS, main
 from meshsplats.cli.common import parse_color, parse_up
+from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.splats import save_gaussians
@@ -179,6 +183,41 @@ def test_info_on_a_mesh(tmp_path, capsys, suffix):
     assert (found["kind"], found["vertices"], found["triangles"], found["splats"]) == ("mesh", 3, 1, 1)
     assert found["upper"] == [1, 1, 1]
     assert found["up"] == [0, -1, 0]
+
+
+def test_info_on_data_sets(tmp_path, capsys):
+    def told(path) -> dict:
+        assert main(["info", str(path), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    colmap = simple_colmap(tmp_path / "colmap", count=9)
+    found = told(colmap)
+    assert (found["kind"], found["layout"], found["pictures"]) == ("data set", "COLMAP", 9)
+    assert (found["training_views"], found["held_out_views"], found["split"]) == (7, 2, "every 8th by name")
+    assert (found["lenses"], found["undistorted_when_read"]) == (["PINHOLE"], False)
+    assert found["bytes_in_memory"] == 9 * 3 * np.prod(found["picture_sizes"][0])
+    assert "points" not in found
+    model = Path(found["read_from"])
+    (model / "points3D.txt").write_text("# a comment\n1 0 0 0 9 9 9 0.5 1 2\n\n2 0 0 1 9 9 9 0.5 1 2\n")
+    assert told(colmap)["points"] == 2
+    (model / "points3D.bin").write_bytes((3).to_bytes(8, "little") + bytes(3 * 51))
+    assert told(colmap)["points"] == 3
+    (model / "points3D.bin").write_bytes((1 << 60).to_bytes(8, "little"))
+    assert "points" not in told(colmap)
+    (model / "test.txt").write_text("nothing\n")
+    assert told(colmap)["split"] == "the data set's own"
+
+    cameras = orbit(make_scene(200), 3, width=16, height=16)
+    pictures = [np.concatenate([np.zeros((16, 16, 3)), np.full((16, 16, 1), 0.5)], axis=2)] * 3
+    folder = write_photographs(tmp_path / "studio", cameras, pictures)
+    for path in (folder, folder / "transforms.json"):
+        found = told(path)
+        assert (found["layout"], found["with_alpha"], found["with_masks"]) == ("nerfstudio", 3, 0)
+        assert found["split"] == "every 8th by name"
+    save_cameras(cameras, tmp_path / "cameras.json")
+    assert told(tmp_path / "cameras.json")["kind"] == "cameras"
+    (tmp_path / "empty").mkdir()
+    assert main(["info", str(tmp_path / "empty")]) == 1
 
 
 def test_info_on_cameras(tmp_path, capsys):

@@ -10,7 +10,9 @@ import pytest
 
 from meshsplats.camera import Camera, orbit
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.conversion import convert
 from meshsplats.dataset import Dataset, Picture, View, splat_views
+from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation import (
     COLUMNS,
     MethodScores,
@@ -231,6 +233,35 @@ def test_table_has_every_scene_and_their_mean():
     assert "| scene | mesh | 20.00 | 20.00 | 0.5000 | 0.1000 |" in table
     assert "| mean | mesh | 25.00 | 25.00 | 0.6000 |  |" in table
     assert "| reported | paper | 28.08 |  | 0.8170 | 0.2290 |" in table
+
+
+def test_columns_that_nothing_fills_are_left_out():
+    heads = lambda *reports, **more: markdown_table(reports, **more).splitlines()[0]  # noqa: E731
+    plain = report_of([20.0], [0.5], [None])
+    assert heads(plain) == "| scene | method | PSNR | median PSNR | SSIM |"
+    assert heads(plain, reported={"paper": (28.0, 0.8, 0.2)}).endswith("| SSIM | LPIPS |")
+    assert heads(plain, report_of([30.0], [0.7], [0.1])).endswith("| SSIM | LPIPS |")
+    view = replace(plain.methods[0].views[0], psnr_exposure=21.0, floaters=3)
+    fitted = replace(plain, methods=(replace(plain.methods[0], views=(view,)),))
+    table = markdown_table([fitted], notes=["Behind: grey."]).splitlines()
+    assert table[0].endswith("| SSIM | PSNR fitted | floater px |")
+    assert table[2].endswith("| 0.5000 | 21.00 | 3.0 |")
+    assert table[-2:] == ["", "Behind: grey."]
+
+
+def test_several_meshes_have_names_of_their_own():
+    cloud = make_scene(200)
+    meshes = {"a": convert(cloud), "b": convert(cloud, mode="flat")}
+    data = Dataset(splat_views(cloud, orbit(cloud, 1, width=16, height=16)))
+    report = evaluate(meshes, data, splats=cloud)
+    assert [scores.method for scores in report.methods] == ["a", "b", "splats_sh0", "splats"]
+    assert report.about["triangles"] == {name: len(mesh.faces) for name, mesh in meshes.items()}
+    for name, mesh in meshes.items():
+        alone = evaluate(mesh, data)
+        assert alone.method("mesh").views == report.method(name).views
+        assert alone.about["triangles"] == len(mesh.faces)
+    with pytest.raises(ValueError, match="cannot have the name 'before'"):
+        evaluate({"before": meshes["a"]}, data, before=meshes["b"])
 
 
 def test_protocols_are_those_of_the_papers_table():

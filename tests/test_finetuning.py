@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from datetime import datetime, timezone
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError, FileFormatError
 from meshsplats.evaluation import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
+from meshsplats.finetuning.checkpoint import OtherRunError, load_checkpoint
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.tuning import (
@@ -255,14 +257,38 @@ def test_resuming_with_other_inputs_is_refused(scene, tmp_path):
     run = RunOptions(tmp_path / "run")
     finetune(mesh, dataset, make_config(steps=2), run=run)
     again = replace(run, resume=True)
-    with pytest.raises(ValueError, match="steps was 2 and is 3"):
-        finetune(mesh, dataset, make_config(steps=3), run=again)
-    with pytest.raises(ValueError, match="another mesh"):
+    with pytest.raises(OtherRunError, match="seed was 0 and is 3"):
+        finetune(mesh, dataset, make_config(steps=2, seed=3), run=again)
+    with pytest.raises(OtherRunError, match="has made 2 steps already, 1 are asked for"):
+        finetune(mesh, dataset, make_config(steps=1), run=again)
+    with pytest.raises(OtherRunError, match="another mesh"):
         finetune(mesh.prune(0.5), dataset, make_config(steps=2), run=again)
-    with pytest.raises(ValueError, match="other views"):
+    with pytest.raises(OtherRunError, match="other views"):
         finetune(mesh, dataset.over((0, 0, 0)), make_config(steps=2), run=again)
-    with pytest.raises(ValueError, match="other views"):
+    with pytest.raises(OtherRunError, match="other views"):
         finetune(mesh, replace(dataset, test=dataset.test[:-1]), make_config(steps=2), run=again)
+
+
+def test_a_run_can_be_made_longer(scene, tmp_path):
+    """From where it ended, with the rates of a run of the new length; what came before is kept."""
+    _, dataset, mesh = scene
+    run = RunOptions(tmp_path / "run")
+    short = finetune(mesh, dataset, make_config(steps=6), run=run)
+    longer = make_config(steps=18)
+    tuned = finetune(mesh, dataset, longer, run=replace(run, resume=True))
+    assert score(tuned, Dataset((), dataset.train)) > score(short, Dataset((), dataset.train)) + 0.5
+    assert [line["step"] for line in Journal(run.folder).metrics()] == [0, 6, 18]
+    assert json.loads((run.folder / "config.json").read_text()) == longer.to_dict()
+    assert [int(p.stem[5:]) for p in sorted((run.folder / "previews").iterdir())] == [
+        *(0, 2, 3, 5, 6),  # quarters of 6
+        *(9, 14, 18),  # those of 18 that were to come
+    ]
+
+
+def test_no_preview_where_none_is_wanted(scene, tmp_path):
+    _, dataset, mesh = scene
+    finetune(mesh, dataset, make_config(steps=4), run=RunOptions(tmp_path / "run", preview_every=0))
+    assert not (tmp_path / "run" / "previews").exists()
 
 
 def test_a_checkpoint_with_arrays_that_do_not_fit_is_refused(scene, tmp_path):
@@ -369,7 +395,7 @@ def test_values_that_are_not_finite_name_their_view(scene, tmp_path):
     run = RunOptions(tmp_path / "run")
     with pytest.raises(DivergenceError, match=r"step \d, view 'broken\.png': the loss is not finite"):
         finetune(mesh, spoilt, make_config(epochs=1), run=run)
-    kept = Journal(run.folder).resume()
+    kept = load_checkpoint(Journal(run.folder).checkpoint_path)
     assert np.isfinite(kept.arrays["mesh.vertices"]).all()
 
 
@@ -454,15 +480,22 @@ def test_what_a_run_writes(scene, tmp_path):
     folder = tmp_path / "run"
     told = []
     run = RunOptions(folder, report_every=4, preview_every=5)
-    finetune(mesh, dataset, make_config(steps=10), run=run, on_progress=told.append)
+    config = make_config(steps=10)
+    finetune(mesh, dataset, config, run=run, on_progress=told.append)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [0, 4, 8, 10]
     assert lines[0]["loss"] is None
     assert lines[-1]["psnr"] > lines[0]["psnr"]
-    assert [p.name for p in sorted((folder / "previews").iterdir())] == [
-        "step_0000005.png",
-        "step_0000010.png",
-    ]
+    assert lines[-1]["ssim"] > lines[0]["ssim"]
+    tuned = State.resume(load_checkpoint(Journal(folder).checkpoint_path).arrays, "display", 12, config, None)
+    scores = evaluate(tuned.result(), dataset).method("mesh")
+    assert lines[-1]["psnr"] == pytest.approx(scores.mean("psnr"))
+    assert lines[-1]["ssim"] == pytest.approx(scores.mean("ssim"))
+    times = [datetime.fromisoformat(line["time"]) for line in lines]
+    assert times == sorted(times)
+    assert abs((datetime.now(timezone.utc) - times[-1]).total_seconds()) < 60
+    previews = [int(p.stem.removeprefix("step_")) for p in sorted((folder / "previews").iterdir())]
+    assert previews == [0, 3, 5, 8, 10]  # after each quarter, and every five steps
     assert json.loads((folder / "config.json").read_text())["steps"] == 10
     assert [p.step for p in told[:3]] == [1, 2, 3]
     assert told[0].steps == 10
@@ -527,7 +560,7 @@ def test_killed_at_random_moments_nothing_is_lost(tmp_path):
         child.wait()
         child.stdout.close()
         if (folder / "checkpoint.safetensors").exists():
-            steps.append(Journal(folder).resume().step)
+            steps.append(load_checkpoint(Journal(folder).checkpoint_path).step)
     assert steps == sorted(steps)
     if not steps:
         finetune(mesh, dataset, make_config(steps=40), run=RunOptions(folder))

@@ -15,7 +15,7 @@ import pytest
 
 from meshsplats.camera import Camera, orbit
 from meshsplats.conversion import convert
-from meshsplats.dataset import Dataset, Picture, View
+from meshsplats.dataset import Dataset, Picture, View, splat_views
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import memory
@@ -277,6 +277,15 @@ def test_memory_is_refused_with_advice(monkeypatch):
     memory.check_memory(mesh, data)
 
 
+def test_splats_that_targets_are_drawn_from_count():
+    mesh, cloud = convert(make_scene(200)), make_scene(4000)
+    views = splat_views(cloud, [view.camera for view in dataset(2).train])
+    arrays = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, cloud.sh)
+    pictures = 2 * 8 * 8 * (8 - 3)  # float16 with alpha in place of bytes
+    more = memory.needed_memory(mesh, Dataset(views)) - memory.needed_memory(mesh, dataset(2))
+    assert more == sum(array.nbytes for array in arrays) + pictures
+
+
 def test_memory_grows_with_what_there_is():
     mesh, data = convert(make_scene(200)), dataset(2)
     base = memory.needed_memory(mesh, data)
@@ -298,7 +307,7 @@ def arrays() -> dict[str, np.ndarray]:
 def checkpoint(step: int = 3):
     from meshsplats.finetuning.checkpoint import Checkpoint
 
-    return Checkpoint(step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays(), (0.25, 1 / 3))
+    return Checkpoint(step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays(), (0.25, 1 / 3), 7)
 
 
 def test_checkpoints_come_back_to_the_last_bit(tmp_path):
@@ -310,6 +319,8 @@ def test_checkpoints_come_back_to_the_last_bit(tmp_path):
     assert (found.step, found.seconds, found.mesh, found.dataset) == (3, 1.5, "mesh", "views")
     assert (found.config, found.losses) == (saved.config, saved.losses)
     assert all((found.arrays[name] == array).all() for name, array in saved.arrays.items())
+    header = load_checkpoint(tmp_path / "c.safetensors", only_header=True)
+    assert (header.step, header.views, header.arrays) == (3, 7, {})
     assert [p.name for p in tmp_path.iterdir()] == ["c.safetensors"]
 
 
@@ -326,9 +337,12 @@ def test_broken_checkpoints_are_refused(tmp_path):
     path.write_bytes(whole.replace(b'\\"version\\": 1', b'\\"version\\": 7'))
     with pytest.raises(FileFormatError, match="version 7"):
         load_checkpoint(path)
-    path.write_bytes(whole.replace(b'\\"step\\": 3', b'\\"step\\":-3'))
-    with pytest.raises(FileFormatError, match="step -3"):
-        load_checkpoint(path)
+    for before, after in ((b'\\"step\\": 3', b'\\"step\\":-3'), (b'\\"views\\": 7', b'\\"views\\":-7')):
+        path.write_bytes(whole.replace(before, after))
+        with pytest.raises(FileFormatError, match="broken: step"):
+            load_checkpoint(path)
+    path.write_bytes(whole.replace(b', \\"views\\": 7', b"              "))
+    assert load_checkpoint(path).views is None  # by an earlier version
     from meshsplats.formats.safetensors import save_safetensors
 
     save_safetensors(path, arrays(), {})
@@ -343,6 +357,7 @@ def test_a_checkpoint_of_another_run_says_what_differs():
 
     found = checkpoint()
     check_same_run(found, FinetuneConfig(), "mesh", "views")
+    check_same_run(found, FinetuneConfig(steps=None, minutes=5), "mesh", "views")  # it may be made longer
     with pytest.raises(ValueError, match=r"seed was 0 and is 5"):
         check_same_run(found, FinetuneConfig(seed=5), "mesh", "views")
     with pytest.raises(ValueError, match="another mesh"):
@@ -366,8 +381,11 @@ def test_fingerprints_change_with_what_they_are_of():
 
 
 def test_resuming_drops_what_came_after_the_checkpoint(tmp_path):
+    def refuse(found):
+        raise ValueError("no")
+
     journal = Journal(tmp_path / "run")
-    journal.begin({"seed": 1})
+    journal.begin({"seed": 0})
     for step in (0, 3, 6):
         journal.note(step, loss=0.5)
     picture = np.zeros((6, 6, 3), np.float32)
@@ -376,7 +394,10 @@ def test_resuming_drops_what_came_after_the_checkpoint(tmp_path):
     journal.save(checkpoint(3))
     with open(tmp_path / "run" / METRICS, "a") as file:
         file.write('{"step": 7, "lo')  # a kill in the middle of a line
-    assert journal.resume().step == 3
+    with pytest.raises(ValueError, match="no"):
+        journal.resume({}, refuse)
+    assert len(journal.metrics()) == 3
+    assert journal.resume({"seed": 1}, lambda found: None).step == 3
     assert [line["step"] for line in journal.metrics()] == [0, 3]
     assert [p.name for p in (tmp_path / "run" / "previews").iterdir()] == ["step_0000002.png"]
     assert json.loads((tmp_path / "run" / "config.json").read_text()) == {"seed": 1}

@@ -17,6 +17,30 @@ def triangle(**changed) -> SplatMesh:
     return SplatMesh(**{"vertices": CORNERS, "faces": FACES, "colors": COLORS, **changed})
 
 
+def test_everything_is_named_in_a_line():
+    from meshsplats.base_mesh import BaseMesh
+    from meshsplats.camera import orbit
+    from meshsplats.dataset import Dataset, Picture, splat_views
+    from meshsplats.demo_scene import make_scene
+
+    cloud = make_scene(1234)
+    assert repr(cloud) == "GaussianCloud(1,234 splats of degree 3, kernel '3dgs')"
+    assert repr(triangle()) == "SplatMesh(3 vertices, 1 triangles, blending 'display')"
+    full = triangle(face_splat=[0], normals=COLORS[:, :3], attributes={"heat": COLORS[:, 0]})
+    assert repr(full) == (
+        "SplatMesh(3 vertices, 1 triangles, 1 splats, blending 'display', attribute 'heat', normals)"
+    )
+    views = splat_views(cloud, orbit(cloud, 3, width=64, height=48))
+    assert repr(views[0]) == f"View({views[0].name!r}, 64 x 48)"
+    data = Dataset(views[:2], views[2:], "still life")
+    assert repr(data) == "Dataset('still life', 2 views to train with, 1 held out, 64 x 48)"
+    assert repr(Dataset(())) == "Dataset(0 views to train with, 0 held out)"
+    assert repr(Picture(np.zeros((4, 6, 3), np.uint8), None, np.ones((4, 6), bool))) == (
+        "Picture(6 x 4 uint8, mask)"
+    )
+    assert repr(BaseMesh(CORNERS, FACES, COLORS)) == "BaseMesh(3 vertices, 1 faces, colours)"
+
+
 def test_good_arrays_are_not_copied():
     mesh = triangle()
     assert mesh.vertices is CORNERS

@@ -81,6 +81,12 @@ class BaseMesh:
     up: np.ndarray = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
     """(3,) float32 direction that points up."""
 
+    def __repr__(self) -> str:
+        parts = [f"{len(self.vertices):,} vertices", f"{len(self.faces):,} faces"]
+        parts += ["colours"] if self.colors is not None else []
+        parts += [f"{len(self.textures)} textures"] if self.textures else []
+        return f"BaseMesh({', '.join(parts)})"
+
     def __post_init__(self) -> None:
         vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
         faces = checked_array("faces", self.faces, np.int32, (None, 3))

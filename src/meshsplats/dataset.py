@@ -54,6 +54,11 @@ class Picture:
             return color
         return color + (1 - _unit(self.alpha))[..., None] * np.asarray(background, np.float32)
 
+    def __repr__(self) -> str:
+        height, width = self.color.shape[:2]
+        more = [name for name in ("alpha", "mask") if getattr(self, name) is not None]
+        return f"Picture({', '.join([f'{width} x {height} {self.color.dtype}', *more])})"
+
     @property
     def nbytes(self) -> int:
         return sum(a.nbytes for a in (self.color, self.alpha, self.mask) if a is not None)
@@ -79,6 +84,9 @@ class View:
     source: Picture | PictureSource
     background: tuple[float, float, float] = WHITE
     """RGB in [0, 1] behind pictures with alpha in ``image``."""
+
+    def __repr__(self) -> str:
+        return f"View({self.name!r}, {self.camera.width} x {self.camera.height})"
 
     @property
     def name(self) -> str:
@@ -128,6 +136,13 @@ class Dataset:
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", tuple(self.train))
         object.__setattr__(self, "test", tuple(self.test))
+
+    def __repr__(self) -> str:
+        sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
+        told = [f"{width} x {height}" for width, height in sizes[:3]] + ["..."] * (len(sizes) > 3)
+        name = [repr(self.name)] if self.name else []
+        counts = [f"{len(self.train)} views to train with", f"{len(self.test)} held out"]
+        return f"Dataset({', '.join([*name, *counts, *told])})"
 
     @property
     def views(self) -> tuple[View, ...]:

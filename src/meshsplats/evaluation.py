@@ -139,7 +139,7 @@ class ScoredView:
 
 
 def evaluate(
-    mesh: SplatMesh | None,
+    mesh: SplatMesh | Mapping[str, SplatMesh] | None,
     dataset: Dataset,
     *,
     before: SplatMesh | None = None,
@@ -159,7 +159,7 @@ def evaluate(
 
     Parameters
     ----------
-    mesh: method ``'mesh'``; None to score only the others.
+    mesh: method ``'mesh'``; several by name, each the method of that name; None to score only the others.
     before: method ``'before'``, for instance the mesh before it was fine-tuned.
     splats: methods ``'splats_sh0'``, and ``'splats'`` with all their spherical harmonics where they have
     more. pictures: method ``'pictures'``, made elsewhere (``picture_folder``).
@@ -170,27 +170,32 @@ def evaluate(
     fit_exposure: also give the PSNR after a gain and an offset a channel are fitted to each picture.
     on_view: called with each view when it is scored.
 
-    Raises ValueError if there is nothing to score or no view, or a view without a pixel that counts.
+    Raises ValueError if there is nothing to score or no view, a view without a pixel that counts, or a mesh
+    with the name of another method.
     """
-    methods: dict[str, PictureAt] = {}
+    meshes = {} if mesh is None else {"mesh": mesh} if isinstance(mesh, SplatMesh) else dict(mesh)
     views = dataset.test or dataset.views
     if samples is None:
         drawn_by = [view.camera for view in views]
+        beside = [] if before is None else [before]
         samples = max(
-            (mesh_samples(dataset.look, m, drawn_by) for m in (mesh, before) if m is not None), default=1
+            (mesh_samples(dataset.look, m, drawn_by) for m in (*meshes.values(), *beside)), default=1
         )
-    if mesh is not None:
-        methods["mesh"] = _of_mesh(mesh, samples, threads)
+    methods: dict[str, PictureAt] = {n: _of_mesh(m, samples, threads) for n, m in meshes.items()}
+    others: dict[str, PictureAt] = {}
     if before is not None:
-        methods["before"] = _of_mesh(before, samples, threads)
+        others["before"] = _of_mesh(before, samples, threads)
     if splats is not None:
         # Beside photographs splats are drawn as they were trained, beside their own images as these are.
         look = dataset.look if _drawn(dataset) else "splats"
-        methods["splats_sh0"] = _of_splats(splats, look, 0, threads)
+        others["splats_sh0"] = _of_splats(splats, look, 0, threads)
         if splats.sh_degree > 0:
-            methods["splats"] = _of_splats(splats, look, None, threads)
+            others["splats"] = _of_splats(splats, look, None, threads)
     if pictures is not None:
-        methods["pictures"] = pictures
+        others["pictures"] = pictures
+    if taken := methods.keys() & others.keys():
+        raise ValueError(f"a mesh cannot have the name {min(taken)!r}, which is that of another method")
+    methods |= others
     if not methods:
         raise ValueError("there is nothing to evaluate: give a mesh, splats or pictures")
     if not views:
@@ -210,12 +215,13 @@ def evaluate(
             )
         if on_view is not None:
             on_view(ScoredView(view, truth, drawn, {name: scores[-1] for name, scores in found.items()}))
+    counts = {name: len(one.faces) for name, one in meshes.items()}
     about = {
         "views": len(views),
         "held_out": bool(dataset.test),
         "look": dataset.look,
         "samples": samples,
-        "triangles": None if mesh is None else len(mesh.faces),
+        "triangles": counts if len(counts) > 1 else next(iter(counts.values()), None),
         "splats": None if splats is None else len(splats),
     }
     return Report(dataset.name, tuple(MethodScores(n, tuple(s)) for n, s in found.items()), about)

@@ -108,29 +108,48 @@ def markdown_table(
     notes: Sequence[str] = (),
 ) -> str:
     """A table of the scenes' means by method, with the mean over the scenes where there are several, and
-    figures ``reported`` elsewhere (PSNR, SSIM, LPIPS); ``notes`` follow it."""
+    figures ``reported`` elsewhere (PSNR, SSIM, LPIPS); ``notes`` follow it. Columns without a value are left
+    out."""
+    heads, table = score_table(reports, reported or {})
     lines = [f"# {title}", ""] if title else []
-    lines += ["| scene | method | PSNR | median PSNR | SSIM | LPIPS |", "|---|---|---|---|---|---|"]
-    rows: dict[str, list[list[float | None]]] = {}
-    for report in reports:
-        for scores in report.methods:
-            row = [scores.mean("psnr"), scores.median("psnr"), scores.mean("ssim"), scores.mean("lpips")]
-            rows.setdefault(scores.method, []).append(row)
-            lines.append(_row(report.scene, scores.method, row))
-    if len(reports) > 1:
-        for method, values in rows.items():
-            columns = list(zip(*values, strict=True))
-            means = [None if None in column else float(np.mean(np.array(column))) for column in columns]
-            lines.append(_row("mean", method, means))
-    for name, (psnr, ssim, lpips) in (reported or {}).items():
-        lines.append(_row("reported", name, [psnr, None, ssim, lpips]))
+    lines += [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    lines += [f"| {' | '.join(row)} |" for row in table]
     return "\n".join([*lines, *(f"\n{note}" for note in notes)]) + "\n"
 
 
-def _row(scene: str, method: str, values: Sequence[float | None]) -> str:
-    digits = (2, 2, 4, 4)
-    cells = ["" if v is None else f"{v:.{d}f}" for v, d in zip(values, digits, strict=True)]
-    return f"| {scene} | {method} | " + " | ".join(cells) + " |"
+_COLUMNS = {
+    "PSNR": ("mean", "psnr", 2),
+    "median PSNR": ("median", "psnr", 2),
+    "SSIM": ("mean", "ssim", 4),
+    "LPIPS": ("mean", "lpips", 4),
+    "PSNR fitted": ("mean", "psnr_exposure", 2),
+    "floater px": ("mean", "floaters", 1),
+}
+"""Head, statistic, score and digits."""
+
+
+def score_table(
+    reports: Sequence[Report], reported: Mapping[str, tuple[float, float, float]]
+) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows of ``markdown_table``."""
+    rows: list[tuple[str, str, list[float | None]]] = []
+    for report in reports:
+        for scores in report.methods:
+            values = [getattr(scores, statistic)(name) for statistic, name, _ in _COLUMNS.values()]
+            rows.append((report.scene, scores.method, values))
+    if len(reports) > 1:
+        for method in dict.fromkeys(method for _, method, _ in rows):
+            columns = zip(*(values for _, name, values in rows if name == method), strict=True)
+            means = [None if None in column else float(np.mean(np.array(column))) for column in columns]
+            rows.append(("mean", method, means))
+    for name, (psnr, ssim, lpips) in reported.items():
+        rows.append(("reported", name, [psnr, None, ssim, lpips, None, None]))
+    shown = [i for i in range(len(_COLUMNS)) if any(values[i] is not None for _, _, values in rows)]
+    digits = [digits for _, _, digits in _COLUMNS.values()]
+    return ["scene", "method", *(list(_COLUMNS)[i] for i in shown)], [
+        [scene, method, *("" if (v := values[i]) is None else f"{v:.{digits[i]}f}" for i in shown)]
+        for scene, method, values in rows
+    ]
 
 
 def _natural(path: Path) -> list:

@@ -74,6 +74,9 @@ class GaussianCloud:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __repr__(self) -> str:
+        return f"GaussianCloud({len(self):,} splats of degree {self.sh_degree}, kernel {self.kernel!r})"
+
     @property
     def sh_degree(self) -> int:
         """Degree of the stored spherical harmonics, 0 to 3."""

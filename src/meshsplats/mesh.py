@@ -106,6 +106,15 @@ class SplatMesh:
             if (face != face[:, :1]).any():
                 raise ValueError("all corners of a triangle must be bound to one face of the base")
 
+    def __repr__(self) -> str:
+        parts = [f"{len(self.vertices):,} vertices", f"{len(self.faces):,} triangles"]
+        if self.splat_count is not None:
+            parts.append(f"{self.splat_count:,} splats")
+        parts += [f"blending {self.blending!r}", *(f"attribute {name!r}" for name in self.attributes)]
+        parts += ["normals"] if self.normals is not None else []
+        parts += ["bound to a base"] if self.binding is not None else []
+        return f"SplatMesh({', '.join(parts)})"
+
     @property
     def splat_count(self) -> int | None:
         """How many splats own at least one triangle; None where the mesh does not know."""

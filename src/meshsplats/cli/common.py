@@ -394,6 +394,7 @@ def configuration(command: str, options: Any) -> dict:
 
 
 def _plain(value: Any) -> Any:
+    """An option's value for JSON, which knows no paths."""
     if isinstance(value, (tuple, list)):
         return [_plain(part) for part in value]
     return shown_path(value) if isinstance(value, Path) else value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +38,13 @@ from meshsplats.cli.targets import TargetOptions
 from meshsplats.dataset import WHITE, Dataset, load_dataset, splat_views
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation import SSIM_CONVENTION, Report, ScoredView, evaluate
-from meshsplats.evaluation_pictures import markdown_table, picture_folder, view_crop, view_strip
+from meshsplats.evaluation_pictures import (
+    markdown_table,
+    picture_folder,
+    score_table,
+    view_crop,
+    view_strip,
+)
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.protocols import PROTOCOLS, Protocol, find_input
@@ -50,20 +57,21 @@ RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION = (
     "config.json",
 )
 Weights = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+Meshes = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Scores pictures of a mesh, and of splats beside it: PSNR, SSIM and LPIPS of each view, their means and
-    medians, and strips truth | mesh | splats | error.
+    """Scores pictures of meshes, and of splats beside them: PSNR, SSIM and LPIPS of each view, their means
+    and medians, and strips truth | mesh | splats | error.
 
     results.json and per_view.json have the shape of those that the 3DGS code writes; report.json has
     everything.
     """
 
-    mesh: tyro.conf.Positional[File] = None
-    """The mesh. With --protocol: a folder with a mesh, splats or a model folder for each scene, by
-    its name."""
+    mesh: tyro.conf.Positional[Meshes] = ()
+    """The mesh, or several to score side by side. With --protocol: a folder with a mesh, splats or a model
+    folder for each scene, by its name."""
     output: Output = tyro.MISSING
     """Folder for the results."""
     data: Folder = None
@@ -84,7 +92,8 @@ class Evaluate:
     sh_degree: Count = None
     """Without --data: the splats' pictures are the truth up to this degree. Default: all that are stored."""
     lpips: Weights = ()
-    """Weights of LPIPS, files or a folder; without them that column is empty."""
+    """Weights of LPIPS, files or a folder: torchvision's vgg16-397923af.pth and vgg.pth of the package lpips,
+    or one file of both (docs/finetuning.md says where they are); without them there is no such column."""
     network: Literal["vgg", "alex"] = "vgg"
     """Network of LPIPS; splatting papers use vgg."""
     fit_exposure: bool = False
@@ -122,17 +131,18 @@ class Evaluate:
             reports = self._run_protocol(PROTOCOLS[self.protocol])
         else:
             self._check_outputs(self.output)
-            mesh = None if self.mesh is None else self._load_mesh(self.mesh)
+            meshes = {name: self._load_mesh(path) for name, path in mesh_names(self.mesh).items()}
             before = None if self.before is None else self._load_mesh(self.before)
             splats = None if self.splats is None else self.reading.load(self.splats)
             dataset = self._dataset(splats)
-            scenes = {"splats": splats, "mesh": mesh, "mesh before": before}
-            background = self._background(dataset, scenes, self.splats or self.mesh)
+            scenes = {"splats": splats, **meshes, "mesh before": before}
+            source = self.splats or (self.mesh[0] if self.mesh else None)
+            background = self._background(dataset, scenes, source)
             if self.data is None and splats is not None:
                 # Their own pictures are the truth; what a mesh could show of it is degree 0.
                 more = splats.sh_degree > 0 and self.sh_degree != 0
                 splats = replace(splats, sh=splats.sh[:, :1]) if more else None
-            reports = [self._score(self.output, dataset, background, mesh, splats, before)]
+            reports = [self._score(self.output, dataset, background, meshes, splats, before)]
         seconds = round(time.perf_counter() - start, 2)
         write_json(self.output / CONFIGURATION, configuration("evaluate", self))
         if self.json:
@@ -149,7 +159,7 @@ class Evaluate:
         if self.amplify <= 0 or self.strips < 0:
             raise ValueError("--amplify must be positive and --strips >= 0")
         if self.protocol is not None:
-            if self.data is None or self.mesh is None:
+            if self.data is None or len(self.mesh) != 1:
                 raise UsageError("--protocol needs a folder of meshes or models, and --data with the scenes")
             for name in ("before", "splats", "pictures", "cameras", "sh_degree"):
                 if getattr(self, name) is not None:
@@ -157,7 +167,7 @@ class Evaluate:
             return
         if self.tune is not None:
             raise UsageError("--tune is for --protocol; otherwise use meshsplats finetune, then evaluate")
-        if self.mesh is None and self.pictures is None and (self.splats is None or self.data is None):
+        if not self.mesh and self.pictures is None and (self.splats is None or self.data is None):
             raise UsageError("nothing to score: give a mesh, --pictures, or --splats with --data")
         if self.data is None and self.splats is None:
             raise UsageError("nothing to compare with: give --data, or --splats")
@@ -216,7 +226,7 @@ class Evaluate:
         folder: Path,
         dataset: Dataset,
         background: Background,
-        mesh: SplatMesh | None,
+        meshes: Mapping[str, SplatMesh],
         splats: GaussianCloud | None,
         before: SplatMesh | None,
     ) -> Report:
@@ -242,7 +252,7 @@ class Evaluate:
             next(bar, None)
 
         report = evaluate(
-            mesh,
+            meshes,
             dataset,
             before=before,
             splats=splats,
@@ -268,13 +278,13 @@ class Evaluate:
 
     def _run_protocol(self, protocol: Protocol) -> list[Report]:
         assert self.data is not None
-        assert self.mesh is not None
+        (folder,) = self.mesh
         self._check_outputs(self.output)
         found = []
         for scene, factor in protocol.scenes.items():
-            source = find_input(self.mesh, scene)
+            source = find_input(folder, scene)
             if source is None or not (self.data / scene).is_dir():
-                missing = f"{self.data / scene}" if source else f"{self.mesh / scene}(.npz, .ply, ...)"
+                missing = f"{self.data / scene}" if source else f"{folder / scene}(.npz, .ply, ...)"
                 warnings.warn(
                     f"{protocol.title}: scene {scene} is left out, no {missing}", DataWarning, stacklevel=2
                 )
@@ -283,7 +293,7 @@ class Evaluate:
         if not found:
             raise FileNotFoundError(
                 f"none of the scenes of {protocol.title} ({', '.join(protocol.scenes)}) is both in"
-                f" {self.mesh} and in {self.data}"
+                f" {folder} and in {self.data}"
             )
         reports = []
         for scene, source, factor in found:
@@ -294,7 +304,9 @@ class Evaluate:
             dataset = dataset.over(background.color)
             mesh, splats, before = self._prepared(given, dataset)
             self.output.mkdir(exist_ok=True)
-            reports.append(self._score(self.output / scene, dataset, background, mesh, splats, before))
+            reports.append(
+                self._score(self.output / scene, dataset, background, {"mesh": mesh}, splats, before)
+            )
         means = {
             name: {
                 key: _mean([r.results().get(name, {}).get(key) for r in reports])
@@ -343,6 +355,21 @@ class Evaluate:
         return _tuned(mesh, dataset, self.tune, self.threads), scene, mesh
 
 
+def mesh_names(paths: Sequence[Path]) -> dict[str, Path]:
+    """A name for each mesh in tables: ``mesh`` for a single one, else that of its file, with as many of the
+    folders above as tell them apart."""
+    if len(paths) == 1:
+        return {"mesh": paths[0]}
+    whole = [Path(os.path.abspath(path)) for path in paths]
+    longest = max((len(path.parts) for path in whole), default=0)
+    forms = [[path.stem for path in whole], [path.name for path in whole]]
+    forms += [["/".join(path.parts[-k:]) for path in whole] for k in range(2, longest + 1)]
+    for names in forms:
+        if len(set(names)) == len(names):
+            return dict(zip(names, paths, strict=True))
+    raise UsageError("a mesh was given twice")
+
+
 def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) -> SplatMesh:
     from meshsplats.finetuning import RunOptions, finetune, make_config
 
@@ -381,27 +408,10 @@ def _print_table(reports: Sequence[Report]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("scene", "method", box=None, pad_edge=False)
-    for column in ("PSNR dB", "median", "SSIM", "LPIPS", "PSNR fitted", "floater px"):
-        table.add_column(column, justify="right")
-    for report in reports:
-        for scores in report.methods:
-            mean = {
-                column: scores.mean(column)
-                for column in ("psnr", "ssim", "lpips", "psnr_exposure", "floaters")
-            }
-            table.add_row(
-                report.scene,
-                scores.method,
-                _shown(mean["psnr"], 2),
-                _shown(scores.median("psnr"), 2),
-                _shown(mean["ssim"], 4),
-                _shown(mean["lpips"], 4),
-                _shown(mean["psnr_exposure"], 2),
-                _shown(mean["floaters"], 1),
-            )
+    heads, rows = score_table(reports, {})
+    table = Table(*heads[:2], box=None, pad_edge=False)
+    for head in heads[2:]:
+        table.add_column(head, justify="right")
+    for row in rows:
+        table.add_row(*row)
     Console().print(table)
-
-
-def _shown(value: float | None, digits: int) -> str:
-    return "n/a" if value is None else f"{value:.{digits}f}"

@@ -33,7 +33,10 @@ from meshsplats.cli.training import (
     behind,
     described,
     draw_preview,
+    earlier_part,
     given,
+    naming_options,
+    note_command,
     run_options,
     shown,
     stopped,
@@ -50,6 +53,7 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
+from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.tuning import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -85,7 +89,8 @@ class Finetune:
     """What the splats are converted to; same: as --preset has it. default: one ellipse of 8 triangles a
     splat. paper: the paper's conversion, also for published."""
     resume: bool = False
-    """Go on where an interrupted run of the same command stopped."""
+    """Go on where an interrupted run of the same command stopped; with --force also after its end, for
+    longer."""
     target: TargetOptions = field(default_factory=TargetOptions)
     tuning: _Tuning = field(default_factory=_Tuning)
     conversion: ConversionOptions = field(default_factory=ConversionOptions)
@@ -93,7 +98,7 @@ class Finetune:
     report_every: int = 100
     """Steps from one score on held-out views to the next."""
     preview_every: int = 500
-    """Steps from one preview picture of the run to the next; 0: none."""
+    """Steps from one preview picture of the run to the next; after each quarter of a short run. 0: none."""
     threads: Count = None
     """At most N threads. Default: all processors."""
     json: bool = False
@@ -115,7 +120,9 @@ class Finetune:
             # Pictures of what is cut off are nothing to learn from; other choices of splats leave gaps that
             # the rest has to fill.
             scene = choose_splats(scene, crop=self.conversion.crop)
-        worthwhile = worthwhile_views(config)
+        earlier = earlier_part(self, files)
+        # A run that is made longer goes on with the views that it has.
+        worthwhile = earlier.views if earlier and earlier.views else worthwhile_views(config)
         dataset = self.target.make(
             scene, self.input, background_of(config), self.threads, worthwhile, self.preset
         )
@@ -131,11 +138,14 @@ class Finetune:
             what += f" of {mesh.splat_count:,} splats, {len(scene):,} before"
         announce(what, mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
+        note_command("finetune", self, files)
         try:
             with files.claimed([self.input], resume=self.resume, force=self.force), shown() as show:
                 tuned = finetune(mesh, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
             return stopped(stop, files)
+        except OtherRunError as error:
+            raise naming_options(error, "finetune", self, files) from None
         save_mesh(tuned, files.mesh)
         record = configuration("finetune", self) | {"tuning": config.to_dict()}
         write_json(files.config, record | ({} if background is None else background.to_dict()))
@@ -144,7 +154,7 @@ class Finetune:
         draw_preview(tuned, files.preview)
         triangles = len(tuned.faces)
         seconds = time.perf_counter() - began
-        tell(self, files, seconds, {"triangles": triangles}, f"{triangles:,} triangles")
+        tell(self, files, seconds, earlier, {"triangles": triangles}, f"{triangles:,} triangles")
         if not self.json:
             print(f"next: {self._next(files, config, background, dataset)}")
         return 0

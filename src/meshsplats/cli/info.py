@@ -1,4 +1,4 @@
-"""``meshsplats info``: what is in a splat file, a mesh, a camera file or a model folder."""
+"""``meshsplats info``: what is in a splat file, a mesh, a camera file, a model folder or a data set."""
 
 from __future__ import annotations
 
@@ -11,10 +11,15 @@ from typing import Any
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, load_cameras
+from meshsplats.camera import Camera, load_cameras, read_json
 from meshsplats.cli import shown_path
 from meshsplats.cli.common import SplatOptions, cameras_beside, identify
-from meshsplats.formats.splats import splat_format
+from meshsplats.dataset import load_dataset
+from meshsplats.datasets.colmap import count_points
+from meshsplats.datasets.folder import Layout, find_layout
+from meshsplats.datasets.photographs import PhotoFile
+from meshsplats.errors import FileFormatError
+from meshsplats.formats.splats import splat_file, splat_format
 from meshsplats.framing import guess_up, scene_bounds
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -25,7 +30,7 @@ TRIED = 4000
 
 @dataclass(frozen=True)
 class Info:
-    """Shows what is in a splat file, a mesh, a camera file or a model folder."""
+    """Shows what is in a splat file, a mesh, a camera file, a model folder, or a data set of photographs."""
 
     input: tyro.conf.Positional[Path]
     """The file or folder."""
@@ -45,11 +50,14 @@ class Info:
 
 def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
     """Findings about ``path``, ready for JSON. Lengths are in scene units."""
-    kind = identify(path)
+    layout = _layout(path)
+    kind = "data set" if layout is not None else identify(path)
     found: dict[str, Any] = {"path": shown_path(path), "kind": kind}
     if path.is_file():
         found["bytes"] = path.stat().st_size
-    if kind == "splats":
+    if layout is not None:
+        found |= _photographs(path, layout)
+    elif kind == "splats":
         found |= {"format": splat_format(path)} | _splats(reading.load(path))
         if cameras := cameras_beside(path):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
@@ -59,6 +67,45 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
         found |= _mesh(load_mesh(path))
     else:
         found |= _cameras(load_cameras(path))
+    return found
+
+
+def _layout(path: Path) -> Layout | None:
+    """That of a data set; None for anything else."""
+    if path.is_dir():
+        try:
+            splat_file(path)
+        except FileFormatError:
+            return find_layout(path)
+        return None
+    if path.suffix.lower() != ".json" or identify(path) != "cameras":
+        return None
+    content = read_json(path)
+    return find_layout(path) if isinstance(content, dict) and "frames" in content else None
+
+
+def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
+    dataset = load_dataset(path)
+    own = not dataset.test or bool(load_dataset(path, test_every=0).test)
+    sources = [view.source for view in dataset.views]
+    photos = [source for source in sources if isinstance(source, PhotoFile)]
+    lenses = sorted({photo.lens.model for photo in photos})
+    found: dict[str, Any] = {
+        "layout": layout.name,
+        "read_from": str(layout.source),
+        "pictures": len({photo.path for photo in photos}),
+        "training_views": len(dataset.train),
+        "held_out_views": len(dataset.test),
+        "split": "the data set's own" if own else "every 8th by name",
+        "lenses": lenses,
+        "undistorted_when_read": not all(photo.lens.is_pinhole for photo in photos),
+        "with_alpha": sum(photo.has_alpha for photo in photos),
+        "with_masks": sum(photo.mask is not None for photo in photos),
+        "bytes_in_memory": dataset.memory,
+        **_cameras([view.camera for view in dataset.views]),
+    }
+    if layout.name == "COLMAP" and (points := count_points(layout.source)) is not None:
+        found["points"] = points
     return found
 
 

@@ -24,7 +24,10 @@ from meshsplats.cli.training import (
     behind,
     described,
     draw_preview,
+    earlier_part,
     given,
+    naming_options,
+    note_command,
     run_options,
     shown,
     stopped,
@@ -32,6 +35,7 @@ from meshsplats.cli.training import (
 )
 from meshsplats.dataset import Dataset
 from meshsplats.finetuning import FinetuneConfig, Interrupted, worthwhile_views
+from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
 from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train
@@ -87,7 +91,8 @@ class Prior:
     minutes: Number = None
     """Length: so much time for the whole command."""
     resume: bool = False
-    """Go on where an interrupted run of the same command stopped."""
+    """Go on where an interrupted run of the same command stopped; with --force also after its end, for
+    longer."""
     laying: LayOptions = field(default_factory=LayOptions)
     target: TargetOptions = field(default_factory=TargetOptions)
     tuning: _Training = field(default_factory=_Training)
@@ -95,7 +100,7 @@ class Prior:
     report_every: int = 100
     """Steps from one score on held-out views to the next."""
     preview_every: int = 500
-    """Steps from one preview picture of the run to the next; 0: none."""
+    """Steps from one preview picture of the run to the next; after each quarter of a short run. 0: none."""
     threads: Count = None
     """At most N threads. Default: all processors."""
     json: bool = False
@@ -115,7 +120,8 @@ class Prior:
         files.check(inputs, resume=self.resume, force=self.force)
         wants_texture = self.laying.colors in ("auto", "texture")
         base = load_base(self.input, texture=self.laying.texture, textures=wants_texture)
-        dataset = self._dataset(base, config)
+        earlier = earlier_part(self, files)
+        dataset = self._dataset(base, config, earlier)
         up = guess_up(SplatMesh(base.vertices, base.faces, _grey(base), up=base.up), _cameras(dataset))
         laid = {name: getattr(self.laying, name) for name in ("triangles", "by_area", "layers", "spacing")}
         prior = bind(
@@ -132,17 +138,20 @@ class Prior:
         what = f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles"
         announce(what, prior.mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
+        note_command("prior", self, files)
         try:
             with files.claimed(inputs, resume=self.resume, force=self.force), shown() as show:
                 trained = train(prior, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
             return stopped(stop, files)
+        except OtherRunError as error:
+            raise naming_options(error, "prior", self, files) from None
         save_mesh(exported(trained, files.mesh), files.mesh)
         write_json(files.config, record)
         draw_preview(trained.mesh, files.preview)
         counts = {"base_faces": len(trained.base_faces), "triangles": len(trained.mesh.faces)}
         made = f"{counts['triangles']:,} triangles on {counts['base_faces']:,} faces"
-        tell(self, files, time.perf_counter() - began, counts, made)
+        tell(self, files, time.perf_counter() - began, earlier, counts, made)
         if not self.json:
             print(f"next: edit {self.input}, moving its vertices, and")
             print(f"  meshsplats deform {shlex.quote(str(files.mesh))} --base edited.obj -o edited.glb")
@@ -167,12 +176,13 @@ class Prior:
             raise UsageError("--spacing has no effect with one layer; give --layers")
         self.target.check()
 
-    def _dataset(self, base: BaseMesh, config: FinetuneConfig) -> Dataset:
+    def _dataset(self, base: BaseMesh, config: FinetuneConfig, earlier: Checkpoint | None) -> Dataset:
         background = background_of(config)
         if self.splats is None:
             mesh = SplatMesh(base.vertices, base.faces, _grey(base))
             return self.target.make(mesh, self.input, background, self.threads)
-        cloud, worthwhile = self.reading.load(self.splats), worthwhile_views(config)
+        cloud = self.reading.load(self.splats)
+        worthwhile = earlier.views if earlier and earlier.views else worthwhile_views(config)
         return self.target.make(cloud, self.splats, background, self.threads, worthwhile)
 
 

@@ -18,9 +18,19 @@ import tyro
 from meshsplats.backgrounds import Background
 from meshsplats.camera import orbit
 from meshsplats.cli import UsageError
-from meshsplats.cli.common import check_outputs, chosen_background, plural, size_of
+from meshsplats.cli.common import (
+    check_outputs,
+    chosen_background,
+    configuration,
+    plural,
+    recorded_options,
+    size_of,
+    write_json,
+)
 from meshsplats.dataset import Dataset
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
+from meshsplats.finetuning.config import LENGTHS
 from meshsplats.formats.locks import locked
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -74,6 +84,11 @@ class RunFiles:
     @property
     def run(self) -> Path:
         return self.mesh.with_suffix(".run")
+
+    @property
+    def command(self) -> Path:
+        """What the run was asked for, while it is not done."""
+        return self.run / "command.json"
 
     @property
     def held_out(self) -> Path:
@@ -178,6 +193,49 @@ def run_options(command: Finetune | Prior, files: RunFiles, began: float) -> Run
     )
 
 
+def earlier_part(command: Finetune | Prior, files: RunFiles) -> Checkpoint | None:
+    """Of a run that is to go on, what was done, without the arrays; None for one that begins."""
+    from meshsplats.finetuning.checkpoint import load_checkpoint
+    from meshsplats.finetuning.journal import CHECKPOINT
+
+    return load_checkpoint(files.run / CHECKPOINT, only_header=True) if command.resume else None
+
+
+def note_command(name: str, command: Finetune | Prior, files: RunFiles) -> None:
+    """Keeps what a run was asked for, to tell later what differs."""
+    if not command.resume:
+        files.run.mkdir(exist_ok=True)
+        write_json(files.command, configuration(name, command))
+
+
+def naming_options(error: OtherRunError, name: str, command: Finetune | Prior, files: RunFiles) -> Exception:
+    """``error`` with the options that differ from those of the run that was to go on."""
+    before = recorded_options(files.command, name)
+    if before is None:
+        return error
+    now = configuration(name, command)["options"]
+    differ = [key for key in now if key not in _FREE and before.get(key) != now[key]]
+    if not differ:
+        return OtherRunError(f"{error}. No option differs, so the files themselves have changed")
+    told = ", ".join(
+        f"--{key.replace('_', '-')} was {_said(before.get(key))} and is {_said(now[key])}" for key in differ
+    )
+    return OtherRunError(f"{error}. Options that differ: {told}")
+
+
+def _said(value: Any) -> str:
+    if value is None:
+        return "not given"
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+_FREE = {
+    *("resume", "force", "json", "threads", "report_every", "preview_every", "cache", "output"),
+    *LENGTHS,
+}
+"""Options that may change when a run goes on."""
+
+
 def stopped(stop: Interrupted, files: RunFiles) -> int:
     """Says how to go on; returns the exit status."""
     say(f"stopped after step {stop.step:,}; the checkpoint is in {files.run}: the same command with")
@@ -186,19 +244,28 @@ def stopped(stop: Interrupted, files: RunFiles) -> int:
 
 
 def tell(
-    command: Finetune | Prior, files: RunFiles, seconds: float, counts: dict[str, int], made: str
+    command: Finetune | Prior,
+    files: RunFiles,
+    seconds: float,
+    earlier: Checkpoint | None,
+    counts: dict[str, int],
+    made: str,
 ) -> None:
-    """Prints what came of it: JSON with ``counts``, or text in which ``made`` stands for them."""
+    """Prints what came of it: JSON with ``counts``, or text in which ``made`` stands for them. It took
+    ``seconds`` since it was begun, or resumed after what was done ``earlier``."""
     from meshsplats.finetuning.journal import Journal
 
     lines = Journal(files.run).metrics()
     scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
     steps = lines[-1]["step"] if lines else 0
+    total = seconds + (0 if earlier is None else earlier.seconds)
+    resumed = "" if earlier is None else f", {seconds:.1f} s of it since it was resumed"
     if command.json:
         result = {
             "mesh": str(files.mesh),
             "steps": steps,
-            "seconds": round(seconds, 2),
+            "seconds": round(total, 2),
+            "seconds_since_resumed": None if earlier is None else round(seconds, 2),
             **counts,
             "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
             "run": str(files.run),
@@ -206,7 +273,7 @@ def tell(
         print(json.dumps(result, indent=1))
         return
     print(
-        f"{files.mesh} ({size_of(files.mesh)}, {made}): {steps:,} steps in {seconds:.1f} s"
+        f"{files.mesh} ({size_of(files.mesh)}, {made}): {steps:,} steps in {total:.1f} s{resumed}"
         + (f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else "")
     )
     print(f"preview: {files.preview}; metrics: {files.run}/metrics.jsonl")

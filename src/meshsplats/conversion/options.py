@@ -29,8 +29,8 @@ class ConversionOptions:
     scale_mul: float | None = None
     """Radius of the rim in standard deviations, 0.1 to 10. Default: calibrated; paper: 2.7."""
     no_triag: int | None = None
-    """Triangles round the centre of an ellipse, 3 to 64 (3d: a multiple of 4; crossed: even). Default: 8 for
-    flat, else 4; paper: 8."""
+    """Number of triangles that make up an ellipse, a fan round its centre: 3 to 64 (3d: a multiple of 4;
+    crossed: even). The name is the paper's. Default: 8 for flat, else 4; paper: 8."""
     opac_mul: float | None = None
     """Opacity of the rim as a fraction of the splat's, 0 to 1. Default: 0; paper: 0.2."""
     center_mul: float | None = None
@@ -40,10 +40,10 @@ class ConversionOptions:
     """Rings of vertices in an ellipse, 1 to 4; the last is the rim. More follow the Gaussian closer: 2 rings
     draw 3 * no_triag triangles an ellipse. Default and paper: 1."""
     detail: Detail | None = None
-    """even: as many triangles for every splat. cameras, for mode 'flat', which it implies, with one ring:
-    from 3 to 80, in the mean ``no_triag``; more for splats that show large and wrong from the cameras given,
-    fewer for those that show little, none for those that hide inside a solid. Fine-tuning does so. Default
-    and paper: even."""
+    """How triangles are shared out among splats. even: every splat has the same number. cameras: that number
+    on average, 3 to 80 by what the cameras given see of the splat: most where it is large in the pictures and
+    a plain fan would look wrong, none where it is hidden inside a solid; for mode 'flat', which it implies,
+    with one ring. Fine-tuning begins so. Default and paper: even."""
     flat_below: float | None = None
     """crossed: a splat whose smallest standard deviation (with its footprint) is less than this fraction of
     the middle one is drawn as one ellipse of twice as many triangles, 0 to 1."""

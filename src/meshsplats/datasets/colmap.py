@@ -1,4 +1,4 @@
-"""COLMAP's sparse models: ``cameras`` and ``images``, binary or text. Points are not read.
+"""COLMAP's sparse models: ``cameras`` and ``images``, binary or text. Points are only counted.
 
 Specification: colmap.github.io/format.html; the binary layout as in src/colmap/scene/reconstruction_io.
 """
@@ -27,6 +27,8 @@ _MODEL_NAMES = list(MODELS)
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _POINT_BYTES = 24
+_LEAST_POINT = 43
+"""Bytes of a point in three dimensions without the pictures that see it."""
 
 
 def find_model(folder: Path, places: tuple[str, ...]) -> Path | None:
@@ -54,6 +56,19 @@ def read_model(model: Path, images: str) -> list[Frame]:
         if before.name == after.name:
             raise FileFormatError(f"{model}: two pictures have the name {after.name[:200]!r}")
     return frames
+
+
+def count_points(model: Path) -> int | None:
+    """Number of points of a sparse model; None if it has none, or no file that could hold so many."""
+    binary, text = model / "points3D.bin", model / "points3D.txt"
+    if binary.is_file():
+        with open(binary, "rb") as file:
+            count = int.from_bytes(file.read(8), "little")
+        return count if count * _LEAST_POINT <= binary.stat().st_size - 8 else None
+    if text.is_file():
+        with open(text, "rb") as file:
+            return sum(1 for line in file if line.strip() and not line.startswith(b"#"))
+    return None
 
 
 # ---- Binary

@@ -6,6 +6,7 @@ import errno
 import os
 import warnings
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 from meshsplats.dataset import PictureStore, View
 from meshsplats.datasets.colmap import find_model, read_model
@@ -21,22 +22,40 @@ def read_folder(path: Path, downscale: int, test_every: int, store: PictureStore
     """Training and test views of the data set at ``path``; see ``dataset.load_dataset``."""
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such data set", str(path))
+    layout = find_layout(path)
+    if layout is None:
+        if path.is_file():
+            raise FileFormatError(f"{path}: a data set is a folder, or its transforms.json")
+        raise FileFormatError(f"{path}: {_what_is_there(path)}")
+    album = Album(path.parent if path.is_file() else path, downscale, store)
+    if layout.name == "COLMAP":
+        return _colmap(layout.source, album, test_every)
+    if layout.name == "NeRF-synthetic":
+        return _nerf_synthetic(layout.source.parent, album)
+    return _nerfstudio(layout.source, album, test_every)
+
+
+class Layout(NamedTuple):
+    """How a data set is laid out."""
+
+    name: Literal["COLMAP", "NeRF-synthetic", "nerfstudio"]
+    source: Path
+    """The sparse model's folder, or the file of the (training) frames."""
+
+
+def find_layout(path: Path) -> Layout | None:
+    """That of the folder or .json file ``path``, which is there; None for any other."""
     if path.is_file():
         if path.suffix.lower() != ".json":
-            raise FileFormatError(f"{path}: a data set is a folder, or its transforms.json")
-        if path.name == "transforms_train.json":
-            return _nerf_synthetic(path.parent, Album(path.parent, downscale, store))
-        return _nerfstudio(path, Album(path.parent, downscale, store), test_every)
-    album = Album(path, downscale, store)
+            return None
+        return Layout("NeRF-synthetic" if path.name == "transforms_train.json" else "nerfstudio", path)
     if (path / "transforms_train.json").is_file():
-        return _nerf_synthetic(path, album)
+        return Layout("NeRF-synthetic", path / "transforms_train.json")
     model = find_model(path, ("sparse/0", "sparse"))
     if model is None and (path / "transforms.json").is_file():
-        return _nerfstudio(path / "transforms.json", album, test_every)
+        return Layout("nerfstudio", path / "transforms.json")
     model = model or find_model(path, ("colmap/sparse/0", "colmap/sparse")) or _other_model(path)
-    if model is None:
-        raise FileFormatError(f"{path}: {_what_is_there(path)}")
-    return _colmap(model, album, test_every)
+    return None if model is None else Layout("COLMAP", model)
 
 
 def _other_model(path: Path) -> Path | None:

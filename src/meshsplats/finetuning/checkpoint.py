@@ -18,7 +18,7 @@ import numpy as np
 from meshsplats.binding import Binding
 from meshsplats.dataset import Dataset, DrawnSplats
 from meshsplats.errors import FileFormatError
-from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
 from meshsplats.formats.safetensors import load_safetensors, save_safetensors
 from meshsplats.mesh import SplatMesh
 
@@ -45,22 +45,24 @@ class Checkpoint:
     arrays: dict[str, np.ndarray]
     losses: tuple[float, ...] = ()
     """Of the steps since the last line of the metrics."""
+    views: int | None = None
+    """Number of training views; None: not known, of a checkpoint by an earlier meshsplats."""
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
     """Writes ``checkpoint``, in place of an older one of that name once it is whole."""
-    names = ("step", "seconds", "config", "mesh", "dataset", "losses")
+    names = ("step", "seconds", "config", "mesh", "dataset", "losses", "views")
     header = {name: getattr(checkpoint, name) for name in names}
     save_safetensors(path, checkpoint.arrays, {_KEY: json.dumps({"version": VERSION, **header})})
 
 
-def load_checkpoint(path: str | Path) -> Checkpoint:
-    """The checkpoint at ``path``. FileFormatError if it is broken, of another kind, or of a later version;
-    FileNotFoundError if there is none."""
+def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoint:
+    """The checkpoint at ``path``; with ``only_header`` without its arrays. FileFormatError if it is broken,
+    of another kind, or of a later version; FileNotFoundError if there is none."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}: leave out --resume to begin anew")
-    arrays, texts = load_safetensors(path)
+    arrays, texts = load_safetensors(path, only_texts=only_header)
     try:
         header = json.loads(texts.get(_KEY, ""))
     except (ValueError, RecursionError):
@@ -72,6 +74,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             f"{path}: a checkpoint of version {header['version']}, this program reads version {VERSION}"
         )
     step, seconds, config, losses = (header[name] for name in ("step", "seconds", "config", "losses"))
+    views = header.get("views")
     if (
         not isinstance(step, int)
         or step < 0
@@ -79,29 +82,34 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         or not isinstance(config, dict)
         or not isinstance(losses, list)
         or not all(isinstance(loss, float) for loss in losses)
+        or not (views is None or (isinstance(views, int) and views > 0))
     ):
         raise FileFormatError(f"{path}: broken: step {step!r}, seconds {seconds!r}")
     made_of = str(header["mesh"]), str(header["dataset"])
-    return Checkpoint(step, float(seconds), config, *made_of, arrays, tuple(losses))
+    return Checkpoint(step, float(seconds), config, *made_of, arrays, tuple(losses), views)
+
+
+class OtherRunError(ValueError):
+    """A checkpoint is of another run than the one that is to go on with it; the message says what differs."""
 
 
 def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset: str) -> None:
-    """ValueError, which says what differs, if ``found`` is not of the run with this configuration, mesh and
-    data set (as fingerprints)."""
+    """OtherRunError if ``found`` is not of the run with this configuration, mesh and data set (as
+    fingerprints). The length may differ, so that a run can be made longer."""
     wanted = config.to_dict()
-    names = [name for name in wanted if found.config.get(name) != wanted[name]]
+    names = [name for name in wanted if name not in LENGTHS and found.config.get(name) != wanted[name]]
     if names:
         told = ", ".join(f"{name} was {found.config.get(name)!r} and is {wanted[name]!r}" for name in names)
-        raise ValueError(
+        raise OtherRunError(
             f"the checkpoint is of another configuration: {told}; give the same options as before"
         )
     if found.mesh != mesh:
-        raise ValueError(
+        raise OtherRunError(
             "the checkpoint began with another mesh: give the same input, and the same options of reading it,"
             " converting it, and of the views, for which it was made"
         )
     if found.dataset != dataset:
-        raise ValueError(
+        raise OtherRunError(
             "the checkpoint was made with other views or pictures of other splats, or by an earlier"
             " meshsplats: give the same data set or splats and the same options of the views"
         )

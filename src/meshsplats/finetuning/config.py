@@ -71,13 +71,13 @@ class FinetuneConfig:
     exposure_rate: float = 0.002
     """Adam's rate of gains and offsets."""
     prune_epochs: float = 5.0
-    """Triangles are dropped each time so many epochs have passed; 0: never."""
+    """The mesh is pruned, as the next two options say, each time so many epochs have passed; 0: never."""
     prune_opacity: float = 1 / 255
-    """Of those, the ones all of whose corners have less opacity than this; their orphaned vertices with
-    them."""
+    """Pruning drops triangles all of whose corners have less opacity than this, and vertices that are then
+    part of no triangle."""
     prune_importance: float = 0.0
-    """Of those, also the splats that training views have before them, but that all together show less of
-    them than this, in pixels: hidden inside, or too faint."""
+    """Pruning also drops splats of which all training views together show less than so many pixels, because
+    they are too faint or hidden by others; those that lie outside every view stay. 0: none."""
     relocate_share: float = 0.0
     """At most this share of the splats is moved at a time: those that show next to nothing take over halves
     of those that are needed most; 0: none, and none on a base mesh. For long runs: what was halved has to

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +26,8 @@ ERROR_FACTOR = 4.0
 
 
 class Journal:
-    """What a run writes while it goes on. Metrics have a JSON object a line: always ``step``, and what is
-    said of it."""
+    """What a run writes while it goes on. Metrics have a JSON object a line: always ``step`` and ``time``
+    (ISO 8601, local with its offset), and what is said of the step."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
@@ -40,12 +42,19 @@ class Journal:
         self.checkpoint_path.unlink(missing_ok=True)
         for preview in self._previews():
             preview.unlink()
-        write_text(self.folder / CONFIGURATION, json.dumps(config, indent=1) + "\n")
+        self._configure(config)
         write_text(self.folder / METRICS, "")
 
-    def resume(self) -> Checkpoint:
-        """The checkpoint; metrics and previews of later steps, which will be made again, are dropped."""
+    def _configure(self, config: dict[str, Any]) -> None:
+        write_text(self.folder / CONFIGURATION, json.dumps(config, indent=1) + "\n")
+
+    def resume(self, config: dict[str, Any], check: Callable[[Checkpoint], None]) -> Checkpoint:
+        """The checkpoint, once ``check`` let it pass. ``config`` takes the place of the earlier one, which
+        may have been of another length. Metrics and previews of later steps, which will be made again, are
+        dropped."""
         checkpoint = load_checkpoint(self.checkpoint_path)
+        check(checkpoint)
+        self._configure(config)
         kept = [line for line in self.metrics() if line["step"] <= checkpoint.step]
         write_text(self.folder / METRICS, "".join(json.dumps(line) + "\n" for line in kept))
         for preview in self._previews():
@@ -57,8 +66,9 @@ class Journal:
         save_checkpoint(checkpoint, self.checkpoint_path)
 
     def note(self, step: int, **values: Any) -> None:
-        """Adds a line to the metrics."""
-        line = json.dumps({"step": step, **values}, allow_nan=False) + "\n"
+        """Adds a line to the metrics, with the time of day."""
+        now = datetime.now().astimezone().isoformat(timespec="seconds")
+        line = json.dumps({"step": step, **values, "time": now}, allow_nan=False) + "\n"
         try:
             with open(self.folder / METRICS, "a", encoding="utf-8") as file:
                 file.write(line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from meshsplats.dataset import CACHE_BYTES, Dataset
+from meshsplats.dataset import CACHE_BYTES, Dataset, DrawnSplats
 from meshsplats.mesh import SplatMesh
 
 VERTEX_BYTES = 7 * 4 * 6 + 4
@@ -19,18 +19,25 @@ FACE_BYTES = 12 + 4 + 4 + 64
 """A triangle, its splat and depth group, and the renderer's lists of them."""
 PIXEL_BYTES = 12 * 12 + 64
 """Pictures, truth and gradients of one step, and the fragments that wait in the renderer's tiles."""
-BASE_BYTES = 300 << 20
+FACE_KEPT, MOST_KEPT = 250, 256 << 20
+"""Arrays of the compiled core for each triangle, which it keeps from picture to picture, and most of them."""
+BASE_BYTES = 75 << 20
 """Python and the libraries."""
 
 
 def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BYTES) -> int:
-    """Bytes that fine-tuning ``mesh`` on ``dataset`` takes, estimated from sizes alone."""
+    """Bytes of the whole process that fine-tunes ``mesh`` on ``dataset``, at its peak, estimated from sizes
+    alone."""
     views = dataset.views
     vertex = VERTEX_BYTES + (BOUND_BYTES if mesh.binding is not None else 0)
     vertex += FILTER_BYTES if mesh.filter_px2 else 0
     pixels = max((view.camera.width * view.camera.height for view in views), default=0)
+    clouds = {id(v.source.cloud): v.source.cloud for v in views if isinstance(v.source, DrawnSplats)}
+    arrays = (a for c in clouds.values() for a in (c.means, c.quaternions, c.scales, c.opacities, c.sh))
     return (
         BASE_BYTES
+        + sum(array.nbytes for array in arrays)
+        + min(len(mesh.faces) * FACE_KEPT, MOST_KEPT)
         + len(mesh.vertices) * vertex
         + len(mesh.faces) * FACE_BYTES
         + pixels * PIXEL_BYTES

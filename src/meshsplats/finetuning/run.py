@@ -11,9 +11,10 @@ import numpy as np
 
 from meshsplats._arrays import evenly
 from meshsplats.dataset import CACHE_BYTES, Dataset, View
-from meshsplats.evaluation import mesh_picture
+from meshsplats.evaluation import masked_ssim, mesh_picture
 from meshsplats.finetuning.checkpoint import (
     Checkpoint,
+    OtherRunError,
     check_same_run,
     dataset_fingerprint,
     mesh_fingerprint,
@@ -34,6 +35,9 @@ WRITING = 1.5
 """Seconds kept back, of a run whose length is a time, for what follows it: writing the mesh, drawing its
 preview. In short runs a hundredth of the time."""
 
+PREVIEWS = 4
+"""Previews that each run has at least."""
+
 WATCHED_VIEWS = 8
 """Most held-out views that are scored while a run goes on."""
 
@@ -49,7 +53,7 @@ class RunOptions:
     report_every: int = 100
     """Steps from one score on held-out views to the next; 0: only at the end."""
     preview_every: int = 500
-    """Steps from one preview picture to the next; 0: none."""
+    """Steps from one preview picture to the next; in short runs there is one after each quarter. 0: none."""
     checkpoint_seconds: float = 30.0
     """Time from one checkpoint to the next."""
     threads: int | None = None
@@ -111,7 +115,7 @@ def finetune(
         on_progress: called after every step.
 
     Raises:
-        ValueError: no training view, an empty mesh, a checkpoint of another run.
+        ValueError: no training view, an empty mesh. OtherRunError: the checkpoint is of another run.
         MemoryError: it would not fit; nothing was written.
         DivergenceError: a view gave values that are not finite; names it.
         Interrupted: after SIGINT or SIGTERM, with a checkpoint, if there is a folder.
@@ -126,8 +130,14 @@ def finetune(
     prints = (mesh_fingerprint(mesh), dataset_fingerprint(dataset)) if journal is not None else ("", "")
     views = len(dataset.train)
     if journal is not None and run.resume:
-        found = journal.resume()
-        check_same_run(found, config, *prints)
+        total = config.total_steps(views)
+
+        def check(found: Checkpoint) -> None:
+            check_same_run(found, config, *prints)
+            if total is not None and found.step > total:
+                raise OtherRunError(f"the run has made {found.step:,} steps already, {total:,} are asked for")
+
+        found = journal.resume(config.to_dict(), check)
         blending = "linear" if config.blending == "linear" else mesh.blending
         state = State.resume(found.arrays, blending, views, config, run.threads)
         step, spent, losses = found.step, found.seconds, found.losses
@@ -167,6 +177,7 @@ class _Run:
         self.report_cost = self.save_cost = self.step_cost = 0.0
         watched = evenly(dataset.test, WATCHED_VIEWS)
         self.watched: tuple[View, ...] = watched
+        self.quarter = int(PREVIEWS * self.fraction)
 
     @property
     def seconds(self) -> float:
@@ -194,6 +205,7 @@ class _Run:
         with StopSignals() as signals:
             if self.step == 0:
                 self._report()
+                self._preview()
                 self._save()
             while not self._done():
                 if signals.received is not None:
@@ -210,10 +222,10 @@ class _Run:
                     self.state = self.state.prune(kept_faces(self.state, views))
                 if moves and self.step % moves == 0 and self.fraction <= RELOCATED:
                     relocate(self.state, views)
-                every, previews = self.run.report_every, self.run.preview_every
+                every = self.run.report_every
                 if every and self.step % every == 0 and not self._done():
                     self._report()
-                if previews and self.step % previews == 0:
+                if self._preview_is_due():
                     self._preview()
                 if time.perf_counter() - self.saved_at >= self.run.checkpoint_seconds:
                     self._save()
@@ -234,26 +246,34 @@ class _Run:
     def _report(self) -> None:
         start = time.perf_counter()
         loss = float(np.mean(self.losses)) if self.losses else None
+        similar = None
         if self.watched:
             mesh = self.state.result()
             scores = []
             for view in self.watched:
-                picture = np.clip(self._picture(mesh, view), 0, 1)
-                scores.append(min(psnr(picture, np.clip(view.image, 0, 1), mask=view.mask), 200.0))
-            self.held_out = float(np.mean(scores))
+                picture, truth = np.clip(self._picture(mesh, view), 0, 1), np.clip(view.image, 0, 1)
+                decibels = min(psnr(picture, truth, mask=view.mask), 200.0)
+                scores.append((decibels, masked_ssim(picture, truth, view.mask, self.run.threads)))
+            self.held_out, similar = (float(mean) for mean in np.mean(scores, axis=0))
         if self.journal is not None:
             self.journal.note(
                 self.step,
                 loss=loss,
                 psnr=self.held_out,
+                ssim=similar,
                 triangles=len(self.state.mesh.faces),
                 seconds=round(self.seconds, 3),
             )
         self.losses.clear()
         self.report_cost = time.perf_counter() - start
 
+    def _preview_is_due(self) -> bool:
+        quarter, every = int(PREVIEWS * self.fraction), self.run.preview_every
+        passed, self.quarter = quarter > self.quarter, quarter
+        return bool(every) and (passed or self.step % every == 0)
+
     def _preview(self) -> None:
-        if self.journal is None:
+        if self.journal is None or not self.run.preview_every:
             return
         view = (self.watched or self.dataset.train)[0]
         picture = np.clip(self._picture(self.state.result(), view), 0, 1)
@@ -270,7 +290,15 @@ class _Run:
         arrays = self.state.arrays()
         config = self.config.to_dict()
         self.journal.save(
-            Checkpoint(self.step, self.seconds, config, *self.prints, arrays, tuple(self.losses))
+            Checkpoint(
+                self.step,
+                self.seconds,
+                config,
+                *self.prints,
+                arrays,
+                tuple(self.losses),
+                len(self.dataset.train),
+            )
         )
         self.save_cost = time.perf_counter() - self.saved_at
 

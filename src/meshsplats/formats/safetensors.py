@@ -68,8 +68,10 @@ def save_safetensors(
             file.write(packed[name].reshape(-1).view(np.uint8).data)
 
 
-def load_safetensors(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """The arrays in the file and its texts.
+def load_safetensors(
+    path: str | os.PathLike[str], *, only_texts: bool = False
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """The arrays in the file (none with ``only_texts``) and its texts.
 
     Numbers of bfloat16, which NumPy lacks, come as float32. Raises FileFormatError for a file that is broken,
     or of types that are not known here, before memory is taken; OSError if it cannot be read.
@@ -81,7 +83,7 @@ def load_safetensors(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray
         if size < 8 or length > min(size - 8, _MOST_HEADER):
             raise _error(path, f"{size:,} bytes do not hold its header")
         entries, texts = _parse_header(path, file.read(length), size - 8 - length)
-        for name, entry in entries.items():
+        for name, entry in ({} if only_texts else entries).items():
             try:
                 array = np.empty(entry.shape, entry.dtype)
             except ValueError as problem:  # empty, but too long in the other directions
