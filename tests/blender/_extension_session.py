@@ -38,7 +38,8 @@ import meshsplats  # noqa: E402
 
 told["package"] = meshsplats.__file__
 thing = bpy.context.object
-thing.location = (1, 2, 3)
+told["origin"] = list(thing.location)
+thing.location = (1, 2, 2)  # of the foot of the ball
 told["triangles"] = {"default": len(thing.data.polygons)}
 told["bounces"] = bpy.context.scene.cycles.transparent_max_bounces
 told["materials"] = [thing.data.materials[0].name]
@@ -134,6 +135,20 @@ values = picture.pixels[:]
 row = [values[4 * (16 * 32 + column)] for column in range(32)]
 told["edge"], told["middle"] = row[1], row[16]
 
+# Named after its folder, and moved to the world's origin; then light, ground and camera in one click.
+model = folder / "chair" / "point_cloud" / "iteration_7"
+model.mkdir(parents=True)
+(model / "point_cloud.ply").write_bytes((folder / "ball.ply").read_bytes())
+bpy.ops.import_scene.meshsplats(filepath=str(model / "point_cloud.ply"), at_origin=True)
+chair = bpy.context.object
+told["named"] = [chair.name, list(chair.location)]
+told["stage"] = sorted(bpy.ops.scene.meshsplats_stage(lights="studio"))
+bpy.ops.scene.meshsplats_stage(lights="studio")
+told["staged"] = sorted(c.name for c in scene.collection.children)
+told["camera"] = scene.camera.name
+told["dressed"] = chair.data.materials[0].name.startswith("Splats, lit")
+bpy.data.objects.remove(chair)
+
 # As in a window, where Blender calls the operator again and again while a thread does the work.
 work = sys.modules[addon + ".work"]
 work.bpy_background = lambda: False
@@ -222,6 +237,7 @@ told["left"] = [
         ("import_scene", "meshsplats"),
         ("object", "meshsplats_shading"),
         ("scene", "meshsplats_set_up"),
+        ("scene", "meshsplats_stage"),
     ]
     if name in dir(getattr(bpy.ops, group))
 ]

@@ -104,7 +104,8 @@ def test_a_whole_session(packed, tmp_path):
     assert told["sog"] is None or 0 < told["sog"] <= 800
     assert told["triangles"]["default"] > told["triangles"]["fewer"] > 0
     assert told["materials"] == ["Splats, lit", "Splats, unlit"]
-    assert told["moved"] == [1.0, 2.0, 3.0], "converting again leaves the object where it was"
+    assert told["origin"] == pytest.approx([0, 0, -1], abs=0.12), "under the ball"
+    assert told["moved"] == [1.0, 2.0, 2.0], "converting again leaves the object where it was"
     assert 64 <= told["bounces"] <= 1024
     assert told["broken"].startswith("Error: ")
     assert "broken.ply" in told["broken"]
@@ -119,6 +120,11 @@ def test_a_whole_session(packed, tmp_path):
     assert told["triangles"]["again"] > told["triangles"]["fewer"]
     assert told["edge"] == pytest.approx(1, abs=0.01)
     assert told["middle"] == pytest.approx(0.7, abs=0.1), "the grey ball is drawn"
+    assert told["named"] == ["chair", [0.0, 0.0, 0.0]]
+    assert told["stage"] == ["FINISHED"]
+    assert told["staged"] == ["Cameras", "Lights", "Surroundings"]
+    assert told["camera"] == "Camera"
+    assert told["dressed"]
     waited = told["waited"]
     assert waited["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["FINISHED"]]
     assert (np.diff(waited["progress"]) >= 0).all()

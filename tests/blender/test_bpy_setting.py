@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
+
 import numpy as np
 import pytest
 
@@ -130,3 +133,19 @@ def test_values_of_light_do_not_change_with_exposure(tmp_path):
         draw(mesh, [camera], pictures=[tmp_path / "a.exr"], options=options)
         values.append(pictures.read_pixels(tmp_path / "a.exr"))
     np.testing.assert_array_equal(*values)
+
+
+@pytest.mark.parametrize("suffix", ["png", "exr"])
+def test_a_picture_that_is_not_whole_is_told(tmp_path, monkeypatch, suffix):
+    """Blender says nothing of a full disk; what it leaves is cut off."""
+    mesh, camera = plate(0.5)
+    path = tmp_path / f"a.{suffix}"
+    draw(mesh, [camera], pictures=[path])
+    pictures._check_written(path, 48 * 36)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(OSError, match="wrote no picture"):
+        pictures._check_written(path, 48 * 36)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 0))
+    with pytest.raises(OSError) as caught:
+        pictures._check_written(path, 48 * 36)
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))

@@ -92,6 +92,7 @@ import json, os, sys, time
 job = json.load(open(sys.argv[-1]))
 for path in job["temporary"].values():
     open(path, "wb").close()  # as Blender's own writer begins
+os.mkdir(os.environ["TMPDIR"] + "/blender_own")
 child = os.fork()
 print(os.getpid(), file=open(sys.argv[1] + ("/child" if child == 0 else "/parent"), "w"), flush=True)
 time.sleep(600)

@@ -179,6 +179,8 @@ def _watch(
         # The worker must be this very package, wherever this process found it.
         places = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
+    # Blender's own temporary files go with ours.
+    environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
     result: dict[str, Any] = {"picture_seconds": [], "picture_processor_seconds": []}
     said: deque[str] = deque(maxlen=40)
     finished, failure, unloadable, status = False, None, None, None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -123,8 +125,24 @@ def _render(scene: Any, path: Path) -> None:
     scene.render.use_overwrite = True
     scene.render.filepath = os.fspath(path)
     bpy.ops.render.render(write_still=True)
-    if not path.exists() or path.stat().st_size == 0:
-        raise OSError(f"{path}: Blender wrote no picture")
+    _check_written(path, scene.render.resolution_x * scene.render.resolution_y)
+
+
+def _check_written(path: Path, pixels: int) -> None:
+    """OSError for a picture that is not whole: Blender says nothing of a full disk."""
+    try:
+        if path.suffix == ".png":
+            with open(path, "rb") as file:
+                whole = file.read()[-8:-4] == b"IEND"
+        else:
+            whole = path.stat().st_size > 0 and read_pixels(path).size > 0
+    except FileNotFoundError:
+        whole = False
+    if whole:
+        return
+    if shutil.disk_usage(path.parent).free < 16 * pixels:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path))
+    raise OSError(f"{path}: Blender wrote no picture")
 
 
 def read_pixels(path: Path) -> np.ndarray:
@@ -160,3 +178,4 @@ def _save(pixels: np.ndarray, path: Path, scene: Any) -> None:
         image.save_render(os.fspath(path), scene=scene)
     finally:
         bpy.data.images.remove(image)
+    _check_written(path, width * height)
