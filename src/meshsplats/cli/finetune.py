@@ -138,9 +138,9 @@ class Finetune:
             what += f" of {mesh.splat_count:,} splats, {len(scene):,} before"
         announce(what, mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
-        note_command("finetune", self, files)
         try:
             with files.claimed([self.input], resume=self.resume, force=self.force), shown() as show:
+                note_command("finetune", self, files)
                 tuned = finetune(mesh, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
             return stopped(stop, files)

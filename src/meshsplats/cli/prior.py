@@ -138,9 +138,9 @@ class Prior:
         what = f"{len(base.faces):,} faces carry {len(prior.mesh.faces):,} triangles"
         announce(what, prior.mesh, dataset, self.target.cache_bytes)
         options = run_options(self, files, began)
-        note_command("prior", self, files)
         try:
             with files.claimed(inputs, resume=self.resume, force=self.force), shown() as show:
+                note_command("prior", self, files)
                 trained = train(prior, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
             return stopped(stop, files)

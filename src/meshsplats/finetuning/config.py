@@ -63,7 +63,7 @@ class FinetuneConfig:
     """Weight of the mean square difference, added to the others."""
     background: Backdrop = "mixed"
     """Behind pictures that have alpha; random: another colour in every step, so that what should be empty
-    becomes so; mixed: that in every second step, and in the others the data set's own background, on which
+    becomes so; mixed: that in every fourth step, and in the others the data set's own background, on which
     pictures are shown and compared. Photographs without alpha are drawn on the latter."""
     exposure: bool = False
     """Photographs: fit a gain and an offset a channel for each training picture, so that changes of light
@@ -90,7 +90,7 @@ class FinetuneConfig:
     samples: int | None = None
     """Side of the grid of samples in each pixel. None: 2, for images that are means over each pixel's area,
     photographs among them; 1 for those of a splat viewer (``Dataset.look``)."""
-    point_share: float = 0.5
+    point_share: float = 0.4
     """Images of splats that are means over each pixel's area: at first, for this share of the run, the mesh
     learns from their values at the pixels' centres, at one sample a pixel. That is quicker, and shows detail
     finer than a pixel as it is. 0: from means alone."""

@@ -24,9 +24,8 @@ def starting_mesh(
     For 'paper' and 'published' that is the paper's conversion. For 'default' it is ours, where ``options``,
     those of ``convert``, do not say otherwise, with one ellipse a splat (``mode='flat'``) of 8 triangles in
     the mean, more where much shows (``detail='cameras'``): two crossed ellipses look better as they are
-    converted, but cost more time in a step and end lower. For the ``look`` 'area' it has no footprint. For
-    'splats' it is to be drawn with a filter (``footprint='filter'``), where the splats' kernel has one: that
-    of 3DGS.
+    converted, but cost more time in a step and end lower. For the ``look`` 'splats' it is to be
+    drawn with a filter (``footprint='filter'``), where the splats' kernel has one: that of 3DGS.
     """
     from meshsplats.conversion import convert
 
@@ -34,11 +33,9 @@ def starting_mesh(
         return convert(cloud, preset="paper", cameras=cameras, **options)
     if options.get("mode") is None and options.get("flat_below") is None:
         options["mode"] = "flat"
-    if options.get("footprint") is None and options.get("footprint_px2") is None:
-        if look == "area":
-            options["footprint"] = "none"
-        elif cloud.kernel == "3dgs":
-            options["footprint"] = "filter"
+    given = options.get("footprint") is not None or options.get("footprint_px2") is not None
+    if look == "splats" and cloud.kernel == "3dgs" and not given:
+        options["footprint"] = "filter"
     one_ring = options.get("mode") == "flat" and options.get("rings") in (None, 1)
     if options.get("detail") is None and one_ring:
         options["detail"] = "cameras"

@@ -28,6 +28,10 @@ It saves a tenth to a sixth of the time, and pictures change by 0.0002 (rms). Le
 lifted where it is dark."""
 
 
+MIXED = 4
+"""With background 'mixed', one step in so many has a random background. On the background that images are
+compared on, one in four is 0.1 dB better than one in two."""
+
 AREA_SAMPLES = 2
 """Side of the grid of samples with which a mesh is compared with means over each pixel's area."""
 
@@ -61,7 +65,7 @@ def target_of(view: View, config: FinetuneConfig, step: int, points: bool = Fals
     background = view.background
     if picture.alpha is not None:
         background = BACKDROPS.get(config.background, background)
-        if config.background == "random" or (config.background == "mixed" and step % 2):
+        if config.background == "random" or (config.background == "mixed" and step % MIXED == 1):
             drawn = np.random.default_rng([config.seed, step, 1]).random(3)
             background = tuple(drawn.astype(np.float32).tolist())
     return Target(picture.over(background), picture.mask, background)
