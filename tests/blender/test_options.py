@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import pytest
 
 from meshsplats.blender import LightOptions, SceneOptions
-from meshsplats.blender.options import check_environment
+from meshsplats.blender.options import LIGHTS, check_environment
 
 
 @pytest.mark.parametrize(
@@ -52,3 +52,33 @@ def test_environment_pictures_are_known_by_content(tmp_path):
         check_environment(bad)
     with pytest.raises(FileNotFoundError):
         SceneOptions(light=replace(LightOptions(), hdri=tmp_path / "none.hdr")).check()
+
+
+def test_named_lights_and_what_is_said_instead():
+    from meshsplats.cli.blender import Blender, _Light
+
+    def light(lights, **given):
+        return Blender(None, None, lit=True, lights=lights, light=_Light(**given)).named_light()
+
+    for name, named in LIGHTS.items():
+        named.check()
+        assert light(name) == named
+    # Also what is the default of another light counts, and 0.
+    assert light("overcast", sun_strength=2.5) == replace(LIGHTS["overcast"], sun_strength=2.5)
+    assert light("sun", sky=0.0, mirror=True) == replace(LIGHTS["sun"], sky=0.0, mirror=True)
+
+
+@pytest.mark.parametrize(
+    ("layers", "options", "seconds"),
+    [
+        (10, SceneOptions(light=LightOptions(), samples=10, threads=2), 1e6 * 10 * 37e-6 / 2),
+        (10, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 390e-6),
+        (10, SceneOptions(threads=1), 1e6 * 10 * 11e-6),
+        (10, SceneOptions(engine="eevee"), None),
+    ],
+)
+def test_the_estimate(layers, options, seconds):
+    from meshsplats.cli.blender import estimated_seconds
+
+    ahead = {"mean_layers": layers, "samples": 10, "pixels": 10**6, "triangles": 0}
+    assert estimated_seconds(ahead, options) == (None if seconds is None else pytest.approx(seconds))

@@ -44,8 +44,8 @@ class LightOptions:
     """What the subject stands on: a grey plane that fades into the background; a catcher, seen only where
     shadows fall (Cycles); or nothing."""
     exposure: float = 0.35
-    """How much brighter pictures are shown, in stops, -20 to 20: with 0.35, white that the light meets as it
-    meets what faces the viewer looks white. The values of an .exr do not change, nor does the background."""
+    """How much brighter pictures are shown than they are lit, in stops, -20 to 20: with 0.35, a white plate
+    that faces the viewer looks white. Neither the values of an .exr change nor the background."""
     mirror: bool = False
     """A mirror behind the subject."""
     glass: bool = False

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 
@@ -46,12 +46,34 @@ _EVERY = 10.0
 _FORMATS = (".png", ".exr", ".blend")
 
 
-@dataclass(frozen=True)
-class _Light(LightOptions):
-    """Light and surroundings of lit pictures. Lengths follow the subject's size."""
+def _described(options: type[LightOptions]) -> type[LightOptions]:
+    """The options of light as ones that may be left out, so that a named light can say them."""
+    metavars = {"sun": "AZIMUTH ELEVATION", "sun_color": "R G B", "sky_color": "R G B", "hdri": "FILE"}
+    typed: dict[str, Any] = {}
+    for name, hint in get_type_hints(options).items():
+        if hint is bool:
+            typed[name] = bool
+            continue
+        choices = "{" + ",".join(map(str, get_args(hint))) + "}"
+        metavar = metavars.get(name) or {int: "N", float: "X"}.get(hint, choices)
+        told = "" if name == "hdri" else f"(default: {_listed(getattr(options, name))})"
+        typed[name] = Annotated[hint | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=told)]
+    about = (
+        "Light and surroundings of lit pictures. Lengths follow the subject's size. Defaults: --lights sun."
+    )
+    values = {name: False if kind is bool else None for name, kind in typed.items()}
+    made = type("LightOptions", (options,), {"__annotations__": typed, "__doc__": about, **values})
+    return dataclass(frozen=True)(made)
 
-    hdri: File = None
-    """Environment picture (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
+
+def _listed(value: Any) -> str:
+    return " ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
+
+
+if TYPE_CHECKING:
+    _Light = LightOptions
+else:
+    _Light = _described(LightOptions)
 
 
 @dataclass(frozen=True)
@@ -164,7 +186,7 @@ class Blender:
         elif suffix == ".blend" and not self.lit and samples > 1:
             raise UsageError("--samples: an unlit .blend takes one sample a pixel; render it larger instead")
         options = SceneOptions(
-            light=self._light() if self.lit else None,
+            light=self.named_light() if self.lit else None,
             engine=self.engine,
             samples=samples,
             background=None if self.transparent else parse_color(self.background),  # type: ignore[arg-type]
@@ -174,11 +196,12 @@ class Blender:
         options.check()
         return options
 
-    def _light(self) -> LightOptions:
+    def named_light(self) -> LightOptions:
         """The named light, with what was given instead."""
         given = {f.name: getattr(self.light, f.name) for f in fields(LightOptions)}
-        changed = {f.name: given[f.name] for f in fields(LightOptions) if given[f.name] != f.default}
-        return replace(LIGHTS[self.lights], **changed)
+        return replace(
+            LIGHTS[self.lights], **{k: v for k, v in given.items() if v is not None and v is not False}
+        )
 
     def _views(self) -> ViewOptions:
         """Mirror and ball need room beside the subject."""
