@@ -65,6 +65,8 @@ def test_meshes_of_linear_light_are_judged_as_they_are_drawn(cloud):
     found = find_background(photographs(mesh, COLORS["white"]), {"mesh": mesh})
     assert found.name == "white"
     assert found.psnr["mesh"]["white"] > 60
+    grey = (0.5, 0.5, 0.5)
+    assert find_background(photographs(mesh, grey), {"mesh": mesh}, given=grey).psnr["mesh"]["#808080"] > 60
 
 
 def test_what_is_named_and_given_goes_before_with_a_warning_where_it_matters(cloud):

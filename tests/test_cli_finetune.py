@@ -22,6 +22,7 @@ from meshsplats.cli.finetune import Finetune
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config, worthwhile_views
+from meshsplats.finetuning.checkpoint import load_checkpoint
 from meshsplats.formats.locks import locked
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.splats import load_gaussians, save_gaussians
@@ -226,11 +227,13 @@ def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
     assert run(*arguments, "--steps", "3") == 0
     first = json.loads(capsys.readouterr().out)
     assert first["seconds_since_resumed"] is None
+    begun = load_checkpoint(tmp_path / "t.run" / "checkpoint.safetensors", only_header=True).seconds
+    assert 0 < begun <= first["seconds"]
     monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: 5)
     assert run(*arguments, "--steps", "6", "--resume", "--force") == 0
     second = json.loads(capsys.readouterr().out)
     assert second["steps"] == 6
-    assert second["seconds"] == pytest.approx(first["seconds"] + second["seconds_since_resumed"], abs=2)
+    assert second["seconds"] == pytest.approx(begun + second["seconds_since_resumed"], abs=0.02)
 
 
 def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):
