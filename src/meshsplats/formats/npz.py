@@ -74,8 +74,11 @@ def write_npz(mesh: SplatMesh, path: Path) -> None:
     if mesh.binding is not None:
         for stored, name in zip(_BOUND, _BINDING, strict=True):
             arrays[stored] = np.asarray(getattr(mesh.binding, name))
-    with open(path, "wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+    # As np.savez does, which in older versions leaves the archive open where the disk is full.
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
 
 
 def read_npz(path: Path) -> SplatMesh:
