@@ -167,7 +167,6 @@ def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
 
 @needs_extra
 def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
-    pytest.importorskip("torch", reason="prior needs torch: pip install 'meshsplats[finetune]'")
     save_gaussians(discs(), tmp_path / "scene.ply")
     assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.npz")]) == 0
     options = ["--resolution", "16", "--views", "8"]

@@ -247,7 +247,7 @@ def test_equal_to_the_reference_in_other_ways():
 
 
 def gradient_of(mesh: SplatMesh, view, function, dtype, **options):
-    torch = pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[finetune]'")
+    torch = pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[torch]'")
     from test_rasterize import gradients
 
     return gradients(function, getattr(torch, dtype), mesh, [view], face_splat=mesh.face_splat, **options)
@@ -265,7 +265,7 @@ def gradient_of(mesh: SplatMesh, view, function, dtype, **options):
     ids=["flat", "samples", "crossed", "rings", "near plane"],
 )
 def test_gradients_equal_to_float64(mesh, options):
-    pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[finetune]'")
+    pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[torch]'")
     from test_rasterize import TOLERANCE, error
 
     from meshsplats.rendering import reference_autograd
@@ -281,7 +281,7 @@ def test_gradients_equal_to_float64(mesh, options):
 
 def test_gradients_by_finite_differences():
     """gradcheck moves every number of the float64 filter: A depends on positions, opacities and pose."""
-    torch = pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[finetune]'")
+    torch = pytest.importorskip("torch", reason="rasterize needs torch: pip install 'meshsplats[torch]'")
     from meshsplats.rendering import reference_autograd
 
     mesh, view = fans(6, 3, "crossed", sizes=(0.05, 0.5)), camera()

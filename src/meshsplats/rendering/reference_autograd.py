@@ -20,7 +20,7 @@ try:
     import torch
 except ImportError as error:
     raise MissingDependencyError(
-        "meshsplats.rendering.reference_autograd needs torch: pip install 'meshsplats[finetune]'"
+        "meshsplats.rendering.reference_autograd needs torch: pip install 'meshsplats[torch]'"
     ) from error
 
 from meshsplats.rendering.autograd import Raster
