@@ -3,10 +3,11 @@
     python benchmarks/finetuning.py --data ../shared/data --minutes 2
     python benchmarks/finetuning.py --data ../shared/data --scenes lego --presets default --minutes 5
 
-Splat files are judged at the cameras `DATA/cameras/*_mid.json` on white at degree 0, at one sample a pixel;
-drawing the targets counts towards the time, judging does not. Photographs are judged on their held-out views:
-mean (median), then the same after a gain and an offset a channel are fitted to each picture. `--exposure`
-fits such to the training pictures, too.
+Splat files are judged at the cameras `DATA/cameras/*_mid.json` on white at degree 0, in the look that is
+learned (`--look area`: means over pixels' areas, against the mesh at as many samples as it needs; `splats`:
+the image of a viewer, against one sample); drawing the targets counts towards the time, judging does not.
+Photographs are judged on their held-out views: mean (median), then the same after a gain and an offset a
+channel are fitted to each picture. `--exposure` fits such to the training pictures, too.
 `--clock processor` counts the processor time of all threads, divided by --processors, instead of the clock on
 the wall: for machines that do other work at the same time.
 """
@@ -65,6 +66,7 @@ def main() -> None:
     parser.add_argument("--processors", type=int, default=2, help="that processor time is divided by")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--sh-degree", type=int, default=0, help="of targets drawn from splats")
+    parser.add_argument("--look", choices=["area", "splats"], default="area")
     parser.add_argument("--exposure", action="store_true", help="fit gains and offsets of the photographs")
     parser.add_argument("--test-views", type=int, default=40, help="at most so many views to judge by")
     options = parser.parse_args()
@@ -94,12 +96,13 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
         judged = ms.Dataset((), data.test[:: -(-len(data.test) // options.test_views)])
     else:
         source = options.data / scene.splats
-        data = TargetOptions(sh_degree=options.sh_degree, held_out=1).make(
-            cloud, source, (1, 1, 1), options.threads, worthwhile_views(config)
-        )
+        target = TargetOptions(sh_degree=options.sh_degree, held_out=1, look=options.look)
+        data = target.make(cloud, source, (1, 1, 1), options.threads, worthwhile_views(config), preset)
         cameras = ms.load_cameras(options.data / scene.cameras)
-        judged = ms.Dataset((), ms.splat_views(cloud, cameras, sh_degree=options.sh_degree))
-    mesh = starting_mesh(cloud, [view.camera for view in data.train], preset=preset)
+        views = ms.splat_views(cloud, cameras, look=options.look, sh_degree=options.sh_degree)
+        judged = ms.Dataset((), views, look=options.look)
+    cameras = [view.camera for view in data.train]
+    mesh = starting_mesh(cloud, cameras, preset=preset, look=data.look)
     told = []
     run = RunOptions(threads=options.threads, report_every=0, spent=seconds())
     if options.clock == "wall" or options.steps:
