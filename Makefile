@@ -99,7 +99,7 @@ test-blender: $(BPY:%=$(BLENDER_VENV)/%/installed)
 	@for version in $(BPY); do \
 	  echo "Blender $$version"; \
 	  MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$$version/bin/python -m pytest \
-	    tests/blender tests/test_conversion.py tests/test_demo_mesh.py || exit 1; \
+	    tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py || exit 1; \
 	done
 
 lint: $(VENV)/installed-dev

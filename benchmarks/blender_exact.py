@@ -29,8 +29,8 @@ from meshsplats.blender import SceneOptions, draw
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.pictures import read_pixels
 from meshsplats.colors import linear_to_srgb
-from meshsplats.metrics import psnr
-from meshsplats.pictures import load_png
+from meshsplats.evaluation.metrics import psnr
+from meshsplats.images.writing import load_png
 
 SCENES = {
     "guitar": "guitar_sh0.ply",

@@ -24,9 +24,9 @@ from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import meshes, pictures, scene, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.colors import linear_to_srgb
+from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import SH_C0
-from meshsplats.metrics import psnr
-from meshsplats.pictures import save_png, strip
+from meshsplats.images.writing import save_png, strip
 
 UP = np.array([0.0, 1.0, 0.0], np.float32)
 SPLATS = 20_000

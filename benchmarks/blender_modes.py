@@ -19,7 +19,7 @@ from meshsplats import GaussianCloud, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.pictures import read_pixels
-from meshsplats.camera import look_at
+from meshsplats.cameras.trajectories import look_at
 
 COUNT = 3000
 NOISE = 0.3

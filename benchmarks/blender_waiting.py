@@ -20,7 +20,7 @@ from meshsplats import convert, orbit, psnr
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.cli.blender import estimated_seconds
 from meshsplats.demo_scene import make_scene
-from meshsplats.pictures import load_png
+from meshsplats.images.writing import load_png
 
 
 def main() -> None:

@@ -23,12 +23,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats.camera import Camera, load_cameras, orbit
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
-from meshsplats.formats.splats import load_gaussians
+from meshsplats.evaluation.metrics import psnr
+from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.metrics import psnr
 from meshsplats.rendering import render, render_splats
 
 STANDARD = {

@@ -17,7 +17,7 @@ import time
 
 import numpy as np
 
-from meshsplats.camera import orbit
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.gaussians import GaussianCloud
 

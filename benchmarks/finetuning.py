@@ -21,7 +21,7 @@ from pathlib import Path
 
 import meshsplats as ms
 from meshsplats.cli.targets import TargetOptions
-from meshsplats.evaluation import evaluate
+from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import (
     FinetuneConfig,
     RunOptions,
@@ -131,7 +131,7 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
 def by_processor_time(mesh, data, config: FinetuneConfig, options, seconds) -> tuple[ms.SplatMesh, int]:
     """The same loop with rates and end by processor time."""
     from meshsplats.finetuning.state import State
-    from meshsplats.finetuning.tuning import kept_faces, make_step
+    from meshsplats.finetuning.step import kept_faces, make_step
 
     state = State.begin(mesh, len(data.train), config, options.threads)
     step, interval = 0, config.prune_interval(len(data.train))

@@ -23,9 +23,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from meshsplats._core.library import load_core
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.losses import photometric_loss
-from meshsplats.rendering.core import load_core
 
 VERTICES = 9  # of a splat
 SHARES = (1, 0.3, 0.03)

@@ -24,7 +24,7 @@ import meshsplats as ms
 from meshsplats.finetuning import make_config, starting_mesh
 from meshsplats.finetuning.config import FinetuneConfig, rates
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.tuning import kept_faces, loss_of, make_step, target_of, view_of_step
+from meshsplats.finetuning.step import kept_faces, loss_of, make_step, target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
 from meshsplats.prior import bind, prior_config
 from meshsplats.rendering.autograd import rasterize

@@ -24,10 +24,10 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._core.library import available_variants
 from meshsplats.camera import Camera
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
-from meshsplats.rendering.core import available_variants
 from meshsplats.rendering.recorded import RecordedPicture
 
 SCENES = {

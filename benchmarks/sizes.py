@@ -128,7 +128,7 @@ def scores(cloud: ms.GaussianCloud, mesh: ms.SplatMesh, look: str, options: argp
 def picture(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
     from PIL import Image
 
-    from meshsplats.pictures import save_png, strip, to_bytes
+    from meshsplats.images.writing import save_png, strip, to_bytes
 
     viewers, _ = tune(cloud, options, look="splats", zooms=(1,), samples=1, footprint="cameras")
     areas, _ = tune(cloud, options, look="area")

@@ -22,12 +22,12 @@ from collections.abc import Callable
 import numpy as np
 from rendering import SCENES, clocked, random_fans
 
+from meshsplats._core.kernels import compare_pictures
+from meshsplats._core.library import available_variants
 from meshsplats.camera import Camera
 from meshsplats.finetuning.adam import RowAdam
-from meshsplats.finetuning.kernels import compare_pictures
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
-from meshsplats.rendering.core import available_variants
 from meshsplats.rendering.recorded import RecordedPicture
 
 

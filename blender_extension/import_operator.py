@@ -57,7 +57,7 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
         from pathlib import Path
 
         from meshsplats.blender.inside import objects
-        from meshsplats.formats.splats import subject_name
+        from meshsplats.formats.gaussians import subject_name
 
         things = []
         for path, prepared in work.results:

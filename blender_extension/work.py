@@ -70,7 +70,7 @@ class Work:
         from pathlib import Path
 
         from meshsplats.blender.inside import objects
-        from meshsplats.formats.recognition import identify
+        from meshsplats.formats.sniff import identify
 
         self._at(number, 0.0, "reading")
         if identify(Path(path)) == "mesh":
@@ -79,7 +79,7 @@ class Work:
             mesh = load_mesh(path)
         else:
             from meshsplats.conversion import convert
-            from meshsplats.formats.splats import load_gaussians
+            from meshsplats.formats.gaussians import load_gaussians
 
             cloud = load_gaussians(path, axes=self.choices["axes"])
             self._at(number, 0.3, "converting")

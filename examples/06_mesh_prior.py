@@ -11,7 +11,7 @@ import numpy as np
 
 import meshsplats as ms
 from meshsplats.demo_scene import make_scene
-from meshsplats.pictures import save_png, strip
+from meshsplats.images.writing import save_png, strip
 from meshsplats.prior import base_surface, bind, prior_config, train
 
 out = Path("example-output")

@@ -7,7 +7,7 @@ import pytest
 from numpy.polynomial.legendre import legval
 
 from meshsplats import demo_scene, load_gaussians
-from meshsplats._demo_light import KEY_LIGHT, Patch, spherical_harmonics
+from meshsplats.demo_scene._light import KEY_LIGHT, Patch, spherical_harmonics
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
 

@@ -19,8 +19,9 @@ def triangle(**changed) -> SplatMesh:
 
 def test_everything_is_named_in_a_line():
     from meshsplats.base_mesh import BaseMesh
-    from meshsplats.camera import orbit
-    from meshsplats.dataset import Dataset, Picture, splat_views
+    from meshsplats.cameras.trajectories import orbit
+    from meshsplats.datasets.splat_targets import splat_views
+    from meshsplats.datasets.views import Dataset, Picture
     from meshsplats.demo_scene import make_scene
 
     cloud = make_scene(1234)

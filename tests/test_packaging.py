@@ -17,8 +17,8 @@ import pytest
 
 import meshsplats
 from meshsplats import cli, demo_scene
+from meshsplats._core import library
 from meshsplats.errors import MissingDependencyError
-from meshsplats.rendering import core
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(
@@ -79,15 +79,15 @@ def test_public_names_are_there_and_others_are_not():
 def test_every_module_imports():
     for module in pkgutil.walk_packages(meshsplats.__path__, "meshsplats."):
         # The core's variants are libraries for ctypes, not modules, and __main__ runs a command.
-        if not re.search(r"\._core_\w+$|\.__main__$", module.name):
+        if not re.search(r"\._core\.meshsplats_\w+$|\.__main__$", module.name):
             with contextlib.suppress(MissingDependencyError):  # extras need not be installed
                 importlib.import_module(module.name)
 
 
 def test_package_holds_its_core_and_its_type_marker():
-    assert core.library_path("baseline") is not None
+    assert library.library_path("baseline") is not None
     assert (Path(meshsplats.__file__).parent / "py.typed").is_file()
-    assert "baseline" in core.available_variants()
+    assert "baseline" in library.available_variants()
 
 
 def test_metadata_asks_for_little_and_caps_nothing():

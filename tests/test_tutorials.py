@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from _photographs import write_photographs
 
-from meshsplats.camera import orbit
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main
 from meshsplats.demo_scene import make_scene
-from meshsplats.formats.splats import save_gaussians
+from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.rendering import render_splats
 
 TUTORIALS = Path(__file__).parents[1] / "docs" / "tutorials"

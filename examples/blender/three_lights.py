@@ -16,7 +16,7 @@ import numpy as np
 import meshsplats as ms
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.demo_scene import make_scene
-from meshsplats.pictures import load_png, save_png, strip
+from meshsplats.images.writing import load_png, save_png, strip
 
 parser = argparse.ArgumentParser()
 parser.add_argument("scene", nargs="?")

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.comparison import compare
 from meshsplats.conversion import convert
-from meshsplats.dataset import Dataset
-from meshsplats.datasets.around import splat_dataset
+from meshsplats.datasets.splat_targets import splat_dataset
+from meshsplats.datasets.views import Dataset
+from meshsplats.evaluation.comparison import compare
 from meshsplats.finetuning import (
     FinetuneConfig,
     Progress,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from meshsplats.camera import Camera, look_at
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import look_at
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 

@@ -17,11 +17,11 @@ from conftest import shared_data
 from meshsplats import convert, load_gaussians, orbit, render
 from meshsplats.blender import SceneOptions, draw
 from meshsplats.blender.inside.pictures import read_pixels
-from meshsplats.camera import look_at
+from meshsplats.cameras.trajectories import look_at
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.evaluation.metrics import psnr
+from meshsplats.images.writing import load_png, to_bytes
 from meshsplats.mesh import SplatMesh
-from meshsplats.metrics import psnr
-from meshsplats.pictures import load_png, to_bytes
 
 
 def pictures(mesh, views, folder: Path, options: SceneOptions | None = None, suffix=".exr"):

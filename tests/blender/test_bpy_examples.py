@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from meshsplats import demo_scene, save_gaussians
-from meshsplats.pictures import load_png
+from meshsplats.images.writing import load_png
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "blender"
 

@@ -15,7 +15,7 @@ from _blender_scenes import ball_splats, cameras, random_mesh
 from meshsplats import convert, render, save_mesh
 from meshsplats.blender.inside import foreign, frame, meshes, objects, pictures, stage, versions
 from meshsplats.colors import srgb_to_linear
-from meshsplats.metrics import psnr
+from meshsplats.evaluation.metrics import psnr
 
 UP = (0.0, -1.0, 0.0)
 

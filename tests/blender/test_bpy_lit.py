@@ -15,9 +15,9 @@ from _blender_scenes import ball_splats
 from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import materials, meshes, pictures, scene, stage, versions
-from meshsplats.camera import look_at
+from meshsplats.cameras.trajectories import look_at
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.metrics import psnr
+from meshsplats.evaluation.metrics import psnr
 
 
 def built(mesh, view, options):

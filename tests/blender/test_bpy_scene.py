@@ -18,7 +18,7 @@ from meshsplats import convert, save_cameras, save_gaussians, save_mesh
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import meshes, pictures
 from meshsplats.cli import main
-from meshsplats.pictures import load_png
+from meshsplats.images.writing import load_png
 
 
 def environment(path):

@@ -17,8 +17,8 @@ from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import objects, pictures, setting, versions
 from meshsplats.blender.options import LIGHTS
-from meshsplats.camera import look_at
-from meshsplats.pictures import load_png
+from meshsplats.cameras.trajectories import look_at
+from meshsplats.images.writing import load_png
 
 
 @pytest.fixture

@@ -22,9 +22,9 @@ import pytest
 from _blender_scenes import cameras, random_mesh
 
 from meshsplats import MissingDependencyError, save_mesh
+from meshsplats._files.locks import locked
 from meshsplats.blender import BlenderError, SceneOptions, draw, launch
 from meshsplats.cli import main
-from meshsplats.formats.locks import locked
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes and libraries of Linux")
 

@@ -7,7 +7,7 @@ import pytest
 from _blender_scenes import random_mesh, sheets
 
 from meshsplats.blender.layers import bounce_limit, count_layers, hidden_by_limit, most_layers
-from meshsplats.camera import look_at
+from meshsplats.cameras.trajectories import look_at
 
 
 @pytest.mark.parametrize("count", [1, 7, 300, 3000])

@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._files.atomic import is_promised, temporary_beside
+from meshsplats._files.locks import try_lock
 from meshsplats.blender import guard
 from meshsplats.blender.inside import MISSING, worker
 from meshsplats.blender.options import SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
-from meshsplats.formats.atomic import is_promised, temporary_beside
-from meshsplats.formats.locks import try_lock
 
 OLDEST = (4, 2)
 

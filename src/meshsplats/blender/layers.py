@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.camera import Camera, a_few, look_at
-from meshsplats.framing import front_axes, scene_bounds
+from meshsplats.camera import Camera, a_few
+from meshsplats.cameras.framing import front_axes, scene_bounds
+from meshsplats.cameras.trajectories import look_at
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 

@@ -13,9 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera, a_few, dome
+from meshsplats.camera import Camera, a_few
+from meshsplats.cameras.framing import guess_up
+from meshsplats.cameras.trajectories import dome
 from meshsplats.conversion.footprint import spacing
-from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.rendering import render
 

@@ -11,8 +11,8 @@ from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, mo
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
 from meshsplats.camera import Camera, a_few
+from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.colors import srgb_to_linear
-from meshsplats.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.mesh import SplatMesh
 
 _FLOOR = 0.002

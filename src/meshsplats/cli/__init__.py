@@ -43,7 +43,7 @@ _standard_input: str | None = None
 
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a full disk, as in ``formats.atomic``."""
+"""Error numbers of a full disk, as in ``_files.atomic``."""
 OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
 """Exit codes. FAILED: the input, or a place that was named, is wrong. LACKING: a library, a program or memory
 is not there. Ended by signal n: 128 + n."""
@@ -178,7 +178,7 @@ def _run(name: str, arguments: list[str]) -> int:
 def _command(name: str, arguments: list[str]) -> int:
     import tyro
 
-    from meshsplats.formats.atomic import promises_kept
+    from meshsplats._files.atomic import promises_kept
 
     module, _, attribute = COMMANDS[name][0].partition(":")
     command = getattr(importlib.import_module(module), attribute)

@@ -52,7 +52,7 @@ class Base:
     """Overwrite existing outputs."""
 
     def run(self) -> None:
-        from meshsplats.camera import load_cameras
+        from meshsplats.cameras.files import load_cameras
         from meshsplats.formats.meshes import save_mesh
         from meshsplats.prior.surface import base_surface
 

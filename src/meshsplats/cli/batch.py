@@ -9,8 +9,8 @@ from pathlib import Path
 from meshsplats.cli import UsageError, shown_path
 from meshsplats.cli.common import check_mesh_suffix, check_outputs, recorded_options
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.gaussians import splat_file, subject_name
 from meshsplats.formats.meshes import MESH_SUFFIXES
-from meshsplats.formats.splats import splat_file, subject_name
 
 INPUT_SUFFIXES = (*MESH_SUFFIXES, ".splat", ".spz", ".sog", ".gltf")
 """Names that are looked at in a folder of inputs."""

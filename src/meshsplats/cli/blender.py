@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 import tyro
 
 from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions
-from meshsplats.camera import Camera, save_cameras
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import save_cameras
 from meshsplats.cli import UsageError, say
 from meshsplats.cli.common import (
     Count,
@@ -270,7 +271,7 @@ def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | N
     microseconds lit, as each layer sends rays to the light that meet others, and 1.1 m unlit."""
     if options.engine != "cycles":
         return None
-    from meshsplats.rendering.api import processors
+    from meshsplats._core.library import processors
 
     layers = ahead["mean_layers"]
     ray = 2e-6 * layers + 0.17e-6 * layers**2 if options.light is not None else 1.1e-6 * layers
@@ -280,7 +281,7 @@ def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | N
 
 
 def _processors(options: SceneOptions) -> str:
-    from meshsplats.rendering.api import processors
+    from meshsplats._core.library import processors
 
     return plural(options.threads or processors(), "thread")
 

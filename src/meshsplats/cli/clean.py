@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, orbit
-from meshsplats.cleaning import FLOATERS, CleaningRules, Findings, find, take_away
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import UsageError, shown_path
 from meshsplats.cli.common import (
     Output,
@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     load_scene,
     size_of,
 )
+from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, take_away
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -78,8 +79,8 @@ class Clean:
     """Overwrite existing outputs."""
 
     def run(self) -> None:
+        from meshsplats.formats.gaussians import save_gaussians
         from meshsplats.formats.meshes import save_mesh
-        from meshsplats.formats.splats import save_gaussians
 
         start = time.perf_counter()
         preview = self.output.with_suffix(".preview.png")
@@ -146,7 +147,7 @@ def _draw(
     scene: GaussianCloud | SplatMesh, left: GaussianCloud | SplatMesh, found: Findings, path: Path
 ) -> None:
     """The strip of three pictures; the first two from where all is seen, the third from where the rest is."""
-    from meshsplats.pictures import save_png, strip
+    from meshsplats.images.writing import save_png, strip
 
     lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
     whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
@@ -155,12 +156,12 @@ def _draw(
 
 
 def _picture(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
-    from meshsplats.evaluation import mesh_picture
+    from meshsplats.evaluation.report import image_of
     from meshsplats.rendering import render_splats
 
     white: Sequence[float] = (1.0, 1.0, 1.0)
     if isinstance(scene, SplatMesh):
-        return np.clip(mesh_picture(scene, camera, white, samples=2)[0], 0, 1)
+        return np.clip(image_of(scene, camera, white, samples=2)[0], 0, 1)
     return np.clip(render_splats(scene, camera, background=white).color, 0, 1)
 
 

@@ -16,13 +16,15 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
-from meshsplats.backgrounds import Background
-from meshsplats.camera import MAX_SIDE, Camera, dome, load_cameras, look_around, orbit
+from meshsplats.camera import MAX_SIDE, Camera
+from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.framing import guess_up
+from meshsplats.cameras.trajectories import dome, look_around, orbit
 from meshsplats.cli import UsageError, one_line, shown_path
-from meshsplats.dataset import WHITE, Dataset
+from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats.recognition import identify
-from meshsplats.framing import guess_up
+from meshsplats.evaluation.backgrounds import Background
+from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -60,7 +62,7 @@ class SplatOptions:
     """Splats with values that are not finite are an error, not left out with a warning."""
 
     def load(self, path: Path) -> GaussianCloud:
-        from meshsplats.formats.splats import load_gaussians
+        from meshsplats.formats.gaussians import load_gaussians
 
         try:
             return load_gaussians(path, strict=self.strict, axes=self.axes)
@@ -122,7 +124,7 @@ class ViewOptions:
         """The data set, where one was named."""
         if self.data is None:
             return None
-        from meshsplats.dataset import load_dataset
+        from meshsplats.datasets.folder import load_dataset
 
         return load_dataset(self.data, downscale=self.downscale)
 
@@ -229,7 +231,7 @@ class PartOptions:
 
     def of(self, scene: Scene) -> Scene:
         """That part of ``scene``."""
-        from meshsplats.cleaning import cropped
+        from meshsplats.conversion.cleaning import cropped
 
         return cropped(scene, self.crop)
 
@@ -271,7 +273,7 @@ def chosen_background(
     """What pictures of ``scenes`` are drawn over: what was ``given``; else white, or beside ``photographs``
     what the model folder ``source`` names or fits the scenes best. Warns where scenes and photographs do not
     agree; unless they cannot, as scenes that are not ``whole``."""
-    from meshsplats.backgrounds import find_background, model_background, warn_of_other_worlds
+    from meshsplats.evaluation.backgrounds import find_background, model_background, warn_of_other_worlds
 
     color = None if given is None else parse_color(given)
     if photographs is None:
@@ -336,7 +338,7 @@ def check_outputs(
     ``folder`` holds all of them and is made later, but not the one above it: a misspelt path must not make a
     tree of folders.
     """
-    from meshsplats.formats.atomic import refuse_existing
+    from meshsplats._files.atomic import refuse_existing
 
     read = [_file_of(source) for source in inputs if source.exists()]
     for path in paths:
@@ -356,7 +358,7 @@ def check_outputs(
 
 def _file_of(source: Path) -> Path:
     """The file that is read where ``source`` is a folder."""
-    from meshsplats.formats.splats import splat_file
+    from meshsplats.formats.gaussians import splat_file
 
     try:
         return splat_file(source) if source.is_dir() else source
@@ -372,7 +374,7 @@ def record_beside(output: Path, kind: str) -> Path:
 
 def write_json(path: Path, content: Any) -> None:
     """Writes ``content`` whole or not at all; infinities and NaN, which JSON lacks, are a ValueError."""
-    from meshsplats.formats.atomic import write_text
+    from meshsplats._files.atomic import write_text
 
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
@@ -444,7 +446,7 @@ def plural(count: int, thing: str) -> str:
 
 def size_of(path: Path) -> str:
     """Size of a file for people: 3.2 MB."""
-    from meshsplats.formats.atomic import in_words
+    from meshsplats._files.atomic import in_words
 
     return in_words(path.stat().st_size)
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import tyro
 
-from meshsplats.camera import save_cameras
+from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.common import (
     DrawOptions,
     File,
@@ -27,8 +27,8 @@ from meshsplats.cli.common import (
     view_names,
     write_json,
 )
-from meshsplats.comparison import Comparison, compare_views
 from meshsplats.errors import FileFormatError
+from meshsplats.evaluation.comparison import Comparison, compare_views
 from meshsplats.rendering.looks import mesh_samples
 
 LOOKS = {
@@ -68,7 +68,7 @@ class Compare:
     """Overwrite existing outputs."""
 
     def run(self) -> None:
-        from meshsplats.pictures import amplified_error, save_png, strip
+        from meshsplats.images.writing import amplified_error, save_png, strip
 
         if not self.amplify > 0:
             raise ValueError(f"--amplify must be positive, got {self.amplify}")

@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, a_few, load_cameras, orbit
+from meshsplats.camera import Camera, a_few
+from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.framing import unit_up
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import (
     FAILED,
     NO_SPACE,
@@ -46,9 +49,8 @@ from meshsplats.cli.common import (
 )
 from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.selection import choose_splats
-from meshsplats.dataset import load_dataset
+from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
-from meshsplats.framing import unit_up
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -320,7 +322,7 @@ class Convert:
         """How close the mesh comes to the splats that it was to show."""
         if self.fidelity is None:
             return None
-        from meshsplats.comparison import compare
+        from meshsplats.evaluation.comparison import compare
 
         if self.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.conversion.crop)
@@ -359,7 +361,7 @@ class Convert:
 
     def _save_splats(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """The splats themselves, in the format that everything reads."""
-        from meshsplats.formats.splats import save_gaussians
+        from meshsplats.formats.gaussians import save_gaussians
 
         start = time.perf_counter()
         cloud = self.reading.load(job.source)
@@ -441,13 +443,13 @@ def _counts(result: dict[str, Any]) -> str:
 
 
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
-    from meshsplats.evaluation import mesh_picture
-    from meshsplats.pictures import save_png
+    from meshsplats.evaluation.report import image_of
+    from meshsplats.images.writing import save_png
     from meshsplats.rendering import render_splats
     from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
     if isinstance(scene, SplatMesh):
-        save_png(path, mesh_picture(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
+        save_png(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
     else:
         save_png(path, render_splats(scene, camera).color)

@@ -32,7 +32,7 @@ class Doctor:
 def examine() -> dict:
     """The findings, ready for JSON."""
     import meshsplats
-    from meshsplats.rendering.api import processors
+    from meshsplats._core.library import processors
 
     needed = _requirements()
     libraries = {e: {name: _version(name) for name in names} for e, names in needed.items()}
@@ -56,12 +56,12 @@ def examine() -> dict:
 
 def _core() -> dict:
     """Variants of the compiled core, and whether the one in use draws a triangle."""
-    from meshsplats.rendering import core
+    from meshsplats._core import library
 
     result: dict = {"works": False, "in_use": None, "available": [], "problem": None}
     try:
-        result["available"] = core.available_variants()
-        result["in_use"] = core.load_core().ms_variant().decode()
+        result["available"] = library.available_variants()
+        result["in_use"] = library.load_core().ms_variant().decode()
         result["works"] = _draws()
         if not result["works"]:
             result["problem"] = "the picture of one triangle is wrong"
@@ -71,7 +71,7 @@ def _core() -> dict:
 
 
 def _draws() -> bool:
-    from meshsplats.camera import look_at
+    from meshsplats.cameras.trajectories import look_at
     from meshsplats.mesh import SplatMesh
     from meshsplats.rendering import render
 

@@ -14,8 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from meshsplats.backgrounds import Background
-from meshsplats.camera import load_cameras
+from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     Count,
@@ -35,10 +34,14 @@ from meshsplats.cli.common import (
     write_json,
 )
 from meshsplats.cli.targets import TargetOptions
-from meshsplats.dataset import WHITE, Dataset, load_dataset, splat_views
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.splat_targets import splat_views
+from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.evaluation import SSIM_CONVENTION, Report, ScoredView, evaluate
-from meshsplats.evaluation_pictures import (
+from meshsplats.evaluation.backgrounds import Background
+from meshsplats.evaluation.benchmarks import PROTOCOLS, Protocol, find_input
+from meshsplats.evaluation.report import SSIM_CONVENTION, Report, ScoredView, evaluate
+from meshsplats.evaluation.strips import (
     markdown_table,
     picture_folder,
     score_table,
@@ -47,7 +50,6 @@ from meshsplats.evaluation_pictures import (
 )
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.protocols import PROTOCOLS, Protocol, find_input
 
 RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION = (
     "results.json",
@@ -231,7 +233,7 @@ class Evaluate:
         before: SplatMesh | None,
     ) -> Report:
         """Evaluates one scene over ``background`` and writes its files into ``folder``."""
-        from meshsplats.lpips import load_lpips
+        from meshsplats.evaluation.lpips import load_lpips
 
         dataset = dataset.over(background.color)
         views = dataset.test or dataset.views
@@ -377,7 +379,7 @@ def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) 
 
 
 def _save_strips(folder: Path, name: str, scored: ScoredView, amplify: float) -> None:
-    from meshsplats.pictures import save_png
+    from meshsplats.images.writing import save_png
 
     makers: dict[str, Callable[[ScoredView, float], np.ndarray]] = {"strips": view_strip, "crops": view_crop}
     for part, make in makers.items():
@@ -391,7 +393,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _write_text(path: Path, text: str) -> None:
-    from meshsplats.formats.atomic import write_text
+    from meshsplats._files.atomic import write_text
 
     write_text(path, text)
 

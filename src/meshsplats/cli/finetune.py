@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from meshsplats.backgrounds import Background
-from meshsplats.camera import save_cameras
+from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.common import (
     Count,
     Number,
@@ -43,8 +42,9 @@ from meshsplats.cli.training import (
     tell,
 )
 from meshsplats.conversion.selection import choose_splats
-from meshsplats.dataset import Dataset, Picture
+from meshsplats.datasets.views import Dataset, Picture
 from meshsplats.errors import DataWarning
+from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import (
     FinetuneConfig,
     Interrupted,
@@ -54,7 +54,7 @@ from meshsplats.finetuning import (
     worthwhile_views,
 )
 from meshsplats.finetuning.checkpoint import OtherRunError
-from meshsplats.finetuning.tuning import samples_of
+from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 

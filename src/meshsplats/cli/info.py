@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, load_cameras, read_json
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import load_cameras, read_json
+from meshsplats.cameras.framing import guess_up, scene_bounds
 from meshsplats.cli import shown_path
 from meshsplats.cli.common import SplatOptions, cameras_beside, identify
-from meshsplats.dataset import load_dataset
 from meshsplats.datasets.colmap import count_points
-from meshsplats.datasets.folder import Layout, find_layout
-from meshsplats.datasets.photographs import PhotoFile
+from meshsplats.datasets.folder import Layout, find_layout, load_dataset
+from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.splats import splat_file, splat_format
-from meshsplats.framing import guess_up, scene_bounds
+from meshsplats.formats.gaussians import splat_file, splat_format
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 

@@ -13,6 +13,7 @@ import tyro
 
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import Count, File, Number, Output, SplatOptions, configuration, write_json
 from meshsplats.cli.targets import TargetOptions
@@ -33,10 +34,9 @@ from meshsplats.cli.training import (
     stopped,
     tell,
 )
-from meshsplats.dataset import Dataset
+from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning import FinetuneConfig, Interrupted, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
-from meshsplats.framing import guess_up
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train
 from meshsplats.prior.bind import LAYERS

@@ -12,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, load_cameras, save_cameras
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     DrawOptions,
@@ -117,7 +118,7 @@ class Render:
             _remove_older(self.output, files.every)
         self._draw(scene, cameras, files, unit, behind)
         if files.turntable:
-            from meshsplats.pictures import load_png, save_animation
+            from meshsplats.images.writing import load_png, save_animation
 
             save_animation(files.turntable, map(load_png, files.pictures), fps=self.fps)
         save_cameras(cameras, files.cameras)
@@ -186,7 +187,7 @@ class Render:
         background: tuple[float, ...],
     ) -> None:
         from meshsplats.colors import linear_to_srgb, srgb_to_linear
-        from meshsplats.pictures import save_array, save_depth_png, save_png, straight_rgba
+        from meshsplats.images.writing import save_array, save_depth_png, save_png, straight_rgba
         from meshsplats.rendering import render, render_splats
         from meshsplats.rendering.samples import needed_samples
 

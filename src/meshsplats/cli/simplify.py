@@ -9,7 +9,8 @@ from pathlib import Path
 
 import tyro
 
-from meshsplats.camera import Camera, load_cameras
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.batch import record_names
 from meshsplats.cli.common import (
@@ -27,7 +28,7 @@ from meshsplats.cli.common import (
     write_json,
 )
 from meshsplats.cli.convert import draw_preview
-from meshsplats.dataset import load_dataset
+from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
 
 
@@ -64,7 +65,7 @@ class Simplify:
 
     def run(self) -> None:
         from meshsplats.conversion.merging import simplify
-        from meshsplats.formats.splats import save_gaussians
+        from meshsplats.formats.gaussians import save_gaussians
 
         self._check()
         preview, config = record_names(self.output.with_suffix(""))

@@ -7,10 +7,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from meshsplats.camera import Camera, load_cameras
+from meshsplats.camera import Camera
+from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import Count, File, Folder, Text, cameras_beside, parse_up
-from meshsplats.dataset import Dataset, load_dataset
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning import FEWEST_VIEWS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -108,7 +110,7 @@ class TargetOptions:
             return dataset
         if not isinstance(scene, GaussianCloud):
             raise UsageError(f"{source} is a mesh: give its photographs with --data, or splats in its place")
-        from meshsplats.datasets.around import splat_dataset
+        from meshsplats.datasets.splat_targets import splat_dataset
 
         if self.cameras is not None:
             cameras: list[Camera] | None = load_cameras(self.cameras)

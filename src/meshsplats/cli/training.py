@@ -11,12 +11,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, get_args, get_type_hints
 
 import tyro
 
-from meshsplats.backgrounds import Background
-from meshsplats.camera import orbit
+from meshsplats._files.locks import locked
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
     check_outputs,
@@ -27,22 +27,39 @@ from meshsplats.cli.common import (
     size_of,
     write_json,
 )
-from meshsplats.dataset import Dataset
+from meshsplats.cli.targets import TargetOptions
+from meshsplats.datasets.views import Dataset
+from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
 from meshsplats.finetuning.config import LENGTHS
-from meshsplats.formats.locks import locked
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
-    from meshsplats.cli.finetune import Finetune
-    from meshsplats.cli.prior import Prior
-
 STARTING_UP = 1.0
 """Seconds that Python and the libraries take before the command's own clock begins."""
+
+
+class TrainingCommand(Protocol):
+    """The options that ``finetune`` and ``prior`` share."""
+
+    @property
+    def target(self) -> TargetOptions: ...
+    @property
+    def tuning(self) -> FinetuneConfig: ...
+    @property
+    def resume(self) -> bool: ...
+    @property
+    def report_every(self) -> int: ...
+    @property
+    def preview_every(self) -> int: ...
+    @property
+    def threads(self) -> int | None: ...
+    @property
+    def json(self) -> bool: ...
 
 
 def described(config: type[FinetuneConfig], standard: FinetuneConfig | None = None) -> type[FinetuneConfig]:
@@ -134,7 +151,7 @@ class RunFiles:
                 self.run.rmdir()  # where nothing was written
 
 
-def given(command: Finetune | Prior) -> dict[str, Any]:
+def given(command: TrainingCommand) -> dict[str, Any]:
     """What of the configuration was given, its length with it."""
     tuning = {k: v for k, v in asdict(command.tuning).items() if v is not None}
     if tuning.get("exposure") and command.target.data is None:
@@ -180,7 +197,7 @@ def announce(what: str, mesh: SplatMesh, dataset: Dataset, cache_bytes: int) -> 
     say(f"{what}; {views}; memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else ""))
 
 
-def run_options(command: Finetune | Prior, files: RunFiles, began: float) -> RunOptions:
+def run_options(command: TrainingCommand, files: RunFiles, began: float) -> RunOptions:
     """Those of a command that began at ``began`` by the performance counter."""
     return RunOptions(
         folder=files.run,
@@ -193,7 +210,7 @@ def run_options(command: Finetune | Prior, files: RunFiles, began: float) -> Run
     )
 
 
-def earlier_part(command: Finetune | Prior, files: RunFiles) -> Checkpoint | None:
+def earlier_part(command: TrainingCommand, files: RunFiles) -> Checkpoint | None:
     """Of a run that is to go on, what was done, without the arrays; None for one that begins."""
     from meshsplats.finetuning.checkpoint import load_checkpoint
     from meshsplats.finetuning.journal import CHECKPOINT
@@ -201,14 +218,14 @@ def earlier_part(command: Finetune | Prior, files: RunFiles) -> Checkpoint | Non
     return load_checkpoint(files.run / CHECKPOINT, only_header=True) if command.resume else None
 
 
-def note_command(name: str, command: Finetune | Prior, files: RunFiles) -> None:
+def note_command(name: str, command: TrainingCommand, files: RunFiles) -> None:
     """Keeps what a run was asked for, to tell later what differs."""
     if not command.resume:
         files.run.mkdir(exist_ok=True)
         write_json(files.command, configuration(name, command))
 
 
-def naming_options(error: OtherRunError, name: str, command: Finetune | Prior, files: RunFiles) -> Exception:
+def naming_options(error: OtherRunError, name: str, command: TrainingCommand, files: RunFiles) -> Exception:
     """``error`` with the options that differ from those of the run that was to go on."""
     before = recorded_options(files.command, name)
     if before is None:
@@ -244,7 +261,7 @@ def stopped(stop: Interrupted, files: RunFiles) -> int:
 
 
 def tell(
-    command: Finetune | Prior,
+    command: TrainingCommand,
     files: RunFiles,
     seconds: float,
     earlier: Checkpoint | None,
@@ -328,12 +345,12 @@ def _text(progress: Progress, loss: float | None) -> str:
 
 
 def draw_preview(mesh: SplatMesh, path: Path) -> None:
-    from meshsplats.evaluation import mesh_picture
-    from meshsplats.pictures import save_png
+    from meshsplats.evaluation.report import image_of
+    from meshsplats.images.writing import save_png
     from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
-    save_png(path, mesh_picture(mesh, camera, (1, 1, 1), samples=needed_samples(mesh, [camera]))[0])
+    save_png(path, image_of(mesh, camera, (1, 1, 1), samples=needed_samples(mesh, [camera]))[0])
 
 
 def say(text: str) -> None:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.conversion.baking import bake_filter
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
@@ -18,7 +19,6 @@ from meshsplats.conversion.merging import simplify
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
 from meshsplats.conversion.selection import disc_areas, inside_box, mean_shadow, most_important
-from meshsplats.framing import guess_up, unit_up
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import Look

@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.camera import Camera, orbit
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, Views
 from meshsplats.mesh import SplatMesh, checked_filter, splat_starts

@@ -11,10 +11,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera, orbit
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import SAMPLE
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.options import ConversionOptions
-from meshsplats.framing import SAMPLE
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
 

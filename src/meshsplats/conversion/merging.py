@@ -18,15 +18,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._core.library import pointer, processors, run
 from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import Views, pixel_sizes, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.formats._orientation import quaternions_of
-from meshsplats.framing import guess_up
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.rendering.api import processors
-from meshsplats.rendering.core import pointer, run
 
 NEIGHBOURS = 8
 """Nearest splats that each may be merged with at first; a merged one has those of both. Of 16, in twice the

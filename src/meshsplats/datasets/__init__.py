@@ -1,1 +1,1 @@
-"""Readers of data sets, one module a folder layout. See :mod:`meshsplats.dataset`."""
+"""Views to train and test with: photographs in folders, one module per layout, or images of splats."""

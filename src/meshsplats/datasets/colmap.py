@@ -17,8 +17,8 @@ from typing import IO
 import numpy as np
 
 from meshsplats.camera import MAX_SIDE
+from meshsplats.datasets.image_files import MAX_NAME, Frame
 from meshsplats.datasets.lens import MODELS, Lens
-from meshsplats.datasets.photographs import MAX_NAME, Frame
 from meshsplats.errors import FileFormatError
 
 MAX_FRAMES = 200_000

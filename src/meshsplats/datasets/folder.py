@@ -1,17 +1,20 @@
-"""What kind of data set a folder holds, and which of its views are for testing."""
+"""``load_dataset``: which layout a folder has, and which of its views are for testing."""
 
 from __future__ import annotations
 
 import errno
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from meshsplats.dataset import PictureStore, View
+import numpy as np
+
 from meshsplats.datasets.colmap import find_model, read_model
-from meshsplats.datasets.photographs import Album, Frame, Taken, split
+from meshsplats.datasets.image_files import Album, Frame, Taken, split
 from meshsplats.datasets.transforms import read_transforms
+from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, PictureStore, View
 from meshsplats.errors import DataWarning, FileFormatError
 
 Views = tuple[list[View], list[View]]
@@ -19,7 +22,7 @@ MAX_LIST_BYTES = 16 << 20
 
 
 def read_folder(path: Path, downscale: int, test_every: int, store: PictureStore) -> Views:
-    """Training and test views of the data set at ``path``; see ``dataset.load_dataset``."""
+    """Training and test views of the data set at ``path``; see ``load_dataset``."""
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such data set", str(path))
     layout = find_layout(path)
@@ -205,3 +208,58 @@ def _looks_like_one(path: Path) -> bool:
     return (
         any((path / name).is_file() for name in named) or find_model(path, ("sparse/0", "sparse")) is not None
     )
+
+
+def load_dataset(
+    path: str | os.PathLike[str],
+    *,
+    downscale: int = 1,
+    test_every: int = 8,
+    background: Sequence[float] = WHITE,
+    cache_bytes: int = CACHE_BYTES,
+) -> Dataset:
+    """The photographs and cameras in a folder.
+
+    Layouts, tried in this order (``docs/datasets.md`` shows them):
+
+    - NeRF-synthetic: ``transforms_train.json``, with ``transforms_test.json`` (else ``transforms_val.json``)
+      as the test views;
+    - COLMAP, as INRIA's 3DGS and Mip-NeRF 360 use it: ``images/`` and ``sparse/0/`` or ``sparse/``, binary or
+      text, any camera model;
+    - nerfstudio: ``transforms.json``, also named itself as ``path``;
+    - COLMAP with ``colmap/sparse/0/`` or ``colmap/sparse/``, with the only model in ``sparse/``, or with the
+      model beside ``images/``.
+
+    ``masks/``, or the masks a file names, say which pixels count. Photographs of lenses that are no pinhole
+    are undistorted when they are read; what the lens did not see is black and masked. Only the headers of
+    pictures are read here: cameras are scaled to the size the pictures really have.
+
+    Parameters
+    ----------
+    downscale: whole factor of the pictures' sides, 1 to 64. ``images_2/``, ``images_4/`` and so on are used
+        where they exist; else each pixel becomes the mean of those it covers.
+    test_every: views 0, n, 2n ... by name are held out, unless the data set has a split of its own; 0: none.
+    background: RGB in [0, 1] of ``View.image`` where pictures have alpha. ``Picture.over`` takes another.
+    cache_bytes: pictures are kept up to this many bytes after their first use; the others are read anew each
+        time.
+
+    Raises
+    ------
+    FileFormatError: a folder of no known layout, a broken file in it, a picture whose shape does not fit its
+        camera, a path that leaves the folder; no picture is there at all.
+    FileNotFoundError: nothing at ``path``.
+    ValueError: an option out of its range.
+
+    Warns with a DataWarning if some pictures or masks are missing: their views are left out, or count wholly.
+    """
+    for option, value, least, most in (("downscale", downscale, 1, 64), ("test_every", test_every, 0, 10**9)):
+        if int(value) != value or not least <= value <= most:
+            raise ValueError(f"{option} must be a whole number from {least} to {most}, got {value}")
+    color = np.asarray(background, np.float64)
+    if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+        raise ValueError(f"background must be three numbers in [0, 1], got {background!r}")
+    if test_every == 1:
+        raise ValueError("test_every must be 0 (no test views) or at least 2: 1 leaves nothing to train with")
+    store = PictureStore(cache_bytes)
+    train, test = read_folder(Path(path), int(downscale), int(test_every), store)
+    return Dataset(tuple(train), tuple(test), Path(os.path.abspath(path)).name).over(color.tolist())

@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.camera import MAX_SIDE, read_json
+from meshsplats.camera import MAX_SIDE
+from meshsplats.cameras.files import read_json
+from meshsplats.datasets.image_files import Frame, find
 from meshsplats.datasets.lens import Lens
-from meshsplats.datasets.photographs import Frame, find, read_header
 from meshsplats.errors import FileFormatError
+from meshsplats.images.reading import read_header
 
 MAX_FRAMES = 200_000
 MAX_SKEW = 1e-2

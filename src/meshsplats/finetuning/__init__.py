@@ -10,9 +10,9 @@ from meshsplats.finetuning.config import (
     make_config,
     worthwhile_views,
 )
+from meshsplats.finetuning.initial import starting_mesh
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.run import Progress, RunOptions, finetune
-from meshsplats.finetuning.start import starting_mesh
 
 __all__ = [
     "FEWEST_VIEWS",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.finetuning.kernels import adam_rows
+from meshsplats._core.kernels import adam_rows
 
 
 class RowAdam:

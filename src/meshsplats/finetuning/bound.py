@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from meshsplats.binding import Binding
-from meshsplats.finetuning.sizes import means_at_vertices
+from meshsplats.finetuning.initial import means_at_vertices
 from meshsplats.mesh import SplatMesh
 
 _ROWS = 1 << 15

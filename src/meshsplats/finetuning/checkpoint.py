@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats.binding import Binding
-from meshsplats.dataset import Dataset, DrawnSplats
+from meshsplats.datasets.splat_targets import DrawnSplats
+from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
 from meshsplats.formats.safetensors import load_safetensors, save_safetensors

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._files.atomic import write_text
 from meshsplats.finetuning.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from meshsplats.formats.atomic import write_text
-from meshsplats.pictures import amplified_error, save_png, strip
+from meshsplats.images.writing import amplified_error, save_png, strip
 
 CHECKPOINT, METRICS, CONFIGURATION, PREVIEWS = (
     "checkpoint.safetensors",

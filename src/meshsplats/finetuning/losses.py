@@ -6,8 +6,8 @@ number of threads.
 
 from __future__ import annotations
 
+from meshsplats._core.kernels import compare_pictures
 from meshsplats.errors import GET_TORCH, MissingDependencyError
-from meshsplats.finetuning.kernels import compare_pictures
 
 try:
     import torch

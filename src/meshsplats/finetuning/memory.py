@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from meshsplats.dataset import CACHE_BYTES, Dataset, DrawnSplats
+from meshsplats.datasets.splat_targets import DrawnSplats
+from meshsplats.datasets.views import CACHE_BYTES, Dataset
 from meshsplats.mesh import SplatMesh
 
 VERTEX_BYTES = 7 * 4 * 6 + 4

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats._arrays import evenly
-from meshsplats.dataset import CACHE_BYTES, Dataset, View
-from meshsplats.evaluation import masked_ssim, mesh_picture
+from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
+from meshsplats.evaluation.metrics import psnr
+from meshsplats.evaluation.report import image_of, masked_ssim
 from meshsplats.finetuning.checkpoint import (
     Checkpoint,
     OtherRunError,
@@ -24,9 +25,8 @@ from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.tuning import kept_faces, make_step, relocate, samples_of
+from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
 from meshsplats.mesh import SplatMesh
-from meshsplats.metrics import psnr
 
 RELOCATED = 0.5
 """Splats are moved in this share of the run: those moved later would not settle any more."""
@@ -281,7 +281,7 @@ class _Run:
 
     def _picture(self, mesh: SplatMesh, view: View) -> np.ndarray:
         samples, threads = samples_of(view, self.config), self.run.threads
-        return mesh_picture(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
+        return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
 
     def _save(self) -> None:
         self.saved_at = time.perf_counter()

@@ -14,9 +14,8 @@ from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
-from meshsplats.finetuning.edges import on_open_edges
+from meshsplats.finetuning.initial import on_open_edges, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, Usage, find_moves, halves
-from meshsplats.finetuning.sizes import vertex_sizes
 from meshsplats.mesh import SplatMesh
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)

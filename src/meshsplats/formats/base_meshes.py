@@ -10,9 +10,9 @@ import numpy as np
 
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
-from meshsplats.formats.gltf_textures import gltf_textures
+from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
-from meshsplats.formats.obj_textures import obj_coordinates, obj_textures
+from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
 
 
 def load_base(
@@ -68,7 +68,7 @@ def load_base(
 
 def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:
     """(h, w, 4) uint8 RGBA of a picture file, or of ``data`` inside the file ``path``."""
-    from meshsplats.datasets.photographs import load_picture
+    from meshsplats.images.reading import load_picture
 
     rgb, alpha = load_picture(path, data)
     return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8) if alpha is None else alpha])

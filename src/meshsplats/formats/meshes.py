@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats.atomic import atomic_path
-from meshsplats.formats.glb import Alpha, ColorType, write_glb
-from meshsplats.formats.glb_compressed import Compression, write_compressed_glb
-from meshsplats.formats.gltf_reader import read_gltf
-from meshsplats.formats.mesh_ply import read_mesh_ply, write_mesh_ply
+from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
+from meshsplats.formats.gltf.reader import read_gltf
+from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
 from meshsplats.formats.npz import read_npz, write_npz
-from meshsplats.formats.obj import read_obj, write_obj
-from meshsplats.formats.usd import write_usd
-from meshsplats.formats.usd_reader import is_usd, read_usd
+from meshsplats.formats.obj.mesh import read_obj, write_obj
+from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_ply
+from meshsplats.formats.usd.reader import is_usd, read_usd
+from meshsplats.formats.usd.writer import write_usd
 from meshsplats.mesh import SplatMesh
 
 _USD = (".usdc", ".usda", ".usd")

@@ -24,7 +24,7 @@ import numpy as np
 
 from meshsplats.binding import Binding
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.mesh_checks import (
+from meshsplats.formats._validation import (
     Budget,
     check_attribute_names,
     checked_binding,

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.atomic import atomic_path
 
 _TYPES = {
     "F64": "<f8",

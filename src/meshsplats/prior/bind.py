@@ -10,12 +10,12 @@ import numpy as np
 
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
-from meshsplats.dataset import View
+from meshsplats.datasets.views import View
 from meshsplats.errors import DataWarning
 from meshsplats.mesh import SplatMesh
+from meshsplats.prior.color_projection import colors_from_views
 from meshsplats.prior.model import MeshPrior
 from meshsplats.prior.pattern import MOST, counts_by_area, face_pattern
-from meshsplats.prior.photographs import colors_from_views
 from meshsplats.prior.shells import Looks, look_at_base
 
 Source = Literal["auto", "texture", "vertices", "views", "grey"]

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshsplats.binding import surface_normals
-from meshsplats.camera import Camera, dome
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import dome
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 

@@ -9,13 +9,14 @@ import numpy as np
 
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
-from meshsplats.camera import Camera, dome
-from meshsplats.dataset import Picture, View
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up, scene_bounds, weighted_quantile
+from meshsplats.cameras.trajectories import dome
+from meshsplats.datasets.views import Picture, View
 from meshsplats.errors import MissingDependencyError
-from meshsplats.framing import guess_up, scene_bounds, weighted_quantile
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior.photographs import colors_from_views
+from meshsplats.prior.color_projection import colors_from_views
 from meshsplats.rendering import render
 
 MAX_RESOLUTION = 512

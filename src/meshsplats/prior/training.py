@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from meshsplats.dataset import Dataset
+from meshsplats.datasets.views import Dataset
 from meshsplats.prior.model import MeshPrior
 
 if TYPE_CHECKING:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from meshsplats._core import library
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, checked_filter
-from meshsplats.rendering import core
 
 MIN_TRANSMITTANCE = 1e-6
 """A sample stops once less than this fraction of light comes through: what is left out stays below it."""
@@ -108,7 +107,7 @@ def render(
         columns = {name: value if value.ndim == 2 else value[:, None] for name, value in chosen.items()}
         widths = {name: column.shape[1] for name, column in columns.items()}
         values = np.ascontiguousarray(np.concatenate(list(columns.values()), axis=1))
-    subject = core.MeshStruct(
+    subject = library.MeshStruct(
         vertex_count=len(mesh.vertices),
         face_count=len(mesh.faces),
         vertices=keep(mesh.vertices),
@@ -126,8 +125,8 @@ def render(
     depths = np.empty((h, w), np.float32) if depth else None
     directions = np.empty((h, w, 3), np.float32) if normals else None
     sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
-    picture = core.PictureStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
-    core.call("ms_render_mesh", subject, camera_struct(camera), options, picture)
+    picture = library.PictureStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
+    library.call("ms_render_mesh", subject, camera_struct(camera), options, picture)
 
     named = {}
     start = 0
@@ -181,7 +180,7 @@ def render_splats(
     if not (np.isfinite(dilation) and dilation >= 0):
         raise ValueError(f"dilation must be a variance in square pixels, >= 0, got {dilation}")
     degree = cloud.sh_degree if sh_degree is None else min(int(sh_degree), cloud.sh_degree)
-    subject = core.SplatsStruct(
+    subject = library.SplatsStruct(
         count=len(cloud),
         means=keep(cloud.means),
         quaternions=keep(cloud.quaternions),
@@ -195,8 +194,8 @@ def render_splats(
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
-    picture = core.PictureStruct(keep(color), keep(alpha), None, None, None, 0)
-    core.call("ms_render_splats", subject, camera_struct(camera), options, picture)
+    picture = library.PictureStruct(keep(color), keep(alpha), None, None, None, 0)
+    library.call("ms_render_splats", subject, camera_struct(camera), options, picture)
     return Rendering(color, alpha, fragments=int(picture.fragments))
 
 
@@ -209,19 +208,19 @@ class Alive:
     def __call__(self, array: np.ndarray | None) -> int | None:
         if array is not None:
             self._arrays.append(array)
-        return core.pointer(array)
+        return library.pointer(array)
 
 
-def camera_struct(camera: Camera) -> core.CameraStruct:
-    rows = (core.c_double * 12)(*camera.world_to_camera[:3].ravel())
-    return core.CameraStruct(
+def camera_struct(camera: Camera) -> library.CameraStruct:
+    rows = (library.c_double * 12)(*camera.world_to_camera[:3].ravel())
+    return library.CameraStruct(
         rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height
     )
 
 
 def checked_options(
     keep: Alive, camera: Camera, background, samples: int, threads: int | None
-) -> core.OptionsStruct:
+) -> library.OptionsStruct:
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
     if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
@@ -234,10 +233,10 @@ def checked_options(
     if not np.isfinite(behind).all():
         raise ValueError("background must be finite")
     assert max(camera.width, camera.height) <= MAX_SIDE
-    return core.OptionsStruct(
+    return library.OptionsStruct(
         samples=int(samples),
         max_layers=0,
-        threads=min(int(threads) if threads else processors(), 256),
+        threads=min(int(threads) if threads else library.processors(), 256),
         min_transmittance=0,
         background=keep(behind),
         background_per_pixel=behind.ndim == 3,
@@ -251,11 +250,3 @@ def compact_groups(depth_group: np.ndarray | None) -> np.ndarray | None:
     values, numbers = np.unique(depth_group, return_inverse=True)
     shift = int(values[0] == -1)
     return np.ascontiguousarray(numbers.reshape(-1) - shift, np.int32)
-
-
-def processors() -> int:
-    """Processors this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on every system
-        return os.cpu_count() or 1

@@ -8,9 +8,10 @@ from typing import Literal, get_args
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import Rendering, render_splats
+from meshsplats.rendering.api import Rendering, render, render_splats
 from meshsplats.rendering.samples import needed_samples
 
 Look = Literal["area", "splats"]
@@ -73,3 +74,20 @@ def draw_splats(
         dilation=DILATION / AREA**2 if area else DILATION,
         threads=threads,
     )
+
+
+def image_of(
+    mesh: SplatMesh,
+    camera: Camera,
+    background: Sequence[float],
+    *,
+    samples: int = 1,
+    max_layers: int | None = None,
+    threads: int | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w, 3) display RGB over a display ``background`` and (h, w) alpha, blended in the space that the
+    mesh was made for: a mesh of linear colours is blended in linear light and encoded after."""
+    linear = mesh.blending == "linear"
+    behind = srgb_to_linear(np.asarray(background)) if linear else background
+    drawn = render(mesh, camera, background=behind, samples=samples, max_layers=max_layers, threads=threads)
+    return (linear_to_srgb(drawn.color) if linear else drawn.color), drawn.alpha

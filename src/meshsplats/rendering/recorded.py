@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from meshsplats._core import library
 from meshsplats.camera import Camera
 from meshsplats.mesh import checked_filter
-from meshsplats.rendering import core
 from meshsplats.rendering.api import MIN_TRANSMITTANCE, Alive, camera_struct, checked_options, compact_groups
 
 LOG_BYTES = 128 << 20
@@ -47,9 +47,9 @@ class RecordedPicture:
         self._options.min_transmittance = min_transmittance
         self._camera = camera_struct(camera)
         if world_to_camera is not None:
-            self._camera.world_to_camera = (core.c_double * 12)(*world_to_camera[:3].ravel())
+            self._camera.world_to_camera = (library.c_double * 12)(*world_to_camera[:3].ravel())
         width = 0 if attributes is None else attributes.shape[1]
-        self._mesh = core.MeshStruct(
+        self._mesh = library.MeshStruct(
             vertex_count=len(vertices),
             face_count=len(faces),
             vertices=keep(vertices),
@@ -66,14 +66,14 @@ class RecordedPicture:
         self.color = np.empty((h, w, 3), np.float32)
         self.alpha = np.empty((h, w), np.float32)
         self.attributes = np.empty((h, w, width), np.float32)
-        picture = core.PictureStruct(
+        picture = library.PictureStruct(
             keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
         )
         self._log = ctypes.c_void_p()
         if log_bytes is None:
-            core.call("ms_render_mesh", self._mesh, self._camera, self._options, picture)
+            library.call("ms_render_mesh", self._mesh, self._camera, self._options, picture)
         else:
-            core.call(
+            library.call(
                 "ms_rasterize",
                 self._mesh,
                 self._camera,
@@ -90,7 +90,7 @@ class RecordedPicture:
 
     def __del__(self) -> None:
         if getattr(self, "_log", None):
-            core.load_core().ms_forget(self._log)
+            library.load_core().ms_forget(self._log)
             self._log = ctypes.c_void_p()
 
     def back(
@@ -114,13 +114,15 @@ class RecordedPicture:
             raise ValueError("the picture was drawn without a log: there is no way back")
         if attributes is not None and not self._mesh.attribute_count:
             attributes = None
-        given = core.PictureGradientStruct(core.pointer(color), core.pointer(alpha), core.pointer(attributes))
-        out = core.VertexGradientsStruct(
-            core.pointer(vertices),
-            core.pointer(colors),
-            None if attributes is None else core.pointer(vertex_attributes),
+        given = library.PictureGradientStruct(
+            library.pointer(color), library.pointer(alpha), library.pointer(attributes)
         )
-        core.call("ms_rasterize_back", self._mesh, self._camera, self._options, self._log, given, out)
+        out = library.VertexGradientsStruct(
+            library.pointer(vertices),
+            library.pointer(colors),
+            None if attributes is None else library.pointer(vertex_attributes),
+        )
+        library.call("ms_rasterize_back", self._mesh, self._camera, self._options, self._log, given, out)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """(v, k) float32: for each vertex the sum of ``values`` (h, w, k) by the weights with which it is

@@ -8,7 +8,7 @@ import numpy as np
 
 from meshsplats._arrays import evenly
 from meshsplats.camera import Camera
-from meshsplats.framing import weighted_quantile
+from meshsplats.cameras.framing import weighted_quantile
 from meshsplats.mesh import SplatMesh, splat_starts
 
 FEWEST, MOST = 2, 8

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.framing import front_axes
+from meshsplats.cameras.framing import front_axes
 
 
 def to_blender(up: np.ndarray) -> np.ndarray:

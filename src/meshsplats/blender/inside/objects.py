@@ -12,8 +12,8 @@ from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
 from meshsplats.blender.subject import lit_arrays, lowest
+from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.baking import bake_filter
-from meshsplats.framing import scene_bounds
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.prior.model import MeshPrior
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from meshsplats.blender.inside import meshes, objects, scene, stage
 from meshsplats.blender.options import LIGHTS, LightOptions
-from meshsplats.camera import orbit
-from meshsplats.framing import SAMPLE, scene_bounds, weighted_quantile
+from meshsplats.cameras.framing import SAMPLE, scene_bounds, weighted_quantile
+from meshsplats.cameras.trajectories import orbit
 
 _SEEN = 0.1
 """Opacity from which a vertex counts."""

@@ -65,11 +65,11 @@ def main(job_path: str) -> None:
         tell(unloadable=str(error))
         sys.exit(1)
 
+    from meshsplats._files.atomic import atomic_path
     from meshsplats.blender.inside import meshes, pictures, stage, versions
     from meshsplats.blender.inside.scene import Subject, build
     from meshsplats.blender.options import LightOptions, SceneOptions
     from meshsplats.camera import Camera
-    from meshsplats.formats.atomic import atomic_path
 
     if bpy.app.version < versions.OLDEST:
         raise ValueError(f"Blender 4.2 or newer is needed, this is {bpy.app.version_string}")

@@ -1,0 +1,148 @@
+"""The compiled core's part in fine-tuning, on NumPy arrays: losses of pictures and Adam on chosen rows.
+
+Callers have checked their arrays: C-contiguous, of the types and shapes named here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
+from typing import NamedTuple
+
+import numpy as np
+
+from meshsplats._core.library import pointer, processors, run
+
+
+class ComparisonStruct(ctypes.Structure):
+    """MsComparison of csrc/ssim.h."""
+
+    _fields_ = [
+        ("count", c_int64),
+        ("height", c_int32),
+        ("width", c_int32),
+        ("channels", c_int32),
+        ("threads", c_int32),
+        ("picture", c_void_p),
+        ("truth", c_void_p),
+        ("mask", c_void_p),
+        ("gradient", c_void_p),
+        ("l1_rate", c_float),
+        ("ssim_rate", c_float),
+        ("l1", c_double),
+        ("ssim", c_double),
+    ]
+
+
+class AdamStruct(ctypes.Structure):
+    """MsAdam of csrc/adam.h."""
+
+    _fields_ = [
+        ("rows", c_int64),
+        ("columns", c_int32),
+        ("threads", c_int32),
+        ("values", c_void_p),
+        ("mean", c_void_p),
+        ("square", c_void_p),
+        ("gradient", c_void_p),
+        ("scale", c_void_p),
+        ("chosen", c_void_p),
+        ("chosen_count", c_int64),
+        ("mask", c_void_p),
+        ("step", c_float),
+        ("beta1_rest", c_float),
+        ("beta2_rest", c_float),
+        ("epsilon", c_float),
+        ("low", c_float),
+        ("high", c_float),
+    ]
+
+
+class Comparison(NamedTuple):
+    """Sums over the channels and the pixels that count."""
+
+    l1: float
+    ssim: float
+    gradient: np.ndarray | None
+    """(b, h, w, c) float32: of ``l1_rate * l1 + ssim_rate * ssim`` with respect to the pictures, 0 at pixels
+    that do not count."""
+
+
+def compare_pictures(
+    pictures: np.ndarray,
+    truths: np.ndarray,
+    mask: np.ndarray | None = None,
+    *,
+    l1_rate: float = 0,
+    ssim_rate: float = 0,
+    gradient: bool = False,
+    threads: int | None = None,
+) -> Comparison:
+    """Sums of |picture - truth| and of SSIM, 3DGS convention, and the gradient of their weighted sum.
+
+    ``pictures`` and ``truths`` are (b, h, w, c) float32, ``mask`` (b, h, w) bool. SSIM is not computed, and
+    its sum is 0, where ``ssim_rate`` is 0. The result has the same bits with any number of ``threads`` (all
+    processors by default) and on every instruction set.
+    """
+    count, height, width, channels = pictures.shape
+    result = np.empty_like(pictures) if gradient else None
+    comparison = ComparisonStruct(
+        count=count,
+        height=height,
+        width=width,
+        channels=channels,
+        threads=threads or processors(),
+        picture=pointer(pictures),
+        truth=pointer(truths),
+        mask=pointer(mask),
+        gradient=pointer(result),
+        l1_rate=l1_rate,
+        ssim_rate=ssim_rate,
+    )
+    run("ms_compare_pictures", comparison)
+    return Comparison(comparison.l1, comparison.ssim, result)
+
+
+def adam_rows(
+    values: np.ndarray,
+    mean: np.ndarray,
+    square: np.ndarray,
+    gradient: np.ndarray,
+    rows: np.ndarray | None,
+    *,
+    step: float,
+    betas: tuple[float, float],
+    eps: float,
+    scale: np.ndarray | None = None,
+    bounds: tuple[float, float] = (-np.inf, np.inf),
+    threads: int | None = None,
+) -> None:
+    """Changes ``values`` and the moments ``mean`` and ``square`` in place, all (v, k) float32.
+
+    ``rows`` is an increasing int32 array of row numbers, a (v,) bool mask, or None for every row. ``step`` is
+    the learning rate with its bias corrections, ``scale`` (v,) float32 multiplies it row by row.
+
+    Raises ValueError, before anything changes, if row numbers are out of range or do not increase.
+    """
+    mask = rows if rows is not None and rows.dtype == bool else None
+    chosen = rows if mask is None else None
+    adam = AdamStruct(
+        rows=len(values),
+        columns=values.shape[1],
+        threads=threads or processors(),
+        values=pointer(values),
+        mean=pointer(mean),
+        square=pointer(square),
+        gradient=pointer(gradient),
+        scale=pointer(scale),
+        chosen=pointer(chosen),
+        chosen_count=0 if chosen is None else len(chosen),
+        mask=pointer(mask),
+        step=step,
+        beta1_rest=1 - betas[0],
+        beta2_rest=1 - betas[1],
+        epsilon=eps,
+        low=bounds[0],
+        high=bounds[1],
+    )
+    run("ms_adam_rows", adam)

@@ -1,0 +1,213 @@
+"""The compiled core behind ctypes: loads the variant that suits the processor and mirrors csrc/types.h."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_int32, c_int64, c_void_p
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+VARIANTS = ("v4", "v3", "baseline")
+"""Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
+
+INTERFACE_VERSION = 3
+
+
+class CameraStruct(ctypes.Structure):
+    _fields_ = [
+        ("world_to_camera", c_double * 12),
+        ("fx", c_double),
+        ("fy", c_double),
+        ("cx", c_double),
+        ("cy", c_double),
+        ("near", c_double),
+        ("width", c_int32),
+        ("height", c_int32),
+    ]
+
+
+class OptionsStruct(ctypes.Structure):
+    _fields_ = [
+        ("samples", c_int32),
+        ("max_layers", c_int32),
+        ("threads", c_int32),
+        ("min_transmittance", c_float),
+        ("background", c_void_p),
+        ("background_per_pixel", c_int32),
+    ]
+
+
+class MeshStruct(ctypes.Structure):
+    _fields_ = [
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("vertices", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("face_splat", c_void_p),
+        ("depth_group", c_void_p),
+        ("normals", c_void_p),
+        ("attributes", c_void_p),
+        ("attribute_count", c_int32),
+        ("filter_px2", c_double),
+    ]
+
+
+class SplatsStruct(ctypes.Structure):
+    _fields_ = [
+        ("count", c_int64),
+        ("means", c_void_p),
+        ("quaternions", c_void_p),
+        ("scales", c_void_p),
+        ("opacities", c_void_p),
+        ("sh", c_void_p),
+        ("sh_stored", c_int32),
+        ("sh_used", c_int32),
+        ("kernel", c_int32),
+        ("dilation", c_float),
+    ]
+
+
+class PictureStruct(ctypes.Structure):
+    _fields_ = [
+        ("color", c_void_p),
+        ("alpha", c_void_p),
+        ("depth", c_void_p),
+        ("normals", c_void_p),
+        ("attributes", c_void_p),
+        ("fragments", c_int64),
+    ]
+
+
+class PictureGradientStruct(ctypes.Structure):
+    _fields_ = [("color", c_void_p), ("alpha", c_void_p), ("attributes", c_void_p)]
+
+
+class VertexGradientsStruct(ctypes.Structure):
+    _fields_ = [("vertices", c_void_p), ("colors", c_void_p), ("attributes", c_void_p)]
+
+
+def pointer(array: np.ndarray | None) -> int | None:
+    """Address of a C-contiguous array, for a structure that is used while the array is alive."""
+    if array is None:
+        return None
+    if not array.flags.c_contiguous:
+        raise ValueError("the core takes C-contiguous arrays only")
+    return array.ctypes.data
+
+
+def library_path(variant: str) -> Path | None:
+    """The file of a variant of the core, or None where it was not built."""
+    import meshsplats._core
+
+    # An editable install keeps the compiled files in another folder of the package's path.
+    for folder in meshsplats._core.__path__:
+        path = Path(folder) / f"meshsplats_{variant}.so"
+        if path.is_file():
+            return path
+    return None
+
+
+def available_variants() -> list[str]:
+    """The variants that were built and that this processor runs, best first."""
+    baseline = library_path("baseline")
+    if baseline is None:
+        return []
+    library = ctypes.CDLL(str(baseline))
+    library.ms_best_variant.restype = c_char_p
+    best = library.ms_best_variant().decode()
+    runs = VARIANTS[VARIANTS.index(best) :]
+    return [variant for variant in runs if library_path(variant)]
+
+
+@cache
+def load_core(variant: str | None = None) -> ctypes.CDLL:
+    """The core's library; the best variant, or the one named by MESHSPLATS_VARIANT, unless another is asked
+    for.
+
+    Raises ImportError if the core was not built, ValueError if the processor cannot run the variant.
+    """
+    available = available_variants()
+    if not available:
+        raise ImportError(
+            "the compiled core of meshsplats is missing: install the package (pip install meshsplats, or"
+            " pip install . in a source tree) instead of running it from its sources"
+        )
+    wanted = variant or os.environ.get("MESHSPLATS_VARIANT") or available[0]
+    if wanted not in available:
+        raise ValueError(
+            f"the core has no variant {wanted!r} that runs here; available: {', '.join(available)}"
+        )
+    library = ctypes.CDLL(str(library_path(wanted)))
+    library.ms_variant.restype = c_char_p
+    if library.ms_interface_version() != INTERFACE_VERSION:
+        raise ImportError(
+            "the compiled core is of another version than the Python code: install the package again"
+        )
+    message = [c_char_p, c_int]
+    mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
+    signatures: dict[str, list] = {
+        "ms_render_mesh": [*mesh_and_camera, POINTER(PictureStruct)],
+        "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(PictureStruct)],
+        "ms_rasterize": [*mesh_and_camera, POINTER(PictureStruct), c_int64, POINTER(c_void_p)],
+        "ms_rasterize_back": [
+            *mesh_and_camera,
+            c_void_p,
+            POINTER(PictureGradientStruct),
+            POINTER(VertexGradientsStruct),
+        ],
+    }
+    for name, arguments in signatures.items():
+        function = getattr(library, name)
+        function.restype = c_int
+        function.argtypes = arguments + message
+    library.ms_forget.restype = None
+    library.ms_forget.argtypes = [c_void_p]
+    return library
+
+
+def call(name: str, *arguments) -> None:
+    """Runs a function of the core. Raises MemoryError, RuntimeError or, for splats that share vertices and
+    cannot be filtered, ValueError, with the core's message."""
+    message = ctypes.create_string_buffer(256)
+    status = getattr(load_core(), name)(*arguments, message, len(message))
+    if status == 1:
+        raise MemoryError(
+            f"{name}: {message.value.decode()}; render fewer triangles, pixels or samples at a time"
+        )
+    if status == 3:
+        raise ValueError(
+            f"{message.value.decode()}: the filter moves each splat's vertices on their own. Give every splat"
+            " its own vertices, or draw without the filter (filter_px2=0)"
+        )
+    if status:
+        raise RuntimeError(f"{name}: {message.value.decode()}")
+
+
+def run(name: str, argument: ctypes.Structure) -> None:
+    """Runs a function of the core that takes one structure. Raises MemoryError, or ValueError with the core's
+    message; ImportError if the core does not have it."""
+    message = ctypes.create_string_buffer(256)
+    try:
+        function = getattr(load_core(), name)
+    except AttributeError:
+        raise ImportError(
+            f"the compiled core has no {name}: it is older than the Python code, install the package again"
+        ) from None
+    status = function(ctypes.byref(argument), message, len(message))
+    text = message.value.decode()
+    if status == 1:
+        raise MemoryError(f"{name}: {text}")
+    if status:
+        raise ValueError(text)
+
+
+def processors() -> int:
+    """Processors this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        return os.cpu_count() or 1

@@ -1,0 +1,1 @@
+"""Where cameras stand: the subject of a scene, orbits and domes around it, and camera files."""

@@ -1,0 +1,128 @@
+"""Camera files: JSON, in our own form or that of the 3D Gaussian Splatting code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats._files.atomic import write_text
+from meshsplats.camera import Camera
+from meshsplats.errors import FileFormatError
+
+MAX_FILE_BYTES = 16 << 20
+"""A larger file of cameras is refused."""
+MAX_CAMERAS = 20_000
+
+
+def load_cameras(path: str | Path) -> list[Camera]:
+    """Cameras of a JSON file, in file order.
+
+    Two forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
+    4x4 matrix and OpenCV axes; ``name``, ``near``, and cx and cy (then the picture's centre) may be missing.
+    The other is the ``cameras.json`` that INRIA's 3DGS trainer writes: ``{img_name, width, height, position,
+    rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and the principal point at the picture's
+    centre. A folder stands for the ``cameras.json`` in it.
+
+    Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
+    kind, and OSError if it cannot be opened.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "cameras.json"
+    entries = read_json(path)
+    if not isinstance(entries, list):
+        other = isinstance(entries, dict) and "frames" in entries
+        what = " with 'frames': of a data set, which load_dataset and --data read" if other else ""
+        raise FileFormatError(
+            f"{path}: a camera file is a JSON list of cameras, this is a JSON {_kind(entries)}{what}"
+        )
+    if not entries:
+        raise FileFormatError(f"{path}: holds no camera")
+    if len(entries) > MAX_CAMERAS:
+        raise FileFormatError(
+            f"{path}: {len(entries)} cameras, more than the {MAX_CAMERAS} that are accepted"
+        )
+    return [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+
+
+def read_json(path: Path) -> Any:
+    """The content of a file of cameras. FileFormatError if it is no JSON, or larger than any such file is."""
+    with open(path, "rb") as file:
+        text = file.read(MAX_FILE_BYTES + 1)
+    if len(text) > MAX_FILE_BYTES:
+        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no file of cameras is")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not a JSON file ({str(error)[:120]})") from None
+
+
+def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
+    """Writes the JSON list that ``load_cameras`` reads; a file of that name is replaced. No digit is lost."""
+    entries = [
+        {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
+        | {"world_to_camera": camera.world_to_camera.tolist()}
+        for camera in cameras
+    ]
+    write_text(path, json.dumps(entries, indent=1) + "\n")
+
+
+def _camera_from_json(entry: object, where: str) -> Camera:
+    if not isinstance(entry, dict):
+        raise FileFormatError(f"{where}: must be a JSON object, got a JSON {_kind(entry)}")
+    name = entry.get("name", entry.get("img_name", ""))
+    if not isinstance(name, str) or len(name) > 1000:
+        raise FileFormatError(f"{where}: field 'name' must be a string of up to 1000 characters")
+    where = f"{where} ({name[:60]!r})" if name else where
+    width, height = (float(_numbers(entry, key, (), where)) for key in ("width", "height"))
+    matrix = np.eye(4)
+    if "world_to_camera" in entry:
+        matrix = _numbers(entry, "world_to_camera", (4, 4), where)
+    elif "rotation" in entry and "position" in entry:
+        rotation = _numbers(entry, "rotation", (3, 3), where).T
+        matrix[:3, :3] = rotation
+        matrix[:3, 3] = -rotation @ _numbers(entry, "position", (3,), where)
+    else:
+        has = ", ".join(entry)[:200]
+        raise FileFormatError(f"{where}: needs 'world_to_camera', or 'rotation' and 'position'; it has {has}")
+    defaults = {"cx": width / 2, "cy": height / 2, "near": 0.01}
+    lens = {
+        key: float(_numbers(entry, key, (), where)) if key in entry or key not in defaults else defaults[key]
+        for key in ("fx", "fy", "cx", "cy", "near")
+    }
+    try:
+        return Camera(matrix, width=width, height=height, name=name, **lens)  # type: ignore[arg-type]
+    except ValueError as error:
+        raise FileFormatError(f"{where}: {error}") from None
+
+
+def _numbers(entry: dict, key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """Field ``key`` as a float64 array of that shape, () for a single number."""
+    if key not in entry:
+        raise FileFormatError(f"{where}: field {key!r} is missing")
+    try:
+        value = np.array(entry[key], dtype=object)
+        fits = value.shape == shape and all(type(v) in (int, float) for v in value.ravel())
+        number = value.astype(np.float64) if fits else None
+    except (ValueError, OverflowError):  # ragged lists; an integer of a thousand digits
+        number = None
+    if number is None or not np.isfinite(number).all():
+        wanted = "a finite number" if shape == () else f"finite numbers of shape {shape}"
+        raise FileFormatError(f"{where}: field {key!r} must be {wanted}, got {_shown(entry[key])}")
+    return number
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, dict):
+        return "object"
+    return "list" if isinstance(value, list) else "value"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, (dict, list)):
+        return f"a JSON {_kind(value)} of {len(value)}"
+    return json.dumps(value)[:60]

@@ -1,0 +1,196 @@
+"""Where the subject of a scene is and which way is up: what an orbit needs to know, robust against stray
+splats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from meshsplats._arrays import evenly
+from meshsplats._cells import Cells
+from meshsplats.camera import Camera
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+DEFAULT_UP = (0.0, -1.0, 0.0)
+"""Splats trained from COLMAP cameras have the y axis pointing down."""
+SAMPLE = 20_000
+"""Points looked at: more do not move the quantiles visibly."""
+SURROUNDINGS = 4.0
+"""Points farther from the centre than this many median distances are surroundings, not the subject. Splats of
+an object on its own reach about 2 (a ball's surface: 1; a filled ball: 1.26; the longest object measured:
+3.9)."""
+
+APART = 0.15
+"""Parts of the subject that are farther than this many radii from the rest stand apart..."""
+FLOATER = 0.01
+"""... and are floaters if they have less than this share of its opacity,"""
+FLOATERS = 0.1
+"""and all such together less than this."""
+COVERED = 0.995
+"""Share of the subject's opacity that must be on the picture."""
+MARGIN = 1.08
+"""Room left round the subject."""
+
+Scene = GaussianCloud | SplatMesh | np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Size of a scene without its strays; frame and units of the scene."""
+
+    center: np.ndarray
+    """(3,) float64 weighted median of the points along each axis."""
+    radius: float
+    """Distance from ``center`` within which 90 % of the weight lies, > 0."""
+    points: np.ndarray
+    """(k, 3) float64 points of the subject: a sample, without the surroundings and without floaters."""
+    weights: np.ndarray
+    """(k,) float64 their weights, >= 0: opacity."""
+    sizes: np.ndarray
+    """(k,) float64 reach of each point: two standard deviations of a splat's middle axis, else 0."""
+
+
+def weighted_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
+    """Smallest of ``values`` (k,) at which the sorted ``weights`` add up to ``q`` (0 to 1) of their sum."""
+    order = np.argsort(values)  # equal values may stand in any order
+    total = np.cumsum(weights[order])
+    return float(values[order[min(np.searchsorted(total, q * total[-1]), len(order) - 1)]])
+
+
+def scene_bounds(scene: Scene) -> Bounds:
+    """Robust bounds of a cloud, a mesh or points (n, 3); opacity is the weight of a splat or vertex.
+
+    Raises ValueError for a scene without points, or if points (n, 3) have another shape or are not finite.
+    """
+    if isinstance(scene, GaussianCloud):
+        points, weights = scene.means, scene.opacities
+    elif isinstance(scene, SplatMesh):
+        points, weights = scene.vertices, scene.colors[:, 3]
+    else:
+        points = np.asarray(scene, np.float64)
+        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+            raise ValueError(f"points must be finite and of shape (n, 3), got {points.shape}")
+        weights = np.ones(len(points))
+    if len(points) == 0:
+        raise ValueError("the scene is empty: there is nothing to place cameras round")
+    step = -(-len(points) // SAMPLE)
+    points = np.asarray(points[::step], np.float64)
+    weights = np.asarray(weights[::step], np.float64)
+    sizes = np.zeros(len(points))
+    if isinstance(scene, GaussianCloud):
+        sizes = 2 * np.median(scene.scales[::step].astype(np.float64), axis=1)
+    if weights.sum() == 0:
+        weights = np.ones(len(points))
+    center = np.array([weighted_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
+    distance = np.linalg.norm(points - center, axis=1)
+    radius = weighted_quantile(distance, weights, 0.9)
+    if radius == 0:
+        # Nearly everything in one spot: use what spread there is, or else the splats' own size.
+        radius = float(distance.max())
+    if radius == 0:
+        radius = float(sizes.max()) or 1.0
+    limit = SURROUNDINGS * weighted_quantile(distance, weights, 0.5)
+    subject = distance <= limit if limit > 0 else np.ones(len(points), bool)
+    subject[subject] = _without_floaters(points[subject], weights[subject], APART * radius)
+    return Bounds(center, radius, points[subject], weights[subject], sizes[subject])
+
+
+def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np.ndarray:
+    """(k,) bool: the points but those of parts that stand apart and weigh little. All, where the parts that
+    weigh something are not nearly everything: then the scene is a scatter of small things."""
+    part = Cells(points, gap).parts()
+    held = np.bincount(part, weights)
+    keep = (held >= FLOATER * held.sum())[part]
+    return keep if weights[keep].sum() >= (1 - FLOATERS) * weights.sum() else np.ones(len(points), bool)
+
+
+def guess_up(scene: Scene | None = None, cameras: Sequence[Camera] | None = None) -> np.ndarray:
+    """(3,) float64 unit direction that points up in the world frame.
+
+    The mean up direction of ``cameras`` where they are known and agree (people hold cameras upright); else
+    what a mesh says of itself; else ``DEFAULT_UP``, as in files trained from COLMAP cameras. The points
+    themselves are not asked: nothing in a cloud of splats tells an upright vase from a hanging lamp.
+    """
+    if cameras:
+        mean = np.mean([-camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+        length = float(np.linalg.norm(mean))
+        if length > 0.2:  # cameras on a whole sphere cancel out and say nothing
+            return mean / length
+    if isinstance(scene, SplatMesh):
+        return scene.up.astype(np.float64)
+    return np.array(DEFAULT_UP)
+
+
+def unit_up(up: Sequence[float] | np.ndarray) -> np.ndarray:
+    """``up`` as a (3,) float64 unit vector. ValueError if it is not three finite numbers or has no length."""
+    vector = np.asarray(up, np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or np.linalg.norm(vector) == 0:
+        raise ValueError(f"up must be three finite numbers that are not all 0, got {up!r}")
+    vector = vector / np.abs(vector).max()
+    return vector / np.linalg.norm(vector)
+
+
+def front_axes(up: np.ndarray) -> np.ndarray:
+    """(3, 3) float64 rows right, up, forward of someone who stands before the scene, for a unit ``up``.
+
+    Right is the world's +x (+z if ``up`` is close to the x axis), made square to ``up``; forward = up x
+    right. So COLMAP's y-down scenes are seen along +z, y-up scenes along -z and z-up scenes along +y.
+    """
+    right = np.array([1.0, 0, 0]) if abs(up[0]) < 0.9 else np.array([0, 0, 1.0])
+    right = right - up * (right @ up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, up, np.cross(up, right)])
+
+
+def middle(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
+    """(3,) middle of the box along ``axes`` that the subject fills: half-way along a guitar, not in its
+    body."""
+    along = bounds.points @ axes.T
+    return np.array([_middle_of(along[:, k], bounds.weights) for k in range(3)]) @ axes
+
+
+def fit_pictures(
+    bounds: Bounds, target: np.ndarray, rotations: Sequence[np.ndarray], slopes: tuple[float, float]
+) -> tuple[np.ndarray, float]:
+    """Point to look at, near ``target``, and the least distance from it at which every view shows it all.
+
+    ``rotations`` (3, 3) turn the world's axes into the views' (OpenCV axes);
+    ``slopes`` are x / z and y / z at the right and the lower edge of the picture.
+    """
+    # What is near looks larger: the middle of the box is not the middle of a picture. Two steps of least
+    # squares over the views bring it there within a few pixels; a dozen of the views are enough to know.
+    some = evenly(rotations, 12)
+    across = np.concatenate([rotation[:2] for rotation in some])
+    for _ in range(2):
+        away = max(_fitting_distance(bounds, target, rotation, slopes) for rotation in some)
+        aside = np.concatenate([_seen_aside(bounds, target, rotation, away) for rotation in some])
+        target = target + np.linalg.lstsq(across, aside, rcond=1e-6)[0]
+    return target, max(_fitting_distance(bounds, target, rotation, slopes) for rotation in rotations)
+
+
+def _fitting_distance(
+    bounds: Bounds, target: np.ndarray, rotation: np.ndarray, slopes: tuple[float, float]
+) -> float:
+    """A point at (x, y, z) from the target, in the view's axes, is on the picture if |x| <= slope (d + z):
+    each asks for d = |x| / slope - z, and the covered share of them decides."""
+    x, y, z = rotation @ (bounds.points - target).T
+    needed = np.maximum((np.abs(x) + bounds.sizes) / slopes[0], (np.abs(y) + bounds.sizes) / slopes[1]) - z
+    return max(weighted_quantile(needed, bounds.weights, COVERED) * MARGIN, 0.1 * bounds.radius)
+
+
+def _seen_aside(bounds: Bounds, target: np.ndarray, rotation: np.ndarray, away: float) -> np.ndarray:
+    """(2,) how far right of and below the picture's centre the subject's middle is seen, as lengths at the
+    target."""
+    x, y, z = rotation @ (bounds.points - target).T
+    seen = z > -0.9 * away
+    if not seen.any():
+        return np.zeros(2)
+    depth, weights = z[seen] + away, bounds.weights[seen]
+    return np.array([_middle_of(x[seen] / depth, weights), _middle_of(y[seen] / depth, weights)]) * away
+
+
+def _middle_of(values: np.ndarray, weights: np.ndarray) -> float:
+    return (weighted_quantile(values, weights, 1 - COVERED) + weighted_quantile(values, weights, COVERED)) / 2

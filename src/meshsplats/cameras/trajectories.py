@@ -1,0 +1,199 @@
+"""Cameras on orbits and domes around a subject, or turning inside a room."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import (
+    DEFAULT_UP,
+    Scene,
+    fit_pictures,
+    front_axes,
+    guess_up,
+    middle,
+    scene_bounds,
+    unit_up,
+)
+
+NEAR_SHARE = 0.01
+"""Near plane of the cameras made here, as a share of their distance to the subject's middle."""
+
+
+def look_at(
+    center: Sequence[float] | np.ndarray,
+    target: Sequence[float] | np.ndarray,
+    *,
+    up: Sequence[float] | np.ndarray = DEFAULT_UP,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 45.0,
+    near: float = 0.01,
+    name: str = "",
+) -> Camera:
+    """Camera at ``center`` (3,) that looks at ``target`` (3,) with ``up`` (3,) towards the picture's upper
+    edge.
+
+    Parameters
+    ----------
+    fov: angle in degrees, 1 to 170, that the shorter side of the picture spans.
+    near: as in Camera.
+
+    Raises ValueError if the two points coincide. Looking straight along ``up``, the scene's front is at the
+    lower edge.
+    """
+    if not 1 <= fov <= 170:
+        raise ValueError(f"fov must lie between 1 and 170 degrees, got {fov}")
+    center = np.asarray(center, np.float64)
+    upward = unit_up(up)
+    forward = np.asarray(target, np.float64) - center
+    length = np.linalg.norm(forward)
+    if not (np.isfinite(length) and length > 0):
+        raise ValueError("center and target must be finite and differ")
+    forward /= length
+    right = np.cross(forward, upward)
+    if np.linalg.norm(right) < 1e-6:
+        right = front_axes(upward)[0]
+        right = right - forward * (right @ forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ center
+    focal = min(width, height) / 2 / np.tan(np.radians(fov) / 2)
+    return Camera(matrix, focal, focal, width / 2, height / 2, width, height, near, name)
+
+
+def orbit(
+    scene: Scene,
+    count: int = 60,
+    *,
+    elevation: float = 15.0,
+    azimuth: float = 0.0,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 45.0,
+    distance: float = 1.0,
+    target: Sequence[float] | np.ndarray | None = None,
+) -> list[Camera]:
+    """``count`` cameras evenly spaced on a circle round the subject of ``scene``, all looking at its middle.
+
+    Parameters
+    ----------
+    scene: GaussianCloud, SplatMesh or points (n, 3); see ``framing.scene_bounds`` for what counts as the
+        subject.
+    elevation: degrees above the subject's horizon, -90 to 90.
+    azimuth: degrees of the first camera, 0 in front (``framing.front_axes``), 90 at the right-hand side.
+    up: (3,) direction; None: ``framing.guess_up``.
+    fov: angle in degrees, 1 to 170, that the shorter side of the picture spans.
+    distance: multiple of the distance at which the subject just fits the picture in every view.
+    target: (3,) point to look at and to go round, from as far away; None: the subject's middle.
+
+    Raises ValueError for an empty scene or a value out of range.
+    """
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
+    return round_subject(scene, angles, up, width, height, fov, distance, target)
+
+
+def dome(
+    scene: Scene,
+    count: int = 32,
+    *,
+    whole: bool = False,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 45.0,
+    distance: float = 1.0,
+    target: Sequence[float] | np.ndarray | None = None,
+) -> list[Camera]:
+    """``count`` cameras spread evenly over the upper half of a sphere round the subject, or all of it.
+
+    The points are those of a Fibonacci spiral: equal steps in height, the golden angle in azimuth, so that
+    each camera has the same share of the surface. Parameters are those of ``orbit``.
+    """
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    golden = 180 * (3 - 5**0.5)
+    lowest = -1.0 if whole else 0.0
+    heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
+    angles = [(i * golden % 360, float(np.degrees(np.arcsin(h)))) for i, h in enumerate(heights)]
+    return round_subject(scene, angles, up, width, height, fov, distance, target)
+
+
+def look_around(
+    scene: Scene,
+    count: int = 60,
+    *,
+    elevation: float = 0.0,
+    azimuth: float = 0.0,
+    up: Sequence[float] | np.ndarray | None = None,
+    width: int = 800,
+    height: int = 800,
+    fov: float = 75.0,
+) -> list[Camera]:
+    """``count`` cameras that stand in the middle of ``scene``, a room say, and turn once round to the right.
+
+    ``elevation`` is the direction they look in, above the horizon; the other parameters are those of
+    ``orbit``.
+    """
+    if count < 1:
+        raise ValueError(f"count must be at least 1, got {count}")
+    bounds = scene_bounds(scene)
+    axes = front_axes(guess_up(scene) if up is None else unit_up(up))
+    lens: dict[str, Any] = {"width": width, "height": height, "fov": fov, "near": bounds.radius * NEAR_SHARE}
+    cameras = []
+    for i in range(count):
+        # Azimuth 0 looks forward, and a turn to the right is a growing angle.
+        direction = _direction(axes, 180 - azimuth - 360 * i / count, elevation)
+        target = bounds.center + bounds.radius * direction
+        cameras.append(look_at(bounds.center, target, up=axes[1], name=f"view_{i:04d}", **lens))
+    return cameras
+
+
+def _direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
+    """Unit vector from the subject to a camera; ``axes`` as from ``front_axes``."""
+    a, e = np.radians(azimuth), np.radians(elevation)
+    right, up, forward = axes
+    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
+
+
+def round_subject(
+    scene: Scene,
+    angles: Sequence[tuple[float, float]],
+    up: Sequence[float] | np.ndarray | None,
+    width: int,
+    height: int,
+    fov: float,
+    distance: float,
+    aim: Sequence[float] | np.ndarray | None = None,
+) -> list[Camera]:
+    """Cameras at (azimuth, elevation) degrees, at the distance from which every picture shows the subject."""
+    if not (np.isfinite(distance) and distance > 0):
+        raise ValueError(f"distance must be positive, got {distance}")
+    if not all(np.isfinite(a) and -90 <= e <= 90 for a, e in angles):
+        raise ValueError("azimuth must be finite and elevation between -90 and 90 degrees")
+    bounds = scene_bounds(scene)
+    axes = front_axes(guess_up(scene) if up is None else unit_up(up))
+    directions = [_direction(axes, azimuth, elevation) for azimuth, elevation in angles]
+    lens: dict[str, Any] = {"up": axes[1], "width": width, "height": height, "fov": fov}
+    target = middle(bounds, axes)
+    around = [look_at(target + direction, target, **lens) for direction in directions]
+    rotations = [camera.world_to_camera[:3, :3] for camera in around]
+    slopes = (width / 2 / around[0].fx, height / 2 / around[0].fy)
+    target, fit = fit_pictures(bounds, target, rotations, slopes)
+    if aim is not None:
+        target = np.asarray(aim, np.float64)
+        if target.shape != (3,) or not np.isfinite(target).all():
+            raise ValueError(f"the target must be three finite numbers, got {aim!r}")
+    away = distance * fit
+    return [
+        look_at(target + away * d, target, near=away * NEAR_SHARE, name=f"view_{i:04d}", **lens)
+        for i, d in enumerate(directions)
+    ]

@@ -1,0 +1,178 @@
+"""Floaters and other things that a subject is better without: which splats they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from meshsplats._cells import Cells
+from meshsplats.cameras.framing import scene_bounds
+from meshsplats.conversion.fans import semi_axes
+from meshsplats.conversion.footprint import spacing
+from meshsplats.conversion.selection import inside
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh, splat_starts
+
+Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
+CELL = 2.5
+"""Side of the cells in which neighbours are counted and parts are connected, in spacings."""
+REACH = 1.5
+"""Standard deviations at which a splat ends, for its neighbours."""
+
+
+@dataclass(frozen=True)
+class CleaningRules:
+    """Which splats go: all that any of these rules names. None: there is no such rule."""
+
+    crop: tuple[float, float, float, float, float, float] | None = None
+    """Those whose centre is outside the box x0 y0 z0 x1 y1 z1, in the coordinates of the file."""
+    min_opacity: float | None = None
+    """Those fainter than this, 0 to 1."""
+    max_distance: float | None = None
+    """Those farther from the middle than this many radii of the subject; within one lies nine tenths of its
+    opacity."""
+    sparse: float | None = None
+    """Those with fewer neighbours than this share of what is usual, 0 to 1: 0.05 takes single floaters
+    and thin clouds."""
+    min_part: float | None = None
+    """Those in parts that touch nothing else and hold less than this share of all opacity, 0 to 1: 0.01 takes
+    clumps in the air."""
+
+    def __post_init__(self) -> None:
+        for name, top in [("min_opacity", 1), ("max_distance", np.inf), ("sparse", 1), ("min_part", 1)]:
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= top:
+                raise ValueError(f"{name} must lie between 0 and {top}, got {value}")
+        if self.crop is not None:
+            low, high = np.array(self.crop[:3]), np.array(self.crop[3:])
+            if not (np.isfinite(self.crop).all() and (low < high).all()):
+                raise ValueError(f"crop must be x0 y0 z0 x1 y1 z1 with x0 < x1 and so on, got {self.crop}")
+
+
+FLOATERS = CleaningRules(sparse=0.05, min_part=0.01)
+"""What goes where nothing else was said."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the rules name, before anything is taken away."""
+
+    gone: dict[str, np.ndarray]
+    """For each rule (n,) bool: the splats that it takes."""
+    opacities: np.ndarray
+    """(n,) float32 of the splats; of a mesh, the largest of each splat's vertices."""
+    owner: np.ndarray | None = None
+    """(f,) int64 of a mesh: the splat that each triangle belongs to; None for splats themselves."""
+
+    @property
+    def kept(self) -> np.ndarray:
+        """(n,) bool: the splats that no rule takes."""
+        return ~np.any(list(self.gone.values()), axis=0)
+
+    def counts(self) -> dict[str, dict[str, float]]:
+        """For each rule, and for ``all`` together: how many splats go, and their share of all opacity."""
+        whole = max(float(self.opacities.sum(dtype=np.float64)), 1e-300)
+        masks = {**self.gone, "all": ~self.kept}
+        return {
+            name: {
+                "splats": int(mask.sum()),
+                "opacity": float(self.opacities[mask].sum(dtype=np.float64)) / whole,
+            }
+            for name, mask in masks.items()
+        }
+
+
+def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> Findings:
+    """The splats of ``scene`` that each of the ``rules`` takes. A mesh that does not know its splats counts
+    each triangle as one.
+
+    Parts and neighbours are told by centres sorted into cells of 2.5 spacings of the splats: centres in
+    neighbouring cells are connected.
+
+    Raises ValueError where there are no rules, and where nothing would be left.
+    """
+    given = [name for name, value in vars(rules).items() if value is not None]
+    if not given:
+        raise ValueError("there is no rule that says what goes")
+    centers, reach, opacities, owner = _splats(scene)
+    gone: dict[str, np.ndarray] = {}
+    if rules.crop is not None:
+        gone["crop"] = ~inside(centers, rules.crop)
+    if rules.min_opacity is not None:
+        gone["min_opacity"] = opacities < rules.min_opacity
+    if rules.max_distance is not None:
+        bounds = scene_bounds(scene)
+        away = np.linalg.norm(centers - bounds.center, axis=1)
+        gone["max_distance"] = away > rules.max_distance * bounds.radius
+    if rules.sparse is not None or rules.min_part is not None:
+        cell = CELL * float(np.median(spacing(centers.astype(np.float32))))
+        cell = max(cell, 1e-12 * (1 + float(abs(centers).max())))
+        if rules.sparse is not None:
+            near = _neighbours(centers, np.linalg.norm(reach, axis=2).max(axis=1), cell)
+            gone["sparse"] = near < rules.sparse * float(np.median(near))
+        if rules.min_part is not None:
+            points = centers[:, None] + np.concatenate([0 * reach[:, :1], reach / 2, reach], axis=1)
+            per = points.shape[1]
+            part = Cells(points.reshape(-1, 3), cell).parts(np.repeat(np.arange(len(centers)), per))[::per]
+            held = np.bincount(part, opacities)
+            gone["min_part"] = (held < rules.min_part * held.sum())[part]
+    found = Findings(gone, opacities, owner)
+    if not found.kept.any():
+        told = ", ".join(f"{name} {int(mask.sum()):,}" for name, mask in gone.items())
+        raise ValueError(f"none of the {len(centers):,} splats would be left ({told})")
+    return found
+
+
+def take_away(scene: Scene, found: Findings) -> Scene:
+    """``scene`` without the splats that ``find`` found in it."""
+    if isinstance(scene, SplatMesh):
+        return scene.keep_faces(found.kept[found.owner])  # type: ignore[return-value]
+    return scene.select(np.flatnonzero(found.kept))
+
+
+def cropped(scene: Scene, box: Sequence[float] | None) -> Scene:
+    """The splats of ``scene``, or the triangles of those, whose centre is in ``box`` x0 y0 z0 x1 y1 z1; all
+    for None. ValueError if there are none."""
+    if box is None:
+        return scene
+    return take_away(scene, find(scene, CleaningRules(crop=tuple(box))))  # type: ignore[arg-type]
+
+
+def _neighbours(centers: np.ndarray, size: np.ndarray, cell: float) -> np.ndarray:
+    """(n,) how many centres lie round each, in cells twice as large as its own ``size`` (n,) or ``cell``: a
+    wall has few splats because they are large, small ones lie scattered on it, and none of them floats."""
+    level = np.clip(np.ceil(np.log2(np.maximum(size / cell, 1))), 0, 8).astype(int)
+    near = np.empty(len(centers), np.int64)
+    for step in np.unique(level):
+        at = level == step
+        near[at] = Cells(centers, cell * 2.0 ** (step + 1)).near()[at]
+    return near
+
+
+def _splats(
+    scene: GaussianCloud | SplatMesh,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Centres (n, 3) float64, (n, 4, 3) float64 where each splat ends, from its centre, opacities (n,), and
+    the splat of each triangle of a mesh."""
+    if isinstance(scene, GaussianCloud):
+        order = np.argsort(scene.scales, axis=1)[:, 1:]
+        sigma = np.take_along_axis(scene.scales, order, axis=1)
+        half = REACH * semi_axes(scene.quaternions, order, sigma).transpose(2, 0, 1).astype(np.float64)
+        return scene.means.astype(np.float64), np.concatenate([half, -half], axis=1), scene.opacities, None
+    if not len(scene.faces):
+        raise ValueError("the mesh has no triangles: there is nothing to clean")
+    starts = np.arange(len(scene.faces)) if scene.face_splat is None else splat_starts(scene.face_splat)
+    counts = np.diff(np.append(starts, len(scene.faces)))
+    owner = np.repeat(np.arange(len(starts)), counts)
+    corners = scene.vertices[scene.faces].astype(np.float64)
+    centers = np.add.reduceat(corners.mean(axis=1), starts) / counts[:, None]
+    # The ends along the two axes of the frame that the splat is longest in.
+    low = np.minimum.reduceat(corners.min(axis=1), starts) - centers
+    high = np.maximum.reduceat(corners.max(axis=1), starts) - centers
+    across = np.argsort(high - low, axis=1)[:, 1:, None] == np.arange(3)
+    ends = np.concatenate([across * high[:, None], across * low[:, None]], axis=1)
+    opacities = np.maximum.reduceat(scene.colors[scene.faces, 3].max(axis=1), starts)
+    return centers, ends, opacities, owner

@@ -1,0 +1,191 @@
+"""Dataset: cameras with the pictures they took, for training and for testing; read from folders, or drawn
+from splats."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.rendering.looks import Look
+
+CACHE_BYTES = 2 << 30
+"""Pictures of a data set kept in memory after their first use, in bytes, where nothing else is asked for."""
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a camera saw. Values are display-referred (sRGB-encoded), rows run from top to bottom."""
+
+    color: np.ndarray
+    """(h, w, 3) RGB as it is on black, so times alpha where there is one: uint8 (255 is 1), or float16 or
+    float32 in units of 1."""
+    alpha: np.ndarray | None = None
+    """(h, w) opacity, of the same type; None: opaque, as photographs are."""
+    mask: np.ndarray | None = None
+    """(h, w) bool, True where the picture counts; None: everywhere."""
+
+    def __post_init__(self) -> None:
+        shape = self.color.shape
+        if len(shape) != 3 or shape[2] != 3 or self.color.dtype not in (np.uint8, np.float16, np.float32):
+            raise ValueError(
+                f"color must have shape (h, w, 3) and type uint8, float16 or float32,"
+                f" got {shape} {self.color.dtype}"
+            )
+        if self.alpha is not None and (self.alpha.shape, self.alpha.dtype) != (shape[:2], self.color.dtype):
+            raise ValueError(f"alpha must have shape {shape[:2]} and the type of color")
+        if self.mask is not None and (self.mask.shape, self.mask.dtype) != (shape[:2], np.dtype(bool)):
+            raise ValueError(f"mask must have shape {shape[:2]} and type bool")
+
+    def over(self, background: Sequence[float] | np.ndarray = WHITE) -> np.ndarray:
+        """(h, w, 3) float32 ``color + (1 - alpha) * background``; ``background``: RGB, (3,) or (h, w, 3)."""
+        color = _unit(self.color)
+        if self.alpha is None:
+            return color
+        return color + (1 - _unit(self.alpha))[..., None] * np.asarray(background, np.float32)
+
+    def __repr__(self) -> str:
+        height, width = self.color.shape[:2]
+        more = [name for name in ("alpha", "mask") if getattr(self, name) is not None]
+        return f"Picture({', '.join([f'{width} x {height} {self.color.dtype}', *more])})"
+
+    @property
+    def nbytes(self) -> int:
+        return sum(a.nbytes for a in (self.color, self.alpha, self.mask) if a is not None)
+
+
+class PictureSource(Protocol):
+    """Something a picture can be had from when it is asked for."""
+
+    def load(self) -> Picture: ...
+
+    @property
+    def nbytes(self) -> int:
+        """Memory the picture takes once loaded, in bytes, known before it is."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera and what it saw. Pictures are read or drawn when they are first asked for."""
+
+    camera: Camera
+    """Pinhole of the picture's size; photographs of other lenses are undistorted to it."""
+    source: Picture | PictureSource
+    background: tuple[float, float, float] = WHITE
+    """RGB in [0, 1] behind pictures with alpha in ``image``."""
+
+    def __repr__(self) -> str:
+        return f"View({self.name!r}, {self.camera.width} x {self.camera.height})"
+
+    @property
+    def name(self) -> str:
+        """The picture's name, relative to the data set."""
+        return self.camera.name
+
+    @property
+    def picture(self) -> Picture:
+        """The picture as stored. ValueError if it has not the camera's size."""
+        picture = self.source if isinstance(self.source, Picture) else self.source.load()
+        size = (self.camera.height, self.camera.width)
+        if picture.color.shape[:2] != size:
+            raise ValueError(
+                f"view {self.name!r}: its picture has shape {picture.color.shape[:2]}, not {size}"
+            )
+        return picture
+
+    @property
+    def image(self) -> np.ndarray:
+        """(h, w, 3) float32 RGB in [0, 1], over ``background`` where the picture has alpha."""
+        return self.picture.over(self.background)
+
+    @property
+    def alpha(self) -> np.ndarray | None:
+        """(h, w) float32 opacity in [0, 1]; None if everything is opaque."""
+        alpha = self.picture.alpha
+        return None if alpha is None else _unit(alpha)
+
+    @property
+    def mask(self) -> np.ndarray | None:
+        """(h, w) bool, True where the picture counts; None: everywhere. Photographs do not count outside
+        their masks, and beyond the borders that undistortion leaves black."""
+        return self.picture.mask
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Views to train with and views held out for testing, each sorted by name unless drawn from splats."""
+
+    train: tuple[View, ...]
+    test: tuple[View, ...] = ()
+    name: str = ""
+    look: Look = "area"
+    """What the images are the truth of (``rendering.looks``); photographs are means over each pixel's
+    area."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "train", tuple(self.train))
+        object.__setattr__(self, "test", tuple(self.test))
+
+    def __repr__(self) -> str:
+        sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
+        told = [f"{width} x {height}" for width, height in sizes[:3]] + ["..."] * (len(sizes) > 3)
+        name = [repr(self.name)] if self.name else []
+        counts = [f"{len(self.train)} views to train with", f"{len(self.test)} held out"]
+        return f"Dataset({', '.join([*name, *counts, *told])})"
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        return self.train + self.test
+
+    @property
+    def memory(self) -> int:
+        """Bytes that all pictures take together once loaded (of which only so many are kept as
+        ``cache_bytes`` says): 3 a pixel for photographs, 8 with alpha, 1 more with masks or undistorted."""
+        return sum(view.source.nbytes for view in self.views)
+
+    def over(self, background: Sequence[float]) -> Dataset:
+        """The same views with another ``background`` behind pictures with alpha."""
+        red, green, blue = map(float, background)
+
+        def changed(views: tuple[View, ...]) -> tuple[View, ...]:
+            return tuple(replace(view, background=(red, green, blue)) for view in views)
+
+        return replace(self, train=changed(self.train), test=changed(self.test))
+
+
+class PictureStore:
+    """Pictures that are kept, up to a number of bytes; those that come later are not.
+
+    Nothing is put out again: training goes through all views over and over, and a store that puts out the
+    oldest would then never have the one asked for.
+    """
+
+    def __init__(self, limit: int) -> None:
+        if limit < 0:
+            raise ValueError(f"cache_bytes must be >= 0, got {limit}")
+        self._left = limit
+        self._kept: dict[object, Picture] = {}
+        self._lock = threading.Lock()
+
+    def find(self, key: object) -> Picture | None:
+        return self._kept.get(key)
+
+    def keep(self, key: object, picture: Picture) -> None:
+        with self._lock:
+            if key not in self._kept and picture.nbytes <= self._left:
+                self._left -= picture.nbytes
+                self._kept[key] = picture
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    """float32 in units of 1, a new array."""
+    result = values.astype(np.float32)
+    if values.dtype == np.uint8:
+        result /= 255
+    return result

@@ -1,0 +1,1 @@
+"""How good images are: metrics, scores on held-out views, comparisons and benchmark protocols."""

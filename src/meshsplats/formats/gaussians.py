@@ -1,0 +1,231 @@
+"""Splat files: the reader is chosen by content, the writer by suffix."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import BinaryIO, Literal, get_args
+
+import numpy as np
+
+from meshsplats.errors import FileFormatError
+from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
+from meshsplats.formats._validation import Budget
+from meshsplats.formats.gltf.splats import read_splat_gltf
+from meshsplats.formats.ply.compressed_splats import is_compressed_splat, read_compressed_ply
+from meshsplats.formats.ply.header import read_header
+from meshsplats.formats.ply.splats import read_float_ply, write_float_ply
+from meshsplats.formats.splats.dot_splat import is_dot_splat, read_dot_splat
+from meshsplats.formats.splats.sog import read_sog
+from meshsplats.formats.splats.spz import is_spz, read_spz
+from meshsplats.formats.splats.streamed_sog import read_streamed_sog
+from meshsplats.gaussians import GaussianCloud
+
+Axes = Literal["auto", "y-down", "y-up"]
+SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "streamed sog", "gltf"]
+
+_CONVERT = "convert it first: npx @playcanvas/splat-transform {name} {stem}.ply"
+_SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
+_EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
+
+
+class UnreadSplats(FileFormatError):
+    """Splats, or what should be some, of a kind that is known and not read."""
+
+
+def load_gaussians(
+    path: str | os.PathLike[str], *, strict: bool = False, axes: Axes = "auto"
+) -> GaussianCloud:
+    """Splats of a file or folder, after activation. The content decides which format it is, not the name:
+    `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json),
+    streamed SOG (folder or its lod-meta.json), glTF and GLB with KHR_gaussian_splatting.
+
+    A folder is a model of the 3D Gaussian Splatting code, of which the
+    ``point_cloud/iteration_*/point_cloud.ply`` of the highest iteration is read, or an unpacked SOG file. A
+    streamed SOG scene is read in the finest level that each of its places has; its coarser levels are folders
+    in it that can be read by themselves.
+
+    The cloud has y down and z forward, as float .ply files have it. ``axes`` says what the file has: 'auto'
+    is what its format prescribes ('y-up' for SPZ and glTF, 'y-down' for the others), so that files of one
+    model agree; but some programs write SPZ with y down, which nothing in the file tells. A 'y-up' file is
+    turned by half a turn, about z if it is glTF, about x otherwise.
+
+    Splats with values that are not finite after activation (an infinite opacity logit is finite: 0 or 1), or
+    with a zero quaternion, are left out with a DataWarning that counts them; with ``strict`` they are an
+    error.
+
+    Raises FileNotFoundError, or FileFormatError for a file that is broken, of another kind, or without a
+    single usable splat; the message says what is wrong and where. MissingDependencyError for SPZ 4 without
+    Zstandard.
+    """
+    if axes not in get_args(Axes):
+        raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+    found = splat_file(Path(path))
+    with found.open("rb") as file:
+        kind = _recognised(file, found)
+        file.seek(0)
+        to_y_down, turn = np.eye(3), HALF_TURN_X
+        if kind == "ply":
+            cloud = read_float_ply(file, read_header(file, found), found, strict=strict)
+        elif kind == "compressed.ply":
+            cloud = read_compressed_ply(file, read_header(file, found), found, strict=strict)
+        elif kind == "splat":
+            cloud = read_dot_splat(file, found, strict=strict)
+        elif kind == "spz":
+            cloud, to_y_down = read_spz(file.read(), found, Budget(found), strict=strict)
+        elif kind == "sog":
+            cloud = read_sog(found, Budget(found), strict=strict)
+        elif kind == "streamed sog":
+            cloud = read_streamed_sog(found, strict=strict)
+        else:
+            cloud, to_y_down, turn = read_splat_gltf(found, strict=strict), HALF_TURN_Z, HALF_TURN_Z
+    if axes != "auto":
+        to_y_down = turn if axes == "y-up" else np.eye(3)
+    return transformed(cloud, to_y_down)
+
+
+def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
+    """The splat format that a file or folder has by its beginning, None if it has none.
+
+    Some containers serve meshes too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to hold one, and any
+    file may be broken. Raises FileNotFoundError, and UnreadSplats for a kind that is known and not read.
+    """
+    source = Path(path)
+    try:
+        found = splat_file(source)
+        with found.open("rb") as file:
+            return _recognised(file, found)
+    except UnreadSplats:
+        raise
+    except FileFormatError:
+        return None
+
+
+def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
+    """Writes ``cloud`` as a float .ply laid out as by the 3D Gaussian Splatting code, whole or not at all.
+
+    Opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, are stored as
+    sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as 2DGS files
+    have it, an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both read back as what
+    they are. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three,
+    with a DataWarning, and reads back as '3dgs'.
+
+    Raises ValueError for another suffix than .ply or for a cloud without splats.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".ply":
+        raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
+    if not len(cloud):
+        raise ValueError("no splats to write: the cloud is empty, and no reader takes such a file")
+    write_float_ply(cloud, target)
+
+
+def _recognised(file: BinaryIO, path: Path) -> SplatFormat:
+    """The format of an opened file. Raises FileFormatError, saying what it is instead if that is clear."""
+    head = file.read(4096)
+    name = path.name.lower()
+    convert = _CONVERT.format(name=path.name, stem=path.stem)
+    if not head:
+        raise FileFormatError(f"{path}: the file is empty")
+    if re.match(rb"ply[ \t]*[\r\n]", head):
+        file.seek(0)
+        header = read_header(file, path)
+        # A mesh is left to the float reader, which says what is missing.
+        return "compressed.ply" if is_compressed_splat(header) else "ply"
+    if is_spz(head):
+        return "spz"
+    if head[:4] in (b"PK\x03\x04", b"PK\x05\x06"):
+        return "sog"
+    if head[:4] == b"glTF":
+        return "gltf"
+    if re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
+        return _recognised_json(file, path, convert)
+    if name.endswith(".ksplat"):
+        raise UnreadSplats(f"{path}: .ksplat files are not read here; {convert}")
+    if is_dot_splat(file):
+        return "splat"
+    if name.endswith(".splat"):
+        raise UnreadSplats(
+            f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
+            f" (it has {path.stat().st_size:,} bytes)"
+        )
+    if head[:2] == b"\x1f\x8b":
+        raise UnreadSplats(f"{path}: a gzip file, but not SPZ; unpack it first")
+    if head.startswith(b"version https://git-lfs"):
+        raise UnreadSplats(f"{path}: a Git LFS pointer, not the file itself, which 'git lfs pull' brings")
+    if re.match(rb"\s*<(!doctype html|html)", head, re.IGNORECASE):
+        raise UnreadSplats(f"{path}: a web page, not the file itself: did the download ask for a login?")
+    raise FileFormatError(
+        f"{path}: not a splat file that is known here, it begins with {head[:8]!r}; expected {_EXPECTED}"
+    )
+
+
+def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
+    """What a JSON file is, by the words in it; its reader parses it."""
+    file.seek(0)
+    text = file.read(8 << 20)
+    if all(name in text for name in _SOG_SECTIONS):  # some name their generator in an asset, as glTF does
+        return "sog"
+    if b'"lodLevels"' in text:
+        return "streamed sog"
+    if b'"asset"' in text:
+        return "gltf"
+    if path.suffix.lower() in (".lcc", ".lcc2") or (b'"splats"' in text and b'"totalLevel"' in text):
+        raise UnreadSplats(f"{path}: .lcc scenes are not read here; {convert}")
+    if b'"means"' in text:
+        return "sog"
+    raise FileFormatError(f"{path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
+
+
+def subject_name(path: Path) -> str:
+    """What ``path`` holds, in a word: the name of the file without its suffix; that of the folder where the
+    file has a name that all have (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
+    if path.name in ("point_cloud.ply", "meta.json", "lod-meta.json"):
+        folder = path.absolute().parent
+        if re.fullmatch(r"iteration_[0-9]+", folder.name):
+            folder = folder.parent
+        if folder.name == "point_cloud":
+            folder = folder.parent
+        return folder.name or path.stem
+    if path.is_dir():
+        return path.absolute().name or "scene"
+    name = path.name
+    for suffix in (".compressed.ply", path.suffix):
+        if suffix and name.lower().endswith(suffix.lower()) and len(name) > len(suffix):
+            return name[: -len(suffix)]
+    return name
+
+
+def splat_file(path: Path) -> Path:
+    """The file that ``path`` stands for: itself, or the newest one of a model folder."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise FileFormatError(f"{path}: neither a file nor a folder")
+    if (path / "meta.json").is_file():
+        return path / "meta.json"
+    if (path / "lod-meta.json").is_file():
+        return path / "lod-meta.json"
+    for folder in (path / "point_cloud", path):
+        iterations = [
+            (int(match[1]), found)
+            for found in folder.glob("iteration_*/point_cloud.ply")
+            if (match := re.fullmatch(r"iteration_([0-9]{1,15})", found.parent.name)) and found.is_file()
+        ]
+        if iterations:
+            return max(iterations)[1]
+        if (folder / "point_cloud.ply").is_file():
+            return folder / "point_cloud.ply"
+    photographs = [n for n in ("transforms.json", "transforms_train.json", "sparse") if (path / n).exists()]
+    if photographs:
+        raise FileFormatError(
+            f"{path}: photographs, not splats ({photographs[0]} is there); commands take them with --data,"
+            " load_dataset reads them"
+        )
+    raise FileFormatError(
+        f"{path}: a folder without splats; expected a model folder with"
+        " point_cloud/iteration_*/point_cloud.ply"
+    )

@@ -1,0 +1,269 @@
+"""A glTF 2.0 file taken apart: its JSON, its buffers, its accessors. Everything is checked against what is
+there.
+
+Nothing is believed: every number that points somewhere is compared with the length of what it points into,
+and nothing is allocated that the file's own bytes do not back.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from meshsplats.errors import FileFormatError
+from meshsplats.formats._validation import Budget
+
+_COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_MAX_JSON_TOKENS = 4_000_000
+"""Brackets and commas: what makes parsed JSON large. Real files have thousands."""
+_READABLE = {
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+    "KHR_texture_basisu",
+    "EXT_mesh_gpu_instancing",
+    "EXT_texture_webp",
+    "EXT_texture_avif",
+    "KHR_lights_punctual",
+    "KHR_materials_variants",
+    "KHR_xmp_json_ld",
+}
+_COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
+
+
+class GltfDocument:
+    """``path`` is `.glb` or, beginning with a brace, `.gltf`; a file that requires an extension which is
+    neither known here nor among ``also_known`` is refused. Raises FileFormatError.
+    """
+
+    def __init__(self, path: Path, also_known: frozenset[str] = frozenset()) -> None:
+        self.path = path
+        self._also_known = also_known
+        self.budget = Budget(path)
+        self._chunk: memoryview | None = None
+        with open(path, "rb") as file:
+            data = memoryview(file.read())
+        self.json = self._parse(self._take_apart(data) if data[:4] == b"glTF" else data)
+        asset = self.json.get("asset")
+        version = asset.get("version") if isinstance(asset, dict) else None
+        if not isinstance(version, str) or version.split(".")[0] != "2":
+            raise self.error(f"not a glTF 2 file: its asset version is {str(version)[:20]!r}, expected '2.0'")
+        self._refuse_extensions()
+        self._buffers: dict[int, memoryview] = {}
+
+    def error(self, message: str) -> FileFormatError:
+        """An error about this file, to be raised."""
+        return FileFormatError(f"{self.path}: {message}")
+
+    # -- structure
+
+    def items(self, kind: str) -> list[dict[str, Any]]:
+        """The top-level array ``kind`` ("meshes", "nodes" ...), empty where it is absent."""
+        found = self.json.get(kind, [])
+        if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
+            raise self.error(f"{kind} must be an array of objects")
+        return found
+
+    def item(self, kind: str, index: object, what: str) -> dict[str, Any]:
+        """Entry ``index`` of the top-level array ``kind``; ``what`` names the one who refers to it."""
+        found = self.items(kind)
+        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
+            raise self.error(f"{what} refers to number {str(index)[:20]} of {len(found)} {kind}")
+        return found[index]
+
+    def whole(self, owner: dict[str, Any], key: str, what: str, default: int | None = None) -> int:
+        """A whole number >= 0."""
+        value = owner.get(key, default)
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
+            raise self.error(f"{what} needs a whole number {key!r}, got {str(value)[:20]}")
+        return value
+
+    def numbers(self, value: object, length: int, what: str) -> np.ndarray:
+        """An array of ``length`` finite numbers, float64."""
+        if (
+            isinstance(value, list)
+            and len(value) == length
+            and all(isinstance(x, (int, float)) and abs(x) < 1e300 for x in value)
+        ):
+            return np.array(value, np.float64)
+        raise self.error(f"{what} must be {length} numbers, got {str(value)[:60]}")
+
+    # -- binary data
+
+    def view_bytes(self, index: object, what: str) -> tuple[memoryview, int | None]:
+        """Bytes of a buffer view and its stride, None where the elements are packed."""
+        view = self.item("bufferViews", index, what)
+        extensions = view.get("extensions")
+        if isinstance(extensions, dict) and _COMPRESSED & extensions.keys():
+            raise self.compressed()
+        buffer = self._buffer(self.whole(view, "buffer", "a buffer view"))
+        offset = self.whole(view, "byteOffset", "a buffer view", 0)
+        length = self.whole(view, "byteLength", "a buffer view")
+        if offset + length > len(buffer):
+            raise self.error(
+                f"buffer view {index} ends at byte {offset + length:,} of a buffer of {len(buffer):,}"
+            )
+        stride = view.get("byteStride")
+        if stride is not None and not 4 <= self.whole(view, "byteStride", "a buffer view") <= 252:
+            raise self.error(f"byteStride of buffer view {index} must be 4 to 252, got {stride}")
+        return buffer[offset : offset + length], stride
+
+    def accessor(self, index: object, what: str) -> np.ndarray:
+        """(count, columns) array of the stored type, a view into the file's bytes."""
+        accessor = self.item("accessors", index, what)
+        if "sparse" in accessor:
+            raise self.error(
+                f"{what} uses a sparse accessor, which is not supported; rewrite the file without,"
+                " for example with 'gltf-transform copy' or Blender"
+            )
+        dtype = _COMPONENTS.get(self.whole(accessor, "componentType", what))
+        columns = _COLUMNS.get(str(accessor.get("type")))
+        if dtype is None or columns is None:
+            raise self.error(
+                f"{what} has type {str(accessor.get('type'))[:20]} of components"
+                f" {accessor['componentType']}, expected numbers or vectors"
+            )
+        count = self.whole(accessor, "count", what)
+        if "bufferView" not in accessor:
+            raise self.error(f"{what} has an accessor without data")
+        data, stride = self.view_bytes(accessor["bufferView"], what)
+        offset = self.whole(accessor, "byteOffset", what, 0)
+        element = columns * np.dtype(dtype).itemsize
+        step = stride or element
+        if step < element or (count and offset + (count - 1) * step + element > len(data)):
+            raise self.error(
+                f"{what} claims {count:,} elements of {element} bytes, every {step} bytes from"
+                f" {offset:,} on, in a buffer view of {len(data):,} bytes"
+            )
+        strides = (step, np.dtype(dtype).itemsize)
+        return np.ndarray((count, columns), dtype, data, offset if count else 0, strides)
+
+    def floats(self, index: object, what: str) -> np.ndarray:
+        """As ``accessor``, float32, integers decoded: fractions of their largest value where
+        ``normalized``."""
+        values = self.accessor(index, what)
+        self.budget.spend(4 * values.size, what)
+        result = values.astype(np.float32)
+        if values.dtype.kind in "iu" and self.item("accessors", index, what).get("normalized") is True:
+            result /= np.float32(np.iinfo(values.dtype).max)
+            np.maximum(result, -1, out=result)
+        return result
+
+    # -- reading
+
+    def _take_apart(self, data: memoryview) -> memoryview:
+        """JSON chunk of a .glb; remembers the binary chunk."""
+        if len(data) < 20:
+            raise self.error(f"truncated .glb file of {len(data)} bytes")
+        _, version, total = struct.unpack_from("<4sII", data)
+        if version != 2:
+            raise self.error(f".glb container of version 2 expected, got version {version}")
+        if total > len(data):
+            raise self.error(f"truncated: {total:,} bytes announced, {len(data):,} present")
+        at, json_chunk = 12, None
+        while at + 8 <= total:
+            length, kind = struct.unpack_from("<II", data, at)
+            if at + 8 + length > total:
+                raise self.error(f"the chunk at byte {at:,} runs past the end of the file")
+            body = data[at + 8 : at + 8 + length]
+            if kind == 0x4E4F534A and json_chunk is None:
+                json_chunk = body
+            elif kind == 0x004E4942 and self._chunk is None:
+                self._chunk = body
+            at += 8 + length
+        if json_chunk is None:
+            raise self.error("a .glb file without JSON chunk")
+        return json_chunk
+
+    def _parse(self, text: memoryview) -> dict[str, Any]:
+        raw = bytes(text)
+        if sum(raw.count(c) for c in (b",", b"[", b"{")) > _MAX_JSON_TOKENS:
+            raise self.error(f"the JSON part has over {_MAX_JSON_TOKENS:,} entries; refused")
+
+        def refuse(name: str) -> float:
+            raise ValueError(f"{name} is no JSON number")
+
+        try:
+            parsed = json.loads(raw, parse_constant=refuse)
+        except (ValueError, RecursionError) as error:
+            raise self.error(f"the JSON part cannot be read: {str(error)[:120]}") from None
+        if not isinstance(parsed, dict):
+            raise self.error("the JSON part must be an object")
+        return parsed
+
+    def _refuse_extensions(self) -> None:
+        required = self.json.get("extensionsRequired", [])
+        if not isinstance(required, list):
+            raise self.error("extensionsRequired must be an array")
+        if any(e in _COMPRESSED for e in required if isinstance(e, str)):
+            raise self.compressed()
+        unknown = [
+            str(e)[:60]
+            for e in required
+            if not isinstance(e, str) or not (_known(e) or e in self._also_known)
+        ]
+        if unknown:
+            raise self.error(f"needs the glTF extension {unknown[0]}, which is not supported")
+
+    def compressed(self) -> FileFormatError:
+        """The error about compression that this reader does not undo."""
+        return self.error(
+            "compressed glTF (Draco or meshopt) is not supported; decompress it first:"
+            " npx @gltf-transform/cli copy in.glb out.glb"
+        )
+
+    def _buffer(self, index: int) -> memoryview:
+        if index in self._buffers:
+            return self._buffers[index]
+        buffer = self.item("buffers", index, "a buffer view")
+        uri = buffer.get("uri")
+        if uri is None:
+            if index != 0 or self._chunk is None:
+                raise self.error(f"buffer {index} has neither data nor URI")
+            data = self._chunk
+        elif not isinstance(uri, str):
+            raise self.error(f"the URI of buffer {index} must be a text")
+        else:
+            data = self.uri_bytes(uri, f"buffer {index}")
+        length = self.whole(buffer, "byteLength", "a buffer")
+        if length > len(data):
+            raise self.error(f"buffer {index} should have {length:,} bytes, has {len(data):,}")
+        self._buffers[index] = data[:length]
+        return self._buffers[index]
+
+    def uri_bytes(self, uri: str, what: str) -> memoryview:
+        """What a URI stands for: base64 data in itself, or a file beside this one."""
+        if not uri.startswith("data:"):
+            return self._beside(uri)
+        head, _, body = uri.partition(",")
+        if not head.endswith(";base64"):
+            raise self.error(f"the data URI of {what} is not base64")
+        try:
+            return memoryview(base64.b64decode(body))
+        except (binascii.Error, ValueError):
+            raise self.error(f"the data URI of {what} is broken") from None
+
+    def _beside(self, uri: str) -> memoryview:
+        """A file that a .gltf file refers to. It must lie in the folder of the .gltf file or below."""
+        folder = Path(os.path.realpath(self.path)).parent
+        name = unquote(uri)
+        target = Path(os.path.realpath(folder / name)) if "\0" not in name else folder
+        if ":" in uri or "\\" in name or os.path.isabs(name) or folder not in target.parents:
+            raise self.error(f"refers to {uri[:80]!r} outside its folder; refused")
+        if not target.is_file():
+            raise self.error(f"its file {uri[:80]!r} is missing")
+        self.budget.extend(target.stat().st_size)
+        return memoryview(target.read_bytes())
+
+
+def _known(extension: str) -> bool:
+    return extension in _READABLE or extension.startswith("KHR_materials_")

@@ -1,0 +1,328 @@
+"""Reading meshes from glTF 2.0: the files of ``glb`` exactly, those of other programs as far as triangles and
+vertex colours go."""
+
+from __future__ import annotations
+
+import warnings
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from meshsplats.binding import Binding
+from meshsplats.colors import linear_to_srgb
+from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
+from meshsplats.formats._validation import checked_binding, checked_mesh, straight_colors
+from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.scene import Placed, placed_meshes, rotation_matrix
+from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.mesh import Blending, SplatMesh
+
+POINTS_TO_LINES = (0, 1, 2, 3)
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+
+@dataclass
+class _Piece:
+    """One primitive as placed by one node."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    linear: np.ndarray
+    normals: np.ndarray | None
+
+
+def read_gltf(path: Path) -> SplatMesh:
+    """The mesh in a `.glb` or `.gltf` file.
+
+    A file of ours comes back as it was saved: positions and extra arrays exactly, colours within the
+    precision they were stored in. From other programs' files all triangles of the scene are joined in
+    its y-up frame; colours are COLOR_0 times the material's base colour, converted to display values;
+    textures are left out with a DataWarning. Buffers must be embedded or lie beside the file. Raises
+    FileFormatError, for Draco and meshopt compression and sparse accessors too.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers end in the check for finite values
+        return _read(GltfDocument(path))
+
+
+def _read(document: GltfDocument) -> SplatMesh:
+    path = document.path
+    placed = list(placed_meshes(document))
+    pieces, skipped, textured = [], 0, 0
+    own = placed[0].mesh if len(placed) == 1 else {}
+    note = _our_note(own)
+    for place in placed:
+        if note and _is_own_placement(place.matrix, note):
+            place = place._replace(matrix=np.eye(4))
+        elif note:  # someone has moved the mesh in the scene
+            note["up"] = [0.0, 1.0, 0.0]
+        for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
+            mode = primitive.get("mode", _TRIANGLES)
+            if mode in POINTS_TO_LINES:
+                skipped += 1
+                _refuse_splats(document, primitive)
+                continue
+            material = material_of(document, primitive)
+            textured += "baseColorTexture" in pbr_of(material)
+            pieces.append(_piece(document, primitive, material, place))
+    if skipped:
+        _warn(f"{path}: {skipped:,} primitives of points or lines were left out")
+    if textured:
+        message = f"{path}: {textured:,} primitives have a texture, which was left out; colours may differ"
+        warnings.warn(message, NoTextureWarning, stacklevel=3)
+    if not pieces:
+        raise document.error("the scene holds no triangles")
+    return _join(document, pieces, own, note)
+
+
+def _piece(
+    document: GltfDocument, primitive: dict[str, Any], material: dict[str, Any], place: Placed
+) -> _Piece:
+    attributes = primitive.get("attributes")
+    if not isinstance(attributes, dict) or "POSITION" not in attributes:
+        raise document.error("a primitive has no POSITION")
+    if "KHR_draco_mesh_compression" in dict_or_empty(primitive.get("extensions")):
+        raise document.compressed()
+    vertices = document.floats(attributes["POSITION"], "POSITION")
+    v = len(vertices)
+    faces = primitive_faces(document, primitive, v)
+    document.budget.spend(64 * v + 12 * len(faces), "a mesh")
+    factor = document.numbers(pbr_of(material).get("baseColorFactor", [1, 1, 1, 1]), 4, "baseColorFactor")
+    linear = np.ones((v, 4), np.float32)
+    if "COLOR_0" in attributes:
+        colors = document.floats(attributes["COLOR_0"], "COLOR_0")
+        if len(colors) != v or colors.shape[1] < 3:
+            raise document.error(f"COLOR_0 must be {v:,} RGB or RGBA colours, got shape {colors.shape}")
+        linear[:, : colors.shape[1]] = colors
+    if (factor != 1).any():
+        linear *= factor.astype(np.float32)
+    if material.get("alphaMode", "OPAQUE") == "OPAQUE":
+        linear[:, 3] = 1
+    normals = None
+    if "NORMAL" in attributes:
+        normals = document.floats(attributes["NORMAL"], "NORMAL")
+    for name, values in (("POSITION", vertices), ("NORMAL", normals)):
+        if values is not None and values.shape != (v, 3):
+            raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")
+    vertices, normals = place.applied(document, attributes, vertices, normals)
+    return _Piece(vertices, faces, linear, normals)
+
+
+def primitive_faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
+    if "indices" in primitive:
+        stored = document.accessor(primitive["indices"], "indices")
+        if stored.dtype.kind != "u" or stored.shape[1] != 1:
+            raise document.error(f"indices must be unsigned integers, got {stored.dtype}")
+        if len(stored) and stored.max() >= v:
+            raise document.error(f"indices run up to {stored.max()}, there are {v:,} vertices")
+        document.budget.spend(4 * len(stored), "indices")
+        corners = stored[:, 0].astype(np.int32)
+    else:
+        corners = np.arange(v, dtype=np.int32)
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode == _TRIANGLES:
+        if len(corners) % 3:
+            raise document.error(f"{len(corners):,} indices are no whole number of triangles")
+        return corners.reshape(-1, 3)
+    n = max(len(corners) - 2, 0)
+    document.budget.spend(36 * n, "indices")
+    i = np.arange(n)
+    if mode == _STRIP:
+        return corners[np.stack([i, i + 1 + i % 2, i + 2 - i % 2], axis=1)]
+    if mode == _FAN:
+        return corners[np.stack([i + 1, i + 2, 0 * i], axis=1)]
+    raise document.error(f"unknown primitive mode {str(mode)[:20]}")
+
+
+def _join(
+    document: GltfDocument, pieces: list[_Piece], own: dict[str, Any], note: dict[str, Any]
+) -> SplatMesh:
+    counts = np.cumsum([0, *(len(p.vertices) for p in pieces)])
+    if counts[-1] > np.iinfo(np.int32).max:
+        raise document.error(f"{counts[-1]:,} vertices are more than a mesh can number")
+    one = len(pieces) == 1
+    linear = pieces[0].linear if one else np.concatenate([p.linear for p in pieces])
+    colors = straight_colors(linear, document.path)
+    if note.get("blending") != "linear":
+        colors[:, :3] = linear_to_srgb(colors[:, :3])
+    normals: np.ndarray | None = None
+    if all(p.normals is not None for p in pieces) and note.get("normals") != "computed":
+        normals = np.concatenate([p.normals for p in pieces])  # type: ignore[misc]
+    faces = [p.faces + np.int32(start) for p, start in zip(pieces, counts[:-1], strict=True)]
+    arrays: dict[str, Any] = {
+        "vertices": pieces[0].vertices if one else np.concatenate([p.vertices for p in pieces]),
+        "faces": np.concatenate(faces),
+        "colors": colors,
+        "normals": normals,
+        "up": (0, 1, 0),
+    }
+    if note and len(own["primitives"]) == 1:
+        arrays |= _restore(document, own, note, len(arrays["faces"]), colors)
+        if arrays.get("binding") is not None and not _still_there(arrays["binding"], arrays["vertices"]):
+            _warn(
+                f"{document.path}: another program has moved vertices, left out: the binding to a base mesh"
+            )
+            arrays["binding"] = None
+    return checked_mesh(document.path, **arrays)
+
+
+# -- what our own files hold beyond glTF
+
+
+def _our_note(mesh: dict[str, Any]) -> dict[str, Any]:
+    """The entry ``extras.meshsplats`` of a mesh where it is one of ours and in order, else an empty one."""
+    note = dict_or_empty(dict_or_empty(mesh.get("extras")).get("meshsplats"))
+    up = note.get("up")
+    good = (
+        isinstance(up, list) and len(up) == 3 and all(isinstance(u, (int, float)) and abs(u) <= 2 for u in up)
+    )
+    if not good or note.get("blending") not in get_args(Blending) or not any(up):  # type: ignore[arg-type]
+        return {}
+    return note
+
+
+def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
+    """Whether the node still does what we wrote: turn the mesh's up direction to +y, nothing more."""
+    wanted = rotation_matrix(up_quaternion(np.array(note["up"], np.float64)))
+    return bool(np.abs(matrix - wanted).max() < 1e-5)
+
+
+def _restore(
+    document: GltfDocument, mesh: dict[str, Any], note: dict[str, Any], f: int, colors: np.ndarray
+) -> dict[str, Any]:
+    """Constructor arguments from our note. What another program has dropped or renumbered is left out, with a
+    DataWarning: better no splat numbers than wrong ones."""
+    result: dict[str, Any] = {"up": note["up"], "blending": note["blending"]}
+    lost: list[str] = []
+    v = len(colors)
+    for name in ("face_splat", "depth_group"):
+        if name in note:
+            values = _raw(document, dict_or_empty(note[name]), "<i4", f)
+            if values is None:
+                lost.append(name)
+            else:
+                result[name] = values
+    if "filter_px2" in note:
+        variance = float(document.numbers([note["filter_px2"]], 1, "filter_px2")[0])
+        if "face_splat" in result:
+            result["filter_px2"] = variance
+        else:
+            lost.append("the filter of its splats")
+    if isinstance(note.get("alpha"), str):
+        true_alpha = _attribute(
+            document, mesh["primitives"][0]["attributes"], {"semantic": note["alpha"]}, v, 1
+        )
+        if true_alpha is None:
+            lost.append("opacities")
+        else:
+            result["colors"] = np.concatenate([colors[:, :3], np.clip(true_alpha, 0, 1)], axis=1)
+    if "binding" in note:
+        result["binding"] = _binding(document, dict_or_empty(note["binding"]), v)
+        if result["binding"] is None:
+            lost.append("the binding to a base mesh")
+    attributes: dict[str, np.ndarray] = {}
+    stored = dict_or_empty(mesh["primitives"][0]["attributes"])
+    entries = note.get("attributes", [])
+    for entry in entries if isinstance(entries, list) else []:
+        key, columns = dict_or_empty(entry).get("name"), dict_or_empty(entry).get("columns")
+        if isinstance(key, str) and (columns is None or (isinstance(columns, int) and 0 <= columns <= 4096)):
+            values = _attribute(document, stored, entry, v, 1 if columns is None else columns)
+            if values is None:
+                lost.append(key[:40])
+            else:
+                attributes[key] = values[:, 0] if columns is None else values
+    if lost:
+        _warn(f"{document.path}: another program has altered the file, left out: {', '.join(lost)}")
+    return result | {"attributes": attributes}
+
+
+def _binding(document: GltfDocument, entry: dict[str, Any], v: int) -> Binding | None:
+    """The binding of a mesh prior's v vertices; None where an array of it is gone or another."""
+    n = document.whole(entry, "baseVertexCount", "a binding")
+    m = document.whole(entry, "baseFaceCount", "a binding")
+    lift = float(document.numbers([entry.get("lift")], 1, "lift of a binding")[0])
+    wanted = {
+        "base_vertices": ("baseVertices", "<f4", (n, 3)),
+        "base_faces": ("baseFaces", "<i4", (m, 3)),
+        "vertex_face": ("vertexFace", "<i4", (v,)),
+        "weights": ("weights", "<f4", (v, 3)),
+        "layers": ("layers", "<i4", (v,)),
+    }
+    parts = {}
+    for name, (key, dtype, shape) in wanted.items():
+        values = _raw(
+            document, dict_or_empty(entry.get(key)), dtype, shape[0] * (3 if len(shape) == 2 else 1)
+        )
+        if values is None:
+            return None
+        parts[name] = values.reshape(shape)
+    return checked_binding(document.path, lift=lift, **parts)
+
+
+def _still_there(binding: Binding, vertices: np.ndarray) -> bool:
+    """Whether the vertices are where the binding has them, but for rounding."""
+    size = float(np.abs(binding.base_vertices).max(initial=0))
+    return bool((np.abs(binding.positions() - vertices) <= 1e-4 * size).all())
+
+
+def _attribute(
+    document: GltfDocument, stored: dict[str, Any], entry: dict[str, Any], v: int, columns: int
+) -> np.ndarray | None:
+    """(v, columns) values of one attribute, None where they are gone."""
+    if columns == 0:
+        return np.empty((v, 0), np.float32)
+    semantic = entry.get("semantic")
+    if semantic is None:
+        values = _raw(document, entry, "<f4", v * columns)
+        return None if values is None else values.reshape(v, columns)
+    if not isinstance(semantic, str) or semantic not in stored:
+        return None
+    values = document.floats(stored[semantic], semantic[:60])
+    return values if values.shape == (v, columns) else None
+
+
+def _raw(document: GltfDocument, entry: dict[str, Any], dtype: str, count: int) -> np.ndarray | None:
+    """``count`` numbers of a buffer view that only our note refers to; None if the view is not the one
+    we wrote."""
+    try:
+        data, _ = document.view_bytes(entry.get("bufferView"), "meshsplats")
+    except FileFormatError:
+        return None
+    if len(data) != count * np.dtype(dtype).itemsize or zlib.crc32(data) != entry.get("crc32"):
+        return None
+    document.budget.spend(len(data), "meshsplats")
+    return np.frombuffer(data, dtype).astype(np.dtype(dtype).newbyteorder("="))
+
+
+# -- small change
+
+
+def material_of(document: GltfDocument, primitive: dict[str, Any]) -> dict[str, Any]:
+    if "material" not in primitive:
+        return {}
+    return document.item("materials", primitive["material"], "a primitive")
+
+
+def pbr_of(material: dict[str, Any]) -> dict[str, Any]:
+    return dict_or_empty(material.get("pbrMetallicRoughness"))
+
+
+def _refuse_splats(document: GltfDocument, primitive: dict[str, Any]) -> None:
+    if any("gaussian_splatting" in name for name in dict_or_empty(primitive.get("extensions"))):
+        raise document.error("holds Gaussian splats, not a mesh; read it with load_gaussians")
+
+
+def dict_or_empty(value: object) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def objects_in(document: GltfDocument, value: object, what: str) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(x, dict) for x in value):
+        raise document.error(f"{what} must be an array of objects")
+    return value
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, DataWarning, stacklevel=4)

@@ -1,0 +1,237 @@
+"""Where the meshes of a glTF scene stand: nodes, instances and skins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from itertools import count
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from meshsplats.formats.gltf.document import GltfDocument
+
+INSTANCING = "EXT_mesh_gpu_instancing"
+_AT_ONCE = 1 << 15
+_PLACE_BYTES = 512
+"""About what a matrix takes on the way."""
+
+
+class Placed(NamedTuple):
+    """A mesh as the scene has it."""
+
+    mesh: dict[str, Any]
+    matrix: np.ndarray
+    """(4, 4) from the mesh's frame to the scene's."""
+    joints: Callable[[], np.ndarray] | None = None
+    """Gives (j, 4, 4), the same by joint of its skin, which take the place of ``matrix`` where a primitive
+    names joints and weights; None: it has no skin."""
+
+    def applied(
+        self,
+        document: GltfDocument,
+        attributes: dict[str, Any],
+        vertices: np.ndarray,
+        normals: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Vertices and normals (v, 3) float32 of a primitive in the scene's frame."""
+        if self.joints is not None and {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
+            mixed = _Mix(document, attributes, self.joints(), len(vertices))
+        elif (self.matrix == np.eye(4)).all():
+            return vertices, normals
+        else:
+            mixed = None
+        moved = np.empty_like(vertices)
+        turned = None if normals is None else np.empty_like(normals)
+        for start in range(0, len(vertices), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            matrices = self.matrix[None] if mixed is None else mixed.of(part)
+            linear = matrices[:, :3, :3]
+            moved[part] = np.einsum("nij,nj->ni", linear, vertices[part]) + matrices[:, :3, 3]
+            if normals is not None and turned is not None:
+                # Normals follow the inverse transpose or, as its length does not matter, the matrix of
+                # cofactors.
+                a, b, c = np.moveaxis(linear, 2, 0)
+                cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+                sides = np.einsum("nij,nj->ni", cofactors, normals[part])
+                length = np.linalg.norm(sides, axis=1, keepdims=True)
+                turned[part] = sides / np.where(length > 0, length, 1)
+        return moved, turned
+
+
+class _Mix:
+    """The matrices of a skin's joints, mixed by each vertex' weights."""
+
+    def __init__(
+        self, document: GltfDocument, attributes: dict[str, Any], joints: np.ndarray, v: int
+    ) -> None:
+        self._joints = joints
+        self._sets: list[tuple[np.ndarray, np.ndarray]] = []
+        for k in count():
+            name, weights_name = f"JOINTS_{k}", f"WEIGHTS_{k}"
+            if name not in attributes or weights_name not in attributes:
+                break
+            numbers = document.accessor(attributes[name], name)
+            weights = document.floats(attributes[weights_name], weights_name)
+            if numbers.shape != (v, 4) or weights.shape != (v, 4) or numbers.dtype.kind != "u":
+                raise document.error(
+                    f"{name} and {weights_name} must be {v:,} times 4 whole numbers and weights, got shapes"
+                    f" {numbers.shape} and {weights.shape}"
+                )
+            used = np.where(weights != 0, numbers, 0)  # what has no weight may be any number
+            if v and used.max() >= len(joints):
+                raise document.error(f"{name} runs up to {used.max()}, the skin has {len(joints)} joints")
+            self._sets.append((used, weights))
+
+    def of(self, part: slice) -> np.ndarray:
+        """(n, 4, 4) for these vertices; weights are scaled to a sum of 1, without any the first joint
+        counts."""
+        numbers = np.concatenate([numbers[part] for numbers, _ in self._sets], axis=1)
+        weights = np.concatenate([weights[part] for _, weights in self._sets], axis=1).astype(np.float64)
+        total = weights.sum(axis=1)
+        weights[total <= 0] = np.eye(1, weights.shape[1])
+        weights /= np.where(total > 0, total, 1)[:, None]
+        mixed = np.zeros((len(numbers), 4, 4))
+        for k in range(numbers.shape[1]):
+            mixed += weights[:, k, None, None] * self._joints[numbers[:, k]]
+        return mixed
+
+
+def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
+    """Each mesh of the scene as often as it stands there."""
+    nodes, scenes = document.items("nodes"), document.items("scenes")
+    if not scenes and not nodes:
+        yield from (Placed(mesh, np.eye(4)) for mesh in document.items("meshes"))
+        return
+    if scenes:
+        scene = document.item("scenes", document.json.get("scene", 0), "the file")
+        roots = _numbers(document, scene.get("nodes", []), "nodes of a scene")
+    else:
+        roots = _nodes_below_none(document)
+    matrices = _world_matrices(document, roots)
+    for index, matrix in matrices.items():
+        node = nodes[index]
+        if "mesh" not in node:
+            continue
+        mesh = document.item("meshes", node["mesh"], f"node {index}")
+        # Primitives share it, and whoever looks at other things of the scene never needs it.
+        joints = cache(partial(_joints, document, node["skin"], matrices)) if "skin" in node else None
+        extensions = node.get("extensions")
+        if isinstance(extensions, dict) and INSTANCING in extensions:
+            yield from (Placed(mesh, matrix @ own) for own in _instances(document, extensions[INSTANCING]))
+        else:
+            yield Placed(mesh, matrix, joints)
+
+
+def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray]) -> np.ndarray:
+    """(j, 4, 4) from the frame of a skinned mesh to the scene's. The node that holds the mesh has no part in
+    it (glTF 2.0, 3.7.3.3)."""
+    skin = document.item("skins", index, "a node")
+    numbers = _numbers(document, skin.get("joints"), "joints of a skin")
+    if not numbers:
+        raise document.error("a skin needs joints")
+    document.budget.spend(_PLACE_BYTES * len(numbers), f"the {len(numbers):,} joints of a node")
+    bound = np.eye(4)[None]
+    if "inverseBindMatrices" in skin:
+        bound = document.floats(skin["inverseBindMatrices"], "inverseBindMatrices").astype(np.float64)
+        if bound.shape[1] != 16 or len(bound) < len(numbers):
+            raise document.error(
+                f"inverseBindMatrices must be {len(numbers)} matrices of 16 numbers, got shape {bound.shape}"
+            )
+        bound = bound[: len(numbers)].reshape(-1, 4, 4).transpose(0, 2, 1)
+    outside = set(numbers) - matrices.keys()
+    if outside:  # of another scene, or of none
+        matrices = matrices | _world_matrices(document, _nodes_below_none(document))
+        for n in outside:
+            document.item("nodes", n, "a skin or node")
+            if n not in matrices:
+                raise document.error(f"node {n} is above itself")
+    return np.stack([matrices[n] for n in numbers]) @ bound
+
+
+def _world_matrices(document: GltfDocument, roots: Sequence[int]) -> dict[int, np.ndarray]:
+    """(4, 4) from the frame of each node at or below ``roots`` to the world's, in the order of the file's
+    tree."""
+    matrices: dict[int, np.ndarray] = {}
+    stack = [(root, np.eye(4)) for root in reversed(roots)]
+    while stack:
+        index, parent = stack.pop()
+        node = document.item("nodes", index, "a scene or node")
+        if index in matrices:
+            raise document.error(f"node {index} has two parents")
+        matrices[index] = parent @ _local_matrix(document, node)
+        children = _numbers(document, node.get("children", []), "children of a node")
+        stack += [(child, matrices[index]) for child in reversed(children)]
+    return matrices
+
+
+def _nodes_below_none(document: GltfDocument) -> list[int]:
+    nodes = document.items("nodes")
+    below = {c for n in nodes for c in _numbers(document, n.get("children", []), "children of a node")}
+    return [i for i in range(len(nodes)) if i not in below]
+
+
+def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:
+    """(4, 4) from a mesh's frame to its node's, instance by instance."""
+    attributes = extension.get("attributes") if isinstance(extension, dict) else None
+    if not isinstance(attributes, dict):
+        raise document.error(f"{INSTANCING} needs an object 'attributes'")
+    rows: dict[str, np.ndarray] = {}
+    for name, columns in (("TRANSLATION", 3), ("ROTATION", 4), ("SCALE", 3)):
+        if name in attributes:
+            rows[name] = document.floats(attributes[name], name).astype(np.float64)
+            if rows[name].shape[1] != columns:
+                raise document.error(
+                    f"{name} of instances must have {columns} columns, got {rows[name].shape}"
+                )
+    counts = {len(values) for values in rows.values()}
+    if not rows:  # attributes of the application alone, one of each for an instance
+        counts = {
+            document.whole(document.item("accessors", i, INSTANCING), "count", INSTANCING)
+            for i in attributes.values()
+        }
+    if len(counts) != 1:
+        raise document.error(f"{INSTANCING} needs as many of each attribute, got {sorted(counts)}")
+    number = counts.pop()
+    document.budget.spend(_PLACE_BYTES * number, f"{number:,} instances")
+    for i in range(number):
+        yield _matrix(
+            *(rows[name][i] if name in rows else None for name in ("TRANSLATION", "ROTATION", "SCALE"))
+        )
+
+
+def _local_matrix(document: GltfDocument, node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return document.numbers(node["matrix"], 16, "matrix of a node").reshape(4, 4).T
+    parts = (("translation", 3), ("rotation", 4), ("scale", 3))
+    return _matrix(*(document.numbers(node[k], n, f"{k} of a node") if k in node else None for k, n in parts))
+
+
+def _matrix(
+    translation: np.ndarray | None, rotation: np.ndarray | None, scale: np.ndarray | None
+) -> np.ndarray:
+    """(4, 4): scaled, turned, moved."""
+    matrix = np.eye(4) if rotation is None else rotation_matrix(rotation)
+    if scale is not None:
+        matrix[:3, :3] *= scale
+    if translation is not None:
+        matrix[:3, 3] = translation
+    return matrix
+
+
+def rotation_matrix(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
+    """(4, 4) matrix of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return matrix
+
+
+def _numbers(document: GltfDocument, value: object, what: str) -> list[int]:
+    if not isinstance(value, list) or not all(isinstance(x, int) for x in value):
+        raise document.error(f"{what} must be an array of whole numbers")
+    return value

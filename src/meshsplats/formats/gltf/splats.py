@@ -1,0 +1,132 @@
+"""glTF and GLB with splats: the extension KHR_gaussian_splatting, plain or holding SPZ.
+
+A primitive of points is a cloud of splats; its attributes are activated already and nodes place it. glTF
+scenes have x to the left, y up and z forward. Drafts of the extension stored log scales, recognised by
+negative values.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.errors import DataWarning
+from meshsplats.formats._orientation import transformed
+from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.scene import placed_meshes
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined
+from meshsplats.formats.splats.spz import read_spz
+from meshsplats.gaussians import GaussianCloud
+
+EXTENSION = "KHR_gaussian_splatting"
+_COMPRESSED = (
+    "KHR_gaussian_splatting_compression_spz_2",
+    "KHR_gaussian_splatting_compression_spz",
+    "KHR_spz_gaussian_splats_compression",
+    "KHR_spz_compression",
+)
+_TO_Y_DOWN = np.diag([-1.0, -1.0, 1.0])
+"""From glTF's x left, y up, z forward to x right, y down, z forward; its own inverse."""
+
+
+def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
+    """The splats of all nodes of a glTF scene, in its frame; errors as ``load_gaussians``."""
+    document = GltfDocument(path, also_known=frozenset({EXTENSION, *_COMPRESSED}))
+    clouds = []
+    for place in placed_meshes(document):
+        for primitive in _splat_primitives(document, place.mesh):
+            cloud = _cloud(document, primitive, strict=strict)
+            try:
+                clouds.append(transformed(cloud, place.matrix))
+            except ValueError as error:
+                raise document.error(f"a node's transform cannot be applied to splats: {error}") from None
+    if not clouds:
+        raise document.error(
+            f"a glTF file without splats (no primitive has {EXTENSION}); load_mesh reads meshes"
+        )
+    return joined(clouds, document.budget)
+
+
+def has_splats(path: Path) -> bool:
+    """Whether a glTF file names the extension; a broken file raises FileFormatError."""
+    document = GltfDocument(path, also_known=frozenset({EXTENSION, *_COMPRESSED}))
+    used = document.json.get("extensionsUsed", [])
+    return isinstance(used, list) and any(name in used for name in (EXTENSION, *_COMPRESSED))
+
+
+def _splat_primitives(document: GltfDocument, mesh: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    primitives = mesh.get("primitives")
+    if not isinstance(primitives, list) or not all(isinstance(p, dict) for p in primitives):
+        raise document.error("the primitives of a mesh must be an array of objects")
+    for primitive in primitives:
+        if {EXTENSION, *_COMPRESSED} & _object(document, primitive, "extensions").keys():
+            yield primitive
+
+
+def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -> GaussianCloud:
+    extensions = _object(document, primitive, "extensions")
+    splatting = _object(document, extensions, EXTENSION)
+    nested = extensions | _object(document, splatting, "extensions")
+    for name in _COMPRESSED:
+        if name in nested:
+            view = _object(document, nested, name).get("bufferView")
+            data, _ = document.view_bytes(view, name)
+            spz = read_spz(data, document.path, document.budget, strict=strict)
+            return transformed(spz.cloud, _TO_Y_DOWN @ spz.to_y_down)
+    if splatting.get("colorSpace") == "lin_rec709_display":
+        warnings.warn(
+            f"{document.path}: these splats were trained in linear colours, which are taken as display"
+            " colours here;"
+            " the picture will be darker than it should",
+            DataWarning,
+            stacklevel=5,
+        )
+    attributes = _object(document, primitive, "attributes")
+    means = _attribute(document, attributes, "POSITION", 3)
+    count = len(means)
+    stored = {
+        name: _attribute(document, attributes, f"{EXTENSION}:{name}", columns, count)
+        for name, columns in (("ROTATION", 4), ("SCALE", 3), ("OPACITY", 1))
+    }
+    sh = [_attribute(document, attributes, f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3, count)]
+    for degree in (1, 2, 3):
+        names = [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)]
+        if not any(name in attributes for name in names):
+            break
+        sh += [_attribute(document, attributes, name, 3, count) for name in names]
+    document.budget.spend(4 * (11 + 3 * len(sh)) * count, f"{count:,} splats")
+    builder = CloudBuilder(count, len(sh), document.path)
+    rows = builder.next(count)
+    rows.means[:] = means
+    rows.quaternions[:] = stored["ROTATION"][:, [3, 0, 1, 2]]
+    scales = stored["SCALE"]
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows.scales[:] = np.exp(scales) if (scales < 0).any() else scales
+    rows.opacities[:] = np.clip(stored["OPACITY"][:, 0], 0, 1)
+    for i, coefficients in enumerate(sh):
+        rows.sh[:, i] = coefficients
+    builder.keep(rows)
+    return builder.finish("3dgs", strict=strict)
+
+
+def _attribute(
+    document: GltfDocument, attributes: dict[str, Any], name: str, columns: int, count: int | None = None
+) -> np.ndarray:
+    if name not in attributes:
+        raise document.error(f"splats need the attribute {name}, which a primitive lacks")
+    values = document.floats(attributes[name], name)
+    if values.shape[1] != columns or (count is not None and len(values) != count):
+        expected = f"({'n' if count is None else count}, {columns})"
+        raise document.error(f"{name} must have shape {expected}, got {values.shape}")
+    return values
+
+
+def _object(document: GltfDocument, owner: dict[str, Any], key: str) -> dict[str, Any]:
+    value = owner.get(key, {})
+    if not isinstance(value, dict):
+        raise document.error(f"{key} must be an object, got {str(value)[:40]}")
+    return value

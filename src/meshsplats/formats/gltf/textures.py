@@ -1,0 +1,154 @@
+"""Base-colour textures of glTF files with their coordinates, for base meshes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.base_mesh import Texture, Wrap
+from meshsplats.errors import DataWarning
+from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.reader import (
+    POINTS_TO_LINES,
+    dict_or_empty,
+    material_of,
+    objects_in,
+    pbr_of,
+    primitive_faces,
+)
+from meshsplats.formats.gltf.scene import placed_meshes
+
+_WRAPS: dict[object, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_SOURCES = ("EXT_texture_webp",)
+"""Extensions that name another picture in place of a texture's own, and that Pillow can read."""
+
+
+def gltf_textures(
+    path: Path, read: Callable[[Path, bytes], np.ndarray], laid: Texture | None = None
+) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None:
+    """Texture coordinates (m, 3, 2) float32, v down, and texture (m,) int32, -1 for none, of each triangle in
+    the order of ``read_gltf``; the textures. None where no triangle has any.
+
+    ``laid``: a texture for all triangles that have coordinates. Raises FileFormatError.
+    """
+    document = GltfDocument(path)
+    shelf = _Shelf(document, read)
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    for place in placed_meshes(document):
+        for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
+            if primitive.get("mode", 4) in POINTS_TO_LINES:
+                continue
+            attributes = dict_or_empty(primitive.get("attributes"))
+            v = document.whole(
+                document.item("accessors", attributes.get("POSITION"), "POSITION"), "count", "POSITION"
+            )
+            faces = primitive_faces(document, primitive, v)
+            material = material_of(document, primitive)
+            info = dict_or_empty(pbr_of(material).get("baseColorTexture"))
+            uv = _coordinates(document, attributes, info, v) if info or laid is not None else None
+            number = -1
+            if uv is not None:
+                number = 0 if laid is not None else shelf.number(material, info)
+                document.budget.spend(24 * len(faces), "texture coordinates")
+            corners = np.zeros((len(faces), 3, 2), np.float32) if uv is None else uv[faces]
+            parts.append((corners, np.full(len(faces), number, np.int32)))
+    if shelf.unread:
+        warnings.warn(
+            f"{path}: {shelf.unread} textures are of a kind that is not read; their faces have none",
+            DataWarning,
+            stacklevel=4,
+        )
+    if not parts or all((number < 0).all() for _, number in parts):
+        return None
+    textures = tuple(shelf.textures) if laid is None else (laid,)
+    return np.concatenate([c for c, _ in parts]), np.concatenate([n for _, n in parts]), textures
+
+
+def _coordinates(
+    document: GltfDocument, attributes: dict[str, Any], info: dict[str, Any], v: int
+) -> np.ndarray | None:
+    """(v, 2) float32, with KHR_texture_transform done; None where there are none."""
+    transform = dict_or_empty(dict_or_empty(info.get("extensions")).get("KHR_texture_transform"))
+    chosen = document.whole(transform if "texCoord" in transform else info, "texCoord", "a texture", 0)
+    name = f"TEXCOORD_{chosen}"
+    if name not in attributes:
+        return None
+    uv = document.floats(attributes[name], name)
+    if uv.shape != (v, 2) or not np.isfinite(uv).all():
+        raise document.error(f"{name} must be {v:,} finite pairs, got shape {uv.shape}")
+    if transform:
+        offset = document.numbers(transform.get("offset", [0, 0]), 2, "offset of a texture")
+        scale = document.numbers(transform.get("scale", [1, 1]), 2, "scale of a texture")
+        turn = float(document.numbers([transform.get("rotation", 0)], 1, "rotation of a texture")[0])
+        u, w = (uv * scale).T
+        cos, sin = np.cos(turn), np.sin(turn)
+        with np.errstate(over="ignore"):
+            moved = np.stack([cos * u + sin * w, cos * w - sin * u], axis=1) + offset
+            uv = moved.astype(np.float32)
+        if not np.isfinite(uv).all():
+            raise document.error("the transform of a texture leads beyond all numbers")
+    return uv
+
+
+@dataclass
+class _Shelf:
+    """The textures that were needed so far."""
+
+    document: GltfDocument
+    read: Callable[[Path, bytes], np.ndarray]
+    textures: list[Texture] = field(default_factory=list)
+    unread: int = 0
+    _numbers: dict[tuple, int] = field(default_factory=dict)
+    _pictures: dict[int, np.ndarray] = field(default_factory=dict)
+
+    def number(self, material: dict[str, Any], info: dict[str, Any]) -> int:
+        """Number of the base-colour texture ``info`` of ``material``; -1 where it is of an unknown kind."""
+        document = self.document
+        texture = document.item("textures", info.get("index"), "baseColorTexture")
+        source = texture.get("source")
+        for name in _SOURCES:
+            source = dict_or_empty(dict_or_empty(texture.get("extensions")).get(name)).get("source", source)
+        if source is None:
+            self.unread += 1
+            return -1
+        sampler: dict[str, Any] = {}
+        if "sampler" in texture:
+            sampler = document.item("samplers", texture["sampler"], "a texture")
+        wraps = [_WRAPS.get(sampler.get(way, 10497)) for way in ("wrapS", "wrapT")]
+        if None in wraps:
+            raise document.error(f"unknown wrapping of a texture: {str(sampler)[:80]}")
+        factor = document.numbers(pbr_of(material).get("baseColorFactor", [1] * 4), 4, "baseColorFactor")
+        mode = material.get("alphaMode", "OPAQUE")
+        cutoff = float(document.numbers([material.get("alphaCutoff", 0.5)], 1, "alphaCutoff")[0])
+        key = (source, *wraps, *factor, mode, cutoff)
+        if key not in self._numbers:
+            pixels = self._picture(source)
+            if mode != "BLEND":
+                pixels = pixels.copy()
+                shown = pixels[..., 3] * (factor[3] / 255) >= cutoff
+                pixels[..., 3] = 255 if mode == "OPAQUE" else np.where(shown, 255, 0)
+                factor[3] = 1
+            self._numbers[key] = len(self.textures)
+            self.textures.append(Texture(pixels, (wraps[0], wraps[1]), tuple(factor)))  # type: ignore[arg-type]
+        return self._numbers[key]
+
+    def _picture(self, source: object) -> np.ndarray:
+        document = self.document
+        image = document.item("images", source, "a texture")
+        assert isinstance(source, int)
+        if source not in self._pictures:
+            if "bufferView" in image:
+                data = bytes(document.view_bytes(image["bufferView"], "a picture")[0])
+            elif isinstance(image.get("uri"), str):
+                data = bytes(document.uri_bytes(image["uri"], f"picture {source}"))
+            else:
+                raise document.error(f"picture {source} has neither data nor URI")
+            pixels = self.read(document.path, data)
+            document.budget.spend(pixels.nbytes, "a picture")
+            self._pictures[source] = pixels
+        return self._pictures[source]

@@ -1,0 +1,320 @@
+"""Meshes as binary glTF 2.0 (`.glb`), the form that viewers, engines and Blender open directly.
+
+Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one primitive, drawn
+from both sides, coloured by COLOR_0 (linear RGBA). glTF is y-up: the node carries a pure rotation from the
+mesh's own frame to a frame whose +y is the mesh's ``up``; vertices are stored untouched. What glTF has no
+place for stands in the mesh's ``extras.meshsplats``. The reader is ``gltf_reader``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import zlib
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from meshsplats.binding import Binding
+from meshsplats.colors import srgb_to_linear
+from meshsplats.formats._validation import check_attribute_names
+from meshsplats.mesh import SplatMesh
+
+ColorType = Literal["uint16", "float32"]
+Alpha = Literal["blend", "mask", "hash-friendly"]
+
+MASK_CUTOFF = 0.2
+"""Opacity from which ``alpha='mask'`` draws. Of 0.05 to 0.5 the best compromise over an opaque figure, a
+furry one and an outdoor scene in three.js (docs/viewers.md)."""
+
+_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_ROWS = 1 << 15
+_MAX_BYTES = (1 << 32) - 1
+
+
+def write_glb(
+    mesh: SplatMesh,
+    path: Path,
+    *,
+    lit: bool = False,
+    color_type: ColorType = "uint16",
+    alpha: Alpha = "blend",
+    extras: bool = True,
+) -> None:
+    """Writes ``mesh`` to ``path``.
+
+    The material is unlit (KHR_materials_unlit): its colours are shown as they are. ``lit`` makes it a rough
+    dielectric that scene lights shade, with the mesh's normals or, where it has none, area-weighted vertex
+    normals. ``color_type`` 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
+
+    ``alpha`` is how viewers are told to treat opacity. 'blend' is the truth, for viewers that sort or blend
+    well enough without. The two others are drawn solid, with the depth buffer, and need no order: 'mask'
+    draws what is at least ``MASK_CUTOFF`` opaque; 'hash-friendly' gives each splat a cutoff of its own, so
+    that among many layers each counts as often as its opacity says: right on average, and grainy.
+    docs/viewers.md compares them.
+
+    Colours of a mesh made for display blending are converted to linear; those of one made for linear
+    blending are stored as they are. ``extras`` False leaves out the arrays that only this project reads.
+    Raises ValueError for a mesh without triangles (glTF has no empty arrays), for normals that are not
+    of unit length, for 'hash-friendly' without ``face_splat`` and for a file beyond the 4 GiB that the
+    format can hold.
+    """
+    if alpha not in get_args(Alpha):
+        raise ValueError(f"alpha must be one of {', '.join(get_args(Alpha))}, got {alpha!r}")
+    if alpha == "hash-friendly" and mesh.face_splat is None:
+        raise ValueError("alpha 'hash-friendly' needs a mesh that knows its splats (face_splat); use 'mask'")
+    if color_type not in get_args(ColorType):
+        raise ValueError(f"color_type must be one of {', '.join(get_args(ColorType))}, got {color_type!r}")
+    if not len(mesh.faces):
+        raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
+    check_attribute_names(mesh)
+    document, parts = _document(mesh, lit, color_type, alpha, extras)
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary = document["buffers"][0]["byteLength"]
+    total = 12 + 8 + len(text) + 8 + binary
+    if total > _MAX_BYTES:
+        raise ValueError(
+            f"the mesh would take {total:,} bytes, a .glb file can hold {_MAX_BYTES:,};"
+            " save it as .npz or .ply, or split it"
+        )
+    with open(path, "wb") as file:
+        file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A))
+        file.write(text)
+        file.write(struct.pack("<II", binary, 0x004E4942))
+        for part in parts:
+            file.write(part.data)
+            file.write(b"\0" * (-part.nbytes % 4))
+
+
+class _Buffer:
+    """The binary chunk under construction: arrays in order, each from a multiple of 4 bytes on."""
+
+    def __init__(self) -> None:
+        self.parts: list[np.ndarray] = []
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+        self.length = 0
+
+    def view(self, array: np.ndarray, target: int | None = None) -> int:
+        """Appends ``array``; number of its buffer view."""
+        little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": little.nbytes}
+        if target is not None:
+            view["target"] = target
+        self.parts.append(little)
+        self.views.append(view)
+        self.length += little.nbytes + -little.nbytes % 4
+        return len(self.views) - 1
+
+    def accessor(self, array: np.ndarray, component: int, target: int, **more: Any) -> int:
+        """Appends an array of numbers (n,) or (n, 1..4); number of its accessor."""
+        columns = 1 if array.ndim == 1 else array.shape[1]
+        accessor = {
+            "bufferView": self.view(array, target),
+            "componentType": component,
+            "count": len(array),
+            "type": _TYPES[columns],
+            **more,
+        }
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+
+def _document(
+    mesh: SplatMesh, lit: bool, color_type: ColorType, alpha: Alpha, with_extras: bool
+) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """The JSON part, and the arrays of the binary part."""
+    from meshsplats import __version__
+
+    buffer = _Buffer()
+    extras: dict[str, Any] = {
+        "version": 1,
+        "blending": mesh.blending,
+        "up": [float(u) for u in mesh.up],
+    }
+    if mesh.filter_px2 and with_extras:
+        extras["filter_px2"] = mesh.filter_px2
+    attributes = {
+        "POSITION": buffer.accessor(
+            mesh.vertices,
+            _FLOAT,
+            _ARRAY_BUFFER,
+            min=[float(x) for x in mesh.vertices.min(axis=0)],
+            max=[float(x) for x in mesh.vertices.max(axis=0)],
+        ),
+    }
+    normals = mesh.normals
+    if normals is not None:
+        _check_unit(normals)
+    elif lit:
+        normals = vertex_normals(mesh)
+        extras["normals"] = "computed"
+    if normals is not None:
+        attributes["NORMAL"] = buffer.accessor(normals, _FLOAT, _ARRAY_BUFFER)
+    colors = linear_colors(mesh, color_type)
+    if alpha == "hash-friendly":
+        shown = _splat_cutoffs(mesh)
+        colors[:, 3] = shown if color_type == "float32" else shown * np.float32(65535) + np.float32(0.5)
+        if with_extras:
+            extras["alpha"] = "_ALPHA"
+            attributes["_ALPHA"] = buffer.accessor(mesh.colors[:, 3], _FLOAT, _ARRAY_BUFFER)
+    if color_type == "uint16":
+        attributes["COLOR_0"] = buffer.accessor(colors, _UINT16, _ARRAY_BUFFER, normalized=True)
+    else:
+        attributes["COLOR_0"] = buffer.accessor(colors, _FLOAT, _ARRAY_BUFFER)
+    # The largest 16-bit index is kept free: graphics interfaces use it as a restart mark.
+    small = len(mesh.vertices) <= 0xFFFF
+    indices = mesh.faces.reshape(-1).astype(np.uint16) if small else mesh.faces.reshape(-1).view(np.uint32)
+    index_accessor = buffer.accessor(indices, _UINT16 if small else _UINT32, _ELEMENT_ARRAY_BUFFER)
+    for name in ("face_splat", "depth_group") if with_extras else ():
+        values = getattr(mesh, name)
+        if values is not None:
+            extras[name] = _raw(buffer, values)
+    for name, values in mesh.attributes.items() if with_extras else ():
+        columns = None if values.ndim == 1 else values.shape[1]
+        entry: dict[str, Any] = {"name": name, "columns": columns}
+        if columns is None or 1 <= columns <= 4:
+            semantic = _semantic(name, attributes)
+            attributes[semantic] = buffer.accessor(values, _FLOAT, _ARRAY_BUFFER)
+            entry["semantic"] = semantic
+        elif columns:
+            entry |= _raw(buffer, values)
+        extras.setdefault("attributes", []).append(entry)
+    if mesh.binding is not None and with_extras:
+        extras["binding"] = _binding(buffer, mesh.binding)
+    material: dict[str, Any] = {
+        "name": "splats",
+        "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
+        "alphaMode": "BLEND" if alpha == "blend" else "MASK",
+        "doubleSided": True,
+    }
+    if alpha != "blend":
+        material["alphaCutoff"] = MASK_CUTOFF if alpha == "mask" else 0.5
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "splats", "mesh": 0, "rotation": up_quaternion(mesh.up)}],
+        "meshes": [
+            {
+                "name": "splats",
+                "primitives": [{"attributes": attributes, "indices": index_accessor, "material": 0}],
+                "extras": {"meshsplats": extras},
+            }
+        ],
+        "materials": [material],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": buffer.length}],
+    }
+    if not lit:
+        material["extensions"] = {"KHR_materials_unlit": {}}
+        document["extensionsUsed"] = ["KHR_materials_unlit"]
+    return document, buffer.parts
+
+
+def _splat_cutoffs(mesh: SplatMesh) -> np.ndarray:
+    """(v,) float32 opacities that, cut at 0.5, show splat s where its true opacity is at least its own
+    cutoff.
+
+    Concretely 0.5 + (opacity - cutoff) / 2, which is linear in the opacity and so crosses 0.5 at the
+    same place inside a triangle. Multiples of the golden ratio spread the cutoffs of successive splats
+    evenly over [0, 1).
+    """
+    assert mesh.face_splat is not None
+    cutoffs = np.zeros(len(mesh.vertices), np.float32)
+    cutoffs[mesh.faces] = (mesh.face_splat * ((5**0.5 - 1) / 2) % 1)[:, None]
+    return np.float32(0.5) + (mesh.colors[:, 3] - cutoffs) / 2
+
+
+def _raw(buffer: _Buffer, values: np.ndarray) -> dict[str, Any]:
+    """Values that no glTF attribute can hold, as a plain buffer view. The check sum tells a reader that a
+    program in between has renumbered or dropped the views."""
+    view = buffer.view(values)
+    return {"bufferView": view, "crc32": zlib.crc32(buffer.parts[view].data)}
+
+
+def _binding(buffer: _Buffer, binding: Binding) -> dict[str, Any]:
+    """What puts the vertices on another pose of the base, each array as it is in ``Binding``."""
+    entry: dict[str, Any] = {
+        "lift": binding.lift,
+        "baseVertexCount": len(binding.base_vertices),
+        "baseFaceCount": len(binding.base_faces),
+    }
+    for key, values in [
+        ("baseVertices", binding.base_vertices),
+        ("baseFaces", binding.base_faces),
+        ("vertexFace", binding.vertex_face),
+        ("weights", binding.weights),
+        ("layers", binding.layers),
+    ]:
+        entry[key] = _raw(buffer, values)
+    return entry
+
+
+def _semantic(name: str, taken: dict[str, int]) -> str:
+    """A free name for an application's own attribute: glTF wants a leading underscore."""
+    plain = "_" + re.sub(r"[^A-Z0-9_]", "_", name.upper())[:60]
+    candidate, number = plain, 2
+    while candidate in taken:
+        candidate, number = f"{plain}_{number}", number + 1
+    return candidate
+
+
+def up_quaternion(up: np.ndarray) -> list[float]:
+    """Unit quaternion x, y, z, w of the shortest rotation that takes the unit vector ``up`` to +y.
+
+    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is the half turn about x,
+    which leaves x to the right and lets a camera that looked along +z look along -z, as glTF's do.
+    """
+    x, y, z = (float(u) for u in np.asarray(up, np.float64) / np.linalg.norm(np.asarray(up, np.float64)))
+    if y < -1 + 1e-9:
+        return [1.0, 0.0, 0.0, 0.0]
+    # up x (0, 1, 0) = (-z, 0, x); half-angle form of the shortest rotation between unit vectors.
+    q = np.array([-z, 0.0, x, 1 + y])
+    return [float(c) for c in q / np.linalg.norm(q)]
+
+
+def linear_colors(mesh: SplatMesh, color_type: ColorType) -> np.ndarray:
+    """(v, 4) linear RGBA of the mesh's vertices, as float32 or as 16-bit fractions of 65535."""
+    result = np.empty(mesh.colors.shape, np.dtype(color_type))
+    for start in range(0, len(result), _ROWS):
+        rows = mesh.colors[start : start + _ROWS]
+        linear = rows if mesh.blending == "linear" else rows.copy()
+        if mesh.blending == "display":
+            linear[:, :3] = srgb_to_linear(rows[:, :3])
+        if color_type == "uint16":
+            linear = linear * np.float32(65535) + np.float32(0.5)
+        result[start : start + _ROWS] = linear
+    return result
+
+
+def vertex_normals(mesh: SplatMesh) -> np.ndarray:
+    """(v, 3) float32 unit normals, the area-weighted means of the normals of the triangles round each vertex.
+    A vertex without area round it gets the mesh's up direction."""
+    corners = [mesh.faces[:, k] for k in range(3)]
+    x, y, z = np.ascontiguousarray(mesh.vertices.T)
+    edges = [[p[corners[k]] - p[corners[0]] for p in (x, y, z)] for k in (1, 2)]
+    sums = np.empty(mesh.vertices.shape, np.float64)
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        weighted = edges[0][i] * edges[1][j] - edges[0][j] * edges[1][i]  # twice the area times the normal
+        sums[:, axis] = sum(np.bincount(corner, weighted, minlength=len(sums)) for corner in corners)
+    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))[:, None]
+    return np.where(length > 0, sums / np.where(length > 0, length, 1), mesh.up).astype(np.float32)
+
+
+def _check_unit(normals: np.ndarray) -> None:
+    length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
+    bad = np.abs(length - 1) > 5e-4
+    if bad.any():
+        row = int(bad.argmax())
+        raise ValueError(
+            f"glTF wants normals of unit length, that of vertex {row} has {length[row]:.4g}"
+            f" ({int(bad.sum())} such); normalise them, or leave them out (normals=None)"
+        )

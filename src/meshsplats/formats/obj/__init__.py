@@ -1,0 +1,1 @@
+"""Wavefront OBJ files, with the textures of their materials."""

@@ -1,0 +1,127 @@
+"""Wavefront `.obj` meshes: vertices, polygons, and colours behind the positions as many programs write
+them."""
+
+from __future__ import annotations
+
+import warnings
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from meshsplats.colors import linear_to_srgb
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._validation import checked_mesh, straight_colors
+from meshsplats.formats.ply.faces import cut_polygons
+from meshsplats.mesh import SplatMesh
+
+_UP_COMMENT = "# meshsplats up"
+_ROWS = 1 << 14
+
+
+def write_obj(mesh: SplatMesh, path: Path) -> None:
+    """Writes positions, display colours behind them and triangles as text; nine digits keep float32
+    exactly.
+
+    The format has no opacity: a mesh that is not opaque is written with a DataWarning that counts its
+    vertices. Positions stay in the mesh's own frame; the up direction stands in a comment, which
+    ``load_mesh`` reads and other programs ignore.
+    """
+    lost = [n for n in ("face_splat", "depth_group") if getattr(mesh, n) is not None] + list(mesh.attributes)
+    translucent = int((mesh.colors[:, 3] < 1).sum())
+    if translucent:
+        more = f"; also left out: {', '.join(n[:40] for n in lost[:8])}" if lost else ""
+        warnings.warn(
+            f"{path.suffix} files have no opacity: {translucent:,} of {len(mesh.vertices):,} vertices are"
+            f" translucent and will look solid{more}. Save as .glb, .ply or .usdc to keep it",
+            DataWarning,
+            stacklevel=3,
+        )
+    rgb = linear_to_srgb(mesh.colors[:, :3]) if mesh.blending == "linear" else mesh.colors[:, :3]
+    up = " ".join(repr(float(u)) for u in mesh.up)
+    corner = "%d" if mesh.normals is None else "%d//%d"
+    with open(path, "wb") as file:
+        file.write(b"# x y z, then red green blue as display values\n")
+        file.write(f"{_UP_COMMENT} {up}\n".encode())
+        _write_rows(file, "v %.9g %.9g %.9g %.9g %.9g %.9g\n", mesh.vertices, rgb)
+        if mesh.normals is not None:
+            _write_rows(file, "vn %.9g %.9g %.9g\n", mesh.normals)
+        columns = [mesh.faces[:, k, None] for k in range(3) for _ in range(corner.count("%"))]
+        _write_rows(file, f"f {corner} {corner} {corner}\n", *columns, plus=1)
+
+
+def _write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: int = 0) -> None:
+    """Writes the (n, c) arrays ``columns`` side by side, each row by the pattern ``line``, ``plus`` added."""
+    for start in range(0, len(columns[0]), _ROWS):
+        rows = np.concatenate([c[start : start + _ROWS] for c in columns], axis=1)
+        if plus:
+            rows = rows + plus
+        file.write((line * len(rows) % tuple(rows.ravel().tolist())).encode())
+
+
+def read_obj(path: Path) -> SplatMesh:
+    """The polygons of all objects and groups as one opaque mesh, cut into triangles.
+
+    Up is +y, the custom of these files, unless a comment of ours says otherwise. Colours are taken from
+    lines ``v x y z r g b``, display values in [0, 1], if all vertices have them; else the mesh is grey,
+    with a DataWarning. Texture coordinates, normals and materials are left out. Raises FileFormatError
+    naming the line.
+    """
+    up = np.array([0.0, 1.0, 0.0])
+    positions, colors, lengths, corners = array("d"), array("d"), array("q"), array("q")
+    with open(path, "rb") as file:
+        for number, words in statements(file.read()):
+            try:
+                if words[:3] == _UP_COMMENT.encode().split():
+                    up = np.array([float(u) for u in words[3:6]])
+                elif words[0] == b"v":
+                    x, y, z = map(float, words[1:4])
+                    positions.extend((x, y, z))
+                    if len(words) >= 7:
+                        colors.extend(map(float, words[4:7]))
+                elif words[0] == b"f":
+                    count = len(positions) // 3
+                    lengths.append(len(words) - 1)
+                    corners.extend(_corner(word, count) for word in words[1:])
+            except (ValueError, OverflowError):
+                text = b" ".join(words)[:60].decode("latin-1")
+                raise FileFormatError(f"{path}: line {number:,} cannot be read: {text!r}") from None
+    if not lengths:
+        raise FileFormatError(f"{path}: holds no faces")
+    faces, _ = cut_polygons(np.array(lengths), np.array(corners), {})
+    vertices = np.array(positions).reshape(-1, 3)
+    stored = np.array(colors).reshape(-1, 3)
+    return checked_mesh(
+        path,
+        vertices=vertices,
+        faces=faces,
+        colors=straight_colors(
+            stored if len(stored) == len(vertices) else np.empty((len(vertices), 0)), path
+        ),
+        up=up,
+    )
+
+
+def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
+    """The words of each line with its number; a backslash at the end joins the next line."""
+    joined = b""
+    for number, line in enumerate(data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n"), 1):
+        if line.endswith(b"\\"):
+            joined += line[:-1] + b" "
+            continue
+        words = (joined + line).split() if joined else line.split()
+        joined = b""
+        if words:
+            yield number, words
+
+
+def _corner(word: bytes, count: int) -> int:
+    """Vertex number, from 0, of ``v``, ``v/vt`` or ``v/vt/vn``; stored from 1, or negative from the
+    latest back."""
+    number = int(word.partition(b"/")[0])
+    number = number - 1 if number > 0 else number + count
+    if word[:1] == b"0" or number < 0:
+        raise ValueError
+    return number

@@ -1,0 +1,173 @@
+"""Texture coordinates of Wavefront `.obj` files, and the pictures that their material libraries name."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from array import array
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+import numpy as np
+
+from meshsplats.base_mesh import Texture, Wrap
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.obj.mesh import statements
+from meshsplats.formats.ply.faces import cut_polygons
+
+MAX_LIBRARY_BYTES = 16 << 20
+"""A larger file of materials is refused."""
+_NUMBERS_AFTER = {b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3}
+"""Options of a texture with so many numbers at most; others have one word."""
+
+
+def obj_coordinates(path: Path) -> tuple[np.ndarray, np.ndarray, list[bytes], list[bytes]] | None:
+    """Of each triangle, in the order of ``read_obj``: texture coordinates (m, 3, 2) float32, v down; whether
+    all its corners have them (m,); the name of its material. And the names of material libraries.
+
+    None for a file without texture coordinates. Raises FileFormatError naming the line.
+    """
+    coordinates, lengths, corners, materials = array("d"), array("q"), array("q"), array("q")
+    names: dict[bytes, int] = {b"": 0}
+    libraries: list[bytes] = []
+    current = 0
+    with open(path, "rb") as file:
+        for number, words in statements(file.read()):
+            try:
+                if words[0] == b"vt":
+                    coordinates.extend((float(words[1]), 1 - float(words[2]) if len(words) > 2 else 0.0))
+                elif words[0] == b"f":
+                    lengths.append(len(words) - 1)
+                    materials.append(current)
+                    count = len(coordinates) // 2
+                    corners.extend(_coordinate(word, count) for word in words[1:])
+                elif words[0] == b"usemtl":
+                    current = names.setdefault(b" ".join(words[1:]), len(names))
+                elif words[0] == b"mtllib":
+                    libraries.append(b" ".join(words[1:]))
+            except (ValueError, IndexError, OverflowError):
+                text = b" ".join(words)[:60].decode("latin-1")
+                raise FileFormatError(f"{path}: line {number:,} cannot be read: {text!r}") from None
+    if not coordinates or not lengths:
+        return None
+    triangles, kept = cut_polygons(np.array(lengths), np.array(corners), {"material": np.array(materials)})
+    uv = np.array(coordinates).reshape(-1, 2)
+    if triangles.max() >= len(uv):
+        raise FileFormatError(f"{path}: a face names texture coordinate {triangles.max() + 1} of {len(uv):,}")
+    with np.errstate(over="ignore"):
+        found = np.where((triangles >= 0)[..., None], uv[triangles], 0).astype(np.float32)
+    complete = np.asarray((triangles >= 0).all(axis=1) & np.isfinite(found).all(axis=(1, 2)))
+    ordered = sorted(names, key=names.__getitem__)
+    return (
+        np.nan_to_num(found, posinf=0, neginf=0),
+        complete,
+        [ordered[i] for i in kept["material"]],
+        libraries,
+    )
+
+
+def _coordinate(word: bytes, count: int) -> int:
+    """Number, from 0, of the texture coordinate in ``v/vt`` or ``v/vt/vn``; -1 where there is none."""
+    parts = word.split(b"/")
+    if len(parts) < 2 or not parts[1]:
+        return -1
+    number = int(parts[1])
+    if number == 0 or number < -count:
+        raise ValueError
+    return number - 1 if number > 0 else number + count
+
+
+def obj_textures(
+    path: Path, libraries: list[bytes], materials: list[bytes], read: Callable[[Path], np.ndarray]
+) -> tuple[np.ndarray, tuple[Texture, ...]]:
+    """(m,) int32 number of the texture of each face, -1 for none, and the textures.
+
+    ``materials`` has the material of each face. Missing libraries and pictures are counted in a DataWarning;
+    FileFormatError for a name that leads out of the folder of ``path``, and for broken files.
+    """
+    maps: dict[bytes, tuple[bytes, Wrap]] = {}
+    missing: list[str] = []
+    for name in libraries:
+        library = _beside(path, name)
+        if library.is_file():
+            maps |= _diffuse_maps(library)
+        else:
+            missing.append(_shown(name))
+    textures: list[Texture] = []
+    numbers: dict[tuple[bytes, Wrap], int] = {}
+    of_material: dict[bytes, int] = {}
+    for material in dict.fromkeys(materials):
+        entry = maps.get(material)
+        of_material[material] = -1
+        if entry is None:
+            continue
+        if entry not in numbers:
+            picture = _beside(path, entry[0])
+            if not picture.is_file():
+                missing.append(_shown(entry[0]))
+                numbers[entry] = -1
+            else:
+                numbers[entry] = len(textures)
+                textures.append(Texture(read(picture), (entry[1], entry[1])))
+        of_material[material] = numbers[entry]
+    if missing:
+        warnings.warn(
+            f"{path}: not there: {', '.join(missing[:5])}; faces that need it have no texture",
+            DataWarning,
+            stacklevel=4,
+        )
+    return np.array([of_material[m] for m in materials], np.int32), tuple(textures)
+
+
+def _diffuse_maps(library: Path) -> dict[bytes, tuple[bytes, Wrap]]:
+    """Picture and what lies beyond its edges for each material that has a ``map_Kd``."""
+    if library.stat().st_size > MAX_LIBRARY_BYTES:
+        raise FileFormatError(f"{library}: a material library of over {MAX_LIBRARY_BYTES >> 20} MiB; refused")
+    maps: dict[bytes, tuple[bytes, Wrap]] = {}
+    material = b""
+    with open(library, "rb") as file:
+        for number, words in statements(file.read()):
+            if words[0] == b"newmtl":
+                material = b" ".join(words[1:])
+            elif words[0] == b"map_Kd":
+                rest, wrap = words[1:], "repeat"
+                while rest and rest[0].startswith(b"-") and len(rest) > 1:
+                    option, values = rest[0], _NUMBERS_AFTER.get(rest[0], 1)
+                    taken = 1
+                    while taken <= values and taken < len(rest) - 1 and (values == 1 or _number(rest[taken])):
+                        taken += 1
+                    if option == b"-clamp" and rest[1:2] == [b"on"]:
+                        wrap = "clamp"
+                    rest = rest[taken:]
+                if not rest:
+                    raise FileFormatError(f"{library}: line {number:,}: map_Kd names no picture")
+                maps[material] = (b" ".join(rest), wrap)  # type: ignore[assignment]
+    return maps
+
+
+def _number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _beside(path: Path, name: bytes) -> Path:
+    """The file ``name`` in the folder of ``path`` or below. FileFormatError if it lies elsewhere."""
+    folder = Path(os.path.realpath(path)).parent
+    clean = os.fsdecode(name).replace("\\", "/")
+    parts = PurePosixPath(clean).parts
+    bad = "\0" in clean or not 0 < len(clean) <= 1000 or clean.startswith("/") or ".." in parts
+    target = (
+        folder if bad or PureWindowsPath(clean).drive else Path(os.path.realpath(folder.joinpath(*parts)))
+    )
+    if folder not in target.parents:
+        raise FileFormatError(
+            f"{path}: refers to {_shown(name)!r} outside its folder; refused. Put it beside the mesh"
+        )
+    return target
+
+
+def _shown(name: bytes) -> str:
+    return name[:80].decode("utf-8", "replace")

@@ -1,0 +1,1 @@
+"""PLY files: splats, meshes, and the header and tables that both have."""

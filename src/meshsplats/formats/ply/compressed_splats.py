@@ -1,0 +1,116 @@
+"""PlayCanvas compressed .ply: 16 bytes a splat, in chunks of 256 that share the range of their values.
+
+Element ``chunk`` holds the ranges, ``vertex`` four 32-bit words a splat, ``sh`` (optional) one byte for each
+f_rest coefficient. Positions and log scales have 11, 10, 11 bits, rotations 2 + 3 x 10, colours and opacity
+8. Specification: developer.playcanvas.com, "Compressed PLY".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import BinaryIO
+
+import numpy as np
+
+from meshsplats.errors import FileFormatError
+from meshsplats.formats.ply.header import Element, PlyHeader
+from meshsplats.formats.ply.splats import kernel_of_comments
+from meshsplats.formats.ply.table import RowReader
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, fill_smallest_three
+from meshsplats.gaussians import SH_C0, GaussianCloud
+
+_SHARED = 256
+"""Splats that share a chunk's ranges."""
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_CHUNKS_AT_ONCE = 128
+_TYPES = {"u4": "uint", "f4": "float", "u1": "uchar"}
+# A byte of a spherical harmonic stands for the middle of its step of 1/32 in [-4, 4], the ends for the ends.
+_COEFFICIENTS = (np.concatenate([[0], (np.arange(1, 255) + 0.5) / 256, [1]]) * 8 - 4).astype(np.float32)
+
+
+def is_compressed_splat(header: PlyHeader) -> bool:
+    """Whether the vertex element holds packed splats."""
+    vertex = header.element("vertex")
+    return vertex is not None and "packed_position" in vertex.names
+
+
+def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object, *, strict: bool) -> GaussianCloud:
+    """The splats of an opened compressed .ply whose header has been read; errors as ``load_gaussians``."""
+    if header.encoding == "ascii":
+        raise FileFormatError(f"{where}: compressed splats must be binary, this .ply is ASCII")
+    vertex, chunk, sh = header.element("vertex"), header.element("chunk"), header.element("sh")
+    if vertex is None or chunk is None:
+        raise FileFormatError(f"{where}: packed splats without the element 'chunk' that holds their ranges")
+    _require(vertex, _PACKED, "u4", where)
+    names = [f"{end}_{kind}{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    colored = "min_r" in chunk.names
+    if colored:
+        names += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+    _require(chunk, names, "f4", where)
+    if chunk.count != -(-vertex.count // _SHARED):
+        raise FileFormatError(
+            f"{where}: {vertex.count:,} splats need {-(-vertex.count // _SHARED):,} chunks of {_SHARED},"
+            f" the header declares {chunk.count:,}"
+        )
+    rest = 0
+    if sh is not None:
+        rest = len(sh.properties)
+        if rest not in (9, 24, 45):
+            raise FileFormatError(f"{where}: element 'sh' has {rest} properties, expected 9, 24 or 45")
+        _require(sh, [f"f_rest_{i}" for i in range(rest)], "u1", where)
+        if sh.count != vertex.count:
+            raise FileFormatError(f"{where}: {sh.count:,} rows of element 'sh' for {vertex.count:,} splats")
+    readers = {e.name: RowReader(file, header, e, where) for e in (vertex, chunk, sh) if e is not None}
+    builder = CloudBuilder(vertex.count, 1 + rest // 3, where)
+    for first in range(0, chunk.count, _CHUNKS_AT_ONCE):
+        n_chunks = min(_CHUNKS_AT_ONCE, chunk.count - first)
+        start = first * _SHARED
+        m = min(n_chunks * _SHARED, vertex.count - start)
+        ranges = readers["chunk"].rows(first, n_chunks)
+        of_splat = np.arange(m) // _SHARED
+        packed = readers["vertex"].rows(start, m)
+        rows = builder.next(m)
+
+        def lerp(low: str, axes: str, t: np.ndarray, ranges=ranges, of_splat=of_splat) -> np.ndarray:
+            a = np.stack([ranges["min_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
+            b = np.stack([ranges["max_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
+            return a * (1 - t) + b * t
+
+        color = _unpacked(packed["packed_color"], (8, 8, 8, 8))
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows.means[:] = lerp("", "xyz", _unpacked(packed["packed_position"], (11, 10, 11)))
+            rows.scales[:] = np.exp(lerp("scale_", "xyz", _unpacked(packed["packed_scale"], (11, 10, 11))))
+            rgb = lerp("", "rgb", color[:, :3]) if colored else color[:, :3]
+            rows.sh[:, 0] = (rgb - np.float32(0.5)) / np.float32(SH_C0)
+        rows.opacities[:] = color[:, 3]
+        turns = packed["packed_rotation"]
+        small = (_unpacked(turns << np.uint32(2), (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))
+        fill_smallest_three(rows.quaternions, small, turns >> np.uint32(30))
+        if rest:
+            table = readers["sh"].rows(start, m)
+            stored = np.stack([table[f"f_rest_{i}"] for i in range(rest)], axis=1)
+            rows.sh[:, 1:] = _COEFFICIENTS[stored].reshape(m, 3, -1).transpose(0, 2, 1)
+        builder.keep(rows)
+    return builder.finish(kernel_of_comments(header.comments), strict=strict)
+
+
+def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """(m, len(bits)) float32 in [0, 1]: fields of 32-bit words, the highest bits first."""
+    out = np.empty((len(words), len(bits)), np.float32)
+    left = 32
+    for i, width in enumerate(bits):
+        left -= width
+        largest = (1 << width) - 1
+        out[:, i] = ((words >> np.uint32(left)) & np.uint32(largest)) / np.float32(largest)
+    return out
+
+
+def _require(element: Element, names: Sequence[str], kind: str, where: object) -> None:
+    """Raises FileFormatError unless ``element`` has properties ``names``, single values of type ``kind``."""
+    found = {p.name: p.dtype for p in element.properties if not p.is_list}
+    for name in names:
+        if name not in found or found[name].newbyteorder("=") != np.dtype(kind):
+            raise FileFormatError(
+                f"{where}: compressed splats need the property {name!r} of type {_TYPES[kind]} in element"
+                f" {element.name!r}"
+            )

@@ -1,0 +1,210 @@
+"""The faces of a PLY file as triangles. Files of triangles only, the rule, are read without a loop over
+faces."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from meshsplats.errors import FileFormatError
+from meshsplats.formats._validation import Budget
+from meshsplats.formats.ply.header import Element, PlyHeader, Property
+
+_INDEX_NAMES = ("vertex_indices", "vertex_index")
+
+
+def read_faces(
+    file: BinaryIO, header: PlyHeader, face: Element, numbers: tuple[str, ...], budget: Budget, path: Path
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Triangles (f, 3) of the element ``face``, and those of the integer properties ``numbers`` that it
+    has, (f,) int64, one value a triangle. Polygons become fans of triangles round their first corner;
+    points and lines vanish. Raises FileFormatError."""
+    index = next((p for p in face.properties if p.name in _INDEX_NAMES and p.is_list), None)
+    if face.count == 0:
+        return np.empty((0, 3), np.int64), {}
+    if index is None or index.dtype.kind not in "iu":
+        raise FileFormatError(f"{path}: element 'face' has no list of integers 'vertex_indices'")
+    keep = [p for p in face.properties if p.name in numbers and not p.is_list and p.dtype.kind in "iu"]
+    size = file.seek(0, io.SEEK_END) - header.data_offset
+    if face.count > max(size, 0):
+        raise FileFormatError(f"{path}: {face.count:,} faces do not fit {max(size, 0):,} bytes (truncated)")
+    # Positions, lengths and corners of polygons that are not all triangles take 8 bytes a value.
+    budget.spend(size * 8 + 64 * face.count, "the faces")
+    file.seek(header.data_offset)
+    data = file.read()
+    polygons = (_ascii if header.encoding == "ascii" else _binary)(data, header, face, index, keep, path)
+    lengths, corners, values = polygons
+    return cut_polygons(lengths, corners, {p.name: v for p, v in zip(keep, values, strict=True)})
+
+
+def cut_polygons(
+    lengths: np.ndarray, corners: np.ndarray, numbers: dict[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Polygons of ``lengths`` (n,) corners each, ``corners`` one after the other, cut into triangles."""
+    if (lengths == 3).all():
+        return corners.reshape(-1, 3), numbers
+    per_face = np.maximum(lengths - 2, 0)
+    owner = np.repeat(np.arange(len(lengths)), per_face)
+    start = (np.cumsum(lengths) - lengths)[owner]
+    step = np.arange(len(owner)) - (np.cumsum(per_face) - per_face)[owner]
+    triangles = np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
+    return triangles, {name: v[owner] for name, v in numbers.items()}
+
+
+# -- binary
+
+
+def _binary(
+    data: bytes, header: PlyHeader, face: Element, index: Property, keep: list[Property], path: Path
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Length of each polygon, all corners one after the other, and the values of ``keep``."""
+    at = 0
+    order = "<" if header.encoding == "binary_little_endian" else ">"
+    for element in header.elements:
+        if element is face:
+            break
+        if element.has_lists:
+            *_, at = _rows(data, element, at, order, path)
+        else:
+            at += element.count * element.minimum_row_bytes
+    uniform = _uniform(data, face, at)
+    if uniform is not None:
+        table = np.frombuffer(data, uniform, face.count, at)
+        column = {p.name: table[f"f{i}"] for i, p in enumerate(face.properties)}
+        corners = column[index.name]["items"]
+        lengths = np.full(face.count, corners.shape[1], np.int64)
+        return lengths, corners.reshape(-1), [column[p.name].astype(np.int64) for p in keep]
+    starts = np.fromiter(_rows(data, face, at, order, path), np.int64, face.count + 1)
+    raw = np.frombuffer(data, np.uint8)
+    place = starts[:-1].copy()
+    lengths, items, values = np.zeros(face.count, np.int64), np.empty(0, index.dtype), []
+    for p in face.properties:
+        if p.count_dtype is None:
+            if p in keep:
+                values.append(_gather(raw, place, p.dtype)[:, 0].astype(np.int64))
+            place += p.dtype.itemsize
+            continue
+        counts = _gather(raw, place, p.count_dtype)[:, 0].astype(np.int64)
+        place += p.count_dtype.itemsize
+        if p is index:
+            lengths = counts
+            first = np.cumsum(counts) - counts
+            inside = np.arange(int(counts.sum())) - np.repeat(first, counts)
+            items = _gather(raw, np.repeat(place, counts) + inside * p.dtype.itemsize, p.dtype)[:, 0]
+        place += counts * p.dtype.itemsize
+    return lengths, items, values
+
+
+def _gather(raw: np.ndarray, places: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """(n, 1) values of ``dtype`` that begin at the bytes ``places``."""
+    return raw[places[:, None] + np.arange(dtype.itemsize)].view(dtype)
+
+
+def _uniform(data: bytes, element: Element, at: int) -> np.dtype | None:
+    """Row type where every row has lists of the lengths of the first one; None where rows differ or data
+    end."""
+    fields: list[tuple] = []
+    offset = at
+    for i, p in enumerate(element.properties):
+        if p.count_dtype is None:
+            fields.append((f"f{i}", p.dtype))
+            offset += p.dtype.itemsize
+            continue
+        head = data[offset : offset + p.count_dtype.itemsize]
+        count = int(np.frombuffer(head, p.count_dtype)[0]) if len(head) == p.count_dtype.itemsize else -1
+        offset += len(head) + count * p.dtype.itemsize
+        if count < 0 or offset > len(data):
+            return None
+        fields.append((f"f{i}", [("count", p.count_dtype), ("items", p.dtype, (count,))]))
+    if at + (offset - at) * element.count > len(data) or offset - at > 1 << 30:
+        return None
+    row = np.dtype(fields)
+    table = np.frombuffer(data, row, element.count, at)
+    for i, p in enumerate(element.properties):
+        if p.is_list and (table[f"f{i}"]["count"] != table[f"f{i}"]["count"][0]).any():
+            return None
+    return row
+
+
+def _rows(data: bytes, element: Element, at: int, order: str, path: Path) -> Iterator[int]:
+    """Byte at which each row of ``element`` begins, then the byte after the last one."""
+    codes = {("i", 1): "b", ("u", 1): "B", ("i", 2): "h", ("u", 2): "H", ("i", 4): "i", ("u", 4): "I"}
+    codes |= {("i", 8): "q", ("u", 8): "Q"}
+    steps: list[tuple[int, struct.Struct | None, int]] = []
+    for p in element.properties:
+        if p.count_dtype is None:
+            steps.append((p.dtype.itemsize, None, 0))
+        else:
+            length = struct.Struct(order + codes[p.count_dtype.kind, p.count_dtype.itemsize])
+            steps.append((length.size, length, p.dtype.itemsize))
+    end = len(data)
+    for row in range(element.count):
+        yield at
+        for size, code, item in steps:
+            if code is not None and at + size <= end:
+                count = code.unpack_from(data, at)[0]
+                if count < 0:
+                    raise FileFormatError(f"{path}: {element.name} {row:,} has a list of length {count}")
+                at += count * item
+            at += size
+        if at > end:
+            raise FileFormatError(
+                f"{path}: {element.name} {row:,} of {element.count:,} runs past the end of the file"
+                " (truncated, or a wrong list length)"
+            )
+    yield at
+
+
+# -- ASCII
+
+
+def _ascii(
+    data: bytes, header: PlyHeader, face: Element, index: Property, keep: list[Property], path: Path
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """As ``_binary``. One face a line, blank lines do not count."""
+    lines = [x for x in data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n") if x.strip()]
+    before = header.elements[: header.elements.index(face)]
+    first = sum(e.count for e in before)
+    lines = lines[first : first + face.count]
+    if len(lines) < face.count:
+        raise FileFormatError(
+            f"{path}: the file ends after {len(lines):,} of {face.count:,} faces (truncated or count wrong)"
+        )
+    lengths: list[int] = []
+    corners: list[int] = []
+    values: list[list[int]] = [[] for _ in keep]
+    for row, line in enumerate(lines):
+        words, at = line.split(), 0
+        try:
+            for p in face.properties:
+                if p.count_dtype is None:
+                    if p in keep:
+                        values[keep.index(p)].append(int(words[at]))
+                    at += 1
+                    continue
+                count = int(words[at])
+                if count < 0 or at + count >= len(words):
+                    raise IndexError
+                if p is index:
+                    lengths.append(count)
+                    corners += map(int, words[at + 1 : at + 1 + count])
+                at += 1 + count
+            if at != len(words):
+                raise IndexError
+        except (ValueError, IndexError):
+            raise FileFormatError(f"{path}: face {row:,} cannot be read: {line[:60]!r}") from None
+    limit = np.iinfo(np.int64)
+    if any(not limit.min <= x <= limit.max for x in corners) or any(
+        not limit.min <= x <= limit.max for v in values for x in v
+    ):
+        raise FileFormatError(f"{path}: a face holds a number beyond 64 bits")
+    return (
+        np.array(lengths, np.int64),
+        np.array(corners, np.int64),
+        [np.array(v, np.int64) for v in values],
+    )

@@ -1,0 +1,204 @@
+"""Meshes as `.ply`: ours (binary, float RGBA, nothing lost) and those of other programs.
+
+A file of ours is little endian. Element ``vertex``: float x y z, nx ny nz where the mesh has normals,
+red green blue alpha (straight, as the mesh holds them, 0 to 1), then ``attribute_NAME`` or
+``attribute_NAME:COLUMN`` with the name in percent encoding. Element ``face``: ``list uchar int
+vertex_indices``, then int ``face_splat`` and ``depth_group`` where the mesh has them. Comments that
+begin with ``meshsplats`` hold the rest.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import quote, unquote
+
+import numpy as np
+
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._validation import Budget, check_attribute_names, checked_mesh, straight_colors
+from meshsplats.formats.ply.faces import read_faces
+from meshsplats.formats.ply.header import MAX_PROPERTIES, Element, PlyHeader, read_header
+from meshsplats.formats.ply.table import FloatTable
+from meshsplats.mesh import SplatMesh
+
+_ATTRIBUTE = "attribute_"
+_ROWS = 1 << 15
+_COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+
+
+# -- writing
+
+
+def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
+    """Writes ``mesh`` to ``path``, every array exactly. Raises ValueError for more attribute columns
+    than a PLY reader should be asked to take."""
+    check_attribute_names(mesh)
+    up = " ".join(repr(float(u)) for u in mesh.up)
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment meshsplats 1",
+        f"comment meshsplats up {up}",
+        f"comment meshsplats blending {mesh.blending}",
+    ]
+    if mesh.filter_px2:
+        header.append(f"comment meshsplats filter_px2 {mesh.filter_px2!r}")
+    columns = [mesh.vertices]
+    names = ["x", "y", "z"]
+    if mesh.normals is not None:
+        columns.append(mesh.normals)
+        names += ["nx", "ny", "nz"]
+    columns.append(mesh.colors)
+    names += ["red", "green", "blue", "alpha"]
+    for name, values in mesh.attributes.items():
+        property_name = _ATTRIBUTE + quote(name, safe="")
+        if values.ndim == 1:
+            names.append(property_name)
+            columns.append(values[:, None])
+        else:
+            names += [f"{property_name}:{i}" for i in range(values.shape[1])]
+            columns.append(values)
+        width = "-" if values.ndim == 1 else values.shape[1]
+        header.append(f"comment meshsplats attribute {property_name} {width}")
+    if len(names) > MAX_PROPERTIES:
+        raise ValueError(f"{len(names)} columns a vertex are more than {MAX_PROPERTIES}; save as .npz")
+    header.append(f"element vertex {len(mesh.vertices)}")
+    header += [f"property float {name}" for name in names]
+    header.append(f"element face {len(mesh.faces)}")
+    header.append("property list uchar int vertex_indices")
+    fields: list[tuple] = [("n", "u1"), ("corners", "<i4", 3)]
+    numbers = {
+        name: values
+        for name, values in (("face_splat", mesh.face_splat), ("depth_group", mesh.depth_group))
+        if values is not None
+    }
+    for name in numbers:
+        header.append(f"property int {name}")
+        fields.append((name, "<i4"))
+    with open(path, "wb") as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        for start in range(0, len(mesh.vertices), _ROWS):
+            part = slice(start, start + _ROWS)
+            rows = np.concatenate([c[part] for c in columns], axis=1).astype("<f4", copy=False)
+            file.write(rows.data)
+        for start in range(0, len(mesh.faces), _ROWS):
+            part = slice(start, start + _ROWS)
+            faces = np.empty(len(mesh.faces[part]), np.dtype(fields))
+            faces["n"] = 3
+            faces["corners"] = mesh.faces[part]
+            for name, values in numbers.items():
+                faces[name] = values[part]
+            file.write(faces.data)
+
+
+# -- reading
+
+
+def read_mesh_ply(path: Path) -> SplatMesh:
+    """The mesh in a `.ply` file of any encoding and byte order; polygons are cut into triangles.
+
+    Colours: red, green, blue and alpha as floats in [0, 1] or unsigned integers; without alpha the mesh is
+    opaque, without colours it is mid grey, with a DataWarning. Raises FileFormatError.
+    """
+    with open(path, "rb") as file:
+        header = read_header(file, path)
+        vertex, face = header.element("vertex"), header.element("face")
+        names = () if vertex is None else vertex.names
+        if face is None and any(n.startswith(("f_dc_", "packed_")) for n in names):
+            raise FileFormatError(f"{path}: holds Gaussian splats, not a mesh; read it with load_gaussians")
+        if vertex is None or any(n not in names for n in "xyz"):
+            raise FileFormatError(f"{path}: not a mesh: no element 'vertex' with x, y and z")
+        if face is None:
+            raise FileFormatError(f"{path}: not a mesh but points: it has no element 'face'")
+        return _read(file, header, vertex, face, path)
+
+
+def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, path: Path) -> SplatMesh:
+    rgb = next((c for c in _COLOR_NAMES if all(n in vertex.names for n in c)), ())
+    alpha = tuple(n for n in ("alpha", "diffuse_alpha", "a") if rgb and n in vertex.names)[:1]
+    groups: dict[str, tuple[str, ...]] = {"vertices": ("x", "y", "z"), "colors": (*rgb, *alpha)}
+    if all(n in vertex.names for n in ("nx", "ny", "nz")):
+        groups["normals"] = ("nx", "ny", "nz")
+    attributes, settings = _notes(header, vertex, path)
+    for name, (_, columns) in attributes.items():
+        groups[f"attribute {name}"] = columns
+    wanted = tuple(dict.fromkeys(n for columns in groups.values() for n in columns))
+    table = FloatTable(file, header, vertex, wanted, path)
+    v = len(table)
+    budget = Budget(path)
+    budget.spend(4 * v * (sum(len(c) for c in groups.values()) + 4), "the vertices")
+    place = {n: i for i, n in enumerate(table.names)}
+    arrays = {key: np.empty((v, len(columns)), np.float32) for key, columns in groups.items()}
+    done = 0
+    for chunk in table.chunks():
+        for key, columns in groups.items():
+            arrays[key][done : done + len(chunk)] = chunk[:, [place[n] for n in columns]]
+        done += len(chunk)
+    types = {p.name: p.dtype for p in vertex.properties}
+    for i, name in enumerate(groups["colors"]):
+        if types[name].kind == "u":
+            arrays["colors"][:, i] /= np.float32(np.iinfo(types[name]).max)
+        elif types[name].kind == "i" and arrays["colors"][:, i].max(initial=0) > 1:
+            # Bytes in a wider type: no program has the largest signed number for white.
+            arrays["colors"][:, i] /= np.float32(255)
+    faces, numbers = read_faces(file, header, face, ("face_splat", "depth_group"), budget, path)
+    if settings.get("filter_px2") and "face_splat" not in numbers:
+        del settings["filter_px2"]
+        warnings.warn(
+            f"{path}: another program has altered the file, left out: the filter of its splats",
+            DataWarning,
+            stacklevel=3,
+        )
+    return checked_mesh(
+        path,
+        vertices=arrays["vertices"],
+        faces=faces,
+        colors=straight_colors(arrays["colors"], path),
+        normals=arrays.get("normals"),
+        attributes={
+            name: arrays[f"attribute {name}"][:, 0] if flat else arrays[f"attribute {name}"]
+            for name, (flat, _) in attributes.items()
+        },
+        **settings,
+        **numbers,
+    )
+
+
+def _notes(
+    header: PlyHeader, vertex: Element, path: Path
+) -> tuple[dict[str, tuple[bool, tuple[str, ...]]], dict[str, Any]]:
+    """What our comments say: each attribute's (whether it is (v,), its properties), and settings."""
+    attributes: dict[str, tuple[bool, tuple[str, ...]]] = {}
+    settings: dict[str, Any] = {}
+    for comment in header.comments:
+        words = comment.split(" ")
+        if words[0] != "meshsplats":
+            continue
+        match words[1:]:
+            case ["up", x, y, z]:
+                try:
+                    settings["up"] = [float(x), float(y), float(z)]
+                except ValueError:
+                    raise FileFormatError(
+                        f"{path}: the up direction must be 3 numbers: {comment[:60]}"
+                    ) from None
+            case ["blending", space]:
+                settings["blending"] = space
+            case ["filter_px2", variance]:
+                try:
+                    settings["filter_px2"] = float(variance)
+                except ValueError:
+                    raise FileFormatError(f"{path}: filter_px2 must be a number: {comment[:60]}") from None
+            case ["attribute", name, width]:
+                names: tuple[str, ...] = (name,)
+                if width.isascii() and width.isdecimal() and len(width) <= 4:
+                    names = tuple(f"{name}:{i}" for i in range(int(width)))
+                missing = [n for n in names if n not in vertex.names]
+                if missing:
+                    raise FileFormatError(f"{path}: property {missing[0][:60]!r} of an attribute is missing")
+                attributes[unquote(name.removeprefix(_ATTRIBUTE))] = (width == "-", names)
+            case _:
+                pass  # a later version's, or the version itself
+    return attributes, settings

@@ -1,0 +1,212 @@
+"""Splats as a float .ply: the layout of the 3D Gaussian Splatting code and its relatives.
+
+Each row of element ``vertex`` is a splat: ``x y z``, ``f_dc_0..2`` and ``f_rest_*`` (spherical harmonics,
+channel by channel), ``opacity`` (logit), ``scale_*`` (logarithms) and ``rot_0..3`` (quaternion w x y z of any
+length). 2DGS files have two scales, the flat axis being the third; Mip-Splatting files have ``filter_3D``,
+the width of a smoothing filter that belongs to scales and opacities. Properties are found by name. How splats
+are to be drawn is said by a comment, if at all: ``SplatRenderMode: mip`` (Brush), ``antialiased 1``
+(Postshot).
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from meshsplats._files.atomic import atomic_path
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.ply.header import Element, PlyHeader
+from meshsplats.formats.ply.table import CHUNK_BYTES, FloatTable
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, SplatRows
+from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
+
+_POSITION = ("x", "y", "z")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_RGB = ("red", "green", "blue")
+_FILTER = "filter_3D"
+_REST_COUNTS = {0: 1, 9: 4, 24: 9, 45: 16}
+"""Number of f_rest properties: coefficients a channel."""
+
+MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
+"""Stored for a scale of 0, whose logarithm is not finite: -87.3."""
+MIN_LOGIT, MAX_LOGIT = -30.0, 20.0
+"""Stored for opacities 0 and 1; a float32 sigmoid of the latter is exactly 1."""
+
+
+class _Columns:
+    """Which properties hold what, and what they mean. Raises FileFormatError if some are missing."""
+
+    def __init__(self, element: Element, header: PlyHeader, where: object) -> None:
+        names = set(element.names)
+        self.scale = tuple(f"scale_{i}" for i in range(3) if f"scale_{i}" in names)
+        missing = [n for n in (*_POSITION, "opacity", "scale_0", "scale_1", *_ROTATION) if n not in names]
+        if not {"opacity", "scale_0", "rot_0"} & names:
+            faces = header.element("face")
+            mesh = f"a mesh with {faces.count:,} faces" if faces and faces.count else "a plain point cloud"
+            raise FileFormatError(
+                f"{where}: not splats but {mesh}: element 'vertex' has no opacity, scale_0.., rot_0.."
+                " properties"
+                f" (it has {_listed(element.names)}); load_mesh reads meshes"
+            )
+        self.color = _DC if names.issuperset(_DC) else _RGB
+        if not names.issuperset(self.color):
+            missing += [n for n in _DC if n not in names]
+        if missing:
+            raise FileFormatError(
+                f"{where}: element 'vertex' lacks {', '.join(missing)}, which splats need (it has"
+                f" {_listed(element.names)})"
+            )
+        rest = sorted(
+            int(n[7:]) for n in names if n.startswith("f_rest_") and n[7:].isdecimal() and n.isascii()
+        )
+        if len(rest) not in _REST_COUNTS or rest != list(range(len(rest))):
+            raise FileFormatError(
+                f"{where}: found {len(rest)} f_rest properties{f' up to f_rest_{rest[-1]}' if rest else ''};"
+                " spherical harmonics of degree 0, 1, 2, 3 have f_rest_0 to f_rest_(n-1) with n = 0, 9, 24,"
+                " 45"
+            )
+        self.coefficients = _REST_COUNTS[len(rest)]
+        self.filter = (_FILTER,) if _FILTER in names else ()
+        # In the order of sh[i] in memory, coefficient by coefficient; files go channel by channel.
+        b = self.coefficients - 1
+        self.sh = (*self.color, *(f"f_rest_{c * b + j}" for j in range(b) for c in range(3)))
+        self.color_span: np.ndarray | None = None
+        if self.color is _RGB:
+            kinds = [p.dtype for name in _RGB for p in element.properties if p.name == name]
+            self.color_span = np.array([np.iinfo(d).max if d.kind in "iu" else 1 for d in kinds], np.float32)
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """All properties that are read."""
+        return (*_POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *self.filter)
+
+
+def is_float_splat(header: PlyHeader) -> bool:
+    """Whether the vertex element looks like float splats rather than points of a mesh."""
+    element, face = header.element("vertex"), header.element("face")
+    if element is None:
+        return False
+    marks = {"scale_0", "rot_0"} if face is not None and face.count else {"opacity", "scale_0", "rot_0"}
+    return bool(marks & set(element.names))
+
+
+def read_float_ply(file: BinaryIO, header: PlyHeader, where: object, *, strict: bool) -> GaussianCloud:
+    """The splats of an opened .ply whose header has been read; errors and warnings as ``load_gaussians``."""
+    element = header.element("vertex")
+    if element is None:
+        raise FileFormatError(
+            f"{where}: no element 'vertex', which holds the splats (found"
+            f" {_listed([e.name for e in header.elements])})"
+        )
+    columns = _Columns(element, header, where)
+    table = FloatTable(file, header, element, columns.needed, where)
+    index = {name: i for i, name in enumerate(table.names)}
+    order = {
+        "means": [index[n] for n in _POSITION],
+        "quaternions": [index[n] for n in _ROTATION],
+        "scales": [index[n] for n in columns.scale],
+        "sh": [index[n] for n in columns.sh],
+    }
+    builder = CloudBuilder(element.count, columns.coefficients, where)
+    for chunk in table.chunks():
+        rows = builder.next(len(chunk))
+        np.take(chunk, order["means"], axis=1, out=rows.means, mode="clip")
+        np.take(chunk, order["quaternions"], axis=1, out=rows.quaternions, mode="clip")
+        np.take(chunk, order["sh"], axis=1, out=rows.sh.reshape(len(chunk), -1), mode="clip")
+        _activate(
+            rows,
+            log_scales=chunk[:, order["scales"]],
+            logits=chunk[:, index["opacity"]],
+            filter_3d=chunk[:, index[_FILTER]] if columns.filter else None,
+        )
+        if columns.color_span is not None:
+            rows.sh[:, 0] = (rows.sh[:, 0] / columns.color_span - np.float32(0.5)) / np.float32(SH_C0)
+        builder.keep(rows)
+    kernel: Kernel = "antialiased" if columns.filter else kernel_of_comments(header.comments)
+    return builder.finish("2dgs" if len(columns.scale) == 2 else kernel, strict=strict)
+
+
+def kernel_of_comments(comments: tuple[str, ...]) -> Kernel:
+    """The kernel that a .ply names in its comments; the last one counts, '3dgs' if there is none."""
+    spelt: dict[str, Kernel] = {
+        "splatrendermode mip": "antialiased",
+        "splatrendermode 2dgs": "2dgs",
+        "splatrendermode default": "3dgs",
+        "antialiased 1": "antialiased",
+        "antialiased 0": "3dgs",
+    }
+    found = [
+        spelt[words] for c in comments if (words := " ".join(c.lower().replace(":", " ").split())) in spelt
+    ]
+    return found[-1] if found else "3dgs"
+
+
+def _activate(
+    rows: SplatRows, *, log_scales: np.ndarray, logits: np.ndarray, filter_3d: np.ndarray | None
+) -> None:
+    """Scales and opacities from logarithms and logits; a scale or opacity of 0 may be stored as infinite.
+
+    Mip-Splatting's filter (Yu et al., CVPR 2024, section 4.1) convolves the splat with an isotropic Gaussian
+    of standard deviation f and keeps its integral: s' = sqrt(s^2 + f^2), o' = o sqrt(prod s^2 / prod s'^2).
+    """
+    axes = log_scales.shape[1]
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        scales = np.exp(log_scales)
+        np.divide(1, 1 + np.exp(-logits), out=rows.opacities)
+        if filter_3d is not None:
+            wide = np.hypot(scales, filter_3d[:, None])
+            rows.opacities[:] *= np.prod(np.where(wide > 0, scales / wide, 1), axis=1)
+            scales = wide
+    rows.scales[:, :axes] = scales
+    rows.scales[:, axes:] = 0
+
+
+def _listed(names: tuple[str, ...] | list[str]) -> str:
+    shown = ", ".join(n[:40] for n in names[:8])
+    return (shown + ", ..." if len(names) > 8 else shown) or "nothing"
+
+
+def write_float_ply(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
+    """Writes ``cloud`` in the layout of the 3D Gaussian Splatting code; see ``save_gaussians``."""
+    k = cloud.sh.shape[1]
+    flat = cloud.kernel == "2dgs" and not cloud.scales[:, 2].any()
+    if cloud.kernel == "2dgs" and not flat:
+        warnings.warn(
+            f"{path}: this '2dgs' cloud has third scales that are not 0; written with three scales,"
+            " it will be read back as '3dgs'",
+            DataWarning,
+            stacklevel=3,
+        )
+    scale_names = [f"scale_{i}" for i in range(2 if flat else 3)]
+    rest_names = [f"f_rest_{i}" for i in range(3 * (k - 1))]
+    names = [*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, "opacity", *scale_names, *_ROTATION]
+    at = {name: i for i, name in enumerate(names)}
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if cloud.kernel == "antialiased":
+        lines.append("comment SplatRenderMode: mip")
+    lines.append(f"element vertex {len(cloud)}")
+    lines += [f"property float {name}" for name in names] + ["end_header", ""]
+    per_chunk = max(1, CHUNK_BYTES // (4 * len(names)))
+    size = 4 * len(names) * len(cloud)
+    with atomic_path(path, needs=size) as temporary, Path(temporary).open("wb") as file:
+        file.write("\n".join(lines).encode("ascii"))
+        for start in range(0, len(cloud), per_chunk):
+            part = slice(start, start + per_chunk)
+            sh = cloud.sh[part]
+            rows = np.zeros((len(sh), len(names)), "<f4")
+            rows[:, :3] = cloud.means[part]
+            rows[:, 6:9] = sh[:, 0]
+            rows[:, 9 : at["opacity"]] = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)
+            opacities = cloud.opacities[part].astype(np.float64)
+            with np.errstate(divide="ignore"):
+                logits = np.log(opacities) - np.log1p(-opacities)
+                logs = np.log(cloud.scales[part, : len(scale_names)])
+            rows[:, at["opacity"]] = np.clip(logits, MIN_LOGIT, MAX_LOGIT)
+            rows[:, at["scale_0"] : at["rot_0"]] = np.maximum(logs, MIN_LOG_SCALE)
+            rows[:, at["rot_0"] : at["rot_0"] + 4] = cloud.quaternions[part]
+            file.write(rows.data)

@@ -1,0 +1,1 @@
+"""Splat formats of their own: SPZ, SOG and .splat."""

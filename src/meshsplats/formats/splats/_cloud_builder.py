@@ -1,0 +1,134 @@
+"""Collects the splats of a file into a GaussianCloud and leaves out those that are not usable."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._validation import Budget
+from meshsplats.gaussians import GaussianCloud, Kernel
+
+
+class SplatRows(NamedTuple):
+    """Views of the rows to be filled next, as in GaussianCloud but with quaternions of any length."""
+
+    means: np.ndarray
+    quaternions: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    sh: np.ndarray
+
+
+class CloudBuilder:
+    """The arrays of a cloud, filled in chunks: ``rows = builder.next(m)``, fill them, ``builder.keep(rows)``.
+
+    A row is dropped and counted if a value is not finite after activation or its quaternion is zero. Later
+    rows take its place, so that no array is ever copied.
+    """
+
+    def __init__(self, count: int, coefficients: int, where: object) -> None:
+        if count == 0:
+            raise FileFormatError(f"{where}: no splats, the file declares 0 of them")
+        self._where, self._count = where, count
+        self._arrays = SplatRows(
+            np.empty((count, 3), np.float32),
+            np.empty((count, 4), np.float32),
+            np.empty((count, 3), np.float32),
+            np.empty(count, np.float32),
+            np.empty((count, coefficients, 3), np.float32),
+        )
+        self._kept = 0
+        self._not_finite = self._zero_quaternions = 0
+        self._first_bad: int | None = None
+
+    def next(self, m: int) -> SplatRows:
+        """The next ``m`` rows, to be written."""
+        return SplatRows(*(a[self._kept : self._kept + m] for a in self._arrays))
+
+    def keep(self, rows: SplatRows) -> None:
+        """Takes the rows that ``next`` gave, normalises their quaternions and drops unusable ones."""
+        m = len(rows.means)
+        finite = np.ones(m, bool)
+        for array in rows:
+            # A sum is not finite if any term is not; only then look value by value.
+            with np.errstate(invalid="ignore", over="ignore"):
+                suspicious = not np.isfinite(array.sum())
+            if suspicious:
+                finite &= np.isfinite(array).reshape(m, -1).all(axis=1)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            q = rows.quaternions.astype(np.float64)  # squares of float32 neither overflow nor vanish
+            norm = np.sqrt(np.einsum("ij,ij->i", q, q))
+            rows.quaternions[:] = q / norm[:, None]
+        turned = norm > 0
+        good = finite & turned
+        if not good.all():
+            if self._first_bad is None:
+                self._first_bad = self._kept + int(good.argmin())
+            self._not_finite += int((~finite).sum())
+            self._zero_quaternions += int((finite & ~turned).sum())
+            m = int(good.sum())
+            for array in rows:
+                array[:m] = array[good]
+        self._kept += m
+
+    def finish(self, kernel: Kernel, *, strict: bool) -> GaussianCloud:
+        """The cloud. Dropped splats are a DataWarning; a FileFormatError if ``strict`` or if none is left."""
+        dropped = self._not_finite + self._zero_quaternions
+        if dropped:
+            reasons = []
+            if self._not_finite:
+                reasons.append(f"{self._not_finite:,} with values that are not finite")
+            if self._zero_quaternions:
+                reasons.append(f"{self._zero_quaternions:,} with a zero quaternion")
+            what = f"{dropped:,} of {self._count:,} splats are unusable: {' and '.join(reasons)}"
+            what += f"; the first is splat {self._first_bad:,} (from 0)"
+            if not self._kept:
+                raise FileFormatError(f"{self._where}: no usable splats; {what}")
+            if strict:
+                raise FileFormatError(f"{self._where}: {what}; without strict they would be left out")
+            warnings.warn(f"{self._where}: {what}; they are left out", DataWarning, stacklevel=4)
+            for array in self._arrays:
+                array.resize((self._kept, *array.shape[1:]), refcheck=False)  # shrinks in place
+        means, quaternions, scales, opacities, sh = self._arrays
+        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
+
+
+def joined(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCloud:
+    """All clouds in one, of at least one; missing harmonics are zero, and the kernel is that of all or
+    '3dgs'."""
+    if len(clouds) == 1:
+        return clouds[0]
+    count, width = sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds)
+    budget.spend(4 * (11 + 3 * width) * count, f"its {count:,} splats together")
+    sh = np.zeros((count, width, 3), np.float32)
+    start = 0
+    for cloud in clouds:
+        sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
+        start += len(cloud)
+    kernels = {cloud.kernel for cloud in clouds}
+    return GaussianCloud(
+        means=np.concatenate([cloud.means for cloud in clouds]),
+        quaternions=np.concatenate([cloud.quaternions for cloud in clouds]),
+        scales=np.concatenate([cloud.scales for cloud in clouds]),
+        opacities=np.concatenate([cloud.opacities for cloud in clouds]),
+        sh=sh,
+        kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
+    )
+
+
+def fill_smallest_three(out: np.ndarray, small: np.ndarray, largest: np.ndarray) -> None:
+    """Writes quaternions ``out`` (m, 4) from three components (m, 3) and the index (m,) of the omitted one.
+
+    Of a unit quaternion the component that is largest in magnitude is omitted and taken as positive; the
+    others follow in order.
+    """
+    rest = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", small, small)))
+    for omitted in range(4):
+        chosen = largest == omitted
+        out[chosen, omitted] = rest[chosen]
+        for i, column in enumerate([c for c in range(4) if c != omitted]):
+            out[chosen, column] = small[chosen, i]

@@ -1,0 +1,61 @@
+""".splat: 32 bytes a splat and nothing else, the format of the first web viewer (antimatter15/splat, MIT).
+
+Each record holds position and scales (6 float32), colour and opacity (4 bytes of 255ths), and the rotation
+(4 bytes, w x y z, 128 + 128 times the component, cut off). There is no header, so a file is recognised by its
+rotations, which must have length 1.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import BinaryIO
+
+import numpy as np
+
+from meshsplats.errors import FileFormatError
+from meshsplats.formats.splats._cloud_builder import CloudBuilder
+from meshsplats.gaussians import SH_C0, GaussianCloud
+
+_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
+_AT_ONCE = 1 << 16
+
+
+def is_dot_splat(file: BinaryIO) -> bool:
+    """Whether the file can be `.splat`: whole records, nine in ten of those looked at with unit rotations."""
+    size = file.seek(0, io.SEEK_END)
+    if size == 0 or size % _RECORD.itemsize:
+        return False
+    count = size // _RECORD.itemsize
+    bytes_ = b""
+    for start in sorted({0, count // 3, count - min(count, 256)}):
+        file.seek(start * _RECORD.itemsize)
+        bytes_ += file.read(256 * _RECORD.itemsize)
+    rotations = _rotations(np.frombuffer(bytes_, _RECORD))
+    return bool((np.abs(np.linalg.norm(rotations, axis=1) - 1) < 0.05).mean() >= 0.9)
+
+
+def read_dot_splat(file: BinaryIO, where: object, *, strict: bool) -> GaussianCloud:
+    """The splats of an opened file for which ``is_dot_splat`` holds; errors as ``load_gaussians``."""
+    count = file.seek(0, io.SEEK_END) // _RECORD.itemsize
+    builder = CloudBuilder(count, 1, where)
+    file.seek(0)
+    for start in range(0, count, _AT_ONCE):
+        m = min(_AT_ONCE, count - start)
+        data = file.read(m * _RECORD.itemsize)
+        if len(data) < m * _RECORD.itemsize:
+            raise FileFormatError(f"{where}: the file became shorter while it was read")
+        records = np.frombuffer(data, _RECORD)
+        rows = builder.next(m)
+        color = records["color"] / np.float32(255)
+        rows.means[:] = records["position"]
+        rows.scales[:] = np.where(records["scale"] < 0, np.nan, records["scale"])  # no deviation is negative
+        rows.quaternions[:] = _rotations(records)
+        rows.opacities[:] = color[:, 3]
+        rows.sh[:, 0] = (color[:, :3] - np.float32(0.5)) / np.float32(SH_C0)
+        builder.keep(rows)
+    return builder.finish("3dgs", strict=strict)
+
+
+def _rotations(records: np.ndarray) -> np.ndarray:
+    # Writers cut 128 + 128 q off to a whole number: the middle of the step is half a unit further.
+    return (records["rotation"] - np.float32(127.5)) / np.float32(127.5)

@@ -1,0 +1,339 @@
+"""SOG: splats as pictures. A folder or a zip archive with ``meta.json`` and one lossless WebP for each
+attribute.
+
+Pixel i (row by row) belongs to splat i. Version 2 looks bytes up in codebooks, version 1 (no version number)
+maps them between a least and a largest value. Specification: developer.playcanvas.com, "The SOG Format".
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import warnings
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.errors import FileFormatError, MissingDependencyError
+from meshsplats.formats._validation import Budget
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, SplatRows, fill_smallest_three
+from meshsplats.gaussians import GaussianCloud, Kernel
+
+_MAX_META_BYTES = 4 << 20
+_MAX_SPLATS = 1 << 28
+_AT_ONCE = 1 << 16
+_COEFFICIENTS = {1: 3, 2: 8, 3: 15}
+_PALETTE_COLUMNS = 64
+"""Entries of the palette of harmonics in a row of its picture."""
+
+
+def read_sog(
+    path: Path, budget: Budget, *, strict: bool, ranges: Sequence[tuple[int, int]] | None = None
+) -> GaussianCloud:
+    """The splats of a `.sog` archive, or of the folder that holds the meta.json ``path``; errors as
+    ``load_gaussians``. ``ranges``: first and end of the splats that are wanted, any number of times; None:
+    all.
+    """
+    with open(path, "rb") as file:
+        zipped = file.read(2) == b"PK"
+    if not zipped:
+        return _Reader(_Folder(path.parent, path, budget), path, budget).read(ranges, strict=strict)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _Reader(_Archive(archive, path), path, budget).read(ranges, strict=strict)
+    except (zipfile.BadZipFile, NotImplementedError) as error:
+        raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
+
+
+def json_object(raw: bytes, most: int, what: str, where: Path) -> dict[str, Any]:
+    """What ``what``, a JSON file of at most ``most`` bytes, holds. FileFormatError, which begins with
+    ``where``, if it is longer or no object."""
+    if len(raw) > most:
+        raise FileFormatError(f"{where}: {what} is longer than {most:,} bytes")
+    try:
+        found = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{where}: {what} cannot be read: {str(error)[:120]}") from None
+    if not isinstance(found, dict):
+        raise FileFormatError(f"{where}: {what} must be an object")
+    return found
+
+
+class _Folder:
+    """Files beside meta.json."""
+
+    def __init__(self, folder: Path, meta: Path, budget: Budget) -> None:
+        self._folder, self._meta, self._budget = folder, meta, budget
+
+    def read_meta(self) -> bytes:
+        with open(self._meta, "rb") as file:
+            return file.read(_MAX_META_BYTES + 1)
+
+    def read(self, name: str) -> bytes:
+        found = self._folder / name
+        if not found.is_file():
+            raise FileFormatError(f"{self._meta}: the file {name!r} that it names is missing")
+        self._budget.extend(os.stat(found).st_size)
+        return found.read_bytes()
+
+
+class _Archive:
+    """Files in a zip archive, beside its meta.json."""
+
+    def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
+        self._archive, self._path = archive, path
+        self._names = set(archive.namelist())
+        metas = [n for n in self._names if n.rsplit("/", 1)[-1] == "meta.json"]
+        if not metas:
+            listed = ", ".join(sorted(self._names)[:5])[:200]
+            raise FileFormatError(
+                f"{path}: a zip archive without meta.json is no SOG file (it holds {listed})"
+            )
+        self._meta = min(metas, key=lambda n: (n.count("/"), n))
+        # Pictures are compressed already: more than this is a decompression bomb.
+        self._limit = (16 << 20) + 4 * os.stat(path).st_size
+
+    def read_meta(self) -> bytes:
+        return self._bytes(self._meta, _MAX_META_BYTES)
+
+    def read(self, name: str) -> bytes:
+        full = self._meta[: -len("meta.json")] + name
+        if full not in self._names:
+            raise FileFormatError(
+                f"{self._path}: the file {name!r} that meta.json names is not in the archive"
+            )
+        return self._bytes(full, self._limit)
+
+    def _bytes(self, name: str, limit: int) -> bytes:
+        try:
+            with self._archive.open(name) as file:
+                data = file.read(limit + 1)
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            NotImplementedError,
+            RuntimeError,
+            OSError,
+            ValueError,
+        ) as e:
+            raise FileFormatError(f"{self._path}: cannot unpack {name[:60]!r}: {str(e)[:120]}") from None
+        if len(data) > limit:
+            raise FileFormatError(f"{self._path}: {name[:60]!r} unpacks to over {limit:,} bytes; refused")
+        return data
+
+
+class _Reader:
+    def __init__(self, files: _Folder | _Archive, where: Path, budget: Budget) -> None:
+        self._files, self._where, self._budget = files, where, budget
+        self._meta = json_object(files.read_meta(), _MAX_META_BYTES, "meta.json", where)
+
+    def _error(self, message: str) -> FileFormatError:
+        return FileFormatError(f"{self._where}: {message}")
+
+    def read(self, ranges: Sequence[tuple[int, int]] | None, *, strict: bool) -> GaussianCloud:
+        version = self._meta.get("version")
+        if version not in (None, 2):
+            raise self._error(f"SOG version {str(version)[:20]}; known are 2, and 1, which has no number")
+        stored = self._count(version)
+        rest = self._section("shN") if "shN" in self._meta else None
+        files = {
+            name: self._files_of(name, n)
+            for name, n in (("means", 2), ("scales", 1), ("quats", 1), ("sh0", 1))
+        }
+        palette, labels = np.empty((0, 0, 3), np.float32), None
+        if rest is not None:
+            files["shN"] = self._files_of("shN", 2)
+        data = {name: [self._files.read(n) for n in names] for name, names in files.items()}
+        self._budget.spend(64 * stored, f"its {stored:,} splats")
+        chosen, count = self._chosen(ranges, stored)
+        if rest is not None:
+            palette = self._palette(data["shN"][0], rest, version)
+            labels = self._pixels(data["shN"][1], "shN labels", stored)[chosen]
+            self._budget.spend(24 * palette.shape[1] * count, "its spherical harmonics")
+        builder = CloudBuilder(count, 1 + palette.shape[1], self._where)
+        rows = builder.next(count)
+        self._fill(
+            rows,
+            {
+                name: [self._pixels(d, name, stored)[chosen] for d in data[name]]
+                for name in data
+                if name != "shN"
+            },
+            version,
+        )
+        if labels is not None:
+            index = labels[:, 0] + labels[:, 1].astype(np.int32) * 256
+            palette = np.concatenate([palette, np.zeros((1, *palette.shape[1:]), np.float32)])
+            np.minimum(index, len(palette) - 1, out=index)  # a label beyond the palette means no harmonics
+            for start in range(0, count, _AT_ONCE):
+                part = slice(start, start + _AT_ONCE)
+                rows.sh[part, 1:] = palette[index[part]]
+        builder.keep(rows)
+        return builder.finish(self._kernel(), strict=strict)
+
+    def _fill(self, rows: SplatRows, pixels: dict[str, list[np.ndarray]], version: int | None) -> None:
+        low, high = pixels["means"]
+        steps = (low[:, :3] + high[:, :3].astype(np.uint16) * 256) / 65535
+        least, most = self._range("means", 3)
+        logs = least + (most - least) * steps
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows.means[:] = np.sign(logs) * np.expm1(np.abs(logs))
+            scales, colors = pixels["scales"][0], pixels["sh0"][0]
+            if version is None:
+                rows.scales[:] = np.exp(self._between("scales", scales[:, :3]))
+                stored = self._between("sh0", colors)
+                rows.sh[:, 0] = stored[:, :3]
+                rows.opacities[:] = 1 / (1 + np.exp(-stored[:, 3]))
+            else:
+                rows.scales[:] = np.exp(self._codebook("scales"))[scales[:, :3]]
+                rows.sh[:, 0] = self._codebook("sh0")[colors[:, :3]]
+                rows.opacities[:] = colors[:, 3] / np.float32(255)
+        turns = pixels["quats"][0]
+        small = (turns[:, :3] / np.float32(127.5) - 1) / np.float32(np.sqrt(2))
+        # The fourth byte is 252 + the index of the largest component; other values leave the quaternion zero.
+        rows.quaternions[:] = 0
+        fill_smallest_three(rows.quaternions, small, turns[:, 3].astype(np.int32) - 252)
+
+    def _chosen(
+        self, ranges: Sequence[tuple[int, int]] | None, stored: int
+    ) -> tuple[np.ndarray | slice, int]:
+        """What picks the splats of ``ranges`` from the rows of all, and their number."""
+        if ranges is None:
+            return slice(None), stored
+        edges = np.zeros(stored + 1, np.int64)  # ranges may overlap, any number of times
+        for first, end in ranges:
+            if end > stored:
+                raise self._error(f"the splats {first:,} to {end:,} are asked for, but it has {stored:,}")
+            edges[first] += 1
+            edges[end] -= 1
+        chosen = np.cumsum(edges[:-1]) > 0
+        return chosen, int(np.count_nonzero(chosen))
+
+    # -- meta.json
+
+    def _section(self, name: str) -> dict[str, Any]:
+        section = self._meta.get(name)
+        if not isinstance(section, dict):
+            raise self._error(f"meta.json has no object {name!r}, which SOG needs")
+        return section
+
+    def _count(self, version: int | None) -> int:
+        if version is None:
+            shape = self._section("means").get("shape")
+            count = shape[0] if isinstance(shape, list) and shape else None
+        else:
+            count = self._meta.get("count")
+        if not isinstance(count, int) or isinstance(count, bool) or not 0 <= count <= _MAX_SPLATS:
+            raise self._error(
+                f"meta.json must give a number of splats up to {_MAX_SPLATS:,}, got {str(count)[:30]}"
+            )
+        return count
+
+    def _files_of(self, name: str, n: int) -> list[str]:
+        names = self._section(name).get("files")
+        if not isinstance(names, list) or len(names) != n or not all(isinstance(x, str) for x in names):
+            raise self._error(f"meta.json must name {n} file(s) of {name!r}, got {str(names)[:80]}")
+        for file_name in names:
+            # A plain name in the folder: nothing that could lead out of it on any system.
+            if not re.fullmatch(r"[^/\\:\0]{1,255}", file_name) or file_name in (".", ".."):
+                raise self._error(
+                    f"meta.json refers to {file_name[:80]!r}, which is no plain file name; refused"
+                )
+        return names
+
+    def _numbers(self, section: str, key: str, lengths: tuple[int, ...]) -> np.ndarray:
+        return self._checked(self._section(section).get(key), section, key, lengths)
+
+    def _checked(self, value: Any, section: str, key: str, lengths: tuple[int, ...]) -> np.ndarray:
+        listed = value if isinstance(value, list) else [value]
+        if len(listed) in lengths and all(isinstance(x, (int, float)) and abs(x) < 1e300 for x in listed):
+            return np.array(listed, np.float64)
+        wanted = " or ".join(map(str, lengths))
+        raise self._error(f"{section}.{key} in meta.json must be {wanted} numbers, got {str(value)[:60]}")
+
+    def _range(self, section: str, n: int) -> tuple[np.ndarray, np.ndarray]:
+        return self._numbers(section, "mins", (n,)), self._numbers(section, "maxs", (n,))
+
+    def _between(self, section: str, pixels: np.ndarray) -> np.ndarray:
+        least, most = self._range(section, pixels.shape[1])
+        return (least + (most - least) * (pixels / np.float64(255))).astype(np.float32)
+
+    def _codebook(self, section: str) -> np.ndarray:
+        book = self._section(section).get("codebook")
+        if isinstance(book, list) and len(book) == 256 and book[0] is None:
+            # Some writers left the first entry empty; it follows from the others as PlayCanvas has it.
+            rest = self._checked(book[1:], section, "codebook", (255,))
+            numbers = np.concatenate([rest[:1] + (rest[0] - rest[-1]) / 255, rest])
+        else:
+            numbers = self._checked(book, section, "codebook", (256,))
+        return numbers.astype(np.float32)
+
+    def _kernel(self) -> Kernel:
+        known: dict[str, Kernel] = {"antialiased": "antialiased", "2dgs": "2dgs"}
+        if self._meta.get("antialias") is True:
+            return "antialiased"
+        return known.get(str(self._meta.get("model")), "3dgs")
+
+    # -- pictures
+
+    def _palette(self, data: bytes, section: dict[str, Any], version: int | None) -> np.ndarray:
+        """(p, k - 1, 3) harmonics that labels refer to."""
+        picture = self._picture(data, "shN centroids", 1 << 24)
+        n = next((c for c in _COEFFICIENTS.values() if c * _PALETTE_COLUMNS == picture.shape[1]), 0)
+        bands = section.get("bands")  # neither they nor the count are in files of the first days of version 2
+        stated = version == 2 and bands is not None
+        if not n or (stated and (not isinstance(bands, int) or _COEFFICIENTS.get(bands) != n)):
+            raise self._error(
+                f"the picture of harmonics is {picture.shape[1]} pixels wide, which does not fit"
+                f" {str(bands)[:20]} bands (192, 512, 960 pixels for 1, 2, 3)"
+            )
+        entries = picture[..., :3].reshape(-1, n, 3)
+        if version is None:
+            least, most = self._range("shN", 1)
+            return (least + (most - least) * (entries / np.float64(255))).astype(np.float32)
+        size = section.get("count", len(entries))
+        if not isinstance(size, int) or not 0 <= size <= len(entries):
+            raise self._error(f"a palette of {str(size)[:20]} harmonics in a picture of {len(entries):,}")
+        return self._codebook("shN")[entries[:size]]
+
+    def _pixels(self, data: bytes, name: str, count: int) -> np.ndarray:
+        """(count, 4) bytes of the first ``count`` pixels."""
+        picture = self._picture(data, name, 2 * count + (1 << 16))
+        if picture.shape[0] * picture.shape[1] < count:
+            raise self._error(
+                f"the picture of {name} has {picture.shape[1]} x {picture.shape[0]} pixels, too few for"
+                f" {count:,} splats"
+            )
+        return picture.reshape(-1, 4)[:count]
+
+    def _picture(self, data: bytes, name: str, most: int) -> np.ndarray:
+        """(height, width, 4) RGBA; refuses pictures of more than ``most`` pixels before unpacking them."""
+        from PIL import Image, features
+
+        if data[:4] == b"RIFF" and not features.check("webp"):
+            raise MissingDependencyError(
+                f"{self._where}: this Pillow was built without WebP, which SOG needs"
+            )
+        try:
+            with warnings.catch_warnings(), Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
+                warnings.simplefilter("ignore")  # Pillow warns of large pictures; the limit below is narrower
+                width, height = image.size
+                if width * height > most:
+                    raise self._error(
+                        f"the picture of {name} has {width} x {height} pixels, expected at most {most:,}"
+                    )
+                self._budget.spend(12 * width * height, f"the picture of {name}")
+                return np.asarray(image.convert("RGBA"))
+        except FileFormatError:
+            raise
+        except Exception as error:  # Pillow's decoders raise whatever their parts do
+            raise self._error(
+                f"the picture of {name} cannot be read: {type(error).__name__} {str(error)[:100]}"
+            ) from None

@@ -1,0 +1,116 @@
+"""Streamed SOG: a folder of SOG parts in several levels of detail, with the index ``lod-meta.json``.
+
+The index has a tree of places; each leaf names, level by level, which splats of which part it shows. Level 0
+has the most detail. Specification: developer.playcanvas.com, "The Streamed SOG Format".
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from meshsplats.errors import FileFormatError
+from meshsplats.formats._validation import Budget
+from meshsplats.formats.splats._cloud_builder import joined
+from meshsplats.formats.splats.sog import json_object, read_sog
+from meshsplats.gaussians import GaussianCloud
+
+_MAX_INDEX_BYTES = 64 << 20
+_MAX_DEPTH = 64
+_PATH = re.compile(r"[^/\\:\0]{1,255}(/[^/\\:\0]{1,255}){0,7}")
+
+
+def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
+    """The splats of the index ``path`` in the finest level that each place has, and those of its environment;
+    errors as ``load_gaussians``."""
+    index = _Index(path)
+    budget = Budget(path)
+    parts = []
+    for name, ranges in index.parts().items():
+        part = path.parent / name
+        if not part.is_file():
+            raise FileFormatError(f"{path}: the part {name!r} that it names is missing")
+        # What reading a part takes is given back after it; the splats stay.
+        own = Budget(part)
+        cloud = read_sog(part, own, strict=strict, ranges=ranges)
+        budget.extend(own.file_bytes)
+        budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
+        parts.append(cloud)
+    if not parts:
+        raise FileFormatError(f"{path}: no splats, its tree has none")
+    kernels = sorted({part.kernel for part in parts})
+    if len(kernels) > 1:
+        raise FileFormatError(f"{path}: its parts are of several kinds of splats: {', '.join(kernels)}")
+    return joined(parts, budget)
+
+
+class _Index:
+    """lod-meta.json, checked as far as it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with open(path, "rb") as file:
+            raw = file.read(_MAX_INDEX_BYTES + 1)
+        self._document = json_object(raw, _MAX_INDEX_BYTES, "the index", path)
+        version = self._document.get("version", 1)
+        if version != 1:
+            raise self._error(f"streamed SOG of version {str(version)[:20]}, known is 1")
+
+    def parts(self) -> dict[str, list[tuple[int, int]] | None]:
+        """First and end of the splats to read by part, as paths beside the index; None: all of them."""
+        names = self._document.get("filenames")
+        if not isinstance(names, list):
+            raise self._error(f"'filenames' must be a list, got {str(names)[:60]}")
+        found: dict[str, list[tuple[int, int]] | None] = {}
+        for number, first, end in self._finest():
+            if number >= len(names):
+                raise self._error(f"its tree names part {number}, but there are {len(names)}")
+            if end > first:
+                ranges = found.setdefault(self._checked(names[number]), [])
+                assert ranges is not None  # only the environment's are
+                ranges.append((first, end))
+        if (environment := self._document.get("environment")) is not None:
+            found[self._checked(environment)] = None
+        return found
+
+    def _finest(self) -> list[tuple[int, int, int]]:
+        """Number of the part, first and end of its splats, leaf by leaf."""
+        found = []
+        waiting: list[tuple[Any, int]] = [(self._document.get("tree"), 0)]
+        while waiting:
+            node, depth = waiting.pop()
+            levels, children = (node.get("lods"), node.get("children")) if isinstance(node, dict) else (0, 0)
+            if isinstance(levels, dict) and levels:
+                found.append(self._entry(levels))
+            elif isinstance(children, list) and depth < _MAX_DEPTH:
+                waiting += [(child, depth + 1) for child in reversed(children)]
+            else:
+                raise self._error(f"a place in its tree has neither 'lods' nor 'children': {str(node)[:60]}")
+        return found
+
+    def _entry(self, levels: dict[str, Any]) -> tuple[int, int, int]:
+        if not all(re.fullmatch("[0-9]{1,6}", level) for level in levels):
+            raise self._error(f"levels must be numbers, got {', '.join(levels)[:60]}")
+        entry = levels[min(levels, key=int)]
+        if not isinstance(entry, dict):
+            raise self._error(f"a level must be an object, got {str(entry)[:80]}")
+
+        def number(key: str) -> int:
+            value = entry.get(key)
+            if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 40:
+                return value
+            raise self._error(f"{key!r} of a level must be a whole number, got {str(value)[:40]}")
+
+        first = number("offset")
+        return number("file"), first, first + number("count")
+
+    def _checked(self, name: Any) -> str:
+        """A path that leads down from the index's folder, on any system."""
+        plain = isinstance(name, str) and _PATH.fullmatch(name)
+        if not plain or any(step in (".", "..") for step in name.split("/")):
+            raise self._error(f"it refers to {str(name)[:80]!r}, which is no path below its folder; refused")
+        return name
+
+    def _error(self, message: str) -> FileFormatError:
+        return FileFormatError(f"{self._path}: {message}")

@@ -1,0 +1,342 @@
+"""The part of reading USD that runs in a process of its own, started by ``usd_reader``.
+
+    python -m meshsplats.formats.usd.extraction FILE RESULT
+
+writes the arrays of all meshes of FILE to RESULT (.npz) and prints a line of JSON: {"error": text}, or what
+goes beside the arrays.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from meshsplats.errors import FileFormatError
+from meshsplats.formats._validation import Budget
+from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.formats.ply.faces import cut_polygons
+from meshsplats.mesh import Blending
+
+_LIBRARY_BYTES = 2 << 30
+_FACTOR = 256
+"""Address space: ``_LIBRARY_BYTES`` above what is taken at the start, and so many times the file's size."""
+
+
+def main(file: Path, result: Path) -> None:
+    import pxr.UsdGeom  # noqa: F401  (loaded before memory is limited)
+
+    _limit_memory(file.stat().st_size)
+    try:
+        told = extract(file, result)
+    except FileFormatError as error:
+        told = {"error": str(error).removeprefix(f"{file}: ")}
+    except MemoryError:
+        told = {
+            "error": "its data would take more memory than a file of this size may (a decompression bomb?)"
+        }
+    print(json.dumps(told))
+
+
+def _limit_memory(file_bytes: int) -> None:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    taken = 0
+    if os.path.exists("/proc/self/statm"):
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    limit = taken + _LIBRARY_BYTES + _FACTOR * file_bytes
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    try:
+        resource.setrlimit(resource.RLIMIT_AS, (limit if hard < 0 else min(limit, hard), hard))
+    except (ValueError, OSError):  # macOS knows the limit, but does not take it
+        return
+
+
+def extract(file: Path, result: Path) -> dict[str, Any]:
+    """Writes the arrays; returns warnings, up direction, blending and the names of the attributes.
+    Raises FileFormatError."""
+    try:
+        return _extract(file, result)
+    except RuntimeError as error:  # the library's own among them
+        try:
+            lines = str(error).split("\n")
+        except UnicodeDecodeError:  # it quotes the file
+            lines = []
+        reason = next((line.strip() for line in lines if line.strip()), "no reason given")
+        raise FileFormatError(f"not readable as USD: {reason.rpartition(' : ')[2][:300]}") from None
+    except UnicodeDecodeError:
+        raise FileFormatError("not readable as USD: it holds text that is not UTF-8") from None
+
+
+def _extract(file: Path, result: Path) -> dict[str, Any]:
+    from pxr import Sdf, Usd, UsdGeom
+
+    layer = Sdf.Layer.OpenAsAnonymous(str(file))  # this file alone; nothing that it refers to
+    if layer is None:
+        raise FileFormatError("not readable as USD")
+    _refuse_references(layer)
+    stage = Usd.Stage.Open(layer)
+    shapes, others = _visible(stage)
+    if not shapes:
+        raise FileFormatError(
+            "the stage holds no visible mesh" + (f", but {others:,} other shapes" if others else "")
+        )
+    told: dict[str, Any] = {"warnings": [], "attributes": [], "blending": "display"}
+    if others:
+        told["warnings"].append(f"{others:,} shapes that are no meshes were left out")
+    budget = Budget(file)
+    note = _our_note(shapes[0]) if len(shapes) == 1 else {}
+    places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
+    pieces = []
+    for shape in shapes:
+        matrix = np.array(places.GetLocalToWorldTransform(shape.GetPrim()))
+        if note and np.abs(matrix - _own_placement(note["up"])).max() < 1e-6:
+            told["up"] = note["up"]
+            matrix = np.eye(4)
+        pieces.append(_piece(shape, matrix, budget, exact=bool(note)))
+    told.setdefault("up", [0, 0, 1] if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else [0, 1, 0])
+    arrays = _joined(pieces)
+    if note:
+        told["blending"] = note["blending"]
+        arrays |= _restored(shapes[0], note, arrays, told)
+    if note.get("normals") == "computed":
+        arrays.pop("normals", None)
+    np.savez(result, **arrays)  # type: ignore[arg-type]
+    return told
+
+
+def _refuse_references(layer: Any) -> None:
+    """FileFormatError if the file would pull in others."""
+    others = [str(p) for p in layer.GetCompositionAssetDependencies() if p]  # '': a reference within the file
+    clips: list[str] = []
+    layer.Traverse("/", lambda at: clips.append(str(at)) if _has_clips(layer, at) else None)
+    if others or clips:
+        named = ", ".join(others[:3])[:200] if others else f"value clips of {clips[0][:100]}"
+        raise FileFormatError(
+            f"refers to other files ({named}), which are not opened; put all into one: usdcat --flatten"
+        )
+
+
+def _has_clips(layer: Any, at: Any) -> bool:
+    prim = layer.GetPrimAtPath(at) if at.IsPrimPath() else None
+    return prim is not None and prim.HasInfo("clips")
+
+
+def _visible(stage: Any) -> tuple[list[Any], int]:
+    """The meshes that are drawn, and how many drawn things are something else."""
+    from pxr import Usd, UsdGeom
+
+    meshes, others = [], 0
+    time = Usd.TimeCode.EarliestTime()
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
+        thing = UsdGeom.Imageable(prim)
+        if not thing or thing.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+            continue
+        if thing.ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+            continue
+        if prim.IsA(UsdGeom.Mesh):
+            meshes.append(UsdGeom.Mesh(prim))
+        elif prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer):
+            others += 1
+    return meshes, others
+
+
+def _piece(shape: Any, matrix: np.ndarray, budget: Budget, *, exact: bool) -> dict[str, np.ndarray]:
+    """Arrays of one mesh in the frame of the stage."""
+    from pxr import UsdGeom
+
+    at = str(shape.GetPath())[-100:]
+    points = _array(shape.GetPointsAttr(), np.float32, at, "points").reshape(-1, 3)
+    lengths = _array(shape.GetFaceVertexCountsAttr(), np.int64, at, "faceVertexCounts")
+    corners = _array(shape.GetFaceVertexIndicesAttr(), np.int64, at, "faceVertexIndices")
+    n, v = len(lengths), len(points)
+    budget.spend(64 * len(corners) + 64 * v, f"mesh {at}")
+    if (lengths < 0).any() or lengths.sum() != len(corners):
+        raise FileFormatError(f"mesh {at}: faceVertexCounts do not add up to {len(corners):,} corners")
+    if len(corners) and (corners.min() < 0 or corners.max() >= v):
+        raise FileFormatError(f"mesh {at}: corners {corners.min()} to {corners.max()} of {v:,} points")
+    color, color_kind = _primvar(shape, "displayColor", 3, v, n, len(corners), at)
+    opacity, opacity_kind = _primvar(shape, "displayOpacity", 1, v, n, len(corners), at)
+    linear = np.ones((v, 4 if color is not None or opacity is not None else 0), np.float32)
+    normals, kind = _primvar(shape, "normals", 3, v, n, len(corners), at)
+    if kind not in ("vertex", "varying"):
+        normals = None
+    of_corner = np.repeat(np.arange(n), lengths)
+    if "uniform" in (color_kind, opacity_kind) or "faceVarying" in (color_kind, opacity_kind):
+        # Colours that change within a vertex: each corner gets a vertex of its own.
+        budget.spend(64 * len(corners), f"mesh {at}")
+        points, normals = points[corners], None if normals is None else normals[corners]
+        spread = {"uniform": of_corner, "vertex": corners, "varying": corners}
+        if color is not None and color_kind in spread:
+            color = color[spread[color_kind]]
+        if opacity is not None and opacity_kind in spread:
+            opacity = opacity[spread[opacity_kind]]
+        linear = np.ones((len(corners), 4), np.float32)
+        corners = np.arange(len(corners))
+    if color is None and linear.shape[1]:
+        linear[:, :3] = 0.18  # the specification's fallback grey
+    for values, columns in ((color, slice(0, 3)), (opacity, slice(3, 4))):
+        if values is not None:
+            linear[:, columns] = values
+    faces, _ = cut_polygons(lengths, corners, {})
+    if shape.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
+        faces = faces[:, ::-1]
+    if (matrix != np.eye(4)).any():
+        points = (points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32)
+        if normals is not None:
+            normals = normals @ np.linalg.pinv(matrix[:3, :3]).T
+    piece = {"vertices": points, "faces": faces.astype(np.int32), "linear": linear}
+    if normals is not None:
+        if not exact:
+            length = np.linalg.norm(normals, axis=1, keepdims=True)
+            normals = normals / np.where(length > 0, length, 1)
+        piece["normals"] = normals.astype(np.float32)
+    return piece
+
+
+def _primvar(
+    shape: Any, name: str, columns: int, v: int, n: int, corners: int, at: str
+) -> tuple[np.ndarray | None, str]:
+    """Values (k, columns) of a primvar, its own or inherited, and its interpolation; (None, '') if there are
+    none."""
+    from pxr import Usd, UsdGeom
+
+    primvar = UsdGeom.PrimvarsAPI(shape).FindPrimvarWithInheritance(name)
+    time = Usd.TimeCode.EarliestTime()
+    if primvar and primvar.HasValue():
+        stored, kind = primvar.ComputeFlattened(time), str(primvar.GetInterpolation())
+    elif name == "normals" and shape.GetNormalsAttr().HasValue():
+        stored, kind = shape.GetNormalsAttr().Get(time), str(shape.GetNormalsInterpolation())
+    else:
+        return None, ""
+    if stored is None:
+        return None, ""
+    try:
+        values = np.asarray(stored, np.float32).reshape(-1, columns)
+    except (ValueError, TypeError):
+        raise FileFormatError(f"mesh {at}: {name} does not hold {columns} numbers a value") from None
+    wanted = {"constant": 1, "uniform": n, "vertex": v, "varying": v, "faceVarying": corners}.get(kind)
+    if len(values) != wanted:
+        raise FileFormatError(
+            f"mesh {at}: {name} ({kind[:20]}) has {len(values):,} values, expected {wanted}"
+        )
+    return values, kind
+
+
+def _array(attribute: Any, dtype: type, at: str, what: str) -> np.ndarray:
+    from pxr import Usd
+
+    stored = attribute.Get(Usd.TimeCode.EarliestTime()) if attribute else None
+    if stored is None:
+        raise FileFormatError(f"mesh {at} has no {what}")
+    return np.array(stored, dtype)
+
+
+def _joined(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    starts = np.cumsum([0, *(len(p["vertices"]) for p in pieces)])
+    if starts[-1] > np.iinfo(np.int32).max:
+        raise FileFormatError(f"{starts[-1]:,} vertices are more than a mesh can number")
+    columns = max(p["linear"].shape[1] for p in pieces)
+    for p in pieces:
+        if p["linear"].shape[1] < columns:
+            p["linear"] = np.tile(np.array([0.18, 0.18, 0.18, 1], np.float32), (len(p["vertices"]), 1))
+    joined = {name: np.concatenate([p[name] for p in pieces]) for name in ("vertices", "linear")}
+    joined["faces"] = np.concatenate(
+        [p["faces"] + np.int32(s) for p, s in zip(pieces, starts[:-1], strict=True)]
+    )
+    if all("normals" in p for p in pieces):
+        joined["normals"] = np.concatenate([p["normals"] for p in pieces])
+    return joined
+
+
+# -- what our own files hold beyond the schemas
+
+
+def _our_note(shape: Any) -> dict[str, Any]:
+    """The custom data of a mesh that ``usd`` wrote, where it is in order; else nothing."""
+    note = shape.GetPrim().GetCustomDataByKey("meshsplats")
+    if not isinstance(note, dict):
+        return {}
+    try:
+        up = [float(u) for u in note["up"]]
+    except (KeyError, TypeError, ValueError):
+        return {}
+    good = len(up) == 3 and 0.5 < np.linalg.norm(up) < 2 and note.get("blending") in get_args(Blending)
+    return {**note, "up": up} if good else {}
+
+
+def _own_placement(up: list[float]) -> np.ndarray:
+    """The matrix (of row vectors) that ``usd`` gave the node."""
+    from pxr import Gf
+
+    x, y, z, w = up_quaternion(np.array(up))
+    return np.array(Gf.Matrix4d(Gf.Rotation(Gf.Quatd(w, x, y, z)), Gf.Vec3d(0)))
+
+
+def _restored(
+    shape: Any, note: dict[str, Any], arrays: dict[str, np.ndarray], told: dict[str, Any]
+) -> dict[str, np.ndarray]:
+    """Splat numbers, depth groups, attributes and the filter. What another program has dropped or altered is
+    left out, with a warning: better no splat numbers than wrong ones."""
+    from pxr import UsdGeom
+
+    def stored(name: str, dtype: type) -> np.ndarray:
+        primvar = UsdGeom.PrimvarsAPI(shape).GetPrimvar(name)
+        return np.array((primvar.Get() if primvar.HasValue() else None) or [], dtype)
+
+    restored: dict[str, np.ndarray] = {}
+    lost: list[str] = []
+    for name in ("face_splat", "depth_group"):
+        if note.get(name) is True:
+            values = stored(name, np.int32)
+            sorted_ = name != "face_splat" or not (values[1:] < values[:-1]).any()
+            if len(values) == len(arrays["faces"]) and sorted_:
+                restored[name] = values
+            else:
+                lost.append(name)
+    if "filter_px2" in note:
+        variance = note["filter_px2"]
+        if not isinstance(variance, (int, float)):
+            raise FileFormatError(f"filter_px2 must be a number, got {str(variance)[:60]}")
+        if "face_splat" in restored:
+            told["filter_px2"] = float(variance)
+        else:
+            lost.append("the filter of its splats")
+    for name, plain, columns in _attributes_of(note):
+        v, wide = len(arrays["vertices"]), abs(columns)
+        values = stored(plain, np.float32) if wide else np.empty(0, np.float32)
+        if values.size != v * wide:
+            lost.append(name)
+            continue
+        restored[f"attribute_{len(told['attributes'])}"] = values.reshape((v,) if columns < 0 else (v, wide))
+        told["attributes"].append(name)
+    if lost:
+        told["warnings"].append(f"another program has altered the file, left out: {', '.join(lost)[:300]}")
+    return restored
+
+
+def _attributes_of(note: dict[str, Any]) -> Iterator[tuple[str, str, int]]:
+    """Name, primvar and columns (-1: one number a vertex) of the attributes in our note."""
+    try:
+        rows = zip(
+            list(note.get("attributes", [])),
+            list(note.get("primvars", [])),
+            [int(c) for c in note.get("columns", [])],
+            strict=True,
+        )
+        for name, plain, columns in rows:
+            if isinstance(name, str) and isinstance(plain, str) and -1 <= columns <= 4096:
+                yield name, plain, columns
+    except (TypeError, ValueError):
+        return
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,0 +1,128 @@
+"""Meshes as Universal Scene Description (`.usdc`, `.usda`, `.usd`), for film tools, Omniverse and
+Blender.
+
+Needs the optional package usd-core. One Mesh under an Xform that turns the mesh's up direction to the
+stage's +y; points are stored untouched, metersPerUnit is 1. Colour and opacity stand in the primvars
+displayColor (linear) and displayOpacity, one value a vertex, and a UsdPreviewSurface material reads them
+from there. Schemas: https://openusd.org/release/api/usd_geom_page_front.html and
+spec_usdpreviewsurface.html there. What the schemas have no place for stands in the mesh's custom data. The
+reader is ``usd_reader``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats.errors import MissingDependencyError
+from meshsplats.formats._validation import check_attribute_names
+from meshsplats.formats.gltf.writer import linear_colors, up_quaternion, vertex_normals
+from meshsplats.mesh import SplatMesh
+
+
+def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
+    """Writes ``mesh`` to ``path``: text for `.usda`, binary for `.usdc` and `.usd`.
+
+    The material emits the colours as they are; ``lit`` makes it a rough surface that scene lights shade,
+    with the mesh's normals or, where it has none, area-weighted vertex normals. Splat numbers, depth
+    groups and further attributes become primvars of the same names (characters that USD forbids become
+    underscores). Raises MissingDependencyError without usd-core.
+    """
+    try:
+        from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, Vt
+    except ImportError as error:
+        raise MissingDependencyError("writing USD needs the extra 'usd': pip install usd-core") from error
+    check_attribute_names(mesh)
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    root = UsdGeom.Xform.Define(stage, "/Splats")
+    stage.SetDefaultPrim(root.GetPrim())
+    Usd.ModelAPI(root.GetPrim()).SetKind(Kind.Tokens.component)
+    x, y, z, w = up_quaternion(mesh.up)
+    root.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
+    shape = UsdGeom.Mesh.Define(stage, "/Splats/Mesh")
+    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices))
+    shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.reshape(-1)))
+    shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    shape.CreateDoubleSidedAttr(True)
+    if len(mesh.vertices):
+        corners = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
+        shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
+    normals = vertex_normals(mesh) if lit and mesh.normals is None else mesh.normals
+    if normals is not None:
+        shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
+        shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    linear = linear_colors(mesh, "float32")
+    colors = shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    colors.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(linear[:, :3])))
+    opacities = shape.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.vertex)
+    opacities.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(linear[:, 3])))
+    _add_material(stage, shape, lit)
+    primvars = UsdGeom.PrimvarsAPI(shape)
+    for name in ("face_splat", "depth_group"):
+        values = getattr(mesh, name)
+        if values is not None:
+            new = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
+            new.Set(Vt.IntArray.FromNumpy(values))
+    up = Gf.Vec3d(*(float(u) for u in mesh.up))
+    note: dict[str, Any] = {"version": 1, "blending": mesh.blending, "up": up}
+    note |= {name: True for name in ("face_splat", "depth_group") if getattr(mesh, name) is not None}
+    if lit and mesh.normals is None:
+        note["normals"] = "computed"
+    if mesh.filter_px2:
+        note["filter_px2"] = mesh.filter_px2
+    taken = {"displayColor", "displayOpacity", "normals", "face_splat", "depth_group"}
+    stored: list[tuple[str, str, int]] = []
+    for name, values in mesh.attributes.items():
+        columns = 1 if values.ndim == 1 else values.shape[1]
+        plain = Tf.MakeValidIdentifier(name)
+        while plain in taken:
+            plain += "_"
+        taken.add(plain)
+        stored.append((name, plain, -1 if values.ndim == 1 else columns))
+        if columns == 0:
+            continue
+        new = primvars.CreatePrimvar(plain, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex, columns)
+        new.Set(Vt.FloatArray.FromNumpy(values.reshape(-1)))
+    if stored:
+        names, plain_names, widths = zip(*stored, strict=True)
+        note |= {"attributes": Vt.StringArray(names), "primvars": Vt.StringArray(plain_names)}
+        note["columns"] = Vt.IntArray(widths)  # -1: one number a vertex, not a table of one column
+    shape.GetPrim().SetCustomData({"meshsplats": note})
+    if not stage.GetRootLayer().Export(str(path)):
+        raise OSError(f"usd-core could not write {path}")
+
+
+def _add_material(stage: Any, shape: Any, lit: bool) -> None:
+    """A UsdPreviewSurface whose colour and opacity come from the primvars."""
+    from pxr import Sdf, UsdShade
+
+    types = Sdf.ValueTypeNames
+    material = UsdShade.Material.Define(stage, "/Splats/Material")
+    surface = UsdShade.Shader.Define(stage, "/Splats/Material/Surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+
+    def reader(name: str, primvar: str, type_name: str, fallback: Any, result: Any) -> Any:
+        shader = UsdShade.Shader.Define(stage, f"/Splats/Material/{name}")
+        shader.CreateIdAttr(f"UsdPrimvarReader_{type_name}")
+        shader.CreateInput("varname", types.String).Set(primvar)
+        shader.CreateInput("fallback", result).Set(fallback)
+        return shader.CreateOutput("result", result)
+
+    color = reader("Color", "displayColor", "float3", (0.5, 0.5, 0.5), types.Float3)
+    opacity = reader("Opacity", "displayOpacity", "float", 1.0, types.Float)
+    surface.CreateInput("diffuseColor" if lit else "emissiveColor", types.Color3f).ConnectToSource(color)
+    if not lit:
+        surface.CreateInput("diffuseColor", types.Color3f).Set((0, 0, 0))
+    surface.CreateInput("opacity", types.Float).ConnectToSource(opacity)
+    surface.CreateInput("roughness", types.Float).Set(1.0)
+    # The specular workflow with black leaves out reflections, which a glow should not have.
+    surface.CreateInput("useSpecularWorkflow", types.Int).Set(0 if lit else 1)
+    if not lit:
+        surface.CreateInput("specularColor", types.Color3f).Set((0, 0, 0))
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
+    UsdShade.MaterialBindingAPI.Apply(shape.GetPrim()).Bind(material)

@@ -1,0 +1,1 @@
+"""Image files: reading them with limits, writing them, and images side by side."""

@@ -1,0 +1,200 @@
+"""Picture files: 8-bit PNG, 16-bit depth PNG, animations, and pictures side by side.
+
+Values are display-referred (sRGB-encoded) RGB, as splats have them, and are stored as they are: value v
+becomes the byte round(255 v). Pillow is imported where it is used.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from meshsplats._files.atomic import write_bytes
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+ANIMATIONS = (".webp", ".gif", ".png")
+"""Suffixes of the animations that can be written; .png is an animated PNG."""
+GAP = 8
+"""Pixels between and round the pictures of a strip."""
+CAPTION = 22
+"""Height of the line of text above a strip, in pixels."""
+
+
+def to_bytes(picture: np.ndarray) -> np.ndarray:
+    """uint8 array of the same shape: ``round(255 * clip(picture, 0, 1))``. ValueError for values not
+    finite."""
+    picture = np.asarray(picture, np.float32)
+    if not np.isfinite(picture).all():
+        raise ValueError("a picture holds values that are not finite")
+    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+
+
+def straight_rgba(premultiplied: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """(h, w, 4) straight RGBA from a picture on black, which is colour times opacity, and its ``alpha`` (h,
+    w).
+
+    Composited over any background in display values, it gives the picture drawn on that background.
+    """
+    covered = alpha > 0
+    color = np.divide(
+        premultiplied, alpha[..., None], out=np.zeros_like(premultiplied), where=covered[..., None]
+    )
+    return np.concatenate([np.clip(color, 0, 1), alpha[..., None]], axis=2).astype(np.float32)
+
+
+def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> None:
+    """Writes ``picture`` (h, w, 3) or (h, w, 4), RGB or straight RGBA in [0, 1], as PNG; replaces an older
+    file."""
+    from PIL import Image
+
+    if np.ndim(picture) != 3 or np.shape(picture)[2] not in (3, 4):
+        raise ValueError(f"a picture must have shape (h, w, 3) or (h, w, 4), got {np.shape(picture)}")
+    image = Image.fromarray(to_bytes(picture))
+    _save(path, image, format="PNG")
+
+
+def load_png(path: str | os.PathLike[str]) -> np.ndarray:
+    """uint8 (h, w, 3), or (h, w, 4) if the file has an alpha channel. OSError for what is not a picture."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        translucent = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+        return np.asarray(image.convert("RGBA" if translucent else "RGB"))
+
+
+def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float) -> None:
+    """Writes ``depth`` (h, w) as 16-bit grey PNG: ``round(depth / unit)``, at most 65535; 0 stays for
+    "nothing there".
+
+    ``unit`` is the depth of one step in scene units, > 0; a reader needs it to get depths back.
+    """
+    from PIL import Image
+
+    if not (np.isfinite(unit) and unit > 0):
+        raise ValueError(f"unit must be positive, got {unit}")
+    steps = np.clip(np.rint(np.asarray(depth, np.float64) / unit), 0, 65535).astype(np.uint16)
+    # Something that is there must not become 0.
+    steps[(depth > 0) & (steps == 0)] = 1
+    _save(path, Image.fromarray(steps), format="PNG")
+
+
+def save_array(path: str | os.PathLike[str], array: np.ndarray) -> None:
+    """Writes ``array`` as .npy; replaces an older file."""
+    encoded = io.BytesIO()  # as below: written to a file, NumPy tells how many numbers did not fit
+    np.save(encoded, array, allow_pickle=False)
+    write_bytes(path, encoded.getbuffer())
+
+
+def save_animation(
+    path: str | os.PathLike[str], frames: Iterable[np.ndarray], *, fps: float = 24.0, max_side: int = 640
+) -> None:
+    """Writes an endless animation as .webp, .gif or .png (APNG), by the suffix of ``path``.
+
+    ``frames`` are uint8 pictures (h, w, 3) or, not for GIF, (h, w, 4) of one size. Their longer side is
+    brought down to ``max_side`` pixels, as animations are large. GIF has 256 colours; the others lose little
+    or nothing.
+
+    Raises ValueError for another suffix, no frames or a rate out of range (0.1 to 100 frames a second).
+    """
+    from PIL import Image
+
+    suffix = Path(path).suffix.lower()
+    if suffix not in ANIMATIONS:
+        raise ValueError(f"an animation is written as {', '.join(ANIMATIONS)}, got {Path(path).name!r}")
+    if not 0.1 <= fps <= 100:
+        raise ValueError(f"fps must lie between 0.1 and 100 frames a second, got {fps}")
+    images = [_fitting(Image.fromarray(frame), max_side) for frame in frames]
+    if not images:
+        raise ValueError("an animation needs at least one frame")
+    options: dict = {".webp": {"quality": 85, "method": 4}, ".gif": {"disposal": 1}, ".png": {}}[suffix]
+    if suffix == ".gif":
+        images = [_paletted(image) for image in images]
+    _save(
+        path,
+        images[0],
+        format={".webp": "WEBP", ".gif": "GIF", ".png": "PNG"}[suffix],
+        save_all=True,
+        append_images=images[1:],
+        duration=round(1000 / fps),
+        loop=0,
+        **options,
+    )
+
+
+def _save(path: str | os.PathLike[str], image: Image.Image, **options: Any) -> None:
+    """Encoded in memory first: Pillow's encoders lose the reason why a disk takes no more."""
+    encoded = io.BytesIO()
+    image.save(encoded, **options)
+    write_bytes(path, encoded.getbuffer())
+
+
+def strip(pictures: Sequence[np.ndarray], captions: Sequence[str] = ()) -> np.ndarray:
+    """(h', w', 3) float32: ``pictures`` (h, w, 3) of one size side by side on white, each under its
+    caption."""
+    height, width = np.shape(pictures[0])[:2]
+    if any(np.shape(picture) != (height, width, 3) for picture in pictures):
+        raise ValueError(
+            f"the pictures of a strip must have one shape, got {[np.shape(p) for p in pictures]}"
+        )
+    top = CAPTION if captions else GAP
+    sheet = np.ones((top + height + GAP, GAP + len(pictures) * (width + GAP), 3), np.float32)
+    for i, picture in enumerate(pictures):
+        left = GAP + i * (width + GAP)
+        sheet[top : top + height, left : left + width] = picture
+    if captions:
+        sheet[:top] = _text(captions, width + GAP, sheet.shape[1])
+    return sheet
+
+
+def amplified_error(a: np.ndarray, b: np.ndarray, factor: float) -> np.ndarray:
+    """(h, w, 3) float32 in [0, 1]: ``clip(factor * |a - b|)``; black where the pictures agree."""
+    return np.clip(np.float32(factor) * np.abs(np.asarray(a, np.float32) - b), 0, 1)
+
+
+def _text(captions: Sequence[str], step: int, width: int) -> np.ndarray:
+    """(CAPTION, width, 3): the captions in dark grey, ``step`` pixels apart."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    line = Image.new("RGB", (width, CAPTION), "white")
+    draw = ImageDraw.Draw(line)
+    font = ImageFont.load_default()
+    for i, caption in enumerate(captions):
+        if isinstance(font, ImageFont.ImageFont):  # before Pillow 10.1, or without FreeType
+            caption = caption.encode("latin-1", "replace").decode("latin-1")
+        draw.text((GAP + i * step, 6), caption, fill=(60, 60, 60), font=font)
+    return np.asarray(line, np.float32) / 255
+
+
+def _fitting(image, max_side: int):
+    from PIL import Image
+
+    factor = max_side / max(image.size)
+    if factor >= 1:
+        return image
+    size = tuple(max(1, round(side * factor)) for side in image.size)
+    return image.resize(size, Image.Resampling.LANCZOS)
+
+
+def _paletted(image):
+    """256 colours chosen for this frame, dithered: smooth shades otherwise show bands."""
+    from PIL import Image
+
+    if image.mode != "RGB":
+        raise ValueError("GIF has no translucency: write a .webp or .png animation of pictures with alpha")
+    palette = image.quantize(255, method=Image.Quantize.MEDIANCUT)
+    numbers = np.array(image.quantize(255, palette=palette, dither=Image.Dither.FLOYDSTEINBERG))
+    # A plain background would be tinted by a mean of similar colours: the commonest colour gets a number of
+    # its own.
+    commonest = max(image.getcolors(image.width * image.height))[1]
+    numbers[(np.asarray(image) == commonest).all(axis=2)] = 255
+    colors = (palette.getpalette() or [])[: 255 * 3]
+    result = Image.fromarray(numbers)
+    result.putpalette([*colors, *[0] * (255 * 3 - len(colors)), *commonest])
+    return result

@@ -1,0 +1,290 @@
+"""``meshsplats convert``, run in this process on a small cloud."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+
+import numpy as np
+import pytest
+from _splats import few_splats
+from PIL import Image
+
+import meshsplats
+from meshsplats.cameras.files import load_cameras, save_cameras
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.cli import main
+from meshsplats.conversion import convert, simplify
+from meshsplats.evaluation.metrics import psnr
+from meshsplats.formats.gaussians import load_gaussians, save_gaussians
+from meshsplats.formats.meshes import load_mesh
+from meshsplats.rendering import render
+from meshsplats.rendering.looks import draw_splats
+from meshsplats.rendering.samples import needed_samples
+
+
+@pytest.fixture
+def splats(tmp_path):
+    cloud = few_splats()
+    save_gaussians(cloud, tmp_path / "my scene.ply")
+    return tmp_path / "my scene.ply"
+
+
+def run(*arguments) -> int:
+    return main(["convert", *map(str, arguments)])
+
+
+@pytest.mark.parametrize("suffix", ["npz", "ply", "glb"])
+def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
+    out = tmp_path / f"mesh.{suffix}"
+    assert run(splats, "-o", out, "--preset", "paper") == 0
+    expected = convert(load_gaussians(splats), preset="paper")
+    mesh = load_mesh(out)
+    np.testing.assert_array_equal(mesh.faces, expected.faces)
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+    with Image.open(tmp_path / "mesh.preview.png") as image:
+        picture = np.asarray(image)
+    assert picture.shape == (800, 800, 3)
+    assert (picture[0] == 255).all()
+    assert picture[200:600, 200:600].mean() < 240
+    assert json.loads((tmp_path / "mesh.config.json").read_text())["options"]["preset"] == "paper"
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith("mesh")) == sorted(
+        ["mesh.config.json", f"mesh.{suffix}", "mesh.preview.png"]
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"40 splats -> {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices"
+    assert lines[-1].startswith("next: meshsplats compare '")  # the space in the name is quoted
+
+
+def test_options_reach_the_conversion(splats, tmp_path):
+    options = {"mode": "flat", "no_triag": 6, "rings": 2, "max_splats": 20, "crop": (-1.0, -1, -1, 1, 1, 1)}
+    flags = [f"--{name.replace('_', '-')}" for name in options]
+    given = []
+    for flag, value in zip(flags, options.values(), strict=True):
+        given += [flag, *(value if isinstance(value, tuple) else (value,))]
+    assert run(splats, "-o", tmp_path / "mesh.npz", "--no-preview", *given) == 0
+    expected = convert(load_gaussians(splats), **options)
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+    np.testing.assert_array_equal(mesh.colors, expected.colors)
+    stored = json.loads((tmp_path / "mesh.config.json").read_text())["options"]
+    assert (stored["no_triag"], stored["scale_mul"], stored["crop"]) == (6, None, [-1, -1, -1, 1, 1, 1])
+
+
+def test_cameras_of_a_model_folder_are_used(splats, tmp_path):
+    folder = tmp_path / "model" / "point_cloud" / "iteration_1"
+    folder.mkdir(parents=True)
+    (folder / "point_cloud.ply").write_bytes(splats.read_bytes())
+    cameras = orbit(load_gaussians(splats), 3, up=(0, 0, 1), width=100)
+    save_cameras(cameras, tmp_path / "model" / "cameras.json")
+    assert run(tmp_path / "model", "-o", tmp_path / "mesh.npz", "--no-preview") == 0
+    expected = convert(load_gaussians(splats), cameras=cameras)
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    np.testing.assert_array_equal(mesh.vertices, expected.vertices)
+    assert not np.array_equal(mesh.vertices, convert(load_gaussians(splats)).vertices)
+    np.testing.assert_allclose(mesh.up, (0, 0, 1), atol=1e-6)
+
+
+def test_json(splats, tmp_path, capsys):
+    assert run(splats, "-o", tmp_path / "mesh.npz", "--json", "--no-preview") == 0
+    result = json.loads(capsys.readouterr().out)
+    mesh = load_mesh(tmp_path / "mesh.npz")
+    assert (result["splats"], result["triangles"]) == (40, len(mesh.faces))
+    assert result["vertices"] == len(mesh.vertices)
+    size = (tmp_path / "mesh.npz").stat().st_size
+    assert result["outputs"] == [{"path": str(tmp_path / "mesh.npz"), "bytes": size}]
+    assert (result["input"], result["preview"]) == (str(splats), None)
+    assert (result["warnings"], result["meshsplats"]) == ([], meshsplats.__version__)
+    assert not (tmp_path / "mesh.preview.png").exists()
+
+
+def test_up(splats, tmp_path):
+    """From the option, else from the cameras, else y points down."""
+    save_cameras(orbit(np.eye(3), 3, up=(0, 0, 1)), tmp_path / "cameras.json")
+    plain = (splats, "-o", tmp_path / "mesh.npz", "--no-preview", "--force")
+    for options, up in [
+        ((), (0, -1, 0)),
+        (("--up", "-x"), (-1, 0, 0)),
+        (("--cameras", tmp_path / "cameras.json"), (0, 0, 1)),
+        (("--cameras", tmp_path / "cameras.json", "--up", "y"), (0, 1, 0)),
+    ]:
+        assert run(*plain, *options) == 0
+        np.testing.assert_allclose(load_mesh(tmp_path / "mesh.npz").up, up, atol=1e-6)
+
+
+@pytest.mark.parametrize("taken", ["mesh.glb", "mesh.preview.png", "mesh.config.json"])
+def test_nothing_is_overwritten(splats, tmp_path, capsys, taken):
+    (tmp_path / taken).write_bytes(b"mine")
+    assert run(splats, "-o", tmp_path / "mesh.glb") == 3
+    assert taken in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith("mesh")] == [taken]
+    assert (tmp_path / taken).read_bytes() == b"mine"
+    assert run(splats, "-o", tmp_path / "mesh.glb", "--force") == 0
+    assert (tmp_path / taken).read_bytes() != b"mine"
+
+
+def test_another_format_lies_beside_the_first(splats, tmp_path):
+    for suffix in (".npz", ".glb"):
+        assert run(splats, "-o", tmp_path / f"mesh{suffix}") == 0
+    names = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("mesh"))
+    records = ["mesh.config.json", "mesh.preview.png", "mesh.glb.config.json", "mesh.glb.preview.png"]
+    assert names == sorted(["mesh.npz", "mesh.glb", *records])
+    assert run(splats, "-o", tmp_path / "mesh.glb") == 3  # the mesh itself is there
+    assert run(splats, "-o", tmp_path / "mesh.npz") == 3
+    before = (tmp_path / "mesh.config.json").read_bytes()
+    assert run(splats, "-o", tmp_path / "mesh.glb", "--force") == 0
+    assert (tmp_path / "mesh.config.json").read_bytes() == before
+
+
+def test_the_input_is_never_the_output(splats, tmp_path, capsys):
+    before = splats.read_bytes()
+    (tmp_path / "link.ply").symlink_to(splats)
+    for output in (splats, tmp_path / "link.ply"):
+        assert run(splats, "-o", output, "--force") == 2
+        assert "is read by this command: give another name" in capsys.readouterr().err
+    assert run(splats, "-o", splats, "--as-splats", "--force") == 2
+    assert splats.read_bytes() == before
+    inner = tmp_path / "model/point_cloud/iteration_7/point_cloud.ply"
+    inner.parent.mkdir(parents=True)
+    inner.write_bytes(before)
+    assert run(tmp_path / "model", "-o", inner, "--as-splats", "--force") == 2
+    assert inner.read_bytes() == before
+
+
+@pytest.mark.parametrize("options", [[], ["--axes", "y-up"], ["--cameras", "cameras.json"]])
+def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, options, monkeypatch):
+    if not options:
+        pytest.importorskip("pxr", reason="install meshsplats[usd]")
+    monkeypatch.chdir(tmp_path)
+    cloud = load_gaussians(splats)
+    save_cameras(orbit(cloud, 2, width=40, height=40, elevation=60), tmp_path / "cameras.json")
+    assert run(splats, "-o", "made.usdc" if not options else "made.npz", "--preset", "paper", *options) == 0
+    command = shlex.split(re.search(r"next: meshsplats (.*)", capsys.readouterr().out)[1])
+    assert main([*command, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    axes = options[1] if options[:1] == ["--axes"] else "auto"
+    cloud, mesh = load_gaussians(splats, axes=axes), load_mesh(command[2])
+    cameras = load_cameras(tmp_path / "made-compare")
+    if options[:1] == ["--cameras"]:
+        assert [c.world_to_camera.tolist() for c in cameras] == [
+            c.world_to_camera.tolist() for c in load_cameras(tmp_path / "cameras.json")
+        ]
+    drawn = render(mesh, cameras[0], samples=needed_samples(mesh, cameras)).color
+    wanted = psnr(drawn, draw_splats(cloud, cameras[0]).color)
+    assert told["views"][0]["psnr"] == pytest.approx(wanted, abs=0.01)
+
+
+def test_a_part_is_shown_not_compared_with_the_whole(splats, tmp_path, capsys):
+    box = ["--crop", "-1", "-1", "-1", "1", "1", "1"]
+    assert run(splats, "-o", tmp_path / "part.npz", *box) == 0
+    out = capsys.readouterr().out
+    part = load_mesh(tmp_path / "part.npz").splat_count
+    assert f"40 splats, {part} of them converted ({part / 40:.1%}) -> " in out
+    assert "next: meshsplats render" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["-o", "mesh.stl"], 2, ".glb"),
+        (["-o", "mesh"], 2, ".glb"),
+        (["-o", "mesh.npz", "--lit"], 2, "--lit"),
+        (["-o", "mesh.npz", "--color-type", "float32"], 2, "--color-type"),
+        (["-o", "mesh.npz", "--preset", "best"], 2, "--preset"),
+        ([], 2, "output"),
+        (["-o", "mesh.npz", "--up", "w"], 1, "--up"),
+        (["-o", "mesh.npz", "--no-triag", "2"], 1, "no_triag"),
+        (["-o", "mesh.npz", "--footprint", "cameras"], 1, "cameras"),
+        (["-o", "mesh.npz", "--cameras", "none.json"], 1, "none.json: No such file"),
+        (["-o", "no/such/mesh.npz"], 1, "no/such"),
+    ],
+)
+def test_mistakes(splats, tmp_path, capsys, monkeypatch, options, code, words):
+    monkeypatch.chdir(tmp_path)
+    assert run(splats, *options) == code
+    assert words in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["my scene.ply"]
+
+
+def test_not_splats(splats, tmp_path, capsys):
+    assert run(splats, "-o", tmp_path / "mesh.ply") == 0
+    assert run(tmp_path / "mesh.ply", "-o", tmp_path / "again.ply", "--as-splats") == 1
+    assert "not splats" in capsys.readouterr().err
+    save_cameras(orbit(np.eye(3), 2), tmp_path / "cameras.json")
+    assert run(tmp_path / "cameras.json", "-o", tmp_path / "again.ply") == 1
+    assert "not splats" in capsys.readouterr().err
+
+
+def test_splats_as_splats(splats, tmp_path, capsys):
+    """Cut out, by the limits one after the other, and otherwise unchanged."""
+    cloud = load_gaussians(splats)
+    box = (-1.0, -1.0, -1.0, 1.0, 1.5, 2.0)
+    out = tmp_path / "part.ply"
+    assert run(splats, "-o", out, "--as-splats", "--crop", *box, "--min-opacity", 0.5) == 0
+    kept = (cloud.means >= box[:3]).all(1) & (cloud.means <= box[3:]).all(1) & (cloud.opacities >= 0.5)
+    assert 3 < kept.sum() < 37
+    part = load_gaussians(out)
+    np.testing.assert_array_equal(part.means, cloud.means[kept])
+    np.testing.assert_allclose(part.opacities, cloud.opacities[kept], atol=1e-6)
+    assert capsys.readouterr().out.startswith(f"{kept.sum()} of 40 splats")
+    assert json.loads((tmp_path / "part.config.json").read_text())["options"]["as_splats"] is True
+    with Image.open(tmp_path / "part.preview.png") as image:
+        assert np.asarray(image)[300:500, 300:500].mean() < 250
+    assert (
+        run(
+            splats,
+            "-o",
+            tmp_path / "few.ply",
+            "--as-splats",
+            "--max-splats",
+            5,
+            "--budget",
+            "drop",
+            "--no-preview",
+        )
+        == 0
+    )
+    few = load_gaussians(tmp_path / "few.ply")
+    importance = cloud.opacities * np.sqrt(np.prod(cloud.scales.astype(float), axis=1)) ** (4 / 3)
+    assert len(few) == 5
+    ranks = np.argsort(np.argsort(-importance))[np.isin(cloud.means[:, 0], few.means[:, 0])]
+    assert ranks.max() < 12  # a rough measure of size agrees roughly
+    assert run(splats, "-o", tmp_path / "merged.ply", "--as-splats", "--max-splats", 5, "--no-preview") == 0
+    np.testing.assert_allclose(
+        load_gaussians(tmp_path / "merged.ply").means, simplify(cloud, 5).means, rtol=1e-6, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "told"),
+    [
+        ("a.glb", [], "--as-splats writes .ply"),
+        ("a.ply", ["--lit"], "--lit: for a mesh"),
+        ("a.ply", ["--data", "nowhere"], "--data: for a mesh"),
+        ("a.ply", ["--data", "nowhere", "--max-splats", "3", "--budget", "drop"], "--data: for a mesh"),
+        ("a.ply", ["--preset", "paper", "--rings", "2"], "--preset, --rings: for a mesh"),
+    ],
+)
+def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options, told):
+    assert run(splats, "-o", tmp_path / name, "--as-splats", *options) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
+
+
+def test_no_splats_left(splats, tmp_path, capsys):
+    assert run(splats, "-o", tmp_path / "a.ply", "--as-splats", "--min-opacity", 0.99) == 1
+    assert "all are fainter than 0.99" in capsys.readouterr().err
+    assert not (tmp_path / "a.ply").exists()
+
+
+@pytest.mark.parametrize("alpha", ["mask", "hash-friendly"])
+def test_alpha_reaches_the_file(splats, tmp_path, capsys, alpha):
+    out = tmp_path / "m.glb"
+    assert run(splats, "-o", out, "--alpha", alpha, "--no-preview") == 0
+    data = out.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert document["materials"][0]["alphaMode"] == "MASK"
+    assert document["materials"][0]["alphaCutoff"] == {"mask": 0.2, "hash-friendly": 0.5}[alpha]
+    assert run(splats, "-o", tmp_path / "m.npz", "--alpha", alpha) == 2
+    assert "--alpha and --compression are for .glb" in capsys.readouterr().err

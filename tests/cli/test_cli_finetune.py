@@ -1,0 +1,361 @@
+"""``meshsplats finetune``, run in this process, and in its own where it is stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _photographs import write_photographs
+
+from meshsplats._files.locks import locked
+from meshsplats.cameras.files import load_cameras, save_cameras
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.cli import main
+from meshsplats.cli.finetune import Finetune
+from meshsplats.cli.targets import TargetOptions
+from meshsplats.demo_scene import make_scene
+from meshsplats.finetuning import make_config, worthwhile_views
+from meshsplats.finetuning.checkpoint import load_checkpoint
+from meshsplats.formats.gaussians import load_gaussians, save_gaussians
+from meshsplats.formats.meshes import load_mesh
+from meshsplats.rendering import render_splats
+
+SMALL = ("--views", "4", "--held-out", "2", "--width", "32")
+
+
+@pytest.mark.parametrize(
+    ("length", "views"),
+    [({"steps": 100}, 200), ({"steps": 1200}, 600), ({"steps": 10**6}, 1000), ({"epochs": 15}, 200),
+     ({"minutes": 2}, 200), ({"minutes": 15}, 900), ({"minutes": 600}, 1000)],
+)  # fmt: skip
+def test_long_runs_have_more_views(length, views):
+    assert worthwhile_views(make_config(**length)) == views
+
+
+@pytest.fixture(scope="module")
+def splats(tmp_path_factory):
+    path = tmp_path_factory.mktemp("finetune") / "scene.ply"
+    save_gaussians(make_scene(300), path)
+    return path
+
+
+def run(*arguments) -> int:
+    return main(["finetune", *map(str, arguments)])
+
+
+def test_from_the_splat_file_alone(splats, tmp_path, capsys):
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "-o", out, *SMALL, "--steps", "12", "--report-every", "6", "--json") == 0
+    told = capsys.readouterr()
+    result = json.loads(told.out)
+    assert result["steps"] == 12
+    assert result["held_out_psnr"]["after"] > result["held_out_psnr"]["before"]
+    assert "memory: about" in told.err
+    assert "step 6/12, loss" in told.err
+    mesh = load_mesh(out)
+    assert result["triangles"] == len(mesh.faces)
+    names = ["tuned.config.json", "tuned.npz", "tuned.preview.png", "tuned.run"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == names
+    config = json.loads((tmp_path / "tuned.config.json").read_text())
+    assert config["tuning"] == make_config(steps=12).to_dict()
+    assert config["options"]["width"] == 32
+    # Nothing is overwritten, and an older run is not lost.
+    assert run(splats, "-o", out, *SMALL, "--steps", "12") == 3
+    assert "--resume goes on with it, --force begins anew" in capsys.readouterr().err
+    assert run(splats, "-o", out, *SMALL, "--steps", "12", "--force") == 0
+    assert np.array_equal(load_mesh(out).vertices, mesh.vertices)
+    assert "next: meshsplats evaluate" in capsys.readouterr().out
+
+
+def told_score(out: str, capsys) -> tuple[float, float]:
+    """Of what was held out, as ``finetune`` told it and as the command scores that it names."""
+    told = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
+    command = shlex.split(re.search(r"next: meshsplats (.*)", out)[1])
+    assert main([*command, "--strips", "0", "--json"]) == 0
+    methods = json.loads(capsys.readouterr().out)["scenes"][0]["methods"]
+    return told, methods["mesh"]["mean"]["psnr"]
+
+
+@pytest.mark.parametrize("options", [["--downscale", "2", "--background", "black"], ["--test-every", "3"]])
+def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_path, capsys, options):
+    cloud = make_scene(300)
+    cameras = orbit(cloud, 9, width=64, height=64)
+    pictures = [render_splats(cloud, c, background=(0.2, 0.5, 0.7)).color for c in cameras]
+    data = write_photographs(tmp_path / "photos here", cameras, pictures)
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "--data", data, "-o", out, "--steps", "4", *options) == 0
+    told, scored = told_score(capsys.readouterr().out, capsys)
+    assert told == pytest.approx(scored, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--sh-degree", "0"],
+        ["--axes", "y-up"],
+        ["--width", "40", "--distance", "0.4", "0.6"],
+        ["--cameras", "nine.json"],
+    ],
+)
+def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys, options, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cloud = make_scene(300)
+    sh = np.zeros((len(cloud), 4, 3), np.float32)
+    sh[:, 0], sh[:, 2] = cloud.sh[:, 0], 1
+    save_gaussians(replace(cloud, sh=sh), "scene.ply")
+    save_cameras(orbit(cloud, 9, width=48, height=48, elevation=50), "nine.json")
+    assert run("scene.ply", "-o", "tuned.npz", "--views", "4", "--steps", "2", *options) == 0
+    told, scored = told_score(capsys.readouterr().out, capsys)
+    assert told == pytest.approx(scored, abs=0.005)
+
+
+def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):
+    cloud = load_gaussians(splats)
+    middle = np.median(cloud.means, axis=0)
+    box = ["--crop", *middle, *(middle + 10)]
+    out = tmp_path / "part.npz"
+    assert run(splats, "-o", out, *SMALL, "--steps", "20", "--json", *box) == 0
+    scores = json.loads(capsys.readouterr().out)["held_out_psnr"]
+    assert min(scores.values()) > 20  # the whole scene's pictures give 8
+    assert (load_mesh(out).vertices[:, 0] > middle[0] - 1).all()
+    camera = orbit(cloud, 1, width=24, height=16)[0]
+    data = write_photographs(tmp_path / "photos", [camera], [render_splats(cloud, camera).color])
+    arguments = ("--data", data, "--test-every", "0", "--steps", "1")
+    assert run(splats, "-o", tmp_path / "b.npz", *arguments, *box) == 0
+    assert "will be painted on the rest" in capsys.readouterr().err
+
+
+def test_a_record_of_everything_given(splats, tmp_path):
+    given = ("--preset", "paper", "--steps", "2")
+    assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, *given) == 0
+    options = json.loads((tmp_path / "tuned.config.json").read_text())["options"]
+    assert (options["preset"], options["steps"], options["width"]) == ("paper", 2, 32)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--cameras", "c.json", "--placement", "inside"], "--placement has no effect with --cameras"),
+        (["--cameras", "c.json", "--up", "z"], "--up has no effect with --cameras"),
+        (["--views", "0"], "--views must be at least 1, got 0"),
+        (["--exposure", "True"], "--exposure has no effect without --data"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(splats, tmp_path, capsys, options, message):
+    assert run(splats, "-o", tmp_path / "t.npz", "--steps", "1", *options) == 2
+    assert message in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_photographs_that_are_all_held_out_are_nothing_to_learn_from(splats, tmp_path, capsys):
+    cloud = make_scene(300)
+    camera = orbit(cloud, 1, width=24, height=16)[0]
+    data = write_photographs(tmp_path / "photos", [camera], [render_splats(cloud, camera).color])
+    assert run(splats, "-o", tmp_path / "t.npz", "--data", data, "--steps", "1") == 1
+    assert "all its 1 views are held out" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "t.npz", "--data", data, "--steps", "1", "--test-every", "0") == 0
+    assert "1 training view, 0 held out, of 24 x 16 pixels" in capsys.readouterr().err
+
+
+def test_cameras_of_a_model_folder_give_way_to_a_placement(tmp_path):
+    cloud = make_scene(300)
+    folder = tmp_path / "model"
+    (folder / "point_cloud/iteration_7").mkdir(parents=True)
+    save_gaussians(cloud, folder / "point_cloud/iteration_7/point_cloud.ply")
+    save_cameras(orbit(cloud, 9, width=48, height=48, elevation=50), folder / "cameras.json")
+    for name, options in (("own", []), ("placed", ["--distance", "0.5", "0.5"])):
+        out = tmp_path / f"{name}.npz"
+        assert run(folder, "-o", out, "--views", "4", "--width", "32", "--steps", "1", *options) == 0
+    held = [load_cameras(tmp_path / f"{name}.run/held_out.cameras.json") for name in ("own", "placed")]
+    assert [len(cameras) for cameras in held] == [2, 8]
+    assert held[0][0].center == pytest.approx(load_cameras(folder)[int(2 * 0.25 * 9 / 2)].center)
+
+
+def test_what_is_read_is_never_written(splats, tmp_path, capsys):
+    before = splats.read_bytes()
+    assert run(splats, "-o", splats, *SMALL, "--steps", "1", "--force") == 2
+    assert "is read by this command" in capsys.readouterr().err
+    assert splats.read_bytes() == before
+
+
+def test_a_run_that_has_ended_is_not_resumed(splats, tmp_path, capsys):
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "-o", out, *SMALL, "--steps", "2") == 0
+    assert run(splats, "-o", out, *SMALL, "--steps", "2", "--resume") == 3
+    assert "the run has come to its end, or there was one before" in capsys.readouterr().err
+
+
+def test_without_views_held_out_the_next_command_shows_the_mesh(splats, tmp_path, capsys):
+    out = tmp_path / "tuned.npz"
+    assert run(splats, "-o", out, "--views", "3", "--held-out", "0", "--width", "32", "--steps", "1") == 0
+    assert "next: meshsplats render" in capsys.readouterr().out
+    assert not (tmp_path / "tuned.run/held_out.cameras.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--sh-degree", "0"], "pictures of other splats.*--sh-degree was not given and is 0"),
+        (["--held-out", "1"], "other views.*--held-out was 2 and is 1"),
+        (["--axes", "y-up"], "another mesh.*options of reading it.*--axes was auto and is y-up"),
+    ],
+)
+def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
+    save_gaussians(make_scene(300), tmp_path / "scene.ply")
+    arguments = (tmp_path / "scene.ply", "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "2")
+    assert run(*arguments) == 0
+    assert run(*arguments, *options, "--resume", "--force") == 1
+    assert re.search(message, capsys.readouterr().err)
+    assert run(*arguments, "--resume", "--force") == 0
+    save_gaussians(make_scene(301), tmp_path / "scene.ply")
+    assert run(*arguments, "--resume", "--force") == 1
+    assert "No option differs, so the files themselves have changed" in capsys.readouterr().err
+
+
+def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
+    """Its views stay, though so long a run would have more; its time counts, too."""
+    arguments = [splats, "-o", tmp_path / "t.npz", "--held-out", "2", "--width", "8", "--json"]
+    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: 4)
+    assert run(*arguments, "--steps", "3") == 0
+    first = json.loads(capsys.readouterr().out)
+    assert first["seconds_since_resumed"] is None
+    begun = load_checkpoint(tmp_path / "t.run" / "checkpoint.safetensors", only_header=True).seconds
+    assert 0 < begun <= first["seconds"]
+    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: 5)
+    assert run(*arguments, "--steps", "6", "--resume", "--force") == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["steps"] == 6
+    assert second["seconds"] == pytest.approx(begun + second["seconds_since_resumed"], abs=0.02)
+
+
+def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):
+    cloud = make_scene(300)
+    cameras = orbit(cloud, 9, width=32, height=32)
+    data = write_photographs(tmp_path / "photos", cameras, [render_splats(cloud, c).color for c in cameras])
+    out = tmp_path / "tuned.ply"
+    options = ("--preset", "paper", "--epochs", "2", "--exposure", "True", "--seed", "3", "--no-triag", "4")
+    assert run(splats, "-o", out, "--data", data, *options) == 0
+    assert "7 training views, 2 held out" in capsys.readouterr().err
+    config = json.loads((tmp_path / "tuned.config.json").read_text())["tuning"]
+    assert config == make_config("paper", epochs=2, exposure=True, seed=3).to_dict()
+    mesh = load_mesh(out)
+    assert len(mesh.faces) == 300 * 4  # --no-triag went to the conversion
+    again = tmp_path / "again.npz"
+    assert run(out, "-o", again, "--data", data, "--steps", "2") == 0  # a mesh is tuned further
+    assert len(load_mesh(again).faces) == len(mesh.faces)
+
+
+def test_given_cameras_are_where_the_targets_are_drawn_from(splats, tmp_path, capsys):
+    cameras = orbit(make_scene(300), 5, width=64, height=48)
+    save_cameras(cameras, tmp_path / "five.json")
+    options = ("--cameras", tmp_path / "five.json", "--views", "3", "--held-out", "1", "--width", "32")
+    assert run(splats, "-o", tmp_path / "t.npz", *options, "--steps", "1") == 0
+    assert "3 training views, 1 held out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--steps", "3", "--minutes", "1"], 2, "give one of --epochs, --steps and --minutes"),
+        (["--data", "d", "--views", "9"], 2, "--views has no effect with --data"),
+        (["--downscale", "2"], 2, "--downscale has no effect with splats"),
+        (["--resume"], 1, "no checkpoint at"),
+        (["--color-rate", "7"], 1, "color_rate must be a number"),
+        (["--data", "nowhere"], 1, "no such data set"),
+        (["--held-out", "-1"], 1, "at least 1 training view"),
+    ],
+)
+def test_wrong_usage_writes_nothing(splats, tmp_path, capsys, arguments, code, message):
+    assert run(splats, "-o", tmp_path / "out.npz", *arguments) == code
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_needs_photographs(splats, tmp_path, capsys):
+    assert main(["convert", str(splats), "-o", str(tmp_path / "m.npz"), "--no-preview"]) == 0
+    assert run(tmp_path / "m.npz", "-o", tmp_path / "t.npz") == 2
+    assert "--data" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "t.stl") == 2
+    assert "-o must end in" in capsys.readouterr().err
+
+
+def test_too_little_memory_is_told_before_the_work(splats, tmp_path, capsys, monkeypatch):
+    from meshsplats.finetuning import memory
+
+    monkeypatch.setattr(memory, "available_memory", lambda: 1 << 20)
+    assert run(splats, "-o", tmp_path / "t.npz", *SMALL) == 5
+    assert "--max-splats" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_neither_torch_nor_safetensors_is_needed(splats, tmp_path):
+    program = (
+        "import sys\n"
+        "class Without:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] in ('torch', 'safetensors'):\n"
+        "            raise ModuleNotFoundError('gone', name=name)\n"
+        "sys.meta_path.insert(0, Without())\n"
+        "from meshsplats.cli import main\n"
+        f"arguments = ['finetune', {str(splats)!r}, '-o', {str(tmp_path / 't.npz')!r}, '--steps', '2']\n"
+        f"sys.exit(main([*arguments, *{SMALL}]))"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+    assert (tmp_path / "t.run" / "checkpoint.safetensors").is_file()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
+    out = tmp_path / "tuned.npz"
+    arguments = [str(splats), "-o", str(out), *SMALL, "--steps", "40", "--report-every", "1"]
+    command = [sys.executable, "-m", "meshsplats", "finetune", *arguments]
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    for line in child.stderr:
+        if "step 3/" in line:
+            child.send_signal(number)
+            break
+    told = child.communicate(timeout=60)[1]
+    assert child.returncode == 128 + number
+    assert "--resume" in told
+    assert not out.exists()
+    assert (tmp_path / "tuned.run" / "checkpoint.safetensors").is_file()
+    assert run(*arguments, "--resume") == 0
+    whole = tmp_path / "whole.npz"
+    assert run(*[str(whole) if a == str(out) else a for a in arguments]) == 0
+    for name in ("vertices", "colors", "faces"):
+        assert np.array_equal(getattr(load_mesh(out), name), getattr(load_mesh(whole), name))
+
+
+def test_two_runs_of_one_name(splats, tmp_path, capsys):
+    folder = tmp_path / "tuned.run"
+    folder.mkdir()
+    with locked(folder / ".lock") as ours:
+        assert ours
+        assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "1") == 3
+        assert "tuned.run: another process is writing this run" in capsys.readouterr().err
+        assert [path.name for path in folder.iterdir()] == [".lock"]
+    assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "1") == 0
+    assert not (folder / ".lock").exists()
+
+
+def test_time_before_the_run_counts(splats, tmp_path):
+    start = time.perf_counter()
+    assert run(splats, "-o", tmp_path / "t.npz", *SMALL, "--minutes", "0.05") == 0
+    assert time.perf_counter() - start < 15
+
+
+def test_every_option_of_the_configuration_can_be_given():
+    command = Finetune(input=None, output=None, steps=5)  # type: ignore[arg-type]
+    assert command.configured() == make_config(steps=5)
+    assert TargetOptions().cache_bytes == 2_000_000_000

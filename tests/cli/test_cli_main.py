@@ -1,0 +1,289 @@
+"""The command line as a whole: overview, errors, exit codes, info, doctor."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from _datasets import simple_colmap
+from _photographs import write_photographs
+
+import meshsplats
+from meshsplats.cameras.files import save_cameras
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.cli import COMMANDS, main
+from meshsplats.cli.common import parse_color, parse_up
+from meshsplats.demo_scene import make_scene
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.formats.meshes import save_mesh
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+
+def cloud(n: int = 30) -> GaussianCloud:
+    rng = np.random.default_rng(0)
+    return GaussianCloud(
+        rng.uniform(-1, 1, (n, 3)),
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.tile([0.1, 0.2, 0.05], (n, 1)),
+        np.linspace(0, 1, n),
+        np.zeros((n, 4, 3)),
+    )
+
+
+def test_overview_and_version(capsys):
+    assert main([]) == 0
+    overview = capsys.readouterr().out
+    assert main(["--help"]) == 0
+    assert capsys.readouterr().out == overview
+    assert all(name in overview for name in COMMANDS)
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"meshsplats {meshsplats.__version__}\n"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help(name, capsys):
+    assert main([name, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"usage: meshsplats {name}" in out
+    assert "json" in out
+    assert "{None}" not in out.split("conversion options")[0]
+
+
+def test_unknown_commands(capsys):
+    assert main(["rendr"]) == 2
+    assert "did you mean 'render'?" in capsys.readouterr().err
+    assert main(["zzz"]) == 2
+    assert "commands: convert" in capsys.readouterr().err
+
+
+def test_version_is_quick_and_needs_nothing():
+    """No NumPy, no tyro, no rich: a script may ask for the version often."""
+    code = (
+        "import sys; from meshsplats.cli import main; main(['--version']);"
+        "print([m for m in ('numpy', 'tyro', 'rich', 'PIL') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[1] == "[]"
+
+
+@dataclass
+class Raises:
+    """A command that ends in the error given."""
+
+    error: ClassVar[BaseException] = ValueError()
+    json: bool = False
+
+    def run(self) -> None:
+        raise type(self).error
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (ValueError("two\n lines"), 1, "meshsplats: error: two lines"),
+        (FileFormatError("a.ply: broken"), 1, "meshsplats: error: a.ply: broken"),
+        (MissingDependencyError("install x"), 5, "meshsplats: error: install x"),
+        (FileNotFoundError(2, "No such file", "a.ply"), 1, "meshsplats: error: a.ply: No such file"),
+        (FileExistsError(17, "there already", "a.ply"), 3, "meshsplats: error: a.ply: there already"),
+        (OSError(28, "no space", "a.ply"), 4, "meshsplats: error: a.ply: no space"),
+        (MemoryError(), 5, "meshsplats: error: out of memory"),
+        (KeyboardInterrupt(), 130, "meshsplats: interrupted"),
+    ],
+)
+def test_errors_are_one_line(monkeypatch, capsys, error, code, line):
+    monkeypatch.setitem(COMMANDS, "raises", (f"{__name__}:Raises", ""))
+    monkeypatch.setattr(Raises, "error", error)
+    assert main(["raises"]) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(line)
+    assert err.count("\n") == 1
+    if code < 128:
+        kinds = {1: "input", 3: "exists", 4: "space", 5: "missing"}
+        assert main(["raises", "--json"]) == code
+        told = json.loads(capsys.readouterr().out)["error"]
+        assert (told["kind"], told["code"], told["type"]) == (kinds[code], code, type(error).__name__)
+        assert line.endswith(told["message"])
+        assert told["path"] == getattr(error, "filename", None)
+        with pytest.raises(type(error)):
+            main(["raises", "--debug"])
+
+
+def test_bugs_are_not_hidden(monkeypatch):
+    monkeypatch.setitem(COMMANDS, "raises", (f"{__name__}:Raises", ""))
+    monkeypatch.setattr(Raises, "error", AttributeError("a bug"))
+    with pytest.raises(AttributeError):
+        main(["raises"])
+
+
+@dataclass
+class Warns:
+    """A command that warns."""
+
+    def run(self) -> None:
+        warnings.warn("3 splats were\nleft out", DataWarning, stacklevel=1)
+        print("done")
+
+
+def test_warnings_are_one_line(monkeypatch, capsys):
+    monkeypatch.setitem(COMMANDS, "warns", (f"{__name__}:Warns", ""))
+    before = warnings.showwarning
+    for _ in range(2):  # each time, not only the first
+        assert main(["warns"]) == 0
+        assert capsys.readouterr() == ("done\n", "meshsplats: warning: 3 splats were left out\n")
+    assert warnings.showwarning is before
+
+
+def test_info_on_splats(tmp_path, capsys):
+    save_gaussians(cloud(), tmp_path / "scene.ply")
+    assert main(["info", str(tmp_path / "scene.ply"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["kind"], found["splats"], found["sh_degree"], found["kernel"]) == ("splats", 30, 1, "3dgs")
+    assert found["format"] == "ply"
+    assert found["faint_splats"] == 1
+    assert found["flatness_median"] == pytest.approx(0.5)
+    np.testing.assert_allclose(found["lower"], cloud().means.min(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(found["scale_5_50_95_percent"], [0.35 / 3] * 3, rtol=1e-4)
+    assert found["bytes"] == (tmp_path / "scene.ply").stat().st_size
+    assert found["becomes_triangles_about"] > 0
+    assert main(["info", str(tmp_path / "scene.ply")]) == 0
+    assert "sh degree" in capsys.readouterr().out
+
+
+def test_info_on_a_model_folder(tmp_path, capsys):
+    folder = tmp_path / "point_cloud" / "iteration_7"
+    folder.mkdir(parents=True)
+    save_gaussians(cloud(), folder / "point_cloud.ply")
+    save_cameras(orbit(cloud(), 4, up=(0, 0, 1)), tmp_path / "cameras.json")
+    assert main(["info", str(tmp_path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["splats"], found["cameras"], found["up_by_cameras"]) == (30, 4, [0, 0, 1])
+    # A broken camera file there is no reason to refuse the splats.
+    (tmp_path / "cameras.json").write_text("{")
+    assert main(["info", str(tmp_path), "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert "cameras" not in json.loads(out)
+    assert "not a JSON file" in err
+
+
+@pytest.mark.parametrize("suffix", ["npz", "ply", "glb"])
+def test_info_on_a_mesh(tmp_path, capsys, suffix):
+    mesh = SplatMesh(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 4), 0.5), face_splat=np.array([4]))
+    save_mesh(mesh, tmp_path / f"mesh.{suffix}")
+    assert main(["info", str(tmp_path / f"mesh.{suffix}"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["kind"], found["vertices"], found["triangles"], found["splats"]) == ("mesh", 3, 1, 1)
+    assert found["upper"] == [1, 1, 1]
+    assert found["up"] == [0, -1, 0]
+
+
+def test_info_on_data_sets(tmp_path, capsys):
+    def told(path) -> dict:
+        assert main(["info", str(path), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    colmap = simple_colmap(tmp_path / "colmap", count=9)
+    found = told(colmap)
+    assert (found["kind"], found["layout"], found["pictures"]) == ("data set", "COLMAP", 9)
+    assert (found["training_views"], found["held_out_views"], found["split"]) == (7, 2, "every 8th by name")
+    assert (found["lenses"], found["undistorted_when_read"]) == (["PINHOLE"], False)
+    assert found["bytes_in_memory"] == 9 * 3 * np.prod(found["picture_sizes"][0])
+    assert "points" not in found
+    model = Path(found["read_from"])
+    (model / "points3D.txt").write_text("# a comment\n1 0 0 0 9 9 9 0.5 1 2\n\n2 0 0 1 9 9 9 0.5 1 2\n")
+    assert told(colmap)["points"] == 2
+    (model / "points3D.bin").write_bytes((3).to_bytes(8, "little") + bytes(3 * 51))
+    assert told(colmap)["points"] == 3
+    (model / "points3D.bin").write_bytes((1 << 60).to_bytes(8, "little"))
+    assert "points" not in told(colmap)
+    (model / "test.txt").write_text("nothing\n")
+    assert told(colmap)["split"] == "the data set's own"
+
+    cameras = orbit(make_scene(200), 3, width=16, height=16)
+    pictures = [np.concatenate([np.zeros((16, 16, 3)), np.full((16, 16, 1), 0.5)], axis=2)] * 3
+    folder = write_photographs(tmp_path / "studio", cameras, pictures)
+    for path in (folder, folder / "transforms.json"):
+        found = told(path)
+        assert (found["layout"], found["with_alpha"], found["with_masks"]) == ("nerfstudio", 3, 0)
+        assert found["split"] == "every 8th by name"
+    save_cameras(cameras, tmp_path / "cameras.json")
+    assert told(tmp_path / "cameras.json")["kind"] == "cameras"
+    (tmp_path / "empty").mkdir()
+    assert main(["info", str(tmp_path / "empty")]) == 1
+
+
+def test_info_on_cameras(tmp_path, capsys):
+    save_cameras(orbit(cloud(), 3, width=20, height=10), tmp_path / "c.json")
+    assert main(["info", str(tmp_path / "c.json"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["kind"], found["cameras"], found["picture_sizes"]) == ("cameras", 3, [[20, 10]])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(b"", "empty"), (b"GIF89a", "neither splats"), (b"ply\nbroken", "x.bin")]
+)
+def test_info_on_anything_else(tmp_path, capsys, content, words):
+    (tmp_path / "x.bin").write_bytes(content)
+    assert main(["info", str(tmp_path / "x.bin")]) == 1
+    assert words in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "missing")]) == 1
+    assert "missing: No such file" in capsys.readouterr().err
+
+
+def test_doctor(capsys, monkeypatch):
+    assert main(["doctor", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["meshsplats"] == meshsplats.__version__
+    assert found["core"]["works"]
+    assert found["core"]["in_use"] in found["core"]["available"]
+    assert found["threads"] >= 1
+    assert found["required"]["numpy"] == np.__version__
+    assert main(["doctor"]) == 0
+    assert "in use" in capsys.readouterr().out
+
+    from meshsplats.cli import doctor
+
+    monkeypatch.setattr(doctor.metadata, "requires", lambda _: ["no-such-thing>=1; extra == 'blender'"])
+    monkeypatch.setattr(doctor, "_draws", lambda: False)
+    assert main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert "pip install 'no-such-thing>=1'" in out
+    assert "DOES NOT WORK" in out
+
+
+@pytest.mark.parametrize(
+    ("text", "direction"),
+    [
+        ("-y", (0, -1, 0)),
+        ("z", (0, 0, 1)),
+        ("+X", (1, 0, 0)),
+        ("0,0.5,-1", (0, 0.5, -1)),
+        ("-1,0,0", (-1, 0, 0)),
+    ],
+)
+def test_up(text, direction):
+    np.testing.assert_array_equal(parse_up(text), direction)
+
+
+@pytest.mark.parametrize("text", ["", "w", "--y", "yy", "1,2", "1,2,3,4", "nan,0,0", "0,0,0", "a,b,c"])
+def test_up_that_is_none(text):
+    with pytest.raises(ValueError, match="--up"):
+        parse_up(text)
+
+
+def test_colors():
+    assert parse_color("Black") == (0, 0, 0)
+    assert parse_color("#ff8000") == (1, 128 / 255, 0)
+    assert parse_color("0.1,0.2,0.3") == (0.1, 0.2, 0.3)
+    for text in ("", "mauve", "#ff80", "#gg0000", "1,2,3", "0,0"):
+        with pytest.raises(ValueError, match="--background"):
+            parse_color(text)

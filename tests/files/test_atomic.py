@@ -1,0 +1,127 @@
+"""Files appear whole or not at all."""
+
+import os
+import stat
+
+import pytest
+
+from meshsplats._files.atomic import atomic_path, refuse_existing
+
+as_root = hasattr(os, "geteuid") and os.geteuid() == 0
+
+
+def test_a_finished_file_replaces_the_old_one(tmp_path):
+    target = tmp_path / "mesh.glb"
+    target.write_bytes(b"old")
+    with atomic_path(target) as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.name.startswith(".")
+        assert temporary.suffix == ".glb"
+        temporary.write_bytes(b"new")
+        assert target.read_bytes() == b"old"
+    assert target.read_bytes() == b"new"
+    assert os.listdir(tmp_path) == ["mesh.glb"]
+
+
+def _write_and_raise(path, error):
+    path.write_bytes(b"half of the n")
+    raise error
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    target = tmp_path / "mesh.glb"
+    target.write_bytes(b"old")
+    with pytest.raises(error), atomic_path(target) as temporary:
+        _write_and_raise(temporary, error)
+    assert target.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["mesh.glb"]
+
+
+def test_a_failure_without_an_old_file_leaves_nothing(tmp_path):
+    with pytest.raises(ValueError), atomic_path(tmp_path / "mesh.glb"):
+        raise ValueError
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_a_new_file_follows_the_umask(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        with atomic_path(tmp_path / "a.npz"):
+            pass
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a.npz").stat().st_mode) == mode
+
+
+def test_a_replaced_file_keeps_its_permissions(tmp_path):
+    target = tmp_path / "a.npz"
+    target.write_bytes(b"")
+    target.chmod(0o640)
+    with atomic_path(target):
+        pass
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+
+
+def test_a_link_stays_a_link(tmp_path):
+    (tmp_path / "real").mkdir()
+    target, link = tmp_path / "real" / "a.npz", tmp_path / "link.npz"
+    link.symlink_to(target)
+    with atomic_path(link) as temporary:
+        temporary.write_bytes(b"x")
+    assert link.is_symlink()
+    assert target.read_bytes() == b"x"
+
+
+def test_long_names_are_fine(tmp_path):
+    target = tmp_path / ("n" * 250 + ".ply")
+    with atomic_path(target) as temporary:
+        temporary.write_bytes(b"x")
+    assert target.read_bytes() == b"x"
+
+
+def test_places_where_no_file_can_be(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(FileNotFoundError, match=r"create the folder .*missing first.*a\.glb"):
+        atomic_path(tmp_path / "missing" / "a.glb").__enter__()
+    with pytest.raises(NotADirectoryError, match="file is not a folder"):
+        atomic_path(tmp_path / "file" / "a.glb").__enter__()
+    with pytest.raises(IsADirectoryError, match="this is a folder"):
+        atomic_path(tmp_path).__enter__()
+    with pytest.raises(IsADirectoryError):
+        atomic_path("/").__enter__()
+    assert os.listdir(tmp_path) == ["file"]
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/null"), reason="no /dev/null on this system")
+def test_devices_are_not_replaced():
+    with pytest.raises(OSError, match="not a regular file"):
+        atomic_path("/dev/null").__enter__()
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+@pytest.mark.skipif(as_root, reason="root may write everywhere")
+def test_protected_places(tmp_path):
+    target = tmp_path / "a.glb"
+    target.write_bytes(b"old")
+    target.chmod(0o444)
+    with pytest.raises(PermissionError, match="write-protected"):
+        atomic_path(target).__enter__()
+    tmp_path.chmod(0o555)
+    try:
+        with pytest.raises(PermissionError, match="no permission to write in the folder"):
+            atomic_path(tmp_path / "b.glb").__enter__()
+    finally:
+        tmp_path.chmod(0o755)
+
+
+def test_existing_outputs_are_refused_unless_forced(tmp_path):
+    old, new = tmp_path / "old.glb", tmp_path / "new.glb"
+    old.write_bytes(b"")
+    with pytest.raises(FileExistsError, match=r"--force.*old\.glb"):
+        refuse_existing([new, old], force=False)
+    with pytest.raises(FileExistsError, match="and 1 more"):
+        refuse_existing([old, tmp_path], force=False)
+    refuse_existing([new, old], force=True)
+    refuse_existing([new], force=False)

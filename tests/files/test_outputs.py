@@ -1,0 +1,333 @@
+"""Outputs when things go wrong: full disks, other writers, signals, pipes that close. Real processes where it
+matters."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from _splats import few_splats
+
+from meshsplats._files import atomic
+from meshsplats._files.atomic import atomic_path, promises_kept, refuse_existing, temporary_beside
+from meshsplats._files.locks import locked
+from meshsplats.cli import main
+from meshsplats.demo_scene import make_scene
+from meshsplats.errors import DataWarning
+from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, save_mesh
+from meshsplats.images.writing import save_animation, save_array, save_png
+from meshsplats.mesh import SplatMesh
+
+posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
+COMMAND = [sys.executable, "-m", "meshsplats"]
+
+
+def large_mesh(vertices: int = 30_000) -> SplatMesh:
+    rng = np.random.default_rng(0)
+    corners = rng.integers(0, vertices, (vertices, 3)).astype(np.int32)
+    return SplatMesh(rng.normal(size=(vertices, 3)), corners, rng.random((vertices, 4)))
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder on a disk of 256 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if not sys.platform.startswith("linux") or not shutil.which("mount"):
+        pytest.skip("needs mount and tmpfs")
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", folder], capture_output=True)
+    if done.returncode:
+        pytest.skip("only root may mount a small disk")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def told(error: OSError, path: Path) -> str:
+    assert error.filename == str(path)
+    assert error.errno == errno.ENOSPC
+    return str(error.strerror)
+
+
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+def test_a_full_disk_is_one_line_with_path_and_bytes(small_disk, suffix):
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr")
+    target = small_disk / f"mesh{suffix}"
+    mesh = large_mesh()
+    if suffix == ".obj":  # which has no opacity, and would warn
+        mesh.colors[:, 3] = 1
+    with pytest.raises(OSError) as caught:
+        save_mesh(mesh, target)
+    needed = atomic.in_words(expected_bytes(mesh, suffix))
+    assert told(caught.value, target) == (
+        f"no space left on the disk: the file needs about {needed}, 262.1 kB are free"
+    )
+    assert list(small_disk.iterdir()) == []
+
+
+def test_pictures_on_a_full_disk(small_disk):
+    picture = np.random.default_rng(0).random((320, 320, 3))
+    frames = [(picture * 255).astype(np.uint8), (picture[::-1] * 255).astype(np.uint8)] * 2
+    for name, save in [
+        ("a.png", lambda path: save_png(path, picture)),
+        ("a.webp", lambda path: save_animation(path, frames)),
+        ("a.npy", lambda path: save_array(path, picture)),
+    ]:
+        with pytest.raises(OSError) as caught:
+            save(small_disk / name)
+        assert "needs about" in told(caught.value, small_disk / name)
+    assert list(small_disk.iterdir()) == []
+
+
+def test_the_command_on_a_full_disk(small_disk, tmp_path, capsys):
+    save_gaussians(make_scene(3000), tmp_path / "scene.ply")
+    arguments = ["convert", str(tmp_path / "scene.ply"), "-o", str(small_disk / "mesh.glb"), "--json"]
+    assert main(arguments) == 4
+    out, err = capsys.readouterr()
+    assert err.startswith(f"meshsplats: error: {small_disk / 'mesh.glb'}: no space left on the disk")
+    assert err.count("\n") == 1
+    told = json.loads(out)["error"]
+    assert (told["kind"], told["code"], told["path"]) == ("space", 4, str(small_disk / "mesh.glb"))
+
+
+@posix
+@pytest.mark.parametrize("suffix", [".usdc", ".glb"])
+def test_a_limit_on_files_is_told(tmp_path, suffix):
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr")
+    save_mesh(large_mesh(), tmp_path / "in.npz")
+    code = (
+        "import resource, sys; from meshsplats.formats.meshes import *;"
+        "mesh = load_mesh(sys.argv[1]); resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000));"
+        "save_mesh(mesh, sys.argv[2])"
+    )
+    target = tmp_path / f"mesh{suffix}"
+    command = [sys.executable, "-c", code, str(tmp_path / "in.npz"), str(target)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("OSError: [Errno 27] larger than a file may be here"), done.stderr
+    assert last.endswith(f"'{target}'")
+    assert [path.name for path in tmp_path.iterdir()] == ["in.npz"]
+
+
+@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
+def test_sizes_are_about_right(tmp_path, suffix):
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr")
+    from dataclasses import replace
+
+    plain = large_mesh(3000)
+    rich = replace(
+        plain,
+        normals=np.tile(np.float32([0, 0, 1]), (3000, 1)),
+        face_splat=np.arange(3000, dtype=np.int32),
+        attributes={"heat": np.linspace(0, 1, 3000)},
+    )
+    for mesh in (plain, rich):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            save_mesh(mesh, tmp_path / f"mesh{suffix}")
+        size = (tmp_path / f"mesh{suffix}").stat().st_size
+        assert 0.6 < expected_bytes(mesh, suffix) / size < 1.6
+
+
+def test_of_two_writers_exactly_one_wins(tmp_path):
+    """Both have found the name free; the second to finish must not touch what the first wrote."""
+
+    def both(target: Path) -> None:
+        with atomic_path(target) as ours:
+            ours.write_bytes(b"ours")
+            target.write_bytes(b"theirs")
+
+    target = tmp_path / "mesh.glb"
+    with promises_kept():
+        refuse_existing([target], force=False)
+        with pytest.raises(FileExistsError, match="another process has written"):
+            both(target)
+        with pytest.raises(FileExistsError, match="another process has written"):
+            both(target)  # told before the work now
+    assert target.read_bytes() == b"theirs"
+    assert os.listdir(tmp_path) == ["mesh.glb"]
+
+
+@pytest.mark.parametrize("links", [True, False], ids=["hard links", "no hard links"])
+def test_many_writers(tmp_path, monkeypatch, links):
+    if not links:
+
+        def refused(*_, **__):
+            raise PermissionError(errno.EPERM, "no hard links here")
+
+        monkeypatch.setattr(os, "link", refused)
+    target, ready, won = tmp_path / "mesh.glb", threading.Barrier(8), []
+
+    def write(number: int) -> None:
+        try:
+            with atomic_path(target, new=True) as temporary:
+                temporary.write_bytes(b"%d" % number)
+                ready.wait()
+            won.append(number)
+        except FileExistsError:
+            pass
+
+    threads = [threading.Thread(target=write, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(won) == 1
+    assert target.read_bytes() == b"%d" % won[0]
+    assert os.listdir(tmp_path) == ["mesh.glb"]
+
+
+def test_a_command_may_write_its_own_output_again(tmp_path):
+    with promises_kept():
+        refuse_existing([tmp_path / "a"], force=False)
+        for content in (b"1", b"2"):
+            with atomic_path(tmp_path / "a") as temporary:
+                temporary.write_bytes(content)
+        refuse_existing([tmp_path / "a"], force=True)
+    assert (tmp_path / "a").read_bytes() == b"2"
+
+
+def test_force_takes_back_the_promise(tmp_path):
+    with promises_kept():
+        refuse_existing([tmp_path / "a"], force=False)
+        (tmp_path / "a").write_bytes(b"theirs")
+        refuse_existing([tmp_path / "a"], force=True)
+        with atomic_path(tmp_path / "a") as temporary:
+            temporary.write_bytes(b"ours")
+    assert (tmp_path / "a").read_bytes() == b"ours"
+    with atomic_path(tmp_path / "a"):
+        pass  # and outside of a command, files are replaced
+
+
+@posix
+def test_two_processes_one_output(tmp_path):
+    save_gaussians(make_scene(3000), tmp_path / "scene.ply")
+    arguments = [*COMMAND, "convert", "scene.ply", "-o", "mesh.glb"]
+    both = [
+        subprocess.Popen([*arguments, "--max-splats", n], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        for n in ("100", "3000")
+    ]
+    errors = [process.communicate()[1] for process in both]
+    codes = [process.returncode for process in both]
+    assert sorted(codes) == [0, 3], errors
+    kept = ("100", "3000")[codes.index(0)]
+    recorded = json.loads((tmp_path / "mesh.config.json").read_text())["options"]["max_splats"]
+    assert str(recorded) == kept
+    names = {"scene.ply", "mesh.glb", "mesh.config.json", "mesh.preview.png"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def _temporaries(folder: Path) -> list[str]:
+    return [name for name in os.listdir(folder) if name.startswith(".")]
+
+
+_HANGING = """
+import sys, time, meshsplats.cli
+from dataclasses import dataclass
+from meshsplats._files.atomic import atomic_path
+@dataclass
+class Hang:
+    def run(self):
+        with atomic_path(sys.argv[1]) as temporary:
+            temporary.write_bytes(b"half")
+            print("writing", flush=True)
+            time.sleep(60)
+sys.modules["hang"] = sys.modules["__main__"]
+meshsplats.cli.COMMANDS["hang"] = ("hang:Hang", "")
+sys.exit(meshsplats.cli.main(["hang"]))
+"""
+
+
+@posix
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT], ids=lambda n: n.name)
+def test_signals_leave_nothing(tmp_path, number):
+    command = [sys.executable, "-c", _HANGING, str(tmp_path / "mesh.glb")]
+    # Where the tests run in the background of a shell, it may have signals ignored.
+    heed = partial(signal.signal, number, signal.SIG_DFL)
+    pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with subprocess.Popen(command, preexec_fn=heed, **pipes) as process:
+        assert process.stdout.readline() == "writing\n"
+        assert len(_temporaries(tmp_path)) == 1
+        process.send_signal(number)
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == 128 + number
+    assert "no file was left half-written" in err
+    assert err.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+@posix
+def test_what_a_kill_leaves_goes_with_the_next_file(tmp_path, monkeypatch):
+    command = [sys.executable, "-c", _HANGING, str(tmp_path / "mesh.glb")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "writing\n"
+        living = temporary_beside(tmp_path / "other.npz")  # of this process
+        living.write_bytes(b"")
+        (tmp_path / ".mesh.0-00000000.0123456789abcdef.glb").write_bytes(b"")  # of another machine
+        monkeypatch.setattr(atomic, "_swept", set())
+        with atomic_path(tmp_path / "first.npz"):
+            pass
+        assert len(_temporaries(tmp_path)) == 3  # all of them are being written, as far as we know
+        process.kill()
+    monkeypatch.setattr(atomic, "_swept", set())
+    with atomic_path(tmp_path / "mesh.npz"):
+        pass
+    left = [living.name, ".mesh.0-00000000.0123456789abcdef.glb"]
+    assert sorted(_temporaries(tmp_path)) == sorted(left)
+
+
+@posix
+@pytest.mark.parametrize("arguments", [["--help"], ["info", "scene.ply"], ["info", "scene.ply", "--json"]])
+def test_a_reader_that_goes_away(tmp_path, arguments):
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as pipe:
+        done = subprocess.run([*COMMAND, *arguments], cwd=tmp_path, stdout=pipe, stderr=subprocess.PIPE)
+    assert done.stderr == b""
+    assert done.returncode == 1
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
+def test_standard_output_that_is_full(tmp_path):
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            [*COMMAND, "info", "scene.ply", "--json"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE
+        )
+    assert done.stderr == b"meshsplats: error: standard output: No space left on device\n"
+    assert done.returncode == 4
+
+
+@posix
+def test_locks_end_with_their_process(tmp_path):
+    path = tmp_path / "lock"
+    code = "import sys, time; from pathlib import Path; from meshsplats._files.locks import locked\n"
+    code += "with locked(Path(sys.argv[1])) as ours: print(ours, flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "True\n"
+        with locked(path) as ours:
+            assert not ours
+        process.kill()
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        with locked(path) as ours:
+            if ours:
+                break
+    assert ours
+    assert not path.exists()

@@ -1,0 +1,427 @@
+"""The parts of a fine-tuning that do not need the renderer: configuration, sizes, checkpoints,
+memory."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.conversion import convert
+from meshsplats.datasets.splat_targets import splat_views
+from meshsplats.datasets.views import Dataset, Picture, View
+from meshsplats.demo_scene import make_scene
+from meshsplats.errors import FileFormatError
+from meshsplats.finetuning import memory
+from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, rates
+from meshsplats.finetuning.initial import on_open_edges, starting_mesh, vertex_sizes
+from meshsplats.finetuning.interruption import StopSignals
+from meshsplats.finetuning.journal import METRICS, Journal
+from meshsplats.finetuning.relocation import HALF, Usage, find_moves, halves
+from meshsplats.mesh import SplatMesh
+
+ROOT = Path(__file__).parents[2]
+
+
+# ---- Configuration
+
+
+def test_presets_are_pinned():
+    """What the paper's text and its code say; a change here is a change of meaning."""
+    paper, published = PRESETS["paper"], PRESETS["published"]
+    assert paper.position_rate == pytest.approx(math.exp(-3) * paper.color_rate)
+    assert paper.prune_opacity == pytest.approx(math.exp(-4))
+    assert (published.color_rate, published.position_rate, published.prune_opacity) == (1e-2, 1e-6, 1e-4)
+    for preset in (paper, published):
+        assert (preset.epochs, preset.steps, preset.minutes) == (15, None, None)
+        assert (preset.ssim_weight, preset.l2_weight, preset.prune_epochs) == (0.4, 0, 10)
+        assert (preset.color_step_decay, preset.final_share) == (0.999, 1)
+        assert (preset.background, preset.position_unit, preset.exposure) == ("white", "scene", False)
+        assert (preset.beta1, preset.beta2, preset.epsilon) == (0.9, 0.999, 1e-8)
+        assert preset.soft_edges is False
+    assert PRESETS["default"] == FinetuneConfig()
+
+
+def test_the_documented_table_has_the_presets_values():
+    text = (ROOT / "docs" / "finetuning.md").read_text(encoding="utf-8")
+    rows = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith("| `")
+    ]
+    table = {row[0].strip("`"): row[1:4] for row in rows}
+    names = [name for name in FinetuneConfig.__dataclass_fields__ if name != "preset"]
+    assert set(names) <= set(table)
+    for name in names:
+        for cell, preset in zip(table[name], ("paper", "published", "default"), strict=True):
+            value = getattr(PRESETS[preset], name)
+            shown = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+            assert cell == shown, f"{name} of {preset}"
+
+
+def test_a_length_takes_the_place_of_the_presets():
+    assert make_config("paper", steps=7).total_steps(100) == 7
+    assert make_config("paper").total_steps(100) == 1500
+    assert make_config("paper", epochs=0.5).total_steps(9) == 4
+    assert make_config("default", minutes=2).total_steps(9) is None
+    assert make_config("paper").prune_interval(30) == 300
+    assert make_config("default", prune_epochs=0).prune_interval(30) == 0
+
+
+def test_rates_fall_over_the_length_and_by_step():
+    config = make_config(
+        color_rate=0.1, position_rate=0.2, final_share=0.01, color_step_decay=0.5, rate_steps=0
+    )
+    assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
+    assert rates(config, 0, 0.5) == pytest.approx((0.01, 0.02))
+    assert rates(config, 3, 1) == pytest.approx((0.1 * 0.01 / 8, 0.002))
+
+
+def test_long_runs_move_positions_less_and_end_lower():
+    config = make_config(steps=1000, color_rate=0.1, position_rate=0.2, final_share=0.04, rate_steps=250)
+    assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
+    # Four times as many steps: half the rate, and half the share at the end.
+    assert rates(config, 500, 0.5) == pytest.approx((0.1 * 0.02**0.5, 0.1 * 0.02**0.5))
+    assert rates(config, 999, 0.999) == pytest.approx((0.1 * 0.02, 0.1 * 0.02), rel=0.01)
+    for step in (100, 250):  # short runs, and those that do not care
+        assert rates(config, step, 1) == pytest.approx((0.1 * 0.04, 0.2 * 0.04))
+        assert rates(replace(config, rate_steps=0), 4 * step, 1) == pytest.approx((0.1 * 0.04, 0.2 * 0.04))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"color_rate": 0}, "color_rate must be a number"),
+        ({"color_rate": float("nan")}, "color_rate"),
+        ({"beta2": 1.0}, "beta2"),
+        ({"steps": 2.5}, "steps must be a whole number"),
+        ({"steps": 3, "minutes": 1}, "steps and minutes"),
+        ({"background": "grey"}, "background must be one of mixed, random, white, black"),
+        ({"blending": "srgb"}, "blending must be one of"),
+        ({"position_unit": "pixel"}, "position_unit must be one of"),
+        ({"exposure": 1}, "exposure must be True or False"),
+        ({"samples": True}, "samples"),
+    ],
+)
+def test_values_out_of_range(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(**changes)
+
+
+def test_names_that_do_not_exist():
+    with pytest.raises(ValueError, match="preset must be one of default, paper, published"):
+        make_config("best")
+    with pytest.raises(TypeError, match="did you mean 'color_rate'"):
+        make_config(colour_rate=1)
+    with pytest.raises(ValueError, match="none of them"):
+        FinetuneConfig(steps=None)
+
+
+# ---- Sizes
+
+
+def test_sizes_follow_the_scale_of_each_splat():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    mesh = SplatMesh(
+        np.concatenate([corners, corners * 4, corners * 2, corners[:1]]),
+        np.arange(9).reshape(3, 3),
+        np.ones((10, 4)),
+        face_splat=[0, 1, 1],
+    )
+    sizes = vertex_sizes(mesh)
+    assert np.allclose(sizes[:3], 1)
+    assert np.allclose(sizes[3:9], 3)  # one splat: the mean of 4 and 2
+    assert sizes[9] == 1  # no triangle: the smallest there is
+    alone = vertex_sizes(replace(mesh, face_splat=None))
+    assert np.allclose(alone, [1, 1, 1, 4, 4, 4, 2, 2, 2, 1])
+    assert np.allclose(vertex_sizes(replace(mesh, vertices=mesh.vertices * 7)), 7 * sizes)
+    flat = SplatMesh(np.zeros((3, 3)), [[0, 1, 2]], np.ones((3, 4)))
+    assert (vertex_sizes(flat) == 0).all()
+
+
+def test_sizes_of_a_real_mesh_are_those_of_its_splats():
+    cloud = make_scene(200)
+    mesh = convert(cloud)
+    sizes = vertex_sizes(mesh)
+    first = mesh.faces[np.searchsorted(mesh.face_splat, np.arange(200)), 0]
+    spread = np.log(sizes[first] / np.sort(cloud.scales, axis=1)[:, 1])
+    assert spread.std() < 0.5
+
+
+def test_open_edges_are_those_of_one_triangle():
+    tetrahedron = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], np.int32)
+    assert not on_open_edges(tetrahedron, 4).any()
+    assert on_open_edges(tetrahedron[:1], 4).tolist() == [True, True, True, False]
+    assert not on_open_edges(np.zeros((0, 3), np.int32), 0).any()
+    mesh = convert(make_scene(200), mode="flat")
+    rims = on_open_edges(mesh.faces, len(mesh.vertices))
+    assert np.array_equal(np.flatnonzero(~rims), np.arange(200) * 9)  # all but the centres
+    shuffled = np.roll(mesh.faces[::-1], 1, axis=1)
+    assert np.array_equal(on_open_edges(shuffled, len(mesh.vertices)), rims)
+
+
+# ---- Relocation
+
+
+def fans(count: int, sides: int = 4) -> SplatMesh:
+    """Fans side by side, twice as long as wide."""
+    angles = np.arange(sides) * 2 * np.pi / sides
+    fan = np.concatenate([[[0, 0, 0]], np.stack([2 * np.cos(angles), np.sin(angles), 0 * angles], 1)])
+    ring = 1 + np.arange(sides)
+    faces = np.stack([0 * ring, ring, np.roll(ring, -1)], 1)
+    numbers = np.arange(count)
+    return SplatMesh(
+        (fan[None] + 10 * numbers[:, None, None]).reshape(-1, 3),
+        (faces[None] + (sides + 1) * numbers[:, None, None]).reshape(-1, 3),
+        np.full((count * (sides + 1), 4), 0.5),
+        face_splat=np.repeat(numbers, sides),
+    )
+
+
+def usage(color: list[float], position: list[float], corners: int) -> Usage:
+    return Usage(*(np.repeat(np.array(values, np.float32), corners) for values in (color, position)))
+
+
+def test_the_idlest_splats_go_to_those_that_are_pushed_most():
+    mesh = fans(6)
+    seen = np.ones(30, bool)
+    # Splat 2 is idle, 4 idler; 5 is pushed most, then 0; 3 shows too little to be halved.
+    of = usage([10, 10, 1.2, 3, 1, 20], [4, 1, 9, 9, 9, 5], 5)
+    idle, needed = find_moves(mesh, of, seen, 0.5)
+    assert (idle[:, 0] // 5).tolist() == [4, 2]
+    assert (needed[:, 0] // 5).tolist() == [5, 0]
+    assert np.array_equal(idle - idle[:, :1], np.tile(np.arange(5), (2, 1)))
+    assert (find_moves(mesh, of, seen, 0.2).idle[:, 0] // 5).tolist() == [4]
+    # What no view looks at may be all there is of its place.
+    seen[20:25] = False
+    assert (find_moves(mesh, of, seen, 0.5).idle[:, 0] // 5).tolist() == [2]
+
+
+def test_only_splats_of_the_commonest_form_with_vertices_of_their_own_move():
+    mesh = fans(6)
+    of = usage([10, 10, 1, 10, 1, 20], [1, 1, 1, 1, 1, 1], 5)
+    seen = np.ones(30, bool)
+    assert len(find_moves(mesh, of, seen, 0.5).idle) == 2
+    cut = replace(mesh, faces=np.delete(mesh.faces, 8, 0), face_splat=np.delete(mesh.face_splat, 8))
+    assert (find_moves(cut, of, seen, 0.5).idle[:, 0] // 5).tolist() == [4]
+    faces = mesh.faces.copy()
+    faces[16] = [10, 21, 22]  # a triangle of splat 4 hangs on splat 2
+    assert len(find_moves(replace(mesh, faces=faces), of, seen, 0.5).idle) == 0
+    assert len(find_moves(replace(mesh, face_splat=None), of, seen, 0.5).idle) == 0
+    still = usage([10, 10, 1, 10, 1, 20], [0, 0, 1, 0, 1, 0], 5)
+    assert len(find_moves(mesh, still, seen, 0.5).idle) == 0
+
+
+def test_halves_lie_side_by_side_along_the_longest_axis():
+    fan = fans(1).vertices[None] + np.float32([3, 1, 2])
+    right, left = halves(fan)
+    if right[0, :, 0].mean() < left[0, :, 0].mean():
+        right, left = left, right
+    reach = lambda half, axis: (half[0, :, axis].min(), half[0, :, axis].max())  # noqa: E731
+    assert reach(right, 0) == pytest.approx((3 - 0.4, 5), abs=1e-5)
+    assert reach(left, 0) == pytest.approx((1, 3 + 0.4), abs=1e-5)
+    for half in (right, left):
+        assert reach(half, 1) == pytest.approx((0, 2), abs=1e-5)
+        assert half[0, :, 2] == pytest.approx(2, abs=1e-5)
+    assert pytest.approx(0.6) == HALF
+
+
+def test_each_preset_begins_with_its_conversion():
+    cloud = make_scene(200)
+    cameras = orbit(cloud, 3, width=40, height=40)
+    mesh = starting_mesh(cloud, cameras)
+    assert 8 * 190 < len(mesh.faces) <= 8 * 200
+    bare = dict(cameras=cameras)
+    assert np.array_equal(mesh.vertices, convert(cloud, detail="cameras", **bare).vertices)
+    even = starting_mesh(cloud, cameras, detail="even")
+    assert np.array_equal(even.vertices, convert(cloud, mode="flat", **bare).vertices)
+    filtered = starting_mesh(cloud, cameras, look="splats", detail="even")
+    bare["footprint"] = "none"
+    assert np.array_equal(filtered.vertices, convert(cloud, mode="flat", **bare).vertices)
+    assert (even.filter_px2, filtered.filter_px2) == (0, pytest.approx(0.3))
+    assert 4 * 190 < len(starting_mesh(cloud, cameras, mode="flat", no_triag=4).faces) <= 4 * 200
+    assert 3 * 190 < len(starting_mesh(cloud, cameras, no_triag=3).faces) <= 3 * 200
+    assert len(starting_mesh(cloud, cameras, rings=2).faces) == 24 * 200
+    assert len(starting_mesh(cloud, cameras, mode="3d", no_triag=4).faces) == 12 * 200
+    for preset in ("paper", "published"):
+        paper = convert(cloud, preset="paper")
+        assert np.array_equal(starting_mesh(cloud, cameras, preset=preset).vertices, paper.vertices)
+
+
+# ---- Memory
+
+
+def dataset(count: int, side: int = 8) -> Dataset:
+    camera = Camera(np.eye(4), side, side, side / 2, side / 2, side, side)
+    picture = Picture(np.zeros((side, side, 3), np.uint8))
+    return Dataset(tuple(View(replace(camera, name=f"v{i}"), picture) for i in range(count)))
+
+
+def test_memory_is_refused_with_advice(monkeypatch):
+    mesh = convert(make_scene(200))
+    data = dataset(2)
+    needed = memory.needed_memory(mesh, data)
+    monkeypatch.setattr(memory, "available_memory", lambda: needed)
+    assert memory.check_memory(mesh, data) == needed
+    monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
+    with pytest.raises(MemoryError, match=r"needs about .* are free: .*--max-splats.*--downscale"):
+        memory.check_memory(mesh, data)
+    monkeypatch.setattr(memory, "available_memory", lambda: None)
+    memory.check_memory(mesh, data)
+
+
+def test_splats_that_targets_are_drawn_from_count():
+    mesh, cloud = convert(make_scene(200)), make_scene(4000)
+    views = splat_views(cloud, [view.camera for view in dataset(2).train])
+    arrays = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, cloud.sh)
+    pictures = 2 * 8 * 8 * (16 - 3)  # means and points, float16 with alpha, in place of bytes
+    more = memory.needed_memory(mesh, Dataset(views)) - memory.needed_memory(mesh, dataset(2))
+    assert more == sum(array.nbytes for array in arrays) + pictures
+
+
+def test_memory_grows_with_what_there_is():
+    mesh, data = convert(make_scene(200)), dataset(2)
+    base = memory.needed_memory(mesh, data)
+    assert memory.needed_memory(convert(make_scene(400)), data) > base
+    assert memory.needed_memory(mesh, dataset(2, 64)) > base
+    assert memory.needed_memory(mesh, dataset(9)) - base == 7 * 8 * 8 * 3
+    assert memory.needed_memory(mesh, dataset(9), cache_bytes=0) == base - 2 * 8 * 8 * 3
+    assert memory.available_memory() is None or memory.available_memory() > 0
+
+
+# ---- Checkpoints and the journal
+
+
+def arrays() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {"mesh.vertices": rng.random((4, 3), np.float32), "mesh.faces": np.arange(3, dtype=np.int32)[None]}
+
+
+def checkpoint(step: int = 3):
+    from meshsplats.finetuning.checkpoint import Checkpoint
+
+    return Checkpoint(step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays(), (0.25, 1 / 3), 7)
+
+
+def test_checkpoints_come_back_to_the_last_bit(tmp_path):
+    from meshsplats.finetuning.checkpoint import load_checkpoint, save_checkpoint
+
+    saved = checkpoint()
+    save_checkpoint(saved, tmp_path / "c.safetensors")
+    found = load_checkpoint(tmp_path / "c.safetensors")
+    assert (found.step, found.seconds, found.mesh, found.dataset) == (3, 1.5, "mesh", "views")
+    assert (found.config, found.losses) == (saved.config, saved.losses)
+    assert all((found.arrays[name] == array).all() for name, array in saved.arrays.items())
+    header = load_checkpoint(tmp_path / "c.safetensors", only_header=True)
+    assert (header.step, header.views, header.arrays) == (3, 7, {})
+    assert [p.name for p in tmp_path.iterdir()] == ["c.safetensors"]
+
+
+def test_broken_checkpoints_are_refused(tmp_path):
+    from meshsplats.finetuning.checkpoint import load_checkpoint, save_checkpoint
+
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(checkpoint(), path)
+    whole = path.read_bytes()
+    for cut in (0, 5, 40, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(FileFormatError, match="not a safetensors file"):
+            load_checkpoint(path)
+    path.write_bytes(whole.replace(b'\\"version\\": 1', b'\\"version\\": 7'))
+    with pytest.raises(FileFormatError, match="version 7"):
+        load_checkpoint(path)
+    for before, after in ((b'\\"step\\": 3', b'\\"step\\":-3'), (b'\\"views\\": 7', b'\\"views\\":-7')):
+        path.write_bytes(whole.replace(before, after))
+        with pytest.raises(FileFormatError, match="broken: step"):
+            load_checkpoint(path)
+    path.write_bytes(whole.replace(b', \\"views\\": 7', b"              "))
+    assert load_checkpoint(path).views is None  # by an earlier version
+    from meshsplats.formats.safetensors import save_safetensors
+
+    save_safetensors(path, arrays(), {})
+    with pytest.raises(FileFormatError, match="not a checkpoint of meshsplats"):
+        load_checkpoint(path)
+    with pytest.raises(FileNotFoundError, match="leave out --resume"):
+        load_checkpoint(tmp_path / "none")
+
+
+def test_a_checkpoint_of_another_run_says_what_differs():
+    from meshsplats.finetuning.checkpoint import check_same_run
+
+    found = checkpoint()
+    check_same_run(found, FinetuneConfig(), "mesh", "views")
+    check_same_run(found, FinetuneConfig(steps=None, minutes=5), "mesh", "views")  # it may be made longer
+    with pytest.raises(ValueError, match=r"seed was 0 and is 5"):
+        check_same_run(found, FinetuneConfig(seed=5), "mesh", "views")
+    with pytest.raises(ValueError, match="another mesh"):
+        check_same_run(found, FinetuneConfig(), "other", "views")
+    with pytest.raises(ValueError, match="other views"):
+        check_same_run(found, FinetuneConfig(), "mesh", "other")
+
+
+def test_fingerprints_change_with_what_they_are_of():
+    from meshsplats.finetuning.checkpoint import dataset_fingerprint, mesh_fingerprint
+
+    mesh = convert(make_scene(200))
+    moved = mesh.vertices.copy()
+    moved[0, 0] = np.nextafter(moved[0, 0], np.float32(9))
+    assert mesh_fingerprint(mesh) == mesh_fingerprint(replace(mesh))
+    assert mesh_fingerprint(mesh) != mesh_fingerprint(replace(mesh, vertices=moved))
+    data = dataset(3)
+    assert dataset_fingerprint(data) == dataset_fingerprint(dataset(3))
+    assert dataset_fingerprint(data) != dataset_fingerprint(dataset(2))
+    assert dataset_fingerprint(data) != dataset_fingerprint(data.over((0, 0, 0)))
+
+
+def test_resuming_drops_what_came_after_the_checkpoint(tmp_path):
+    def refuse(found):
+        raise ValueError("no")
+
+    journal = Journal(tmp_path / "run")
+    journal.begin({"seed": 0})
+    for step in (0, 3, 6):
+        journal.note(step, loss=0.5)
+    picture = np.zeros((6, 6, 3), np.float32)
+    journal.preview(2, picture, picture)
+    journal.preview(4, picture, picture)
+    journal.save(checkpoint(3))
+    with open(tmp_path / "run" / METRICS, "a") as file:
+        file.write('{"step": 7, "lo')  # a kill in the middle of a line
+    with pytest.raises(ValueError, match="no"):
+        journal.resume({}, refuse)
+    assert len(journal.metrics()) == 3
+    assert journal.resume({"seed": 1}, lambda found: None).step == 3
+    assert [line["step"] for line in journal.metrics()] == [0, 3]
+    assert [p.name for p in (tmp_path / "run" / "previews").iterdir()] == ["step_0000002.png"]
+    assert json.loads((tmp_path / "run" / "config.json").read_text()) == {"seed": 1}
+    journal.begin({"seed": 2})
+    assert journal.metrics() == []
+    assert not journal.checkpoint_path.exists()
+    assert not list((tmp_path / "run" / "previews").iterdir())
+
+
+def test_the_folder_above_a_run_is_not_made(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Journal(tmp_path / "no" / "run").begin({})
+
+
+# ---- Signals
+
+
+def test_the_first_signal_is_kept_and_the_second_interrupts():
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with StopSignals() as stop:
+        assert stop.received is None
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.received == signal.SIGTERM
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before

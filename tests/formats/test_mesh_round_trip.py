@@ -1,0 +1,150 @@
+"""Saved meshes come back as they were."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _meshes import assert_same, random_mesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from meshsplats import DataWarning, SplatMesh, load_mesh, save_mesh
+from meshsplats.formats import meshes
+from meshsplats.formats.gltf import writer as glb
+
+SUFFIXES = (".npz", ".ply", ".glb")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@given(seed=st.integers(0, 2**32 - 1), extras=st.booleans(), blending=st.sampled_from(["display", "linear"]))
+def test_round_trip(tmp_path_factory, suffix, seed, extras, blending):
+    rng = np.random.default_rng(seed)
+    mesh = random_mesh(rng, *rng.integers(3, 40, 2), extras=extras, blending=blending)
+    path = tmp_path_factory.mktemp("mesh") / f"mesh{suffix}"
+    save_mesh(mesh, path)
+    assert_same(load_mesh(path), mesh, 1 / 10_000 if suffix == ".glb" else 0)
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".usdc", ".usda", ".obj"])
+def test_the_filter_of_the_splats_stays(tmp_path, suffix):
+    """Programs that draw without it get a warning, and .obj files cannot hold it."""
+    if suffix.startswith(".usd"):
+        pytest.importorskip("pxr", reason="usd-core is not installed")
+    mesh = random_mesh(np.random.default_rng(7))
+    mesh = replace(mesh, filter_px2=0.1, colors=np.column_stack([mesh.colors[:, :3], np.ones(9)]))
+    path = tmp_path / f"m{suffix}"
+    if suffix in (".npz", ".ply"):
+        save_mesh(mesh, path)
+    else:
+        with pytest.warns(DataWarning, match=r"a filter of 0\.1 px\^2, which other programs do not have"):
+            save_mesh(mesh, path)
+    assert load_mesh(path).filter_px2 == (0 if suffix == ".obj" else 0.1)
+    save_mesh(replace(mesh, filter_px2=0), path)
+    assert load_mesh(path).filter_px2 == 0
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".ply"])
+@pytest.mark.parametrize("vertices", [0, 5])
+def test_meshes_without_triangles(tmp_path, suffix, vertices):
+    empty = np.empty((0, 3))
+    mesh = SplatMesh(np.ones((vertices, 3)), empty.astype(int), np.ones((vertices, 4)))
+    save_mesh(mesh, tmp_path / f"m{suffix}")
+    assert_same(load_mesh(tmp_path / f"m{suffix}"), mesh)
+
+
+def test_gltf_cannot_hold_a_mesh_without_triangles(tmp_path):
+    mesh = SplatMesh(np.ones((2, 3)), np.empty((0, 3), int), np.ones((2, 4)))
+    with pytest.raises(ValueError, match=r"without triangles.*\.npz"):
+        save_mesh(mesh, tmp_path / "m.glb")
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("vertices", [0xFFFF, 0x10000])
+def test_glb_at_the_limit_of_16_bit_indices(tmp_path, vertices):
+    rng = np.random.default_rng(0)
+    mesh = random_mesh(rng, vertices, 10, extras=False)
+    mesh = replace(mesh, faces=np.array([[0, 1, vertices - 1], [vertices - 1, 0, vertices - 2]]))
+    save_mesh(mesh, tmp_path / "m.glb")
+    assert_same(load_mesh(tmp_path / "m.glb"), mesh, 1 / 10_000)
+
+
+def test_glb_with_float_colors_is_exact_to_rounding(tmp_path):
+    mesh = random_mesh(np.random.default_rng(1))
+    save_mesh(mesh, tmp_path / "m.glb", color_type="float32")
+    assert_same(load_mesh(tmp_path / "m.glb"), mesh, 1e-6)
+
+
+def test_normals_made_for_a_lit_glb_are_not_taken_for_the_meshs_own(tmp_path):
+    mesh = random_mesh(np.random.default_rng(2), extras=False)
+    save_mesh(mesh, tmp_path / "m.glb", lit=True)
+    assert load_mesh(tmp_path / "m.glb").normals is None
+
+
+def test_saving_twice_changes_nothing(tmp_path):
+    """What 16 bits have rounded once is not rounded again."""
+    mesh = random_mesh(np.random.default_rng(3), 2000, 3000)
+    for name in ("a", "b"):
+        save_mesh(mesh, tmp_path / f"{name}.glb")
+        mesh = load_mesh(tmp_path / f"{name}.glb")
+    one, two = ((tmp_path / f"{name}.glb").read_bytes() for name in "ab")
+    assert len(one) == len(two)
+    assert sum(a != b for a, b in zip(one, two, strict=True)) < 40  # the last digits of the up direction
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_writer_that_fails_leaves_the_old_file(tmp_path, monkeypatch, suffix):
+    def half(mesh, path, **options):
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    path = tmp_path / f"m{suffix}"
+    path.write_bytes(b"old")
+    monkeypatch.setitem(meshes._WRITERS, suffix, half)
+    with pytest.raises(KeyboardInterrupt):
+        save_mesh(random_mesh(np.random.default_rng(0)), path)
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == [path.name]
+
+
+def test_what_save_mesh_refuses(tmp_path):
+    mesh = random_mesh(np.random.default_rng(0))
+    with pytest.raises(ValueError, match=r"\.npz, \.ply, \.glb"):
+        save_mesh(mesh, tmp_path / "m.stl")
+    with pytest.raises(ValueError, match=r"color_type applies to \.glb only, not to \.ply"):
+        save_mesh(mesh, tmp_path / "m.ply", color_type="uint16")
+    with pytest.raises(ValueError, match=r"lit applies to \.glb, \.usdc, \.usda, \.usd only, not to \.ply"):
+        save_mesh(mesh, tmp_path / "m.ply", lit=True)
+    with pytest.raises(ValueError, match="color_type must be one of uint16, float32, got 'uint8'"):
+        save_mesh(mesh, tmp_path / "m.glb", color_type="uint8")
+    with pytest.raises(FileNotFoundError, match="create the folder"):
+        save_mesh(mesh, tmp_path / "missing" / "m.ply")
+    long = replace(mesh, normals=mesh.normals * 2)
+    with pytest.raises(ValueError, match="normals of unit length, that of vertex 0 has 2"):
+        save_mesh(long, tmp_path / "m.glb")
+    for name in ("a\0b", "x" * 201, "\ud800"):
+        odd = replace(mesh, attributes={name: np.zeros(9)})
+        for suffix in SUFFIXES:
+            with pytest.raises(ValueError, match="cannot be stored"):
+                save_mesh(odd, tmp_path / f"m{suffix}")
+    many = replace(mesh, attributes={"a": np.zeros((9, 5000))})
+    with pytest.raises(ValueError, match="5010 columns"):
+        save_mesh(many, tmp_path / "m.ply")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_glb_beyond_what_32_bits_can_say_is_refused_before_writing(tmp_path, monkeypatch):
+    assert glb._MAX_BYTES == 2**32 - 1
+    mesh = random_mesh(np.random.default_rng(0), 1000, 10)
+    monkeypatch.setattr(glb, "_MAX_BYTES", 40_000)
+    with pytest.raises(ValueError, match=r"would take \d+,\d+ bytes, a \.glb file can hold 40,000"):
+        save_mesh(mesh, tmp_path / "m.glb")
+    assert os.listdir(tmp_path) == []
+
+
+def test_files_are_recognised_by_content(tmp_path):
+    mesh = random_mesh(np.random.default_rng(4))
+    for suffix in SUFFIXES:
+        save_mesh(mesh, tmp_path / f"m{suffix}")
+        (tmp_path / f"m{suffix}").rename(tmp_path / "thing.dat")
+        assert_same(load_mesh(tmp_path / "thing.dat"), mesh, 1e-4)

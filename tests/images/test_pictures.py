@@ -1,0 +1,164 @@
+"""Picture files, read back by Pillow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFont
+
+from meshsplats.images.writing import (
+    CAPTION,
+    GAP,
+    amplified_error,
+    load_png,
+    save_animation,
+    save_array,
+    save_depth_png,
+    save_png,
+    straight_rgba,
+    strip,
+    to_bytes,
+)
+
+RNG = np.random.default_rng(0)
+
+
+def test_bytes_are_rounded():
+    values = np.array([-0.5, 0, 0.49 / 255, 0.51 / 255, 127.4 / 255, 127.6 / 255, 1, 7])
+    assert to_bytes(values).tolist() == [0, 0, 0, 1, 127, 128, 255, 255]
+    with pytest.raises(ValueError, match="not finite"):
+        to_bytes(np.array([np.nan]))
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_png_comes_back(tmp_path, channels):
+    stored = RNG.integers(0, 256, (5, 7, channels))
+    save_png(tmp_path / "a.png", stored / 255)
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.mode == ("RGB", "RGBA")[channels - 3]
+        np.testing.assert_array_equal(np.asarray(image), stored)
+    np.testing.assert_array_equal(load_png(tmp_path / "a.png"), stored)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_png_of_another_shape_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="shape"):
+        save_png(tmp_path / "a.png", np.zeros((5, 7)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_straight_alpha_composes_to_the_same_picture():
+    """Over any background: straight * alpha + background * (1 - alpha) is the picture drawn on it."""
+    alpha = RNG.uniform(0, 1, (6, 5)).astype(np.float32)
+    alpha[0] = 0
+    color = RNG.uniform(0, 1, (6, 5, 3)).astype(np.float32)
+    rgba = straight_rgba(color * alpha[..., None], alpha)
+    np.testing.assert_allclose(rgba[1:, :, :3], color[1:], atol=1e-5)
+    np.testing.assert_array_equal(rgba[0], 0)
+    np.testing.assert_array_equal(rgba[..., 3], alpha)
+
+
+def test_depth_png(tmp_path):
+    depth = np.array([[0, 1e-9, 2.5], [4.99, 5.0, 1e9]])
+    save_depth_png(tmp_path / "d.png", depth, 0.5)
+    with Image.open(tmp_path / "d.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), [[0, 1, 5], [10, 10, 65535]])
+    with pytest.raises(ValueError, match="unit"):
+        save_depth_png(tmp_path / "e.png", depth, 0)
+
+
+def test_array(tmp_path):
+    save_array(tmp_path / "d.npy", np.eye(2))
+    np.testing.assert_array_equal(np.load(tmp_path / "d.npy", allow_pickle=False), np.eye(2))
+
+
+def moving_square(count: int = 6, side: int = 24, channels: int = 3) -> list[np.ndarray]:
+    frames = []
+    for i in range(count):
+        frame = np.full((side, side, channels), 255, np.uint8)
+        frame[4:12, 2 * i : 2 * i + 8, :3] = (200, 40, 10)
+        frames.append(frame)
+    return frames
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif", ".png"])
+def test_animation(tmp_path, suffix):
+    path = tmp_path / f"turn{suffix}"
+    save_animation(path, iter(moving_square()), fps=20)
+    with Image.open(path) as image:
+        assert (image.n_frames, image.size, image.info["loop"]) == (6, (24, 24), 0)
+        image.seek(3)
+        frame = np.asarray(image.convert("RGB")).astype(int)
+        assert image.info["duration"] == 50
+    assert np.abs(frame[8, 10] - (200, 40, 10)).max() < 30
+    assert frame[8, 4].min() > 220
+    assert frame[20, 20].min() > 250
+
+
+def test_gif_keeps_the_background(tmp_path):
+    """256 colours for thousands: those of the picture may shift a little, the plain background must not."""
+    frame = np.full((64, 64, 3), (250, 253, 251), np.uint8)
+    frame[:16] -= RNG.integers(0, 6, (16, 64, 3), np.uint8)  # shades that are nearly the background's
+    frame[16:32] -= RNG.integers(0, 200, (16, 64, 3), np.uint8)
+    save_animation(tmp_path / "a.gif", [frame, frame[:, ::-1]])
+    with Image.open(tmp_path / "a.gif") as image:
+        for i in range(2):
+            image.seek(i)
+            shown = np.asarray(image.convert("RGB"))
+            np.testing.assert_array_equal(shown[32:], frame[32:])
+
+
+def test_animation_is_brought_to_size_and_keeps_alpha(tmp_path):
+    frames = moving_square(3, 100, 4)
+    frames[0][50:, :, 3] = 0
+    save_animation(tmp_path / "t.webp", frames, max_side=50)
+    with Image.open(tmp_path / "t.webp") as image:
+        assert image.size == (50, 50)
+        alpha = np.asarray(image.convert("RGBA"))[..., 3]
+    assert (alpha[30:].max(), alpha[:20].min()) == (0, 255)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "frames", "words"),
+    [
+        ("a.mp4", {}, moving_square(2), "written as"),
+        ("a.gif", {"fps": 0}, moving_square(2), "fps"),
+        ("a.gif", {}, [], "at least one"),
+        ("a.gif", {}, moving_square(2, 24, 4), "no translucency"),
+    ],
+)
+def test_animations_that_cannot_be(tmp_path, name, options, frames, words):
+    with pytest.raises(ValueError, match=words):
+        save_animation(tmp_path / name, frames, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_strip():
+    a, b = RNG.uniform(0, 1, (2, 4, 90, 3)).astype(np.float32)
+    plain = strip([a, b])
+    assert plain.shape == (4 + 2 * GAP, 2 * 90 + 3 * GAP, 3)
+    np.testing.assert_array_equal(plain[GAP:-GAP, GAP : GAP + 90], a)
+    np.testing.assert_array_equal(plain[GAP:-GAP, 2 * GAP + 90 : -GAP], b)
+    assert plain[:GAP].min() == plain[:, :GAP].min() == 1
+    titled = strip([a, b], ["one", "two"])
+    np.testing.assert_array_equal(titled[CAPTION:-GAP, GAP : GAP + 90], a)
+    assert titled[:CAPTION, :90].min() < 0.5  # there is text over each picture
+    assert titled[:CAPTION, 100:].min() < 0.5
+    with pytest.raises(ValueError, match="one shape"):
+        strip([a, b[:3]])
+
+
+@pytest.mark.parametrize("name", ["load_default", "load_default_imagefont"])
+def test_captions_in_any_script(name, monkeypatch):
+    """Pillow without FreeType, or before version 10.1, has a font of Latin letters only."""
+    if not hasattr(ImageFont, name):
+        pytest.skip(f"this Pillow has no {name}")
+    monkeypatch.setattr(ImageFont, "load_default", getattr(ImageFont, name))
+    titled = strip([np.ones((4, 90, 3))], ["méthode Ω"])
+    assert titled[:CAPTION].min() < 0.5
+
+
+def test_amplified_error():
+    a = np.array([[[0.5, 0.5, 0.5]]], np.float32)
+    b = np.array([[[0.6, 0.5, 0.1]]], np.float32)
+    np.testing.assert_allclose(amplified_error(a, b, 4), [[[0.4, 0, 1]]], atol=1e-6)
