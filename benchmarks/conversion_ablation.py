@@ -49,12 +49,12 @@ PRESETS: list[tuple[str, dict]] = [
 ]
 MODES: list[tuple[str, dict]] = [
     ("default, flat, 8 triangles", dict(mode="flat")),
-    ("default, flat, 4 triangles", dict(mode="flat", no_triag=4)),
+    ("default, flat, 4 triangles", dict(mode="flat", sides=4)),
     ("default, flat, 24 triangles in 2 rings", dict(mode="flat", rings=2)),
-    ("default, crossed, 2 x 6 triangles", dict(no_triag=6)),
-    ("default, crossed, 2 x 18 triangles in 2 rings", dict(no_triag=6, rings=2)),
+    ("default, crossed, 2 x 6 triangles", dict(sides=6)),
+    ("default, crossed, 2 x 18 triangles in 2 rings", dict(sides=6, rings=2)),
     ("default, 3d, 3 x 4 triangles", dict(mode="3d")),
-    ("default, 3d, 3 x 8 triangles", dict(mode="3d", no_triag=8)),
+    ("default, 3d, 3 x 8 triangles", dict(mode="3d", sides=8)),
 ]
 VARIATIONS: list[tuple[str, dict]] = [
     ("no footprint", dict(footprint="none")),
@@ -68,13 +68,13 @@ VARIATIONS: list[tuple[str, dict]] = [
     ("always two ellipses (flat_below 0)", dict(flat_below=0.0)),
     ("flat_below 0.3", dict(flat_below=0.3)),
     ("faint splats as large as others", dict(shrink_faint=False)),
-    ("centre not above the splat's opacity (center_mul 1)", dict(center_mul=1.0)),
-    ("scale_mul 2.8", dict(scale_mul=2.8)),
-    ("scale_mul 3.2", dict(scale_mul=3.2)),
-    ("opac_mul 0.05", dict(opac_mul=0.05)),
+    ("centre not above the splat's opacity (center_opacity 1)", dict(center_opacity=1.0)),
+    ("rim_radius 2.8", dict(rim_radius=2.8)),
+    ("rim_radius 3.2", dict(rim_radius=3.2)),
+    ("rim_opacity 0.05", dict(rim_opacity=0.05)),
     ("half the triangles, by importance", dict(max_triangles="half", budget="drop")),
 ]
-GRID = dict(scale_mul=(2.0, 2.7, 3.3), no_triag=(4, 8), opac_mul=(0.0, 0.2), footprint=("none", "cameras"))
+GRID = dict(rim_radius=(2.0, 2.7, 3.3), sides=(4, 8), rim_opacity=(0.0, 0.2), footprint=("none", "cameras"))
 
 
 @dataclass
@@ -197,9 +197,9 @@ def main() -> None:
     print_table("The default with one thing changed", scenes, VARIATIONS)
     grid = []
     for radius, sides, rim, footprint in product(*GRID.values()):
-        options = dict(preset="paper", scale_mul=radius, no_triag=sides, opac_mul=rim, footprint=footprint)
+        options = dict(preset="paper", rim_radius=radius, sides=sides, rim_opacity=rim, footprint=footprint)
         grid.append((f"{radius} / {sides} / {rim} / {footprint}", options))
-    print_table("Flat fans of the paper: scale_mul / no_triag / opac_mul / footprint", scenes, grid)
+    print_table("Flat fans of the paper: rim_radius / sides / rim_opacity / footprint", scenes, grid)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ from meshsplats import (
     render,
     render_splats,
 )
-from meshsplats.rendering.recorded import RecordedPicture
+from meshsplats.rendering.backward import TapedRendering
 
 SIZES = (200, 400, 800, 1600)
 TINY = 1e-9
@@ -65,7 +65,7 @@ def cost(work: Callable[[], object], repeat: int) -> float:
 
 
 def back_and_forth(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
-    picture = RecordedPicture(
+    picture = TapedRendering(
         mesh.vertices,
         mesh.faces,
         mesh.colors,

@@ -28,7 +28,7 @@ from meshsplats._core.library import available_variants
 from meshsplats.camera import Camera
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
-from meshsplats.rendering.recorded import RecordedPicture
+from meshsplats.rendering.backward import TapedRendering
 
 SCENES = {
     "160k": (20_000, 0.03, 0.04, 400),
@@ -94,8 +94,8 @@ def run(name: str, threads: int, repeat: int) -> None:
     towards = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
 
-    def recorded() -> RecordedPicture:
-        return RecordedPicture(
+    def recorded() -> TapedRendering:
+        return TapedRendering(
             mesh.vertices, mesh.faces, mesh.colors, None, camera, face_splat=mesh.face_splat, threads=threads
         )
 

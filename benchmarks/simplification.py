@@ -109,11 +109,11 @@ def meshes(arguments):
 
 
 WAYS = {
-    "crossed, 8": {"mode": "crossed", "no_triag": 4},
-    "flat, 8": {"mode": "flat", "no_triag": 8},
-    "flat, 6": {"mode": "flat", "no_triag": 6},
-    "flat, 4": {"mode": "flat", "no_triag": 4},
-    "flat, 3": {"mode": "flat", "no_triag": 3},
+    "crossed, 8": {"mode": "crossed", "sides": 4},
+    "flat, 8": {"mode": "flat", "sides": 8},
+    "flat, 6": {"mode": "flat", "sides": 6},
+    "flat, 4": {"mode": "flat", "sides": 4},
+    "flat, 3": {"mode": "flat", "sides": 3},
     "chosen": {},
 }
 

@@ -22,13 +22,13 @@ from collections.abc import Callable
 import numpy as np
 from rendering import SCENES, clocked, random_fans
 
-from meshsplats._core.kernels import compare_pictures
+from meshsplats._core.kernels import compare_images
 from meshsplats._core.library import available_variants
 from meshsplats.camera import Camera
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
-from meshsplats.rendering.recorded import RecordedPicture
+from meshsplats.rendering.backward import TapedRendering
 
 
 def table(heads: list[str]) -> None:
@@ -52,8 +52,8 @@ class Step:
         # Rates so small that every step draws the same scene.
         self.optimizers = [RowAdam(self.vertices, lr=1e-9), RowAdam(self.colors, lr=1e-9, bounds=(0, 1))]
 
-    def draw(self) -> RecordedPicture:
-        return RecordedPicture(
+    def draw(self) -> TapedRendering:
+        return TapedRendering(
             self.vertices,
             self.mesh.faces,
             self.colors,
@@ -68,7 +68,7 @@ class Step:
         picture = self.draw()
         times.append(time.perf_counter())
         rates = dict(l1_rate=0.6 / self.truth.size, ssim_rate=-0.4 / self.truth.size)
-        compared = compare_pictures(
+        compared = compare_images(
             picture.color[None], self.truth, gradient=True, threads=self.threads, **rates
         )
         assert compared.gradient is not None

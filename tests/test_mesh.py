@@ -21,7 +21,7 @@ def test_everything_is_named_in_a_line():
     from meshsplats.base_mesh import BaseMesh
     from meshsplats.cameras.trajectories import orbit
     from meshsplats.datasets.splat_targets import splat_views
-    from meshsplats.datasets.views import Dataset, Picture
+    from meshsplats.datasets.views import Dataset, ViewImage
     from meshsplats.demo_scene import make_scene
 
     cloud = make_scene(1234)
@@ -36,8 +36,8 @@ def test_everything_is_named_in_a_line():
     data = Dataset(views[:2], views[2:], "still life")
     assert repr(data) == "Dataset('still life', 2 views to train with, 1 held out, 64 x 48)"
     assert repr(Dataset(())) == "Dataset(0 views to train with, 0 held out)"
-    assert repr(Picture(np.zeros((4, 6, 3), np.uint8), None, np.ones((4, 6), bool))) == (
-        "Picture(6 x 4 uint8, mask)"
+    assert repr(ViewImage(np.zeros((4, 6, 3), np.uint8), None, np.ones((4, 6), bool))) == (
+        "ViewImage(6 x 4 uint8, mask)"
     )
     assert repr(BaseMesh(CORNERS, FACES, COLORS)) == "BaseMesh(3 vertices, 1 faces, colours)"
 

@@ -58,7 +58,7 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
 
 
 def test_options_reach_the_conversion(splats, tmp_path):
-    options = {"mode": "flat", "no_triag": 6, "rings": 2, "max_splats": 20, "crop": (-1.0, -1, -1, 1, 1, 1)}
+    options = {"mode": "flat", "sides": 6, "rings": 2, "max_splats": 20, "crop": (-1.0, -1, -1, 1, 1, 1)}
     flags = [f"--{name.replace('_', '-')}" for name in options]
     given = []
     for flag, value in zip(flags, options.values(), strict=True):
@@ -69,7 +69,7 @@ def test_options_reach_the_conversion(splats, tmp_path):
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
     np.testing.assert_array_equal(mesh.colors, expected.colors)
     stored = json.loads((tmp_path / "mesh.config.json").read_text())["options"]
-    assert (stored["no_triag"], stored["scale_mul"], stored["crop"]) == (6, None, [-1, -1, -1, 1, 1, 1])
+    assert (stored["sides"], stored["rim_radius"], stored["crop"]) == (6, None, [-1, -1, -1, 1, 1, 1])
 
 
 def test_cameras_of_a_model_folder_are_used(splats, tmp_path):
@@ -194,7 +194,7 @@ def test_a_part_is_shown_not_compared_with_the_whole(splats, tmp_path, capsys):
         (["-o", "mesh.npz", "--preset", "best"], 2, "--preset"),
         ([], 2, "output"),
         (["-o", "mesh.npz", "--up", "w"], 1, "--up"),
-        (["-o", "mesh.npz", "--no-triag", "2"], 1, "no_triag"),
+        (["-o", "mesh.npz", "--sides", "2"], 1, "sides"),
         (["-o", "mesh.npz", "--footprint", "cameras"], 1, "cameras"),
         (["-o", "mesh.npz", "--cameras", "none.json"], 1, "none.json: No such file"),
         (["-o", "no/such/mesh.npz"], 1, "no/such"),

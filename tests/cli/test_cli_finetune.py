@@ -242,13 +242,13 @@ def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):
     cameras = orbit(cloud, 9, width=32, height=32)
     data = write_photographs(tmp_path / "photos", cameras, [render_splats(cloud, c).color for c in cameras])
     out = tmp_path / "tuned.ply"
-    options = ("--preset", "paper", "--epochs", "2", "--exposure", "True", "--seed", "3", "--no-triag", "4")
+    options = ("--preset", "paper", "--epochs", "2", "--exposure", "True", "--seed", "3", "--sides", "4")
     assert run(splats, "-o", out, "--data", data, *options) == 0
     assert "7 training views, 2 held out" in capsys.readouterr().err
     config = json.loads((tmp_path / "tuned.config.json").read_text())["tuning"]
     assert config == make_config("paper", epochs=2, exposure=True, seed=3).to_dict()
     mesh = load_mesh(out)
-    assert len(mesh.faces) == 300 * 4  # --no-triag went to the conversion
+    assert len(mesh.faces) == 300 * 4  # --sides went to the conversion
     again = tmp_path / "again.npz"
     assert run(out, "-o", again, "--data", data, "--steps", "2") == 0  # a mesh is tuned further
     assert len(load_mesh(again).faces) == len(mesh.faces)

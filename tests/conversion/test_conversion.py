@@ -68,7 +68,7 @@ class TestPaper:
         np.testing.assert_array_equal(mesh.up, [0, -1, 0])
 
     def test_three_ellipses_by_hand(self):
-        mesh = convert(one_splat(), preset="paper", mode="3d", no_triag=4)
+        mesh = convert(one_splat(), preset="paper", mode="3d", sides=4)
         # Four rim points an ellipse: the six points on the axes and the centre, nothing else.
         expected = [
             (1, 2, 3),
@@ -97,7 +97,7 @@ class TestPaper:
 
     def test_the_splat_is_turned(self):
         # A quarter turn about z: the splat's x axis points along the world's y.
-        mesh = convert(one_splat(quaternion=(HALF, 0, 0, HALF)), preset="paper", no_triag=4)
+        mesh = convert(one_splat(quaternion=(HALF, 0, 0, HALF)), preset="paper", sides=4)
         np.testing.assert_allclose(
             mesh.vertices - [1, 2, 3],
             [(0, 0, 0), (0, -0.27, 0), (0.54, 0, 0), (0, 0.27, 0), (-0.54, 0, 0)],
@@ -123,12 +123,12 @@ class TestPaper:
 
     @pytest.mark.parametrize("sides", [3, 5, 8, 13])
     def test_counts_flat(self, sides):
-        mesh = convert(many(7), preset="paper", no_triag=sides)
+        mesh = convert(many(7), preset="paper", sides=sides)
         assert (len(mesh.vertices), len(mesh.faces)) == (7 * (sides + 1), 7 * sides)
 
     @pytest.mark.parametrize("sides", [4, 8, 12, 20])
     def test_counts_3d(self, sides):
-        mesh = convert(many(7), preset="paper", mode="3d", no_triag=sides)
+        mesh = convert(many(7), preset="paper", mode="3d", sides=sides)
         assert (len(mesh.vertices), len(mesh.faces)) == (7 * (3 * sides - 5), 7 * 3 * sides)
         for splat in range(7):
             assert len(np.unique(mesh.vertices[corners_of(mesh, splat)], axis=0)) == 3 * sides - 5
@@ -176,8 +176,8 @@ class TestEllipses:
         mesh = convert(
             cloud,
             mode=mode,
-            no_triag=sides,
-            scale_mul=radius,
+            sides=sides,
+            rim_radius=radius,
             rings=rings,
             footprint="none",
             shrink_faint=False,
@@ -196,7 +196,7 @@ class TestEllipses:
     def test_winding_and_order(self):
         cloud = many(30, 3)
         for mode, per_ellipse in [("flat", 8), ("3d", 8), ("crossed", 4)]:
-            mesh = convert(cloud, mode=mode, no_triag=per_ellipse, footprint="none")
+            mesh = convert(cloud, mode=mode, sides=per_ellipse, footprint="none")
             assert (np.diff(mesh.face_splat) >= 0).all()
             first = np.array([corners_of(mesh, splat)[0] for splat in np.unique(mesh.face_splat)])
             np.testing.assert_array_equal(np.unique(mesh.faces[:, 0]), first)  # one centre, listed first
@@ -219,7 +219,7 @@ class TestEllipses:
 
     def test_crossed_by_hand(self):
         mesh = convert(
-            one_splat(), scale_mul=2, center_mul=1, footprint="none", compensation=0, shrink_faint=False
+            one_splat(), rim_radius=2, center_opacity=1, footprint="none", compensation=0, shrink_faint=False
         )
         # The longest axis is y, the next x: one ellipse in y-x, one in y-z; they meet in the points along y.
         expected = [
@@ -245,7 +245,7 @@ class TestEllipses:
         np.testing.assert_allclose(flat.vertices[:, 2], 3)
 
     def test_rings_by_hand(self):
-        mesh = convert(one_splat(), mode="flat", no_triag=3, rings=2, footprint="none")
+        mesh = convert(one_splat(), mode="flat", sides=3, rings=2, footprint="none")
         assert (len(mesh.vertices), len(mesh.faces)) == (7, 9)
         assert mesh.faces.tolist() == [
             [0, 1, 2],
@@ -266,7 +266,7 @@ class TestEllipses:
         assert (mesh.colors[4:, 3] == 0).all()
 
     def test_opacity_is_clamped(self):
-        mesh = convert(one_splat(opacity=1), footprint="none", center_mul=1.5, compensation=0)
+        mesh = convert(one_splat(opacity=1), footprint="none", center_opacity=1.5, compensation=0)
         assert mesh.colors[:, 3].max() == 1
 
 

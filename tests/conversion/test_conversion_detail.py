@@ -150,8 +150,8 @@ def test_what_is_hidden_gets_no_triangles():
 @pytest.mark.parametrize("mean", [3, 8, 20])
 def test_as_many_triangles_in_all(mean):
     cloud, views = scene(2), cameras()
-    mesh = convert(cloud, cameras=views, detail="cameras", no_triag=mean)
-    even = convert(cloud, cameras=views, mode="flat", no_triag=mean)
+    mesh = convert(cloud, cameras=views, detail="cameras", sides=mean)
+    even = convert(cloud, cameras=views, mode="flat", sides=mean)
     assert len(mesh.faces) <= len(even.faces)
     assert len(mesh.faces) > 0.9 * len(even.faces)
     counts = np.bincount(mesh.face_splat, minlength=len(cloud))
@@ -170,7 +170,7 @@ def test_a_splat_has_the_fan_of_its_level():
     counts = np.bincount(mesh.face_splat, minlength=len(cloud))
     assert len(set(counts)) >= 4
     for (sides, rings), triangles in zip(LEVELS, TRIANGLES, strict=True):
-        even = convert(cloud, cameras=views, mode="flat", no_triag=sides, rings=rings)
+        even = convert(cloud, cameras=views, mode="flat", sides=sides, rings=rings)
         for splat in np.flatnonzero(counts == triangles):
             a, b = (m.keep_faces(m.face_splat == splat) for m in (mesh, even))
             assert (a.faces == b.faces).all()
@@ -182,7 +182,7 @@ def test_a_splat_has_the_fan_of_its_level():
 def test_max_triangles_is_kept():
     cloud, views = scene(4), cameras()
     options = dict(cameras=views, detail="cameras", max_triangles=200)
-    mesh = convert(cloud, **options, no_triag=8)
+    mesh = convert(cloud, **options, sides=8)
     assert 150 < len(mesh.faces) <= 200
     assert mesh.splat_count == 25
     finer = convert(cloud, **options)

@@ -47,7 +47,7 @@ def reaches(mesh: SplatMesh, cloud: GaussianCloud) -> np.ndarray:
     return np.linalg.norm(mesh.vertices.reshape(-1, 9, 3)[:, 1:] - cloud.means[:, None], axis=2)
 
 
-FLAT = dict(mode="flat", scale_mul=1.0, center_mul=1.0, compensation=0.0, shrink_faint=False)
+FLAT = dict(mode="flat", rim_radius=1.0, center_opacity=1.0, compensation=0.0, shrink_faint=False)
 
 
 class TestPixelSize:
@@ -264,7 +264,7 @@ class TestCompensation:
     )
     def test_factors(self, mode, scales, factor):
         cloud = cloud_at([[0, 0, 0]], opacity=0.2, scales=scales)
-        options = dict(mode=mode, footprint="none", center_mul=1, scale_mul=2, no_triag=8)
+        options = dict(mode=mode, footprint="none", center_opacity=1, rim_radius=2, sides=8)
         mesh = convert(cloud, **options)
         assert mesh.colors[0, 3] == pytest.approx(0.2 * factor, rel=0.015)
         half = convert(cloud, **options, compensation=0.5)

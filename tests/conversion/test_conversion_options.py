@@ -90,7 +90,7 @@ class TestSelection:
 
     def test_max_triangles(self):
         cloud = row_of([0.2, 0.8, 0.6, 0.4])
-        options = dict(budget="drop", no_triag=4)
+        options = dict(budget="drop", sides=4)
         assert kept(convert(cloud, max_triangles=31, **options)) == [1, 2, 3]
         assert kept(convert(cloud, max_triangles=32, **options)) == [0, 1, 2, 3]
         assert len(convert(cloud, max_triangles=16, **options).faces) == 16
@@ -120,19 +120,19 @@ REFUSED = [
     (dict(mode="2d"), "mode must be one of"),
     (dict(footprint="camera"), "footprint must be one of"),
     (dict(colors="rgb"), "colors must be one of"),
-    (dict(no_triag=2), "no_triag must be a whole number from 3 to 64, got 2"),
-    (dict(no_triag=65), "no_triag"),
-    (dict(no_triag=4.5), "no_triag"),
-    (dict(no_triag=True), "no_triag"),
-    (dict(no_triag="8"), "no_triag"),
-    (dict(mode="3d", no_triag=6), "multiple of 4"),
-    (dict(no_triag=5), "even"),
-    (dict(scale_mul=0), "scale_mul"),
-    (dict(scale_mul=11), "scale_mul"),
-    (dict(scale_mul=float("nan")), "scale_mul"),
-    (dict(opac_mul=-0.1), "opac_mul"),
-    (dict(opac_mul=1.1), "opac_mul must be a number from 0 to 1, got 1.1"),
-    (dict(center_mul=0), "center_mul"),
+    (dict(sides=2), "sides must be a whole number from 3 to 64, got 2"),
+    (dict(sides=65), "sides"),
+    (dict(sides=4.5), "sides"),
+    (dict(sides=True), "sides"),
+    (dict(sides="8"), "sides"),
+    (dict(mode="3d", sides=6), "multiple of 4"),
+    (dict(sides=5), "even"),
+    (dict(rim_radius=0), "rim_radius"),
+    (dict(rim_radius=11), "rim_radius"),
+    (dict(rim_radius=float("nan")), "rim_radius"),
+    (dict(rim_opacity=-0.1), "rim_opacity"),
+    (dict(rim_opacity=1.1), "rim_opacity must be a number from 0 to 1, got 1.1"),
+    (dict(center_opacity=0), "center_opacity"),
     (dict(rings=0), "rings"),
     (dict(rings=5), "rings"),
     (dict(compensation=1.5), "compensation"),
@@ -172,9 +172,9 @@ def test_refused(options, message):
 
 
 def test_misspelt_option():
-    with pytest.raises(TypeError, match="no option 'scalemul'; did you mean 'scale_mul'"):
+    with pytest.raises(TypeError, match="no option 'scalemul'; did you mean 'rim_radius'"):
         convert(row_of([0.5]), scalemul=2)
-    with pytest.raises(TypeError, match="options: mode, scale_mul, no_triag"):
+    with pytest.raises(TypeError, match="options: mode, rim_radius, sides"):
         convert(row_of([0.5]), zzz=2)
 
 
@@ -190,10 +190,10 @@ def test_every_option_does_something():
     )
     other = dict(
         mode="3d",
-        scale_mul=2.0,
-        no_triag=6,
-        opac_mul=0.3,
-        center_mul=0.7,
+        rim_radius=2.0,
+        sides=6,
+        rim_opacity=0.3,
+        center_opacity=0.7,
         rings=2,
         detail="cameras",
         flat_below=0.6,

@@ -89,7 +89,7 @@ def test_profile_of_a_point():
 def test_fans_integrate_as_their_profile_says(sides, rings):
     """Opacity integrated triangle by triangle over the mesh: area times the mean of its corners."""
     splat = GaussianCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[0.3, 0.2, 0.0]], [0.5], np.zeros((1, 1, 3)))
-    mesh = convert(splat, mode="flat", no_triag=sides, rings=rings, footprint="none", compensation=0)
+    mesh = convert(splat, mode="flat", sides=sides, rings=rings, footprint="none", compensation=0)
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     integral = (area * mesh.colors[mesh.faces, 3].mean(axis=1)).sum()

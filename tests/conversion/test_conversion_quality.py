@@ -62,7 +62,7 @@ def test_each_look_is_what_its_conversion_is_best_at(scene):
 def test_each_ingredient_helps(scene):
     cloud, close, _ = scene
     full = likeness(convert(cloud, cameras=close), cloud, close)
-    for options in (dict(mode="flat"), dict(opac_mul=0.2), dict(scale_mul=2.0)):
+    for options in (dict(mode="flat"), dict(rim_opacity=0.2), dict(rim_radius=2.0)):
         assert likeness(convert(cloud, cameras=close, **options), cloud, close) < full - 0.3, options
     wide = likeness(convert(cloud, cameras=close, look="splats"), cloud, close, "splats")
     assert likeness(convert(cloud, footprint="none"), cloud, close, "splats") < wide - 0.3
@@ -82,7 +82,7 @@ def test_without_cameras(count):
 def test_more_triangles_help(scene):
     cloud, close, _ = scene
     eight = likeness(convert(cloud, cameras=close), cloud, close)
-    rings = likeness(convert(cloud, cameras=close, no_triag=6, rings=2), cloud, close)
+    rings = likeness(convert(cloud, cameras=close, sides=6, rings=2), cloud, close)
     assert rings > eight + 0.3
 
 

@@ -429,11 +429,11 @@ class TestLimits:
             assert mesh_likeness(merged, self) > mesh_likeness(dropped, self) + 2
 
     def test_what_was_asked_for_stays(self):
-        mesh = convert(self.cloud, max_triangles=700, mode="crossed", no_triag=6)
+        mesh = convert(self.cloud, max_triangles=700, mode="crossed", sides=6)
         assert len(mesh.faces) == 700 // 12 * 12
         assert len(convert(self.cloud, max_triangles=700, preset="paper").faces) == 700 // 8 * 8
         with pytest.raises(ValueError, match="max_triangles must be at least 12, one splat's, got 11"):
-            convert(self.cloud, max_triangles=11, no_triag=6, mode="crossed")
+            convert(self.cloud, max_triangles=11, sides=6, mode="crossed")
 
     @pytest.mark.parametrize(
         ("most", "each", "count"),
@@ -442,7 +442,7 @@ class TestLimits:
     def test_triangles_of_a_flat_splat(self, most, each, count):
         given = ConversionOptions(mode="flat", max_triangles=most)
         chosen, found = within_limits(given, given.resolved("default", has_cameras=False), 1000)
-        assert (chosen.no_triag, found) == (each, count)
+        assert (chosen.sides, found) == (each, count)
 
     @pytest.mark.parametrize("kernel", ["3dgs", "antialiased", "2dgs"])
     def test_kernels(self, kernel):

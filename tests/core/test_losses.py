@@ -13,7 +13,7 @@ from meshsplats.evaluation import metrics
 
 torch = pytest.importorskip("torch", reason="the losses need torch: pip install 'meshsplats[torch]'")
 
-from meshsplats._core.kernels import compare_pictures  # noqa: E402
+from meshsplats._core.kernels import compare_images  # noqa: E402
 from meshsplats.finetuning import losses  # noqa: E402
 from meshsplats.finetuning.losses import l1, photometric_loss, ssim  # noqa: E402
 
@@ -282,9 +282,9 @@ def test_gradients_are_made_only_where_they_are_wanted(monkeypatch):
 
     def spy(*arrays, gradient, **options):
         made.append(gradient)
-        return compare_pictures(*arrays, gradient=gradient, **options)
+        return compare_images(*arrays, gradient=gradient, **options)
 
-    monkeypatch.setattr(losses, "compare_pictures", spy)
+    monkeypatch.setattr(losses, "compare_images", spy)
     picture, truth = pair(9, 20, 20, 3)
     x = picture.clone().requires_grad_()
     with torch.no_grad():

@@ -26,7 +26,7 @@ from meshsplats.datasets.splat_targets import (
     splat_dataset,
     splat_views,
 )
-from meshsplats.datasets.views import Picture, View
+from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud
@@ -46,9 +46,9 @@ def test_bytes_and_floats_over_a_background():
     red = np.zeros((2, 3, 3), np.uint8)
     red[..., 0] = 51
     half = np.full((2, 3), 51, np.uint8)
-    np.testing.assert_allclose(Picture(red, half).over((0, 0, 1))[1, 2], (0.2, 0, 0.8), atol=1e-6)
-    np.testing.assert_allclose(Picture(red).over((0, 0, 1))[1, 2], (0.2, 0, 0), atol=1e-6)
-    floats = Picture(np.full((2, 3, 3), 0.25, np.float16), np.full((2, 3), 0.5, np.float16))
+    np.testing.assert_allclose(ViewImage(red, half).over((0, 0, 1))[1, 2], (0.2, 0, 0.8), atol=1e-6)
+    np.testing.assert_allclose(ViewImage(red).over((0, 0, 1))[1, 2], (0.2, 0, 0), atol=1e-6)
+    floats = ViewImage(np.full((2, 3, 3), 0.25, np.float16), np.full((2, 3), 0.5, np.float16))
     assert floats.over((1, 0, 0)).dtype == np.float32
     np.testing.assert_array_equal(floats.over((1, 0, 0))[0, 0], (0.75, 0.25, 0.25))
 
@@ -65,15 +65,15 @@ def test_bytes_and_floats_over_a_background():
 )
 def test_pictures_check_themselves(arrays, message):
     with pytest.raises(ValueError, match=message):
-        Picture(*arrays)
+        ViewImage(*arrays)
 
 
 def test_a_view_checks_that_its_picture_has_the_cameras_size():
     camera = look_at((0, 0, -1), (0, 0, 0), width=3, height=2, name="a")
-    view = View(camera, Picture(np.zeros((2, 3, 3), np.uint8)))
+    view = View(camera, ViewImage(np.zeros((2, 3, 3), np.uint8)))
     assert (view.name, view.image.shape, view.alpha, view.mask) == ("a", (2, 3, 3), None, None)
     with pytest.raises(ValueError, match="view 'a': its picture has shape"):
-        _ = View(camera, Picture(np.zeros((3, 2, 3), np.uint8))).image
+        _ = View(camera, ViewImage(np.zeros((3, 2, 3), np.uint8))).image
 
 
 # ---- Memory
@@ -83,8 +83,8 @@ def test_pictures_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, mo
     from meshsplats.datasets import image_files as photographs
 
     reads = []
-    original = photographs.load_picture
-    monkeypatch.setattr(photographs, "load_picture", lambda path: reads.append(path.name) or original(path))
+    original = photographs.load_image
+    monkeypatch.setattr(photographs, "load_image", lambda path: reads.append(path.name) or original(path))
     folder = simple_colmap(tmp_path, 4)
     dataset = load_dataset(folder, test_every=0, cache_bytes=3 * 12 * 8 * 3)  # three of the four
     assert reads == []
@@ -93,7 +93,7 @@ def test_pictures_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, mo
         for i, view in enumerate(dataset.train):
             assert view.image[0, 0, 0] == np.float32(10 * i / 255)
     assert sorted(reads) == ["p00.png", "p01.png", "p02.png", *["p03.png"] * 3]
-    assert all(view.picture.color.dtype == np.uint8 for view in dataset.train)
+    assert all(view.load().color.dtype == np.uint8 for view in dataset.train)
 
 
 def test_memory_is_known_before_and_right(tmp_path):
@@ -104,7 +104,7 @@ def test_memory_is_known_before_and_right(tmp_path):
         dataset = load_dataset(folder)
     assert [view.source.nbytes for view in sorted(dataset.views, key=lambda v: v.name)] == [288, 768, 384]
     for view in dataset.views:
-        assert view.picture.nbytes == view.source.nbytes
+        assert view.load().nbytes == view.source.nbytes
 
 
 # ---- Options
@@ -136,7 +136,7 @@ def test_the_background_can_be_changed(tmp_path):
     assert (dataset.train[0].image == 1).all()
 
 
-# ---- Picture files
+# ---- ViewImage files
 
 
 def test_grey_palette_and_sixteen_bits(tmp_path):
@@ -227,13 +227,13 @@ def test_splat_views_are_the_images_of_their_look(cloud, look):
         np.testing.assert_allclose(view.image, want.color, atol=1e-3)
         np.testing.assert_allclose(view.alpha, want.alpha, atol=1e-3)
         want = draw_splats(cloud, camera, look, sh_degree=1, background=(1, 0, 0))
-        np.testing.assert_allclose(view.picture.over((1, 0, 0)), want.color, atol=1e-3)
-        assert view.picture is view.picture  # drawn once
-        assert view.picture.nbytes == 8 * 40 * 30
+        np.testing.assert_allclose(view.load().over((1, 0, 0)), want.color, atol=1e-3)
+        assert view.load() is view.load()  # drawn once
+        assert view.load().nbytes == 8 * 40 * 30
         points = view.source.points()
         want = draw_splats(cloud, camera, look, sh_degree=1, background=(1, 0, 0), samples=1)
         np.testing.assert_allclose(points.over((1, 0, 0)), want.color, atol=1e-3)
-        assert view.source.nbytes == {"area": 2, "splats": 1}[look] * view.picture.nbytes
+        assert view.source.nbytes == {"area": 2, "splats": 1}[look] * view.load().nbytes
 
 
 def test_means_over_areas_come_from_points(cloud):

@@ -79,12 +79,12 @@ def test_alpha_goes_over_any_background(tmp_path):
     alpha = 51 * 2 / 255
     np.testing.assert_allclose(views[2].alpha, np.full((8, 12), alpha, np.float32), atol=3e-4)
     straight = np.array([200, 100, 0]) / 255
-    for got, background in [(views[2].image, (0, 1, 0.5)), (views[2].picture.over((1, 1, 1)), (1, 1, 1))]:
+    for got, background in [(views[2].image, (0, 1, 0.5)), (views[2].load().over((1, 1, 1)), (1, 1, 1))]:
         want = alpha * straight + (1 - alpha) * np.array(background)
         np.testing.assert_allclose(got, np.broadcast_to(want, (8, 12, 3)), atol=5e-4)
     pattern = np.random.default_rng(0).uniform(size=(8, 12, 3))
-    np.testing.assert_allclose(views[0].picture.over(pattern), pattern, atol=1e-6)  # wholly clear
-    np.testing.assert_allclose(views[5].picture.over(pattern)[0, 0], straight, atol=5e-4)  # wholly opaque
+    np.testing.assert_allclose(views[0].load().over(pattern), pattern, atol=1e-6)  # wholly clear
+    np.testing.assert_allclose(views[5].load().over(pattern)[0, 0], straight, atol=5e-4)  # wholly opaque
     assert views[0].mask is None
 
 
@@ -97,7 +97,7 @@ def test_smaller_pictures_mix_colours_by_their_opacity(tmp_path):
     view = load_dataset(tmp_path, downscale=2).train[0]
     assert (view.camera.width, view.camera.height) == (6, 4)
     np.testing.assert_allclose(view.alpha, 0.5, atol=1e-3)
-    np.testing.assert_allclose(view.picture.over((0, 0, 0))[0, 0], (100 / 255, 0, 0), atol=1e-3)
+    np.testing.assert_allclose(view.load().over((0, 0, 0))[0, 0], (100 / 255, 0, 0), atol=1e-3)
 
 
 def test_validation_views_stand_in_for_missing_test_views(tmp_path):

@@ -14,7 +14,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
-from meshsplats.datasets.views import Dataset, Picture, View
+from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import find_background, model_background, warn_of_other_worlds
@@ -40,7 +40,7 @@ def photographs(scene, color, count=3) -> Dataset:
             picture = image_of(scene, camera, color)[0]
         else:
             picture = render_splats(scene, camera, background=color).color
-        views.append(View(camera, Picture(np.clip(picture, 0, 1).astype(np.float32))))
+        views.append(View(camera, ViewImage(np.clip(picture, 0, 1).astype(np.float32))))
     return Dataset(tuple(views))
 
 
@@ -99,7 +99,7 @@ def test_alpha_goes_over_white_unless_something_else_is_said(cloud):
     assert find_background(data, {}).name == "white"
     # Alpha that is 1 everywhere leaves nothing open: a photograph after all.
     solid = [
-        View(v.camera, Picture(np.float32(v.picture.over((0, 0, 0))), np.ones((32, 32), np.float32)))
+        View(v.camera, ViewImage(np.float32(v.load().over((0, 0, 0))), np.ones((32, 32), np.float32)))
         for v in data.train
     ]
     assert find_background(Dataset(tuple(solid)), {"splats": cloud}).name == "black"
@@ -108,7 +108,7 @@ def test_alpha_goes_over_white_unless_something_else_is_said(cloud):
 def test_masked_views_do_not_count(cloud):
     data = photographs(cloud, COLORS["black"])
     white = photographs(cloud, COLORS["white"]).train[0]
-    hidden = View(white.camera, Picture(white.image, None, np.zeros((32, 32), bool)))
+    hidden = View(white.camera, ViewImage(white.image, None, np.zeros((32, 32), bool)))
     assert find_background(Dataset((hidden, *data.train)), {"splats": cloud}).psnr["splats"]["black"] > 100
 
 
@@ -118,7 +118,7 @@ def test_pictures_of_something_else_are_told(cloud):
         warnings.simplefilter("error")
         warn_of_other_worlds(find_background(data, {"splats": cloud}))
     noise = np.random.default_rng(0)
-    other = [View(v.camera, Picture(noise.random((32, 32, 3), np.float32))) for v in data.train]
+    other = [View(v.camera, ViewImage(noise.random((32, 32, 3), np.float32))) for v in data.train]
     found = find_background(Dataset(tuple(other)), {"splats": cloud})
     with pytest.warns(DataWarning, match=r"splats shows next to nothing of the photographs \(\d+\.\d dB\)"):
         warn_of_other_worlds(found)

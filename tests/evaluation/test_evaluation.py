@@ -13,7 +13,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
-from meshsplats.datasets.views import Dataset, Picture, View
+from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.benchmarks import PROTOCOLS, find_input
 from meshsplats.evaluation.metrics import psnr, ssim
@@ -27,7 +27,7 @@ from meshsplats.evaluation.report import (
     image_of,
     masked_ssim,
 )
-from meshsplats.evaluation.strips import markdown_table, picture_folder, worst_window
+from meshsplats.evaluation.strips import image_folder, markdown_table, worst_window
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_png
 from meshsplats.mesh import SplatMesh
@@ -44,14 +44,16 @@ def quad(color, *, half=0.5, blending="display") -> SplatMesh:
 def view(color, alpha=None, mask=None, camera=CAMERA, background=(1.0, 1.0, 1.0)) -> View:
     shape = (camera.height, camera.width)
     picture = np.broadcast_to(np.asarray(color, np.float32), (*shape, 3)).copy()
-    return View(camera, Picture(picture, alpha, mask), background)
+    return View(camera, ViewImage(picture, alpha, mask), background)
 
 
 def test_psnr_by_hand_and_on_the_views_background():
     """The square covers 100 of 384 pixels and differs by 0.1 there; elsewhere both are background."""
     inside = np.zeros((16, 24), np.float32)
     inside[3:13, 7:17] = 1
-    target = View(CAMERA, Picture(np.float32(0.5) * inside[..., None].repeat(3, 2), inside), (0.2, 0.4, 0.6))
+    target = View(
+        CAMERA, ViewImage(np.float32(0.5) * inside[..., None].repeat(3, 2), inside), (0.2, 0.4, 0.6)
+    )
     report = evaluate(quad([0.6, 0.6, 0.6, 1]), Dataset((), (target,)))
     scores = report.method("mesh").views[0]
     assert scores.psnr == pytest.approx(10 * np.log10(384 / (100 * 0.01)), abs=1e-4)
@@ -65,13 +67,13 @@ def test_masked_pixels_do_not_count():
     mask[:, :12] = False
     wrong = np.full((16, 24, 3), 0.5, np.float32)
     wrong[:, :12] = 0.9
-    target = View(CAMERA, Picture(wrong, None, mask))
+    target = View(CAMERA, ViewImage(wrong, None, mask))
     perfect = quad([0.5, 0.5, 0.5, 1], half=20)
     scores = evaluate(perfect, Dataset((), (target,))).method("mesh").views[0]
     assert scores.psnr > 100
     assert scores.ssim == pytest.approx(1, abs=1e-6)
     with pytest.raises(ValueError, match=r"a/one\.png.*no pixel"):
-        evaluate(perfect, Dataset((), (View(CAMERA, Picture(wrong, None, ~mask & mask)),)))
+        evaluate(perfect, Dataset((), (View(CAMERA, ViewImage(wrong, None, ~mask & mask)),)))
 
 
 def test_masked_ssim_is_that_of_the_cropped_picture():
@@ -193,26 +195,26 @@ def test_pictures_by_name_and_by_order(tmp_path):
     cameras = [replace(CAMERA, name=f"set/r_{i}.png") for i in (2, 10)]
     for i, name in enumerate(("r_2", "r_10")):
         save_png(tmp_path / f"{name}.png", np.full((16, 24, 3), (51 + 51 * i) / 255, np.float32))
-    at = picture_folder(tmp_path, cameras)
+    at = image_folder(tmp_path, cameras)
     assert at(cameras[0], (1, 1, 1))[0][0, 0] == pytest.approx([0.2] * 3)
     assert at(cameras[1], (1, 1, 1))[0][0, 0] == pytest.approx([0.4] * 3)
     unnamed = [replace(CAMERA, name=f"other_{i}") for i in range(2)]
-    at = picture_folder(tmp_path, unnamed)
+    at = image_folder(tmp_path, unnamed)
     assert at(unnamed[0], (1, 1, 1))[0][0, 0] == pytest.approx([0.2] * 3)  # 2 before 10
     with pytest.raises(FileNotFoundError, match="2 pictures for 3 views"):
-        picture_folder(tmp_path, [*unnamed, CAMERA])
+        image_folder(tmp_path, [*unnamed, CAMERA])
     with pytest.raises(FileNotFoundError, match="no folder"):
-        picture_folder(tmp_path / "none", unnamed)
+        image_folder(tmp_path / "none", unnamed)
 
 
 def test_pictures_with_alpha_go_over_the_background_and_sizes_are_checked(tmp_path):
     save_png(tmp_path / "one.png", np.tile(np.float32([1, 0, 0, 0.6]), (16, 24, 1)))
-    color, alpha = picture_folder(tmp_path, [CAMERA])(CAMERA, (0, 0, 1))
+    color, alpha = image_folder(tmp_path, [CAMERA])(CAMERA, (0, 0, 1))
     assert np.allclose(color, [0.6, 0, 0.4], atol=1e-6)
     assert np.allclose(alpha, 0.6)
     small = replace(CAMERA, width=20)
     with pytest.raises(ValueError, match="24 x 16 pixels, the view 20 x 16"):
-        picture_folder(tmp_path, [small])(small, (0, 0, 0))
+        image_folder(tmp_path, [small])(small, (0, 0, 0))
 
 
 def test_worst_window_holds_the_largest_error():

@@ -18,7 +18,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset, splat_views
-from meshsplats.datasets.views import Dataset, Picture, View
+from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError, FileFormatError
 from meshsplats.evaluation.report import evaluate
@@ -135,8 +135,8 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     gain, offset = np.float32([1.1, 0.9, 1.2]), np.float32([0.05, -0.1, 0.02])
     state.exposures[0] = [*gain, *offset]
     mask = np.random.default_rng(0).random((48, 48)) < 0.6 if masked else None
-    image, background = dataset.train[0].picture.over((0.2, 0.9, 0.4)), (0.3, 0.1, 0.8)
-    view = View(dataset.train[0].camera, Picture(image, None, mask), background)
+    image, background = dataset.train[0].load().over((0.2, 0.9, 0.4)), (0.3, 0.1, 0.8)
+    view = View(dataset.train[0].camera, ViewImage(image, None, mask), background)
     found = []
     monkeypatch.setattr(State, "step", lambda state, gradients, *rest: found.extend(gradients))
     loss = make_step(state, [view], 0, 0.0)
@@ -166,8 +166,8 @@ def test_exposures_of_photographs_are_found(scene):
     gains = np.array([[1.2, 1.15, 1.2], [0.8, 0.85, 0.8]], np.float32)
     train = []
     for i, view in enumerate(dataset.train):
-        train.append(View(view.camera, Picture(np.clip(view.image * gains[i % 2], 0, 3))))
-    test = [View(view.camera, Picture(view.image)) for view in dataset.test]
+        train.append(View(view.camera, ViewImage(np.clip(view.image * gains[i % 2], 0, 3))))
+    test = [View(view.camera, ViewImage(view.image)) for view in dataset.test]
     photographs = Dataset(tuple(train), tuple(test))
     plain = finetune(mesh, photographs, make_config(epochs=8))
     fitted = finetune(mesh, photographs, make_config(epochs=8, exposure=True, exposure_rate=0.02))
@@ -325,19 +325,19 @@ def test_every_epoch_shows_every_view_once_in_another_order():
 
 def test_backgrounds_are_random_only_where_alpha_is_known(scene):
     _, dataset, _ = scene
-    drawn, photo = dataset.train[0], View(dataset.train[0].camera, Picture(dataset.train[0].image))
+    drawn, photo = dataset.train[0], View(dataset.train[0].camera, ViewImage(dataset.train[0].image))
     random, mixed, white = (make_config(background=name) for name in ("random", "mixed", "white"))
     colors = {target_of(drawn, random, step).background for step in range(5)}
     assert len(colors) == 5
     assert target_of(drawn, random, 3).background == target_of(drawn, random, 3).background
     assert target_of(photo, random, 3).background == (1, 1, 1)
     assert target_of(drawn, white, 3).background == (1, 1, 1)
-    on_black = View(drawn.camera, drawn.picture, (0, 0, 0))
+    on_black = View(drawn.camera, drawn.load(), (0, 0, 0))
     for step in range(6):
         wanted = target_of(drawn, random, step).background if step % 4 == 1 else (0, 0, 0)
         assert target_of(on_black, mixed, step).background == wanted
     target = target_of(drawn, random, 3)
-    assert np.allclose(target.color, drawn.picture.over(target.background))
+    assert np.allclose(target.color, drawn.load().over(target.background))
 
 
 def test_a_step_changes_only_what_its_view_shows(scene):
@@ -379,18 +379,19 @@ def test_masked_pixels_have_no_say(scene):
     def tuned(wrong):
         image = view.image.copy()
         image[:, :20] = wrong
-        masked = Dataset((View(view.camera, Picture(image, None, mask)),))
+        masked = Dataset((View(view.camera, ViewImage(image, None, mask)),))
         return finetune(mesh, masked, make_config(steps=3, l2_weight=1.0))
 
     assert same(tuned(0.0), tuned(1.0))
-    none = Dataset((View(view.camera, Picture(view.image, None, np.zeros((48, 48), bool))),))
+    none = Dataset((View(view.camera, ViewImage(view.image, None, np.zeros((48, 48), bool))),))
     assert same(finetune(mesh, none, make_config(steps=3, prune_epochs=0)), mesh)
 
 
 def test_values_that_are_not_finite_name_their_view(scene, tmp_path):
     _, dataset, mesh = scene
     bad = View(
-        replace(dataset.train[2].camera, name="broken.png"), Picture(np.full((48, 48, 3), np.nan, np.float32))
+        replace(dataset.train[2].camera, name="broken.png"),
+        ViewImage(np.full((48, 48, 3), np.nan, np.float32)),
     )
     spoilt = Dataset((*dataset.train[:2], bad), dataset.test)
     run = RunOptions(tmp_path / "run")
@@ -416,7 +417,7 @@ def test_importance_is_what_the_pictures_show():
         np.ones((12, 4)),
         face_splat=[0, 0, 1, 1, 2, 2],
     )
-    view = View(camera, Picture(np.zeros((16, 24, 3), np.float32)))
+    view = View(camera, ViewImage(np.zeros((16, 24, 3), np.float32)))
     state = State.begin(mesh, 1, make_config(prune_importance=0.5), None)
     shown, before = importance(state, [view])
     assert shown.reshape(3, 4).sum(axis=1) == pytest.approx([100, 0, 0], abs=1e-3)

@@ -17,7 +17,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
-from meshsplats.datasets.views import Dataset, Picture, View
+from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import memory
@@ -247,10 +247,10 @@ def test_each_preset_begins_with_its_conversion():
     bare["footprint"] = "none"
     assert np.array_equal(filtered.vertices, convert(cloud, mode="flat", **bare).vertices)
     assert (even.filter_px2, filtered.filter_px2) == (0, pytest.approx(0.3))
-    assert 4 * 190 < len(starting_mesh(cloud, cameras, mode="flat", no_triag=4).faces) <= 4 * 200
-    assert 3 * 190 < len(starting_mesh(cloud, cameras, no_triag=3).faces) <= 3 * 200
+    assert 4 * 190 < len(starting_mesh(cloud, cameras, mode="flat", sides=4).faces) <= 4 * 200
+    assert 3 * 190 < len(starting_mesh(cloud, cameras, sides=3).faces) <= 3 * 200
     assert len(starting_mesh(cloud, cameras, rings=2).faces) == 24 * 200
-    assert len(starting_mesh(cloud, cameras, mode="3d", no_triag=4).faces) == 12 * 200
+    assert len(starting_mesh(cloud, cameras, mode="3d", sides=4).faces) == 12 * 200
     for preset in ("paper", "published"):
         paper = convert(cloud, preset="paper")
         assert np.array_equal(starting_mesh(cloud, cameras, preset=preset).vertices, paper.vertices)
@@ -261,7 +261,7 @@ def test_each_preset_begins_with_its_conversion():
 
 def dataset(count: int, side: int = 8) -> Dataset:
     camera = Camera(np.eye(4), side, side, side / 2, side / 2, side, side)
-    picture = Picture(np.zeros((side, side, 3), np.uint8))
+    picture = ViewImage(np.zeros((side, side, 3), np.uint8))
     return Dataset(tuple(View(replace(camera, name=f"v{i}"), picture) for i in range(count)))
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
 from meshsplats.binding import Binding, surface_normals
-from meshsplats.datasets.views import Picture, View
+from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
 from meshsplats.prior.bind import LAYERS, SHELLS_DEPTH
@@ -123,7 +123,7 @@ def test_shells_lie_behind_what_the_views_see():
         matrix = np.eye(4)
         matrix[:3, :3] = turn
         views.append(
-            View(Camera(matrix, 16, 16, 16, 16, 32, 32), Picture(np.full((32, 32, 3), 0.5, np.float32)))
+            View(Camera(matrix, 16, 16, 16, 16, 32, 32), ViewImage(np.full((32, 32, 3), 0.5, np.float32)))
         )
     prior = bind(cube(), layers=2, views=views)
     assert prior.lift > 0
@@ -177,7 +177,7 @@ def test_colors_come_from_the_views_that_see_a_place():
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = turn, -turn @ (axis * 4)
         camera = Camera(matrix, 60, 60, 16, 16, 32, 32)
-        views.append(View(camera, Picture(np.tile(wanted[side], (32, 32, 1)))))
+        views.append(View(camera, ViewImage(np.tile(wanted[side], (32, 32, 1)))))
     mesh = bind(base, triangles=4, layers=1, views=views).mesh
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     axis = np.abs(middle).argmax(axis=1)
@@ -197,7 +197,7 @@ def test_shells_take_the_colours_that_views_show_behind_the_base():
     shade = np.repeat(0.5 + 0.5 * np.sin(5 * flat[:, :1]), 3, axis=1)
     truth = SplatMesh(flat, sheet.faces, np.column_stack([shade, np.ones(len(flat))]), up=sheet.up)
     cameras = orbit(truth, 12, width=160, height=160, elevation=50)
-    views = [View(camera, Picture(render(truth, camera, background=(0, 0, 0)).color)) for camera in cameras]
+    views = [View(camera, ViewImage(render(truth, camera, background=(0, 0, 0)).color)) for camera in cameras]
     above = BaseMesh(flat + np.float32([0, 0, height]), sheet.faces, up=sheet.up)
     mesh = bind(above, layers=2, spacing=-height, views=views).mesh
     middle = np.abs(mesh.vertices[:, :2]).max(axis=1) < 0.5
@@ -212,9 +212,9 @@ def test_what_no_view_sees_takes_the_colours_next_to_it():
     matrix = np.eye(4)
     matrix[2, 3] = 5
     camera = Camera(matrix, 60, 60, 16, 16, 32, 32)
-    seen = View(camera, Picture(np.full((32, 32, 3), 0.25, np.float32)))
+    seen = View(camera, ViewImage(np.full((32, 32, 3), 0.25, np.float32)))
     np.testing.assert_allclose(bind(base, triangles=4, views=[seen]).mesh.colors[:, :3], 0.25, atol=1e-6)
-    empty = View(camera, Picture(np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.uint8)))
+    empty = View(camera, ViewImage(np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.uint8)))
     np.testing.assert_array_equal(bind(base, views=[empty]).mesh.colors[:, :3], 0.5)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import Dataset, SplatMesh, orbit, psnr, render
-from meshsplats.datasets.views import Picture, View
+from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import RunOptions, make_config
@@ -29,7 +29,7 @@ def views_of(mesh, count=6, side=40) -> tuple[View, ...]:
     views = []
     for camera in orbit(mesh, count, width=side, height=side, elevation=35):
         drawn = render(mesh, camera, background=(0, 0, 0))
-        views.append(View(camera, Picture(drawn.color, drawn.alpha)))
+        views.append(View(camera, ViewImage(drawn.color, drawn.alpha)))
     return tuple(views)
 
 

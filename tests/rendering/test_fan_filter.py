@@ -25,10 +25,10 @@ from test_rendering_variants import VIEWS, assert_picture, in_another_process, s
 from meshsplats import SplatMesh, convert
 from meshsplats._core import library
 from meshsplats.rendering import reference, render
-from meshsplats.rendering.recorded import RecordedPicture
+from meshsplats.rendering.backward import TapedRendering
 
 MODES = ("flat", "crossed", "3d")
-SHAPES = [("flat", {}), ("flat", {"no_triag": 3}), ("flat", {"rings": 3}), ("crossed", {}), ("3d", {})]
+SHAPES = [("flat", {}), ("flat", {"sides": 3}), ("flat", {"rings": 3}), ("crossed", {}), ("3d", {})]
 
 
 def fans(
@@ -193,7 +193,7 @@ def test_an_invisible_splat_has_a_shape():
     """Its gradient tells what it would add, where its filter would have it."""
     mesh, view = diamond((20, 18), (2.0, 2.0), alpha=0.0), plain_camera()
     options = {"face_splat": mesh.face_splat, "filter_px2": 8.0, "samples": 8}
-    picture = RecordedPicture(mesh.vertices, mesh.faces, mesh.colors, None, view, **options)
+    picture = TapedRendering(mesh.vertices, mesh.faces, mesh.colors, None, view, **options)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     nothing, all_pixels = np.zeros_like(picture.color), np.ones_like(picture.alpha)
     picture.back(nothing, all_pixels, None, vertices=points, colors=colors)
@@ -220,7 +220,7 @@ def test_hostile(view):
         )
         mixed = replace(own, vertices=scaled(own.vertices, 10 ** rng.uniform(-40, 38, (180, 1))))
         assert_picture(render(mixed, view, filter_px2=100, samples=3, **options))
-        picture = RecordedPicture(
+        picture = TapedRendering(
             mixed.vertices, mixed.faces, mixed.colors, None, view, face_splat=own.face_splat, filter_px2=0.3
         )
         points, colors = np.zeros_like(mixed.vertices), np.zeros_like(mixed.colors)
@@ -260,7 +260,7 @@ def gradient_of(mesh: SplatMesh, view, function, dtype, **options):
         (lambda: fans(1, 25), {}),
         (lambda: fans(1, 25), {"filter_px2": 8.0, "samples": 2}),
         (lambda: fans(2, 25, "crossed"), {"filter_px2": 8.0}),
-        (lambda: fans(3, 15, "flat", rings=2, no_triag=5), {"filter_px2": 1.0}),
+        (lambda: fans(3, 15, "flat", rings=2, sides=5), {"filter_px2": 1.0}),
         (lambda: fans(2, 30, z=0.8), {"filter_px2": 1.0}),
     ],
     ids=["flat", "samples", "crossed", "rings", "near plane"],
@@ -309,7 +309,7 @@ def many() -> SplatMesh:
 
 def back(mesh: SplatMesh, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     view = camera(70, 50)
-    picture = RecordedPicture(
+    picture = TapedRendering(
         mesh.vertices,
         mesh.faces,
         mesh.colors,
@@ -396,7 +396,7 @@ def test_splats_of_any_size_look_as_their_viewer_shows_them():
             scales=np.array([[size, 0.6 * size, 0.01 * size]], np.float32),
         )
         truth = render_splats(cloud, view, background=(0, 0, 0)).alpha
-        mesh = convert(cloud, footprint="filter", mode="flat", no_triag=16, rings=3, shrink_faint=False)
+        mesh = convert(cloud, footprint="filter", mode="flat", sides=16, rings=3, shrink_faint=False)
         found = render(mesh, view, background=(0, 0, 0)).alpha
         assert np.abs(found - truth).max() < 0.06, size
         if size < 0.02:

@@ -254,7 +254,7 @@ def digest(**options) -> str:
 def test_same_bits_whatever_the_threads_and_the_log():
     expected = digest(threads=1)
     assert digest(threads=1, seed=1) != expected
-    for options in ({"threads": 2}, {"threads": 5}, {"log_bytes": 0}, {"log_bytes": 3000, "threads": 3}):
+    for options in ({"threads": 2}, {"threads": 5}, {"tape_bytes": 0}, {"tape_bytes": 3000, "threads": 3}):
         assert digest(**options) == expected, options
 
 

@@ -68,7 +68,7 @@ class Comparison(NamedTuple):
     that do not count."""
 
 
-def compare_pictures(
+def compare_images(
     pictures: np.ndarray,
     truths: np.ndarray,
     mask: np.ndarray | None = None,

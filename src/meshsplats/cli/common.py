@@ -111,9 +111,9 @@ class ViewOptions:
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
     folder, of the mesh, else -y, as COLMAP's scenes have it."""
     width: Count = None
-    """Picture width in pixels. With --cameras or --data, pictures are scaled to this width."""
+    """Image width in pixels. With --cameras or --data, pictures are scaled to this width."""
     height: Count = None
-    """Picture height in pixels. Default: the width. Not with --cameras or --data, where it follows."""
+    """Image height in pixels. Default: the width. Not with --cameras or --data, where it follows."""
 
     @property
     def moving(self) -> bool:

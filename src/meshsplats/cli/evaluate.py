@@ -42,8 +42,8 @@ from meshsplats.evaluation.backgrounds import Background
 from meshsplats.evaluation.benchmarks import PROTOCOLS, Protocol, find_input
 from meshsplats.evaluation.report import SSIM_CONVENTION, Report, ScoredView, evaluate
 from meshsplats.evaluation.strips import (
+    image_folder,
     markdown_table,
-    picture_folder,
     score_table,
     view_crop,
     view_strip,
@@ -237,7 +237,7 @@ class Evaluate:
 
         dataset = dataset.over(background.color)
         views = dataset.test or dataset.views
-        pictures = None if self.pictures is None else picture_folder(self.pictures, [v.camera for v in views])
+        pictures = None if self.pictures is None else image_folder(self.pictures, [v.camera for v in views])
         lpips = load_lpips(list(self.lpips) or None, network=self.network)
         shown = set(np.linspace(0, len(views) - 1, min(self.strips, len(views))).round().astype(int).tolist())
         names = view_names(len(views))

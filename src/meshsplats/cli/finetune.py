@@ -42,7 +42,7 @@ from meshsplats.cli.training import (
     tell,
 )
 from meshsplats.conversion.selection import choose_splats
-from meshsplats.datasets.views import Dataset, Picture
+from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import (
@@ -130,7 +130,7 @@ class Finetune:
         if self.target.data is not None:
             whole = self.conversion.crop is None
             if not whole:
-                _warn_of_the_rest(dataset.train[0].picture)
+                _warn_of_the_rest(dataset.train[0].load())
             dataset, background = behind(dataset, scene, config, self.input, self.threads, whole=whole)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
         what = f"{len(mesh.faces):,} triangles"
@@ -195,7 +195,7 @@ class Finetune:
         return shlex.join(map(str, words))
 
 
-def _warn_of_the_rest(picture: Picture) -> None:
+def _warn_of_the_rest(picture: ViewImage) -> None:
     if picture.alpha is None and picture.mask is None:
         warnings.warn(
             "--crop with photographs that have neither masks nor alpha: what it cuts off is still on them,"

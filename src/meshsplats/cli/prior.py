@@ -66,7 +66,7 @@ class LayOptions:
     """Where colours begin: the base's texture, its vertex colours, the pictures that see a place most
     squarely; auto: the first of these that there is."""
     texture: File = None
-    """Picture that is laid on the base by its texture coordinates, where its file names none."""
+    """Image that is laid on the base by its texture coordinates, where its file names none."""
 
 
 @dataclass(frozen=True)

@@ -255,7 +255,7 @@ _ORDERS = np.array(
 
 def _shapes(sigma: np.ndarray, options: ConversionOptions) -> tuple[list[Shape], np.ndarray]:
     """The shapes in use and (n,) which of them each splat takes."""
-    sides, rings = int(options.no_triag), int(options.rings)  # type: ignore[arg-type]
+    sides, rings = int(options.sides), int(options.rings)  # type: ignore[arg-type]
     choice = np.zeros(len(sigma), np.int8)
     if options.mode != "crossed":
         return [_ellipse(sides, rings, options, options.mode)], choice  # type: ignore[arg-type]
@@ -269,12 +269,12 @@ def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "fl
         fit_profile,
         sides,
         rings,
-        rim_opacity=options.opac_mul,
-        center_opacity=options.center_mul,
+        rim_opacity=options.rim_opacity,
+        center_opacity=options.center_opacity,
         conserve=True,
     )
-    profile = fit(rim_radius=options.scale_mul)
-    if mode == "crossed" and options.scale_mul is None:
+    profile = fit(rim_radius=options.rim_radius)
+    if mode == "crossed" and options.rim_radius is None:
         profile = fit(rim_radius=CROSSED_REACH * profile.radii[-1])
     return Shape(pattern(sides, rings, mode), profile)
 

@@ -17,10 +17,10 @@ so."""
 
 
 def triangles_each(options: ConversionOptions) -> int:
-    """Triangles of a splat by ``mode``, ``no_triag`` and ``rings``; in the mean where ``detail`` shares them
+    """Triangles of a splat by ``mode``, ``sides`` and ``rings``; in the mean where ``detail`` shares them
     out."""
     ellipses = len(PLANES[options.mode])  # type: ignore[index]
-    return ellipses * (2 * options.rings - 1) * options.no_triag  # type: ignore[operator]
+    return ellipses * (2 * options.rings - 1) * options.sides  # type: ignore[operator]
 
 
 def within_limits(
@@ -38,10 +38,10 @@ def within_limits(
     most = chosen.max_triangles
     if most is None or count * triangles_each(chosen) <= most:
         return chosen, count
-    own = (given.no_triag, given.rings, chosen.scale_mul, chosen.center_mul)
+    own = (given.sides, given.rings, chosen.rim_radius, chosen.center_opacity)
     if chosen.mode == "flat" and all(value is None for value in own):
         each = round(most / count / SHARE_KEPT)
-        chosen = replace(chosen, no_triag=min(max(each, FEWEST), triangles_each(chosen)))
+        chosen = replace(chosen, sides=min(max(each, FEWEST), triangles_each(chosen)))
     if most < triangles_each(chosen):
         raise ValueError(f"max_triangles must be at least {triangles_each(chosen)}, one splat's, got {most}")
     return chosen, min(count, most // triangles_each(chosen))

@@ -16,8 +16,8 @@ from meshsplats._arrays import evenly
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.backward import TapedRendering
 from meshsplats.rendering.looks import Look, draw_splats
-from meshsplats.rendering.recorded import RecordedPicture
 
 LEVELS = ((3, 1), (4, 1), (6, 1), (8, 1), (8, 2), (12, 2), (12, 3), (16, 3))
 """Sides and rings of the ellipses to choose from, by their number of triangles."""
@@ -80,7 +80,7 @@ def visibility(
     chosen = evenly(cameras, min(max(len(cameras) // 8, fewest), most))
     for own in chosen:
         camera = own.within(SIDE)
-        picture = RecordedPicture(
+        picture = TapedRendering(
             mesh.vertices,
             mesh.faces,
             mesh.colors,

@@ -26,19 +26,19 @@ class ConversionOptions:
     """flat: one ellipse in the two largest axes of each splat. crossed: a second one, upright on it along the
     longest axis, so that no splat vanishes edge-on; a splat flatter than ``flat_below`` gets one finer
     ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3."""
-    scale_mul: float | None = None
+    rim_radius: float | None = None
     """Radius of the rim in standard deviations, 0.1 to 10. Default: calibrated; paper: 2.7."""
-    no_triag: int | None = None
+    sides: int | None = None
     """Number of triangles that make up an ellipse, a fan round its centre: 3 to 64 (3d: a multiple of 4;
     crossed: even). The name is the paper's. Default: 8 for flat, else 4; paper: 8."""
-    opac_mul: float | None = None
+    rim_opacity: float | None = None
     """Opacity of the rim as a fraction of the splat's, 0 to 1. Default: 0; paper: 0.2."""
-    center_mul: float | None = None
+    center_opacity: float | None = None
     """Opacity of the centre as a multiple of the splat's, above 0 to 2; the product is clamped to 1. Default:
     calibrated; paper: 1."""
     rings: int | None = None
     """Rings of vertices in an ellipse, 1 to 4; the last is the rim. More follow the Gaussian closer: 2 rings
-    draw 3 * no_triag triangles an ellipse. Default and paper: 1."""
+    draw 3 * sides triangles an ellipse. Default and paper: 1."""
     detail: Detail | None = None
     """How triangles are shared out among splats. even: every splat has the same number. cameras: that number
     on average, 3 to 80 by what the cameras given see of the splat: most where it is large in the pictures and
@@ -86,7 +86,7 @@ class ConversionOptions:
     max_splats: int | None = None
     """At most so many splats: see ``budget``."""
     max_triangles: int | None = None
-    """At most so many triangles: see ``budget``. In mode 'flat', where neither ``no_triag`` nor the profile
+    """At most so many triangles: see ``budget``. In mode 'flat', where neither ``sides`` nor the profile
     is given, splats get fewer triangles each, 4 at least, before they get fewer."""
     budget: Budget | None = None
     """How max_splats and max_triangles are kept. merge: splats that are alike are merged. drop: only the most
@@ -111,8 +111,8 @@ class ConversionOptions:
         full = replace(
             self, **{f.name: getattr(defaults, f.name) for f in fields(self) if f.name not in given}
         )
-        if full.no_triag is None:
-            full = replace(full, no_triag=8 if full.mode == "flat" else 4)
+        if full.sides is None:
+            full = replace(full, sides=8 if full.mode == "flat" else 4)
         if full.footprint is None:
             source: Footprint = "cameras" if has_cameras else "framing"
             full = replace(full, footprint=source if self.viewing_distance is None else "distance")
@@ -135,10 +135,10 @@ class ConversionOptions:
                 raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
         if not isinstance(self.shrink_faint, bool):
             raise ValueError(f"shrink_faint must be True or False, got {self.shrink_faint!r}")
-        if self.mode == "3d" and self.no_triag % 4:  # type: ignore[operator]
-            raise ValueError(f"no_triag must be a multiple of 4 in mode '3d', got {self.no_triag}")
-        if self.mode == "crossed" and self.no_triag % 2:  # type: ignore[operator]
-            raise ValueError(f"no_triag must be even in mode 'crossed', got {self.no_triag}")
+        if self.mode == "3d" and self.sides % 4:  # type: ignore[operator]
+            raise ValueError(f"sides must be a multiple of 4 in mode '3d', got {self.sides}")
+        if self.mode == "crossed" and self.sides % 2:  # type: ignore[operator]
+            raise ValueError(f"sides must be even in mode 'crossed', got {self.sides}")
         if "flat_below" in given and self.mode != "crossed":
             raise ValueError(f"flat_below is for mode 'crossed', got mode {self.mode!r}")
         if self.detail == "cameras":
@@ -180,10 +180,10 @@ _KINDS = {
 }
 
 _RANGES: list[tuple[str, float, float, bool]] = [
-    ("scale_mul", 0.1, 10, False),
-    ("no_triag", 3, 64, True),
-    ("opac_mul", 0, 1, False),
-    ("center_mul", 1e-3, 2, False),
+    ("rim_radius", 0.1, 10, False),
+    ("sides", 3, 64, True),
+    ("rim_opacity", 0, 1, False),
+    ("center_opacity", 1e-3, 2, False),
     ("rings", 1, 4, True),
     ("flat_below", 0, 1, False),
     ("compensation", 0, 1, False),
@@ -199,7 +199,7 @@ PRESETS = {
     "default": ConversionOptions(
         mode="crossed",
         look="area",
-        opac_mul=0.0,
+        rim_opacity=0.0,
         rings=1,
         detail="even",
         flat_below=0.15,
@@ -213,10 +213,10 @@ PRESETS = {
     "paper": ConversionOptions(
         mode="flat",
         look="area",
-        scale_mul=2.7,
-        no_triag=8,
-        opac_mul=0.2,
-        center_mul=1.0,
+        rim_radius=2.7,
+        sides=8,
+        rim_opacity=0.2,
+        center_opacity=1.0,
         rings=1,
         detail="even",
         flat_below=0.0,
@@ -229,8 +229,8 @@ PRESETS = {
         colors="degree0",
     ),
 }
-"""default: calibrated to look like the splats. paper: arXiv 2502.07754 with its published code's opac_mul and
-no_triag."""
+"""default: calibrated to look like the splats. paper: arXiv 2502.07754 with its published code's rim_opacity and
+sides."""
 
 
 def make_options(named: dict) -> ConversionOptions:

@@ -14,14 +14,14 @@ import numpy as np
 from meshsplats.datasets.colmap import find_model, read_model
 from meshsplats.datasets.image_files import Album, Frame, Taken, split
 from meshsplats.datasets.transforms import read_transforms
-from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, PictureStore, View
+from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View
 from meshsplats.errors import DataWarning, FileFormatError
 
 Views = tuple[list[View], list[View]]
 MAX_LIST_BYTES = 16 << 20
 
 
-def read_folder(path: Path, downscale: int, test_every: int, store: PictureStore) -> Views:
+def read_folder(path: Path, downscale: int, test_every: int, store: ImageCache) -> Views:
     """Training and test views of the data set at ``path``; see ``load_dataset``."""
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such data set", str(path))
@@ -239,7 +239,7 @@ def load_dataset(
     downscale: whole factor of the pictures' sides, 1 to 64. ``images_2/``, ``images_4/`` and so on are used
         where they exist; else each pixel becomes the mean of those it covers.
     test_every: views 0, n, 2n ... by name are held out, unless the data set has a split of its own; 0: none.
-    background: RGB in [0, 1] of ``View.image`` where pictures have alpha. ``Picture.over`` takes another.
+    background: RGB in [0, 1] of ``View.image`` where pictures have alpha. ``ViewImage.over`` takes another.
     cache_bytes: pictures are kept up to this many bytes after their first use; the others are read anew each
         time.
 
@@ -260,6 +260,6 @@ def load_dataset(
         raise ValueError(f"background must be three numbers in [0, 1], got {background!r}")
     if test_every == 1:
         raise ValueError("test_every must be 0 (no test views) or at least 2: 1 leaves nothing to train with")
-    store = PictureStore(cache_bytes)
+    store = ImageCache(cache_bytes)
     train, test = read_folder(Path(path), int(downscale), int(test_every), store)
     return Dataset(tuple(train), tuple(test), Path(os.path.abspath(path)).name).over(color.tolist())

@@ -13,9 +13,9 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.datasets.lens import WHOLE, Lens, Pinhole, pinholes, undistort
-from meshsplats.datasets.views import Picture, PictureStore
+from meshsplats.datasets.views import ImageCache, ViewImage
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.images.reading import Header, load_picture, read_header
+from meshsplats.images.reading import Header, load_image, read_header
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", ".JPG", ".JPEG")
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""
@@ -89,9 +89,9 @@ class PhotoFile:
     pinhole: Pinhole
     mask: Path | None
     has_alpha: bool
-    store: PictureStore = field(repr=False)
+    store: ImageCache = field(repr=False)
 
-    def load(self) -> Picture:
+    def load(self) -> ViewImage:
         picture = self.store.find(self)
         if picture is None:
             picture = self._read()
@@ -103,8 +103,8 @@ class PhotoFile:
         masked = self.mask is not None or not self.lens.is_pinhole
         return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
 
-    def _read(self) -> Picture:
-        color, alpha = load_picture(self.path)
+    def _read(self) -> ViewImage:
+        color, alpha = load_image(self.path)
         size = (self.lens.width, self.lens.height)
         if alpha is None:
             color = _resized(color, size)
@@ -125,14 +125,14 @@ class PhotoFile:
             else:
                 mask = seen
         if alpha is None:
-            return Picture(color, None, mask)
-        return Picture(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
+            return ViewImage(color, None, mask)
+        return ViewImage(np.ascontiguousarray(color[..., :3]), np.ascontiguousarray(color[..., 3]), mask)
 
     def _read_mask(self, size: tuple[int, int]) -> np.ndarray:
         """(h, w) bool. A pixel counts if the mask is light (128 of 255 or more), and opaque where it has
         alpha, all over it."""
         assert self.mask is not None
-        color, alpha = load_picture(self.mask)
+        color, alpha = load_image(self.mask)
         light = color.max(axis=2)
         if alpha is not None:
             light = np.minimum(light, alpha)
@@ -160,7 +160,7 @@ class Album:
     folder: Path
     """The data set's folder, which no path may leave."""
     downscale: int
-    store: PictureStore
+    store: ImageCache
     missing: list[str] = field(default_factory=list)
     no_mask: list[str] = field(default_factory=list)
 

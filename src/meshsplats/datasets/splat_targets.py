@@ -19,7 +19,7 @@ from meshsplats.cameras.framing import (
     weighted_quantile,
 )
 from meshsplats.cameras.trajectories import NEAR_SHARE, look_at
-from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, Picture, PictureStore, View
+from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View, ViewImage
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.looks import Look, check_look, draw_splats
 
@@ -348,15 +348,19 @@ def splat_views(
     """
     check_look(look)
     red, green, blue = map(float, background)
-    store = PictureStore(cache_bytes)
+    store = ImageCache(cache_bytes)
     return tuple(
-        View(camera, DrawnSplats(cloud, camera, look, sh_degree, samples, threads, store), (red, green, blue))
+        View(
+            camera,
+            RenderedSplats(cloud, camera, look, sh_degree, samples, threads, store),
+            (red, green, blue),
+        )
         for camera in cameras
     )
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnSplats:
+class RenderedSplats:
     """A picture of splats, drawn when it is asked for."""
 
     cloud: GaussianCloud
@@ -365,17 +369,17 @@ class DrawnSplats:
     sh_degree: int | None
     samples: int | None
     threads: int | None
-    store: PictureStore = field(repr=False)
+    store: ImageCache = field(repr=False)
 
-    def load(self) -> Picture:
+    def load(self) -> ViewImage:
         return self._drawn(self.samples)
 
-    def points(self) -> Picture:
+    def points(self) -> ViewImage:
         """The values at the pixels' centres alone, of which the mean over their areas is made (look
         'area')."""
         return self._drawn(1)
 
-    def _drawn(self, samples: int | None) -> Picture:
+    def _drawn(self, samples: int | None) -> ViewImage:
         picture = self.store.find((self, samples))
         if picture is None:
             drawn = draw_splats(
@@ -389,7 +393,7 @@ class DrawnSplats:
             )
             # Beyond float16 lies only what no display can show.
             color = np.clip(drawn.color, 0, 60_000).astype(np.float16)
-            picture = Picture(color, drawn.alpha.astype(np.float16))
+            picture = ViewImage(color, drawn.alpha.astype(np.float16))
             self.store.keep((self, samples), picture)
         return picture
 

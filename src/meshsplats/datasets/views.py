@@ -19,7 +19,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class ViewImage:
     """What a camera saw. Values are display-referred (sRGB-encoded), rows run from top to bottom."""
 
     color: np.ndarray
@@ -52,17 +52,17 @@ class Picture:
     def __repr__(self) -> str:
         height, width = self.color.shape[:2]
         more = [name for name in ("alpha", "mask") if getattr(self, name) is not None]
-        return f"Picture({', '.join([f'{width} x {height} {self.color.dtype}', *more])})"
+        return f"ViewImage({', '.join([f'{width} x {height} {self.color.dtype}', *more])})"
 
     @property
     def nbytes(self) -> int:
         return sum(a.nbytes for a in (self.color, self.alpha, self.mask) if a is not None)
 
 
-class PictureSource(Protocol):
+class ImageSource(Protocol):
     """Something a picture can be had from when it is asked for."""
 
-    def load(self) -> Picture: ...
+    def load(self) -> ViewImage: ...
 
     @property
     def nbytes(self) -> int:
@@ -76,7 +76,7 @@ class View:
 
     camera: Camera
     """Pinhole of the picture's size; photographs of other lenses are undistorted to it."""
-    source: Picture | PictureSource
+    source: ViewImage | ImageSource
     background: tuple[float, float, float] = WHITE
     """RGB in [0, 1] behind pictures with alpha in ``image``."""
 
@@ -88,10 +88,9 @@ class View:
         """The picture's name, relative to the data set."""
         return self.camera.name
 
-    @property
-    def picture(self) -> Picture:
-        """The picture as stored. ValueError if it has not the camera's size."""
-        picture = self.source if isinstance(self.source, Picture) else self.source.load()
+    def load(self) -> ViewImage:
+        """The image as stored: read or rendered now, or from the cache. ValueError if it has not the camera's size."""
+        picture = self.source if isinstance(self.source, ViewImage) else self.source.load()
         size = (self.camera.height, self.camera.width)
         if picture.color.shape[:2] != size:
             raise ValueError(
@@ -102,19 +101,19 @@ class View:
     @property
     def image(self) -> np.ndarray:
         """(h, w, 3) float32 RGB in [0, 1], over ``background`` where the picture has alpha."""
-        return self.picture.over(self.background)
+        return self.load().over(self.background)
 
     @property
     def alpha(self) -> np.ndarray | None:
         """(h, w) float32 opacity in [0, 1]; None if everything is opaque."""
-        alpha = self.picture.alpha
+        alpha = self.load().alpha
         return None if alpha is None else _unit(alpha)
 
     @property
     def mask(self) -> np.ndarray | None:
         """(h, w) bool, True where the picture counts; None: everywhere. Photographs do not count outside
         their masks, and beyond the borders that undistortion leaves black."""
-        return self.picture.mask
+        return self.load().mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +158,7 @@ class Dataset:
         return replace(self, train=changed(self.train), test=changed(self.test))
 
 
-class PictureStore:
+class ImageCache:
     """Pictures that are kept, up to a number of bytes; those that come later are not.
 
     Nothing is put out again: training goes through all views over and over, and a store that puts out the
@@ -170,13 +169,13 @@ class PictureStore:
         if limit < 0:
             raise ValueError(f"cache_bytes must be >= 0, got {limit}")
         self._left = limit
-        self._kept: dict[object, Picture] = {}
+        self._kept: dict[object, ViewImage] = {}
         self._lock = threading.Lock()
 
-    def find(self, key: object) -> Picture | None:
+    def find(self, key: object) -> ViewImage | None:
         return self._kept.get(key)
 
-    def keep(self, key: object, picture: Picture) -> None:
+    def keep(self, key: object, picture: ViewImage) -> None:
         with self._lock:
             if key not in self._kept and picture.nbytes <= self._left:
                 self._left -= picture.nbytes

@@ -195,6 +195,6 @@ def _scores(
             behind = np.asarray(color, np.float32)
             picture = drawn.color + through * (srgb_to_linear(behind) if linear else behind)
             picture = np.clip(linear_to_srgb(picture) if linear else picture, 0, 1)
-            truth = np.clip(view.picture.over(color), 0, 1)
+            truth = np.clip(view.load().over(color), 0, 1)
             found[name].append(min(psnr(picture, truth, mask=mask), 200.0))
     return {name: float(np.mean(values)) if values else 0.0 for name, values in found.items()}

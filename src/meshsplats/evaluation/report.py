@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.datasets.splat_targets import DrawnSplats
+from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import GaussianCloud
@@ -28,7 +28,7 @@ FLOATER_MARGIN = 2
 """Pixels round what the truth shows that are not looked at: edges are soft."""
 COLUMNS = ("psnr", "ssim", "lpips", "psnr_exposure", "floaters")
 
-PictureAt = Callable[[Camera, Sequence[float]], tuple[np.ndarray, np.ndarray | None]]
+ImageAt = Callable[[Camera, Sequence[float]], tuple[np.ndarray, np.ndarray | None]]
 """(h, w, 3) display RGB over a background, and (h, w) alpha or None."""
 
 
@@ -144,7 +144,7 @@ def evaluate(
     *,
     before: SplatMesh | None = None,
     splats: GaussianCloud | None = None,
-    pictures: PictureAt | None = None,
+    pictures: ImageAt | None = None,
     samples: int | None = None,
     lpips: Lpips | None = None,
     fit_exposure: bool = False,
@@ -162,7 +162,7 @@ def evaluate(
     mesh: method ``'mesh'``; several by name, each the method of that name; None to score only the others.
     before: method ``'before'``, for instance the mesh before it was fine-tuned.
     splats: methods ``'splats_sh0'``, and ``'splats'`` with all their spherical harmonics where they have
-    more. pictures: method ``'pictures'``, made elsewhere (``picture_folder``).
+    more. pictures: method ``'pictures'``, made elsewhere (``image_folder``).
     samples: side of the grid of samples in each pixel, for meshes. None: as many as the mesh needs at this
         size where the images are means over each pixel's area (``Dataset.look``), photographs among them;
         1 where they are a splat viewer's.
@@ -181,8 +181,8 @@ def evaluate(
         samples = max(
             (mesh_samples(dataset.look, m, drawn_by) for m in (*meshes.values(), *beside)), default=1
         )
-    methods: dict[str, PictureAt] = {n: _of_mesh(m, samples, threads) for n, m in meshes.items()}
-    others: dict[str, PictureAt] = {}
+    methods: dict[str, ImageAt] = {n: _of_mesh(m, samples, threads) for n, m in meshes.items()}
+    others: dict[str, ImageAt] = {}
     if before is not None:
         others["before"] = _of_mesh(before, samples, threads)
     if splats is not None:
@@ -230,12 +230,12 @@ def evaluate(
 def masked_ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None, threads: int | None = None) -> float:
     """``metrics.ssim`` in the convention of 3DGS where ``mask`` (h, w) is True; the rest counts as the
     outside of the picture. Pictures (h, w, 3) float32."""
-    from meshsplats._core.kernels import compare_pictures
+    from meshsplats._core.kernels import compare_images
 
     x, y = (np.ascontiguousarray(p[None], np.float32) for p in (a, b))
     inside = None if mask is None else np.ascontiguousarray(mask[None])
     pixels = a.shape[0] * a.shape[1] if mask is None else int(mask.sum())
-    return compare_pictures(x, y, inside, ssim_rate=1, threads=threads).ssim / (pixels * a.shape[2])
+    return compare_images(x, y, inside, ssim_rate=1, threads=threads).ssim / (pixels * a.shape[2])
 
 
 def fit_exposure_to(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
@@ -283,17 +283,17 @@ def _empty(view: View) -> np.ndarray | None:
 
 def _drawn(dataset: Dataset) -> bool:
     """Whether the images are those of splats."""
-    return any(isinstance(view.source, DrawnSplats) for view in dataset.views[:1])
+    return any(isinstance(view.source, RenderedSplats) for view in dataset.views[:1])
 
 
-def _of_mesh(mesh: SplatMesh, samples: int, threads: int | None) -> PictureAt:
+def _of_mesh(mesh: SplatMesh, samples: int, threads: int | None) -> ImageAt:
     def at(camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         return image_of(mesh, camera, background, samples=samples, threads=threads)
 
     return at
 
 
-def _of_splats(cloud: GaussianCloud, look: Look, degree: int | None, threads: int | None) -> PictureAt:
+def _of_splats(cloud: GaussianCloud, look: Look, degree: int | None, threads: int | None) -> ImageAt:
     def at(camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         drawn = draw_splats(cloud, camera, look, background=background, sh_degree=degree, threads=threads)
         return drawn.color, drawn.alpha

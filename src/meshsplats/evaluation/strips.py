@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.evaluation.report import PictureAt, Report, ScoredView
+from meshsplats.evaluation.report import ImageAt, Report, ScoredView
 from meshsplats.images.writing import amplified_error, strip
 
 CROP_SHARE = 4
@@ -55,7 +55,7 @@ def worst_window(error: np.ndarray) -> tuple[int, int, int]:
     return int(top), int(left), side
 
 
-def picture_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> PictureAt:
+def image_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> ImageAt:
     """Pictures made elsewhere, one file for each of ``cameras``.
 
     A file belongs to the view of its name, without folder and suffix; or, if there are as many files as views

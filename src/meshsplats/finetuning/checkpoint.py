@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.binding import Binding
-from meshsplats.datasets.splat_targets import DrawnSplats
+from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
@@ -183,7 +183,7 @@ def dataset_fingerprint(dataset: Dataset) -> str:
         lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height)
         digest.update(repr((view.name, lens, view.background)).encode())
         digest.update(camera.world_to_camera.tobytes())
-    drawn = [view.source for view in dataset.views if isinstance(view.source, DrawnSplats)]
+    drawn = [view.source for view in dataset.views if isinstance(view.source, RenderedSplats)]
     for source in drawn:
         degree = source.cloud.sh_degree if source.sh_degree is None else source.sh_degree
         digest.update(repr((source.look, degree, source.samples, source.cloud.kernel)).encode())

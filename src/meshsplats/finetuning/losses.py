@@ -6,7 +6,7 @@ number of threads.
 
 from __future__ import annotations
 
-from meshsplats._core.kernels import compare_pictures
+from meshsplats._core.kernels import compare_images
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 
 try:
@@ -112,9 +112,9 @@ class _Weighted(torch.autograd.Function):
         l1_weight, ssim_weight, constant = weights
         rates = dict(l1_rate=l1_weight / count, ssim_rate=ssim_weight / count, threads=threads)
         wanted = [needed and gradients for needed in ctx.needs_input_grad[:2]]
-        result = compare_pictures(x, y, inside, gradient=wanted[0], **rates)
+        result = compare_images(x, y, inside, gradient=wanted[0], **rates)
         # Both sums are symmetric, so the truth's gradient is that of the pictures the other way round.
-        other = compare_pictures(y, x, inside, gradient=True, **rates).gradient if wanted[1] else None
+        other = compare_images(y, x, inside, gradient=True, **rates).gradient if wanted[1] else None
         ctx.save_for_backward(
             *(
                 None if gradient is None else torch.from_numpy(gradient).view(picture.shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from meshsplats.datasets.splat_targets import DrawnSplats
+from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
 from meshsplats.mesh import SplatMesh
 
@@ -33,7 +33,7 @@ def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BY
     vertex = VERTEX_BYTES + (BOUND_BYTES if mesh.binding is not None else 0)
     vertex += FILTER_BYTES if mesh.filter_px2 else 0
     pixels = max((view.camera.width * view.camera.height for view in views), default=0)
-    clouds = {id(v.source.cloud): v.source.cloud for v in views if isinstance(v.source, DrawnSplats)}
+    clouds = {id(v.source.cloud): v.source.cloud for v in views if isinstance(v.source, RenderedSplats)}
     arrays = (a for c in clouds.values() for a in (c.means, c.quaternions, c.scales, c.opacities, c.sh))
     return (
         BASE_BYTES

@@ -9,15 +9,15 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import evenly
-from meshsplats._core.kernels import compare_pictures
+from meshsplats._core.kernels import compare_images
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.datasets.splat_targets import DrawnSplats
+from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKDROPS, FinetuneConfig, rates
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
-from meshsplats.rendering.recorded import RecordedPicture, shown_pixels
+from meshsplats.rendering.backward import TapedRendering, shown_pixels
 
 IMPORTANCE_VIEWS = 64
 """Most training views, evenly spread, that are drawn to find out what they show of each splat."""
@@ -57,12 +57,12 @@ def view_of_step(config: FinetuneConfig, step: int, views: int) -> int:
 def learns_from_points(view: View, config: FinetuneConfig, fraction: float) -> bool:
     """Whether ``view`` still gives its values at the pixels' centres (see ``FinetuneConfig.point_share``)."""
     source = view.source
-    return fraction < config.point_share and isinstance(source, DrawnSplats) and source.look == "area"
+    return fraction < config.point_share and isinstance(source, RenderedSplats) and source.look == "area"
 
 
 def target_of(view: View, config: FinetuneConfig, step: int, points: bool = False) -> Target:
     """The truth of ``view`` in step ``step``; ``points``: at the pixels' centres, not of their areas."""
-    picture = view.source.points() if points and isinstance(view.source, DrawnSplats) else view.picture
+    picture = view.source.points() if points and isinstance(view.source, RenderedSplats) else view.load()
     background = view.background
     if picture.alpha is not None:
         background = BACKDROPS.get(config.background, background)
@@ -79,7 +79,7 @@ class Drawn:
         color: (h, w, 3) float32 display RGB.
     """
 
-    def __init__(self, recorded: RecordedPicture, linear: bool) -> None:
+    def __init__(self, recorded: TapedRendering, linear: bool) -> None:
         self._recorded, self._linear = recorded, linear
         self.color = linear_to_srgb(recorded.color) if linear else recorded.color
 
@@ -97,7 +97,7 @@ def samples_of(view: View, config: FinetuneConfig) -> int:
     """Side of the grid of samples with which the mesh is drawn to be compared with ``view``."""
     if config.samples is not None:
         return config.samples
-    viewer = isinstance(view.source, DrawnSplats) and view.source.look == "splats"
+    viewer = isinstance(view.source, RenderedSplats) and view.source.look == "splats"
     return 1 if viewer else AREA_SAMPLES
 
 
@@ -105,7 +105,7 @@ def draw(state: State, view: View, background: Sequence[float], samples: int) ->
     """The mesh as ``view`` has it before it, over a display ``background``."""
     linear = state.mesh.blending == "linear"
     behind = np.asarray(background, np.float32)
-    recorded = RecordedPicture(
+    recorded = TapedRendering(
         state.vertices,
         state.mesh.faces,
         state.colors,
@@ -135,7 +135,7 @@ def loss_of(
     mask = target.mask
     count = picture.size if mask is None else int(mask.sum()) * picture.shape[2]
     share = config.ssim_weight
-    compared = compare_pictures(
+    compared = compare_images(
         picture[None],
         target.color[None],
         None if mask is None else mask[None],

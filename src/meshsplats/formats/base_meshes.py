@@ -68,9 +68,9 @@ def load_base(
 
 def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:
     """(h, w, 4) uint8 RGBA of a picture file, or of ``data`` inside the file ``path``."""
-    from meshsplats.images.reading import load_picture
+    from meshsplats.images.reading import load_image
 
-    rgb, alpha = load_picture(path, data)
+    rgb, alpha = load_image(path, data)
     return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8) if alpha is None else alpha])
 
 

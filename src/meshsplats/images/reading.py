@@ -33,7 +33,7 @@ def read_header(path: Path) -> Header:
         return Header(image.width, image.height, _has_alpha(image))
 
 
-def load_picture(path: Path, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+def load_image(path: Path, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """uint8 (h, w, 3) RGB, and uint8 (h, w) straight alpha or None. FileFormatError for a broken picture.
 
     ``data`` is a picture that lies inside another file, which ``path`` then names in messages."""

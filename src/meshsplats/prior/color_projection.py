@@ -70,7 +70,7 @@ def _seen(
 
     ``depths`` (n,) are how far from the base they lie.
     """
-    camera, picture = view.camera, view.picture
+    camera, picture = view.camera, view.load()
     x, y, z = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
     front = z > camera.near
     depth = np.where(front, z, 1)

@@ -12,7 +12,7 @@ from meshsplats.binding import Binding
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds, weighted_quantile
 from meshsplats.cameras.trajectories import dome
-from meshsplats.datasets.views import Picture, View
+from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import MissingDependencyError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -89,7 +89,7 @@ def base_surface(
         solid = drawn.alpha >= _SOLID
         depth = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)
         _add(total, weight, depth, camera, low, voxel)
-        views.append(View(camera, Picture(np.clip(drawn.color, 0, 1), drawn.alpha)))
+        views.append(View(camera, ViewImage(np.clip(drawn.color, 0, 1), drawn.alpha)))
         if progress is not None:
             progress()
     field = np.where(weight > 0, total / np.where(weight > 0, weight, 1), -1)

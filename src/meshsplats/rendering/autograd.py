@@ -10,7 +10,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.rendering.api import MIN_TRANSMITTANCE
-from meshsplats.rendering.recorded import LOG_BYTES, RecordedPicture
+from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering
 
 try:
     import torch
@@ -45,7 +45,7 @@ def rasterize(
     filter_px2: float = 0.0,
     min_transmittance: float = MIN_TRANSMITTANCE,
     threads: int | None = None,
-    log_bytes: int = LOG_BYTES,
+    tape_bytes: int = TAPE_BYTES,
 ) -> Raster:
     """The pictures that ``render`` draws, differentiable once.
 
@@ -53,7 +53,7 @@ def rasterize(
     the pictures as drawn: values move with the interpolation (perspective included) and the blending; which
     triangles a sample sees and in which order is constant, so an edge that passes over a sample gives no
     gradient. An opacity of 1 is no exception: its gradient tells what is behind (at least six layers
-    of it). Memory for the way back is a log of at most ``log_bytes`` a picture, about two bytes for each
+    of it). Memory for the way back is a log of at most ``tape_bytes`` a picture, about two bytes for each
     fragment; tiles beyond are drawn once more. Every result has the same bits in every run, with any number
     of threads.
 
@@ -114,7 +114,7 @@ def rasterize(
         _per_face("face_splat", face_splat, len(faces)),
         _per_face("depth_group", depth_group, len(faces)),
         dict(filter_px2=filter_px2, samples=samples, min_transmittance=min_transmittance, threads=threads),
-        log_bytes,
+        tape_bytes,
     )
     inputs = (vertices, attributes, behind, poses)
     if torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in inputs):
@@ -130,7 +130,7 @@ class _Constant(NamedTuple):
     face_splat: np.ndarray | None
     depth_group: np.ndarray | None
     options: dict[str, Any]
-    log_bytes: int
+    tape_bytes: int
 
 
 def _draw(
@@ -139,7 +139,7 @@ def _draw(
     background: torch.Tensor,
     poses: torch.Tensor | None,
     constant: _Constant,
-    records: list[RecordedPicture] | None,
+    records: list[TapedRendering] | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The pictures; to ``records``, if given, what going back needs."""
     points = _array(vertices)
@@ -149,7 +149,7 @@ def _draw(
     behind = background.detach().numpy()
     drawn = []
     for number, camera in enumerate(constant.cameras):
-        picture = RecordedPicture(
+        picture = TapedRendering(
             points,
             constant.faces,
             colors,
@@ -159,7 +159,7 @@ def _draw(
             world_to_camera=None if poses is None else poses[number].detach().double().numpy(),
             face_splat=constant.face_splat,
             depth_group=constant.depth_group,
-            log_bytes=None if records is None else constant.log_bytes,
+            tape_bytes=None if records is None else constant.tape_bytes,
             **constant.options,
         )
         drawn.append((picture.color, picture.alpha, picture.attributes))

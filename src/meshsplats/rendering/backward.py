@@ -12,12 +12,12 @@ from meshsplats.camera import Camera
 from meshsplats.mesh import checked_filter
 from meshsplats.rendering.api import MIN_TRANSMITTANCE, Alive, camera_struct, checked_options, compact_groups
 
-LOG_BYTES = 128 << 20
+TAPE_BYTES = 128 << 20
 """Most memory that the log of one picture takes: about two bytes for each fragment. Going back, tiles whose
 log did not fit are drawn once more."""
 
 
-class RecordedPicture:
+class TapedRendering:
     """A picture of a mesh, drawn as ``render`` draws it, with a log of what was blended."""
 
     def __init__(
@@ -36,11 +36,11 @@ class RecordedPicture:
         samples: int = 1,
         min_transmittance: float = MIN_TRANSMITTANCE,
         threads: int | None = None,
-        log_bytes: int | None = LOG_BYTES,
+        tape_bytes: int | None = TAPE_BYTES,
     ) -> None:
         """Arrays are those of a ``SplatMesh``, C-contiguous, float32 and int32, and are kept, not copied:
         they must not change until ``back`` is called. ``attributes`` are (v, k); ``world_to_camera`` (4, 4)
-        takes the place of the camera's; without ``log_bytes`` the picture is drawn faster and there is no
+        takes the place of the camera's; without ``tape_bytes`` the picture is drawn faster and there is no
         way back."""
         keep = self._keep = Alive()
         self._options = checked_options(keep, camera, background, samples, threads)
@@ -70,7 +70,7 @@ class RecordedPicture:
             keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
         )
         self._log = ctypes.c_void_p()
-        if log_bytes is None:
+        if tape_bytes is None:
             library.call("ms_render_mesh", self._mesh, self._camera, self._options, picture)
         else:
             library.call(
@@ -79,7 +79,7 @@ class RecordedPicture:
                 self._camera,
                 self._options,
                 picture,
-                log_bytes,
+                tape_bytes,
                 ctypes.byref(self._log),
             )
         self.fragments = int(picture.fragments)
@@ -156,7 +156,7 @@ def shown_pixels(
 ) -> np.ndarray:
     """(v,) float32 pixels that a picture shows of each vertex: sums of its blending weights, of pixels where
     ``mask``, (h, w) bool."""
-    picture = RecordedPicture(
+    picture = TapedRendering(
         vertices,
         faces,
         colors,
