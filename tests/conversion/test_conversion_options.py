@@ -172,8 +172,8 @@ def test_refused(options, message):
 
 
 def test_misspelt_option():
-    with pytest.raises(TypeError, match="no option 'scalemul'; did you mean 'rim_radius'"):
-        convert(row_of([0.5]), scalemul=2)
+    with pytest.raises(TypeError, match="no option 'rimradius'; did you mean 'rim_radius'"):
+        convert(row_of([0.5]), rimradius=2)
     with pytest.raises(TypeError, match="options: mode, rim_radius, sides"):
         convert(row_of([0.5]), zzz=2)
 

@@ -229,8 +229,8 @@ PRESETS = {
         colors="degree0",
     ),
 }
-"""default: calibrated to look like the splats. paper: arXiv 2502.07754 with its published code's rim_opacity and
-sides."""
+"""default: calibrated to look like the splats. paper: arXiv 2502.07754 with the rim opacity and the
+number of sides of its published code."""
 
 
 def make_options(named: dict) -> ConversionOptions:

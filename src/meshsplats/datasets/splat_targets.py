@@ -348,6 +348,7 @@ def splat_views(
     """
     check_look(look)
     red, green, blue = map(float, background)
+    color = (red, green, blue)
     store = ImageCache(cache_bytes)
     return tuple(
         View(

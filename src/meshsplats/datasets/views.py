@@ -89,7 +89,8 @@ class View:
         return self.camera.name
 
     def load(self) -> ViewImage:
-        """The image as stored: read or rendered now, or from the cache. ValueError if it has not the camera's size."""
+        """The image as stored: read or rendered now, or from the cache. ValueError if its size is not
+        the camera's."""
         picture = self.source if isinstance(self.source, ViewImage) else self.source.load()
         size = (self.camera.height, self.camera.width)
         if picture.color.shape[:2] != size:
