@@ -348,7 +348,6 @@ def splat_views(
     """
     check_look(look)
     red, green, blue = map(float, background)
-    color = (red, green, blue)
     store = ImageCache(cache_bytes)
     return tuple(
         View(
