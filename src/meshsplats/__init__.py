@@ -1,12 +1,50 @@
 """MeshSplats: Gaussian splats as ordinary triangle meshes.
 
-Names are loaded when first used, so that ``import meshsplats`` stays quick.
+The usual way through the package is ``load_gaussians`` -> ``convert`` -> ``finetune`` -> ``save_mesh``, with
+``render`` and ``compare`` to look at the result. Names are loaded when first used, so that ``import
+meshsplats`` stays quick and needs NumPy alone.
 """
 
 from __future__ import annotations
 
 import importlib
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at run time
+    from meshsplats.base_mesh import BaseMesh
+    from meshsplats.camera import Camera
+    from meshsplats.cameras.files import load_cameras, save_cameras
+    from meshsplats.cameras.trajectories import dome, look_around, look_at, orbit
+    from meshsplats.conversion import ConversionOptions, bake_filter, convert, simplify
+    from meshsplats.datasets.folder import load_dataset
+    from meshsplats.datasets.splat_targets import splat_dataset
+    from meshsplats.datasets.views import Dataset, View, ViewImage
+    from meshsplats.errors import DataWarning, DivergenceError, FileFormatError, MissingDependencyError
+    from meshsplats.evaluation.backgrounds import find_background
+    from meshsplats.evaluation.comparison import Comparison, compare
+    from meshsplats.evaluation.metrics import psnr, ssim
+    from meshsplats.evaluation.report import Report, evaluate
+    from meshsplats.finetuning import (
+        FinetuneConfig,
+        Interrupted,
+        Progress,
+        RunOptions,
+        finetune,
+        make_config,
+        starting_mesh,
+    )
+    from meshsplats.formats.base_meshes import load_base
+    from meshsplats.formats.gaussians import load_gaussians, save_gaussians
+    from meshsplats.formats.meshes import load_mesh, save_mesh
+    from meshsplats.gaussians import GaussianCloud
+    from meshsplats.mesh import SplatMesh
+    from meshsplats.prior import MeshPrior, load_prior, train_prior
+    from meshsplats.prior.bind import bind
+    from meshsplats.rendering import Rendering, render, render_splats
+    from meshsplats.rendering.autograd import rasterize as rasterize
+    from meshsplats.rendering.looks import draw_splats
+    from meshsplats.rendering.samples import needed_samples
 
 try:
     __version__ = version("meshsplats")
@@ -14,54 +52,102 @@ except PackageNotFoundError:  # run from a source tree that was never installed
     __version__ = "0+unknown"
 
 _HOME = {
-    "GaussianCloud": "meshsplats.gaussians",
-    "SplatMesh": "meshsplats.mesh",
-    "Camera": "meshsplats.camera",
-    "load_cameras": "meshsplats.cameras.files",
-    "save_cameras": "meshsplats.cameras.files",
-    "dome": "meshsplats.cameras.trajectories",
-    "orbit": "meshsplats.cameras.trajectories",
-    "Dataset": "meshsplats.datasets.views",
-    "View": "meshsplats.datasets.views",
-    "load_dataset": "meshsplats.datasets.folder",
-    "splat_views": "meshsplats.datasets.splat_targets",
-    "splat_dataset": "meshsplats.datasets.splat_targets",
-    "load_gaussians": "meshsplats.formats.gaussians",
-    "save_gaussians": "meshsplats.formats.gaussians",
-    "load_mesh": "meshsplats.formats.meshes",
-    "save_mesh": "meshsplats.formats.meshes",
-    "convert": "meshsplats.conversion",
-    "bake_filter": "meshsplats.conversion",
-    "simplify": "meshsplats.conversion",
-    "render": "meshsplats.rendering",
-    "render_splats": "meshsplats.rendering",
-    "Rendering": "meshsplats.rendering",
-    "draw_splats": "meshsplats.rendering.looks",
-    "needed_samples": "meshsplats.rendering.samples",
-    "finetune": "meshsplats.finetuning",
-    "FinetuneConfig": "meshsplats.finetuning",
-    "MeshPrior": "meshsplats.prior",
-    "load_prior": "meshsplats.prior",
-    "evaluate": "meshsplats.evaluation.report",
-    "find_background": "meshsplats.evaluation.backgrounds",
-    "Report": "meshsplats.evaluation.report",
-    "psnr": "meshsplats.evaluation.metrics",
-    "ssim": "meshsplats.evaluation.metrics",
-    "FileFormatError": "meshsplats.errors",
-    "MissingDependencyError": "meshsplats.errors",
-    "DataWarning": "meshsplats.errors",
+    "meshsplats.base_mesh": ("BaseMesh",),
+    "meshsplats.camera": ("Camera",),
+    "meshsplats.cameras.files": ("load_cameras", "save_cameras"),
+    "meshsplats.cameras.trajectories": ("dome", "look_around", "look_at", "orbit"),
+    "meshsplats.conversion": ("ConversionOptions", "bake_filter", "convert", "simplify"),
+    "meshsplats.datasets.folder": ("load_dataset",),
+    "meshsplats.datasets.splat_targets": ("splat_dataset",),
+    "meshsplats.datasets.views": ("Dataset", "View", "ViewImage"),
+    "meshsplats.errors": ("DataWarning", "DivergenceError", "FileFormatError", "MissingDependencyError"),
+    "meshsplats.evaluation.backgrounds": ("find_background",),
+    "meshsplats.evaluation.comparison": ("Comparison", "compare"),
+    "meshsplats.evaluation.metrics": ("psnr", "ssim"),
+    "meshsplats.evaluation.report": ("Report", "evaluate"),
+    "meshsplats.finetuning": (
+        *("FinetuneConfig", "Interrupted", "Progress", "RunOptions"),
+        *("finetune", "make_config", "starting_mesh"),
+    ),
+    "meshsplats.formats.base_meshes": ("load_base",),
+    "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussians"),
+    "meshsplats.formats.meshes": ("load_mesh", "save_mesh"),
+    "meshsplats.gaussians": ("GaussianCloud",),
+    "meshsplats.mesh": ("SplatMesh",),
+    "meshsplats.prior": ("MeshPrior", "load_prior", "train_prior"),
+    "meshsplats.prior.bind": ("bind",),
+    "meshsplats.rendering": ("Rendering", "render", "render_splats"),
+    "meshsplats.rendering.autograd": ("rasterize",),
+    "meshsplats.rendering.looks": ("draw_splats",),
+    "meshsplats.rendering.samples": ("needed_samples",),
 }
+_MODULES = {name: module for module, names in _HOME.items() for name in names}
 
-__all__ = ["__version__", *_HOME]
+# All but ``rasterize``, which needs torch: a star import must not.
+__all__ = [
+    "BaseMesh",
+    "Camera",
+    "Comparison",
+    "ConversionOptions",
+    "DataWarning",
+    "Dataset",
+    "DivergenceError",
+    "FileFormatError",
+    "FinetuneConfig",
+    "GaussianCloud",
+    "Interrupted",
+    "MeshPrior",
+    "MissingDependencyError",
+    "Progress",
+    "Rendering",
+    "Report",
+    "RunOptions",
+    "SplatMesh",
+    "View",
+    "ViewImage",
+    "__version__",
+    "bake_filter",
+    "bind",
+    "compare",
+    "convert",
+    "dome",
+    "draw_splats",
+    "evaluate",
+    "find_background",
+    "finetune",
+    "load_base",
+    "load_cameras",
+    "load_dataset",
+    "load_gaussians",
+    "load_mesh",
+    "load_prior",
+    "look_around",
+    "look_at",
+    "make_config",
+    "needed_samples",
+    "orbit",
+    "psnr",
+    "render",
+    "render_splats",
+    "save_cameras",
+    "save_gaussians",
+    "save_mesh",
+    "simplify",
+    "splat_dataset",
+    "ssim",
+    "starting_mesh",
+    "train_prior",
+]
 
+if not TYPE_CHECKING:  # a checker would take any name for one that this finds
 
-def __getattr__(name: str):
-    if name in _HOME:
-        value = getattr(importlib.import_module(_HOME[name]), name)
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULES:
+            raise AttributeError(f"module 'meshsplats' has no attribute {name!r}")
+        value = getattr(importlib.import_module(_MODULES[name]), name)
         globals()[name] = value
         return value
-    raise AttributeError(f"module 'meshsplats' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted(set(globals()) | set(__all__))
+    return sorted({*globals(), *_MODULES})

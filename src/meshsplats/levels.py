@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.conversion import convert
+from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.comparison import compare
@@ -77,21 +77,22 @@ def make_level(
     level: Level,
     targets: Dataset,
     config: FinetuneConfig | None = None,
+    options: ConversionOptions | None = None,
     *,
+    up: Sequence[float] | np.ndarray | None = None,
     run: RunOptions | None = None,
     on_progress: Callable[[Progress], None] | None = None,
-    **options: Any,
 ) -> SplatMesh:
     """The mesh of ``level``: splats merged to its number, converted, and fine-tuned on ``targets`` as
     ``config`` says; without one, converted only.
 
-    ``options`` are those of ``convert``; ``run`` and ``on_progress`` those of ``finetune``.
+    ``options`` and ``up`` are those of ``convert``; ``run`` and ``on_progress`` those of ``finetune``.
     """
     if config is None:
         cameras = [view.camera for view in targets.test]
-        return convert(cloud, cameras=cameras, max_splats=level.splats, **options)
+        return convert(cloud, options, cameras=cameras, up=up, max_splats=level.splats)
     cameras = [view.camera for view in targets.train]
-    mesh = starting_mesh(cloud, cameras, max_splats=level.splats, **options)
+    mesh = starting_mesh(cloud, cameras, options, up=up, max_splats=level.splats)
     return finetune(mesh, targets, config, run=run, on_progress=on_progress)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,12 +17,17 @@ from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, Views, pixel_sizes, widen
 from meshsplats.conversion.merging import simplify
-from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
+from meshsplats.conversion.options import PRESETS, ConversionOptions, Preset, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
 from meshsplats.conversion.selection import disc_areas, inside_box, mean_shadow, most_important
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import Look
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from meshsplats.conversion.options import ConversionChanges
 
 __all__ = [
     "PRESETS",
@@ -41,11 +47,12 @@ axes, two ellipses are narrower than the splat. Of the same integrated opacity, 
 
 def convert(
     cloud: GaussianCloud,
+    options: ConversionOptions | None = None,
     *,
-    preset: str = "default",
+    preset: Preset = "default",
     cameras: Sequence[Camera] | None = None,
     up: Sequence[float] | np.ndarray | None = None,
-    **options,
+    **changes: Unpack[ConversionChanges],
 ) -> SplatMesh:
     """Every splat as one or more fans of translucent triangles round its centre.
 
@@ -58,13 +65,14 @@ def convert(
 
     Args:
         cloud: the splats.
+        options: what to do otherwise than ``preset`` does; fields that are None are the preset's.
         preset: 'default' or 'paper'.
         cameras: where the mesh will be seen from. They give the size of a pixel at each splat
             (``footprint``), the mean colour if asked for (``colors``) and what is up. Without them, pictures
             of the whole subject are assumed.
         up: direction that points up, world frame; that of the cameras by default, else (0, -1, 0).
-        options: the fields of ``ConversionOptions``, which say what they mean; the preset's values by
-            default.
+        changes: fields of ``ConversionOptions``, which says what they mean, in place of those of
+            ``options``: ``convert(cloud, max_triangles=500_000)``.
 
     Returns:
         A mesh whose vertices are ordered by splat; within a splat the centre comes first, then ring by ring
@@ -76,7 +84,7 @@ def convert(
         TypeError: an option that does not exist.
         ValueError: an option out of range, options that contradict each other, or nothing left to draw.
     """
-    given = make_options(options)
+    given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
     filter_px2 = _filter_of(cloud, chosen)
     direction = guess_up(None, cameras) if up is None else unit_up(up)

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, TypedDict, get_args
 
 import numpy as np
 
 from meshsplats.rendering.looks import Look
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 Mode = Literal["crossed", "flat", "3d"]
 Footprint = Literal["cameras", "framing", "distance", "density", "filter", "none"]
 Colors = Literal["degree0", "cameras"]
 Detail = Literal["even", "cameras"]
 Budget = Literal["merge", "drop"]
+Preset = Literal["default", "paper"]
 
 
 @dataclass(frozen=True)
@@ -233,12 +237,41 @@ PRESETS = {
 number of sides of its published code."""
 
 
-def make_options(named: dict) -> ConversionOptions:
-    """``ConversionOptions(**named)``; a misspelt name is a TypeError that says which names there are."""
+class ConversionChanges(TypedDict, total=False):
+    """The fields of ``ConversionOptions`` as keywords, for type checkers and editors."""
+
+    mode: Mode | None
+    rim_radius: float | None
+    sides: int | None
+    rim_opacity: float | None
+    center_opacity: float | None
+    rings: int | None
+    detail: Detail | None
+    flat_below: float | None
+    compensation: float | None
+    look: Look | None
+    footprint: Footprint | None
+    footprint_px2: float | None
+    viewing_distance: float | None
+    focal: float | None
+    min_opacity: float | None
+    shrink_faint: bool | None
+    crop: tuple[float, float, float, float, float, float] | None
+    max_splats: int | None
+    max_triangles: int | None
+    budget: Budget | None
+    colors: Colors | None
+
+
+def make_options(
+    options: ConversionOptions | None = None, **changes: Unpack[ConversionChanges]
+) -> ConversionOptions:
+    """``options``, none by default, with ``changes``. A misspelt name is a TypeError that says which names
+    there are."""
     known = [f.name for f in fields(ConversionOptions)]
-    for name in named:
+    for name in changes:
         if name not in known:
             close = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
             raise TypeError(f"convert has no option {name!r}{hint}")
-    return ConversionOptions(**named)
+    return replace(options or ConversionOptions(), **changes)

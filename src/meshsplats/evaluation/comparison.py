@@ -101,7 +101,18 @@ def compare_views(
         yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))
 
 
-def compare(cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera], **options) -> Comparison:
+def compare(
+    cloud: GaussianCloud,
+    mesh: SplatMesh,
+    cameras: Sequence[Camera],
+    *,
+    look: Look = "area",
+    sh_degree: int | None = None,
+    background: Sequence[float] = (1, 1, 1),
+    samples: int | None = None,
+    max_layers: int | None = None,
+    threads: int | None = None,
+) -> Comparison:
     """PSNR and SSIM of the mesh's pictures against the splats', view by view. Options are those of
     ``compare_views``.
 
@@ -109,4 +120,15 @@ def compare(cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera], **
     """
     if not cameras:
         raise ValueError("cameras must hold at least one camera")
-    return Comparison(tuple(view.score for view in compare_views(cloud, mesh, cameras, **options)))
+    views = compare_views(
+        cloud,
+        mesh,
+        cameras,
+        look=look,
+        sh_degree=sh_degree,
+        background=background,
+        samples=samples,
+        max_layers=max_layers,
+        threads=threads,
+    )
+    return Comparison(tuple(view.score for view in views))

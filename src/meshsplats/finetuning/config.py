@@ -6,7 +6,10 @@ import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, get_args
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 Unit = Literal["splat", "scene"]
 Backdrop = Literal["mixed", "random", "white", "black"]
@@ -199,7 +202,39 @@ colour rate is left open there and taken from its code. published: those of its 
 as they were meant. ``docs/finetuning.md`` has the table."""
 
 
-def make_config(preset: str = "default", **changes: Any) -> FinetuneConfig:
+class FinetuneChanges(TypedDict, total=False):
+    """The fields of ``FinetuneConfig`` as keywords, for type checkers and editors."""
+
+    epochs: float | None
+    steps: int | None
+    minutes: float | None
+    color_rate: float
+    position_rate: float
+    position_unit: Unit
+    soft_edges: bool
+    final_share: float
+    rate_steps: int
+    color_step_decay: float
+    beta1: float
+    beta2: float
+    epsilon: float
+    ssim_weight: float
+    l2_weight: float
+    background: Backdrop
+    exposure: bool
+    exposure_rate: float
+    prune_epochs: float
+    prune_opacity: float
+    prune_importance: float
+    relocate_share: float
+    relocate_epochs: float
+    blending: Literal["mesh", "display", "linear"]
+    samples: int | None
+    point_share: float
+    seed: int
+
+
+def make_config(preset: str = "default", **changes: Unpack[FinetuneChanges]) -> FinetuneConfig:
     """The configuration of ``preset`` with ``changes``; a length that is given takes the place of the
     preset's.
 
@@ -208,6 +243,12 @@ def make_config(preset: str = "default", **changes: Any) -> FinetuneConfig:
     """
     if preset not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
+    return with_changes(PRESETS[preset], **changes)
+
+
+def with_changes(config: FinetuneConfig, **changes: Unpack[FinetuneChanges]) -> FinetuneConfig:
+    """``config`` with ``changes``; a length that is given takes the place of its own. Errors are those of
+    ``make_config``."""
     known = [f.name for f in fields(FinetuneConfig) if f.name != "preset"]
     for name in changes:
         if name not in known:
@@ -215,8 +256,10 @@ def make_config(preset: str = "default", **changes: Any) -> FinetuneConfig:
             hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
             raise TypeError(f"fine-tuning has no option {name!r}{hint}")
     if any(changes.get(name) is not None for name in LENGTHS):
-        changes = {name: None for name in LENGTHS} | changes
-    return replace(PRESETS[preset], **changes)
+        whole: FinetuneChanges = {"epochs": None, "steps": None, "minutes": None}
+        whole.update(changes)
+        return replace(config, **whole)
+    return replace(config, **changes)
 
 
 def worthwhile_views(config: FinetuneConfig) -> int:

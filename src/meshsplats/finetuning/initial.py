@@ -3,45 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.conversion import ConversionOptions, convert
+from meshsplats.conversion.options import make_options
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, splat_starts
-from meshsplats.rendering.looks import Look
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from meshsplats.conversion.options import ConversionChanges
 
 
 def starting_mesh(
     cloud: GaussianCloud,
     cameras: Sequence[Camera],
+    options: ConversionOptions | None = None,
     *,
     preset: str = "default",
-    look: Look = "area",
-    **options: Any,
+    up: Sequence[float] | np.ndarray | None = None,
+    **changes: Unpack[ConversionChanges],
 ) -> SplatMesh:
-    """``cloud`` converted for the fine-tuning of that ``preset``, to be seen from ``cameras``.
+    """``cloud`` converted for the fine-tuning of ``preset``, to be seen from ``cameras``.
 
-    For 'paper' and 'published' that is the paper's conversion. For 'default' it is ours, where ``options``,
-    those of ``convert``, do not say otherwise, with one ellipse a splat (``mode='flat'``) of 8 triangles in
-    the mean, more where much shows (``detail='cameras'``): two crossed ellipses look better as they are
-    converted, but cost more time in a step and end lower. For the ``look`` 'splats' it is to be
-    drawn with a filter (``footprint='filter'``), where the splats' kernel has one: that of 3DGS.
+    For 'paper' and 'published' this is the paper's conversion. For 'default' it is ours, with one ellipse per
+    splat (``mode='flat'``) of 8 triangles on average, more where much is visible (``detail='cameras'``),
+    unless ``options`` or ``changes``, as in ``convert``, say otherwise: two crossed ellipses look better
+    before fine-tuning, but a step takes longer and the result is worse. With ``look='splats'`` the mesh is to
+    be drawn with the filter of 3DGS (``footprint='filter'``), where the splats' kernel has it.
     """
-    from meshsplats.conversion import convert
-
+    chosen = make_options(options, **changes)
     if preset != "default":
-        return convert(cloud, preset="paper", cameras=cameras, **options)
-    if options.get("mode") is None and options.get("flat_below") is None:
-        options["mode"] = "flat"
-    given = options.get("footprint") is not None or options.get("footprint_px2") is not None
-    if look == "splats" and cloud.kernel == "3dgs" and not given:
-        options["footprint"] = "filter"
-    one_ring = options.get("mode") == "flat" and options.get("rings") in (None, 1)
-    if options.get("detail") is None and one_ring:
-        options["detail"] = "cameras"
-    return convert(cloud, preset="default", cameras=cameras, look=look, **options)
+        return convert(cloud, replace(chosen, look=None), preset="paper", cameras=cameras, up=up)
+    if chosen.mode is None and chosen.flat_below is None:
+        chosen = replace(chosen, mode="flat")
+    no_footprint = chosen.footprint is None and chosen.footprint_px2 is None
+    if chosen.look == "splats" and cloud.kernel == "3dgs" and no_footprint:
+        chosen = replace(chosen, footprint="filter")
+    if chosen.detail is None and chosen.mode == "flat" and chosen.rings in (None, 1):
+        chosen = replace(chosen, detail="cameras")
+    return convert(cloud, chosen, cameras=cameras, up=up)
 
 
 def vertex_sizes(mesh: SplatMesh) -> np.ndarray:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,13 +21,18 @@ from meshsplats.finetuning.checkpoint import (
     dataset_fingerprint,
     mesh_fingerprint,
 )
-from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
 from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from meshsplats.finetuning.config import FinetuneChanges
 
 RELOCATED = 0.5
 """Splats are moved in this share of the run: those moved later would not settle any more."""
@@ -102,6 +108,7 @@ def finetune(
     *,
     run: RunOptions | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    **changes: Unpack[FinetuneChanges],
 ) -> SplatMesh:
     """``mesh`` with positions, colours and opacities optimised so that its pictures are those of the training
     views of ``dataset``: photographs (``load_dataset``) or the splats' own pictures (``splat_dataset``).
@@ -113,14 +120,17 @@ def finetune(
         config: what is done; the preset 'default' by default.
         run: where it is written down, and whether it goes on from a checkpoint.
         on_progress: called after every step.
+        changes: fields of ``FinetuneConfig`` in place of those of ``config``: ``finetune(mesh, data,
+            minutes=2)``.
 
     Raises:
+        TypeError: a field that does not exist.
         ValueError: no training view, an empty mesh. OtherRunError: the checkpoint is of another run.
         MemoryError: it would not fit; nothing was written.
         DivergenceError: a view gave values that are not finite; names it.
         Interrupted: after SIGINT or SIGTERM, with a checkpoint, if there is a folder.
     """
-    config, run = config or FinetuneConfig(), run or RunOptions()
+    config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()
     if not dataset.train:
         raise ValueError("the data set has no training views")
     if not len(mesh.faces):
