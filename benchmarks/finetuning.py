@@ -21,6 +21,7 @@ from pathlib import Path
 
 import meshsplats as ms
 from meshsplats.cli.targets import TargetOptions
+from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import (
     FinetuneConfig,
@@ -99,7 +100,7 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
         target = TargetOptions(sh_degree=options.sh_degree, held_out=1, look=options.look)
         data = target.make(cloud, source, (1, 1, 1), options.threads, worthwhile_views(config), preset)
         cameras = ms.load_cameras(options.data / scene.cameras)
-        views = ms.splat_views(cloud, cameras, look=options.look, sh_degree=options.sh_degree)
+        views = splat_views(cloud, cameras, look=options.look, sh_degree=options.sh_degree)
         judged = ms.Dataset((), views, look=options.look)
     cameras = [view.camera for view in data.train]
     mesh = starting_mesh(cloud, cameras, preset=preset, look=data.look)
