@@ -1,9 +1,10 @@
 // Draws .glb files with three.js and Babylon.js in a headless Chromium, from given cameras.
 //
-//   node viewers.mjs jobs.json      jobs: [{viewer, glb, cameras, out, hash, near, far}, ...]
+//   node viewers.mjs jobs.json      jobs: [{viewer, glb, cameras, out, hash, sorted, antialias, near, far}, ...]
 //
 // Runs in a folder where `npm install three babylonjs babylonjs-loaders puppeteer-core` was run; CHROMIUM names
-// the browser. `out` receives one PNG a camera. See viewers.py.
+// the browser. `out` receives one PNG per camera. `sorted` (three.js): triangles are sorted by their centres for each
+// camera, far to near; `antialias`: MSAA. See viewers.py and tuned.py.
 
 import fs from 'fs';
 import http from 'http';
@@ -36,8 +37,24 @@ import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 ${MATRICES}
 const canvas = document.getElementById('c');
-const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
-window.draw = async (url, cameras, near, far, hash) => {
+// Far triangles first: an index sorted by the depths of the triangles' centres.
+function sortTriangles(geometry, order, view) {
+  const p = geometry.attributes.position, n = order.length / 3, depth = new Float32Array(n), e = view.elements;
+  for (let i = 0; i < n; i++) {
+    let z = 0;
+    for (let k = 0; k < 3; k++) {
+      const v = order[3 * i + k];
+      z += e[2] * p.getX(v) + e[6] * p.getY(v) + e[10] * p.getZ(v);
+    }
+    depth[i] = z;
+  }
+  const sorted = Uint32Array.from({ length: n }, (_, i) => i).sort((a, b) => depth[a] - depth[b]);
+  const index = new Uint32Array(3 * n);
+  sorted.forEach((t, i) => { for (let k = 0; k < 3; k++) index[3 * i + k] = order[3 * t + k]; });
+  geometry.setIndex(new THREE.BufferAttribute(index, 1));
+}
+window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
+  const renderer = new THREE.WebGLRenderer({ canvas, antialias, preserveDrawingBuffer: true });
   const gltf = await new GLTFLoader().loadAsync(url);
   const scene = new THREE.Scene();
   scene.background = new THREE.Color(1, 1, 1);
@@ -47,6 +64,8 @@ window.draw = async (url, cameras, near, far, hash) => {
   gltf.scene.traverse(o => { if (o.isMesh) mesh = o; });
   mesh.frustumCulled = false;
   if (hash) Object.assign(mesh.material, { alphaHash: true, transparent: false, depthWrite: true, needsUpdate: true });
+  if (sorted) mesh.material.forceSinglePass = true;  // else back faces are drawn before front faces
+  const order = mesh.geometry.index.array.slice();
   const pictures = [];
   for (const k of cameras) {
     renderer.setSize(k.width, k.height, false);
@@ -56,6 +75,9 @@ window.draw = async (url, cameras, near, far, hash) => {
     camera.matrixWorld.copy(camera.matrixWorldInverse).invert();
     camera.projectionMatrix.fromArray(projection(k, near, far));
     camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+    if (sorted) {
+      sortTriangles(mesh.geometry, order, camera.matrixWorldInverse.clone().multiply(mesh.matrixWorld));
+    }
     renderer.render(scene, camera);
     pictures.push(canvas.toDataURL('image/png'));
   }
@@ -122,21 +144,18 @@ const browser = await puppeteer.launch({
   protocolTimeout: 600000,
   args: ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
 });
-for (const viewer of new Set(jobs.map(job => job.viewer))) {
+for (const [i, job] of jobs.entries()) {
   const page = await browser.newPage();
   page.on('pageerror', error => console.error(String(error)));
-  await page.goto(home + '/' + viewer);
+  await page.goto(home + '/' + job.viewer);
   await page.waitForFunction('window.version');
-  console.log(viewer + '=' + await page.evaluate('window.version'));
-  for (const [i, job] of jobs.entries()) {
-    if (job.viewer !== viewer) continue;
-    const cameras = JSON.parse(fs.readFileSync(job.cameras));
-    const pictures = await page.evaluate(
-      (...args) => window.draw(...args), home + '/glb/' + i, cameras, job.near, job.far, job.hash);
-    fs.mkdirSync(job.out, { recursive: true });
-    pictures.forEach((p, n) => fs.writeFileSync(
-      path.join(job.out, n + '.png'), Buffer.from(p.split(',')[1], 'base64')));
-  }
+  console.log(job.viewer + '=' + await page.evaluate('window.version'));
+  const cameras = JSON.parse(fs.readFileSync(job.cameras));
+  const pictures = await page.evaluate(
+    (...args) => window.draw(...args), home + '/glb/' + i, cameras, job.near, job.far, job.hash, Boolean(job.sorted), Boolean(job.antialias));
+  fs.mkdirSync(job.out, { recursive: true });
+  pictures.forEach((p, n) => fs.writeFileSync(
+    path.join(job.out, n + '.png'), Buffer.from(p.split(',')[1], 'base64')));
   await page.close();
 }
 await browser.close();
