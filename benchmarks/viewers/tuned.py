@@ -74,9 +74,8 @@ def main() -> None:
         )
         program = done.stdout.splitlines()[0].partition("=")[2]
         print(f"{args.splats.name}, dB")
-        print(
-            f"| mesh | side | {program}, MSAA | {program}, pixel ratio 2 | ours, 2 x 2 |\n|---|---|---|---|---|"
-        )
+        print(f"| mesh | side | {program}, MSAA | {program}, pixel ratio 2 | ours, 2 x 2 |")
+        print("|---|---|---|---|---|")
         for (name, mesh), side in itertools.product(meshes.items(), args.sizes):
             truths = [ms.draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras[side]]
             columns = [
