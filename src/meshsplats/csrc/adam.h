@@ -19,9 +19,9 @@ struct MsAdam {
     const float *scale;             // (rows,), times the step; or null
     const int32_t *chosen;          // row numbers, increasing; or null
     int64_t chosen_count;
-    const uint8_t *mask;            // (rows,), 0: left out; or null. Without both every row is taken
+    const uint8_t *mask;  // (rows,), 0: left out; or null. Without both every row is taken
     float step, beta1_rest, beta2_rest, epsilon;  // step: rate and bias corrections; the others: 1 - beta
-    float low, high;                // values end within these
+    float low, high;                              // values end within these
 };
 
 }  // extern "C"
@@ -65,16 +65,16 @@ inline int64_t skip_zeros(const uint8_t *mask, int64_t at, int64_t end) {
     return at;
 }
 
-// Calls adam_run for each unbroken run of rows. Throws before any value changes if row numbers are not increasing
-// numbers of rows.
+// Calls adam_run for each unbroken run of rows. Throws before any value changes if row numbers are not
+// increasing numbers of rows.
 inline void adam_rows(const MsAdam &a) {
     constexpr int64_t SHARE = 8192;  // rows
     if (a.chosen) {
         for (int64_t i = 0; i < a.chosen_count; ++i)
             if (a.chosen[i] < 0 || a.chosen[i] >= a.rows || (i && a.chosen[i] <= a.chosen[i - 1]))
-                throw std::invalid_argument("row numbers must increase and lie in [0, " + std::to_string(a.rows) +
-                                            "), got " + std::to_string(a.chosen[i]) + " at place " +
-                                            std::to_string(i));
+                throw std::invalid_argument("row numbers must increase and lie in [0, " +
+                                            std::to_string(a.rows) + "), got " + std::to_string(a.chosen[i]) +
+                                            " at place " + std::to_string(i));
         parallel_blocks(a.threads, a.chosen_count, SHARE, [&](int64_t begin, int64_t end, int) {
             for (int64_t i = begin, next; i < end; i = next) {
                 for (next = i + 1; next < end && a.chosen[next] == a.chosen[next - 1] + 1;) ++next;

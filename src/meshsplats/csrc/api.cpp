@@ -18,9 +18,11 @@
 
 namespace {
 
-// Calls draw(worker, tile, list, length) for every tile, with one worker a thread; returns the number of fragments blended.
+// Calls draw(worker, tile, list, length) for every tile, with one worker a thread; returns the number of
+// fragments blended.
 template <class MakeWorker, class Draw>
-int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int threads, MakeWorker make_worker, Draw draw) {
+int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int threads,
+                   MakeWorker make_worker, Draw draw) {
     threads = (int)std::min<int64_t>(threads, grid.tiles());
     std::vector<decltype(make_worker())> workers(threads);
     ms::TileLists lists(grid, items, threads);
@@ -47,12 +49,13 @@ void draw_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::Ent
 
 using PictureWorker = ms::MeshTile<ms::PictureTile>;
 
-int64_t draw_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera, const MsOptions &options,
-                  const MsPicture &picture, ms::PictureLog *log) {
+int64_t draw_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera,
+                  const MsOptions &options, const MsPicture &picture, ms::PictureLog *log) {
     return draw_tiles(
         grid, scene.items, options.threads,
         [&] {
-            auto worker = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, picture, camera));
+            auto worker =
+                std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, picture, camera));
             if (log) worker->blend().record();
             return worker;
         },
@@ -83,8 +86,8 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
     const MsVertexGradients of_drawn{filter ? moved.data() : out.vertices, out.colors, out.attributes};
     ms::VertexGradients sum(mesh, of_drawn, channels, threads);
 
-    // Gradients of a few tiles at a time wait to be added in order: of so few that they need little memory, but enough for
-    // threads not to wait for each other.
+    // Gradients of a few tiles at a time wait to be added in order: of so few that they need little memory,
+    // but enough for threads not to wait for each other.
     constexpr int WAVE = 256;
     const int64_t wave_triangles = (int64_t)threads << 17;
     std::vector<ms::TileGradients> waiting(WAVE);
@@ -98,7 +101,9 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
     auto run = [&](int64_t begin, int64_t end, ms::TileLists *lists) {
         for (int64_t wave = begin; wave < end;) {
             int count = 0;
-            for (int64_t triangles = 0; count < WAVE && wave + count < end && (count < threads || triangles < wave_triangles); ++count) {
+            for (int64_t triangles = 0;
+                 count < WAVE && wave + count < end && (count < threads || triangles < wave_triangles);
+                 ++count) {
                 const ms::PackedLog *entries = log.find(wave + count);
                 triangles += entries ? (int64_t)entries->face_count() : lists->length(wave + count);
             }
@@ -106,20 +111,23 @@ void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &option
             ms::on_threads(threads, [&](int thread) {
                 auto &worker = workers[thread];
                 if (!worker)
-                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}, {}});
+                    worker.reset(
+                        new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}, {}});
                 for (int i; (i = next.fetch_add(1)) < count;) {
                     const int64_t tile = wave + i;
                     const ms::PackedLog *entries = log.find(tile);
                     if (!entries) {
                         if (!worker->again) {
-                            worker->again = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, nothing, camera));
+                            worker->again = std::make_unique<PictureWorker>(
+                                scene, ms::PictureTile(scene, options, nothing, camera));
                             worker->again->blend().record();
                         }
                         draw_tile(grid, *worker->again, tile, lists->list(tile), lists->length(tile));
-                        worker->packed.pack(worker->again->blend().log(), *worker->again->blend().pieces(), [&](size_t bytes) {
-                            worker->memory.resize(bytes);
-                            return worker->memory.data();
-                        });
+                        worker->packed.pack(worker->again->blend().log(), *worker->again->blend().pieces(),
+                                            [&](size_t bytes) {
+                                                worker->memory.resize(bytes);
+                                                return worker->memory.data();
+                                            });
                         entries = &worker->packed;
                     }
                     int x, y;
@@ -169,8 +177,9 @@ MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 MS_EXPORT const char *ms_best_variant() {
 #if defined(__x86_64__)
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl"))
         return "v4";
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
         __builtin_cpu_supports("bmi2"))
@@ -179,10 +188,10 @@ MS_EXPORT const char *ms_best_variant() {
     return "baseline";
 }
 
-// All functions from here on return 0, or 1 (memory), 3 (splats that share vertices cannot be filtered) or 2 (other) with a
-// message.
-MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, MsPicture *picture,
-                             char *message, int message_size) {
+// All functions from here on return 0, or 1 (memory), 3 (splats that share vertices cannot be filtered) or 2
+// (other) with a message.
+MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
+                             MsPicture *picture, char *message, int message_size) {
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
@@ -191,8 +200,8 @@ MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const M
 }
 
 // The same, with a log of at most `budget` bytes to go back by, which ms_forget frees.
-MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, MsPicture *picture,
-                           int64_t budget, void **log, char *message, int message_size) {
+MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
+                           MsPicture *picture, int64_t budget, void **log, char *message, int message_size) {
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
@@ -203,9 +212,9 @@ MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsO
     });
 }
 
-MS_EXPORT int ms_rasterize_back(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, const void *log,
-                                const MsPictureGradient *given, const MsVertexGradients *out, char *message,
-                                int message_size) {
+MS_EXPORT int ms_rasterize_back(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
+                                const void *log, const MsPictureGradient *given, const MsVertexGradients *out,
+                                char *message, int message_size) {
     return guarded(message, message_size,
                    [&] { go_back(*mesh, *camera, *options, *(const Record *)log, *given, *out); });
 }
@@ -219,7 +228,9 @@ MS_EXPORT int ms_render_splats(const MsSplats *splats, const MsCamera *camera, c
         ms::SplatScene scene(*splats, *camera, grid, options->threads);
         picture->fragments = draw_tiles(
             grid, scene.items, options->threads,
-            [&] { return std::make_unique<ms::SplatTile>(scene, grid, *options, *picture, *camera, *splats); },
+            [&] {
+                return std::make_unique<ms::SplatTile>(scene, grid, *options, *picture, *camera, *splats);
+            },
             [&](ms::SplatTile &worker, int64_t tile, const ms::Entry *list, int64_t length) {
                 draw_tile(grid, worker, tile, list, length);
             });

@@ -1,16 +1,19 @@
-// A low-pass filter for fans: what a viewer of splats adds to the covariance of each on the picture, for triangles.
+// A low-pass filter for fans: what a viewer of splats adds to the covariance of each on the picture, for
+// triangles.
 //
-// The triangles of one splat are a fan. Its opacity, linear inside each triangle, is a density over the picture, of mean c and
-// covariance M. A filter of variance s moves the projected vertices p to c + A (p - c) with A = (M + s I)^(1/2) M^(-1/2) =
-// (I + s M^-1)^(1/2): the density then has the covariance M + s I. Depths and opacities stay as they are.
+// The triangles of one splat are a fan. Its opacity, linear inside each triangle, is a density over the
+// picture, of mean c and covariance M. A filter of variance s moves the projected vertices p to c + A (p - c)
+// with A = (M + s I)^(1/2) M^(-1/2) = (I + s M^-1)^(1/2): the density then has the covariance M + s I. Depths
+// and opacities stay as they are.
 //
-// For a triangle of area T with opacities a_i, sum a, at positions q_i, with Q = sum q_i and B = sum a_i q_i, the integrals of
-// opacity times 1, q and q q^T over the triangle are
+// For a triangle of area T with opacities a_i, sum a, at positions q_i, with Q = sum q_i and B = sum a_i q_i,
+// the integrals of opacity times 1, q and q q^T over the triangle are
 //     T a / 3,  T / 12 (a Q + B),  T / 60 (a Q Q^T + B Q^T + Q B^T + sum (a + 2 a_i) q_i q_i^T).
 //
-// Two limits need care. A fan seen edge on has no width in one direction, where its vertices' offsets would be multiplied
-// without end: NARROWEST bounds that. Nor has it an area to weigh its triangles by: areas are those of triangles (x, y, k / z)
-// with a k that counts depth as SIDEWAYS of what it is in the plane of the picture.
+// Two limits need care. A fan seen edge on has no width in one direction, where its vertices' offsets would
+// be multiplied without end: NARROWEST bounds that. Nor has it an area to weigh its triangles by: areas are
+// those of triangles (x, y, k / z) with a k that counts depth as SIDEWAYS of what it is in the plane of the
+// picture.
 #pragma once
 
 #include <cstring>
@@ -28,12 +31,18 @@ struct SharedVertices : std::runtime_error {
 
 class FanFilter {
   public:
-    // Moves the projected vertices that triangles use. A fan that reaches nearer than the near plane or has no area stays as it
-    // is. Keeps what the way back needs; the arrays of the mesh must stay as they are. Throws SharedVertices.
-    FanFilter(const MsMesh &mesh, const Projection &projection, int samples, Large<Projected> &&plain, int threads)
-        : mesh_(mesh), projection_(projection), variance_(mesh.filter_px2 * samples * samples),
-          depth_scale_(SIDEWAYS * std::sqrt(projection.fx * projection.fy)), plain_(std::move(plain)),
-          moved_(mesh.vertex_count), owner_(mesh.vertex_count) {
+    // Moves the projected vertices that triangles use. A fan that reaches nearer than the near plane or has
+    // no area stays as it is. Keeps what the way back needs; the arrays of the mesh must stay as they are.
+    // Throws SharedVertices.
+    FanFilter(const MsMesh &mesh, const Projection &projection, int samples, Large<Projected> &&plain,
+              int threads)
+        : mesh_(mesh),
+          projection_(projection),
+          variance_(mesh.filter_px2 * samples * samples),
+          depth_scale_(SIDEWAYS * std::sqrt(projection.fx * projection.fy)),
+          plain_(std::move(plain)),
+          moved_(mesh.vertex_count),
+          owner_(mesh.vertex_count) {
         for (int64_t i = 0; i < mesh.face_count; ++i)
             if (i == 0 || mesh.face_splat[i] != mesh.face_splat[i - 1]) starts_.push_back((int32_t)i);
         fans_.resize(starts_.size());
@@ -58,7 +67,8 @@ class FanFilter {
                         moved_[v] = p;
                     } else {
                         const double x = p.x - fan.x, y = p.y - fan.y;
-                        moved_[v] = {fan.x + (fan.a[0] * x + fan.a[1] * y), fan.y + (fan.a[1] * x + fan.a[2] * y), p.w};
+                        moved_[v] = {fan.x + (fan.a[0] * x + fan.a[1] * y),
+                                     fan.y + (fan.a[1] * x + fan.a[2] * y), p.w};
                     }
                 });
             }
@@ -69,8 +79,8 @@ class FanFilter {
 
     const Projected *moved() const { return moved_.data(); }
 
-    // Adds to `out` the gradients of positions and opacities that follow from `towards`, those of the moved vertices in camera
-    // space.
+    // Adds to `out` the gradients of positions and opacities that follow from `towards`, those of the moved
+    // vertices in camera space.
     void back(const float *towards, const MsVertexGradients &out, int threads) const {
         Large<int32_t> met(owner_);  // then: -1 - place of the vertex among its fan's
         std::vector<std::vector<Pulled>> work(threads);
@@ -97,12 +107,14 @@ class FanFilter {
                     }
                     continue;
                 }
-                pull_density(number, pull_positions(fan, towards, pulled.data(), count), met.data(), pulled.data());
+                pull_density(number, pull_positions(fan, towards, pulled.data(), count), met.data(),
+                             pulled.data());
                 for (int i = 0; i < count; ++i) {
                     const Pulled &g = pulled[i];
                     const Projected &p = plain_[g.vertex];
                     add_position(g.vertex, g.x * projection_.fx * p.w, g.y * projection_.fy * p.w,
-                                 g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w, out);
+                                 g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w,
+                                 out);
                     out.colors[4 * (int64_t)g.vertex + 3] += (float)g.alpha;
                 }
             }
@@ -112,18 +124,21 @@ class FanFilter {
   private:
     static constexpr double NARROWEST = 1e-4;  // of the filter's variance
     static constexpr double SIDEWAYS = 0.1;
-    static constexpr double FAINTEST = 1e-6;   // added to opacities, so that fans without any have a shape, too
+    static constexpr double FAINTEST =
+        1e-6;  // added to opacities, so that fans without any have a shape, too
 
     struct Fan {
-        double share;         // 1 / (60 times the integral of opacity over twice the areas); before `solve`, without the 1 /
-        double x, y;          // mean; before, from the origin and over `share`
-        double m[3];          // covariance: xx, xy, yy; before, likewise
-        double x0, y0;        // origin
-        double k;             // of depths
-        double a[3];          // A
+        double share;  // 1 / (60 times the integral of opacity over twice the areas); before `solve`, without
+                       // the 1 /
+        double x, y;   // mean; before, from the origin and over `share`
+        double m[3];   // covariance: xx, xy, yy; before, likewise
+        double x0, y0;  // origin
+        double k;       // of depths
+        double a[3];    // A
         bool moves;
     };
-    // How the loss changes with the density at q from the mean: (q^T h q + c . q - level) times the fan's share.
+    // How the loss changes with the density at q from the mean: (q^T h q + c . q - level) times the fan's
+    // share.
     struct Influence {
         double h[3], c[2], level;
     };
@@ -148,11 +163,12 @@ class FanFilter {
 
     template <class Body>
     void fan_blocks(int threads, Body body) const {
-        parallel_blocks(threads, (int64_t)fans_.size(), 1 << 10,
-                        [&](int64_t begin, int64_t end, int thread) { body((int32_t)begin, (int32_t)end, thread); });
+        parallel_blocks(threads, (int64_t)fans_.size(), 1 << 10, [&](int64_t begin, int64_t end, int thread) {
+            body((int32_t)begin, (int32_t)end, thread);
+        });
     }
-    // Calls body(vertex) for each vertex of a fan, for some more than once; for few where triangles list the same vertex first
-    // and go on where the last one ended.
+    // Calls body(vertex) for each vertex of a fan, for some more than once; for few where triangles list the
+    // same vertex first and go on where the last one ended.
     template <class Body>
     __attribute__((always_inline)) void each_corner(int32_t fan, Body body) const {
         int32_t head = -1, tail = -1;
@@ -166,7 +182,8 @@ class FanFilter {
     }
 
     // Of up to eight triangles, from `i` on and before `end`.
-    __attribute__((always_inline)) void corners(int64_t i, int64_t end, double x0, double y0, double k, Corners &c) const {
+    __attribute__((always_inline)) void corners(int64_t i, int64_t end, double x0, double y0, double k,
+                                                Corners &c) const {
         c.in_front = true;
         c.held = (int)std::min<int64_t>(EIGHT, end - i);
         for (int j = 0; j < 3 && c.held < EIGHT; ++j) c.x[j] = c.y[j] = c.w[j] = c.a[j] = Eight{};
@@ -245,7 +262,8 @@ class FanFilter {
         fan.a[0] = (b[0] + root) * scale;
         fan.a[1] = b[1] * scale;
         fan.a[2] = (b[2] + root) * scale;
-        fan.moves = fan.moves & solid & (inverse.share > 0) & (fan.a[0] + std::fabs(fan.a[1]) + fan.a[2] < 1e30);
+        fan.moves =
+            fan.moves & solid & (inverse.share > 0) & (fan.a[0] + std::fabs(fan.a[1]) + fan.a[2] < 1e30);
     }
 
     // Of the covariance, no narrower than NARROWEST.
@@ -253,8 +271,8 @@ class FanFilter {
         double m[3], share;  // and 1 / determinant
     };
     Inverse inverted(const Fan &fan) const {
-        const double least = NARROWEST * variance_, xx = fan.m[0] + least, xy = fan.m[1], yy = fan.m[2] + least,
-                     share = 1 / (xx * yy - xy * xy);
+        const double least = NARROWEST * variance_, xx = fan.m[0] + least, xy = fan.m[1],
+                     yy = fan.m[2] + least, share = 1 / (xx * yy - xy * xy);
         return {{yy * share, -xy * share, xx * share}, share};
     }
 
@@ -267,7 +285,8 @@ class FanFilter {
             Pulled &to = pulled[i];
             const Projected &p = plain_[to.vertex], &q = moved_[to.vertex];
             const float *t = towards + 3 * (int64_t)to.vertex;
-            const double z = 1 / p.w, x = t[0] * unit_x * z, y = t[1] * unit_y * z, dx = p.x - fan.x, dy = p.y - fan.y;
+            const double z = 1 / p.w, x = t[0] * unit_x * z, y = t[1] * unit_y * z, dx = p.x - fan.x,
+                         dy = p.y - fan.y;
             g[0] += x * dx;
             g[1] += 0.5 * (x * dy + y * dx);
             g[2] += y * dy;
@@ -278,8 +297,10 @@ class FanFilter {
             found.c[1] += y - to.y;
             to.alpha = 0;
         }
-        // A A = I + s M^-1: A X + X A = g has X = (det A g + adj A g adj A) / (2 tr A det A), and h = -s M^-1 X M^-1.
-        const double det = a[0] * a[2] - a[1] * a[1], share = 1 / (2 * (a[0] + a[2]) * det), adjoint[3] = {a[2], -a[1], a[0]};
+        // A A = I + s M^-1: A X + X A = g has X = (det A g + adj A g adj A) / (2 tr A det A), and h = -s M^-1
+        // X M^-1.
+        const double det = a[0] * a[2] - a[1] * a[1], share = 1 / (2 * (a[0] + a[2]) * det),
+                     adjoint[3] = {a[2], -a[1], a[0]};
         double x[3], around[3];
         between(adjoint, g, around);
         for (int i = 0; i < 3; ++i) x[i] = (det * g[i] + around[i]) * share;
@@ -291,7 +312,8 @@ class FanFilter {
     }
 
     // Adds the gradients by way of the density, whose moments A and c are.
-    void pull_density(int32_t number, const Influence &influence, const int32_t *place, Pulled *pulled) const {
+    void pull_density(int32_t number, const Influence &influence, const int32_t *place,
+                      Pulled *pulled) const {
         const Fan &fan = fans_[number];
         const double *h = influence.h, *c = influence.c;
         const int64_t first = starts_[number], end = starts_[number + 1];
@@ -306,8 +328,9 @@ class FanFilter {
                 square[j] = hx[j] * t.x[j] + hy[j] * t.y[j];
                 straight[j] = c[0] * t.x[j] + c[1] * t.y[j];
             }
-            const Eight qx = t.x[0] + t.x[1] + t.x[2], qy = t.y[0] + t.y[1] + t.y[2], hqx = hx[0] + hx[1] + hx[2],
-                        hqy = hy[0] + hy[1] + hy[2], whole = qx * hqx + qy * hqy, squares = square[0] + square[1] + square[2],
+            const Eight qx = t.x[0] + t.x[1] + t.x[2], qy = t.y[0] + t.y[1] + t.y[2],
+                        hqx = hx[0] + hx[1] + hx[2], hqy = hy[0] + hy[1] + hy[2], whole = qx * hqx + qy * hqy,
+                        squares = square[0] + square[1] + square[2],
                         lines = straight[0] + straight[1] + straight[2];
             const Eight hbx = t.a[0] * hx[0] + t.a[1] * hx[1] + t.a[2] * hx[2],
                         hby = t.a[0] * hy[0] + t.a[1] * hy[1] + t.a[2] * hy[2];
@@ -318,7 +341,8 @@ class FanFilter {
                                        5 * (lines + straight[j]) - 20 * influence.level;
                 to_alpha[j] = share * by_alpha;
                 value += t.a[j] * by_alpha;
-                const Eight one = 2 * (t.sum + t.a[j]), two = 2 * (t.sum + 2 * t.a[j]), five = 5 * (t.sum + t.a[j]);
+                const Eight one = 2 * (t.sum + t.a[j]), two = 2 * (t.sum + 2 * t.a[j]),
+                            five = 5 * (t.sum + t.a[j]);
                 to[j][0] = share * (one * hqx + 2 * hbx + two * hx[j] + five * c[0]);
                 to[j][1] = share * (one * hqy + 2 * hby + two * hy[j] + five * c[1]);
                 to[j][2] = Eight{};
@@ -326,7 +350,8 @@ class FanFilter {
             // By the triangle's area: its integral, linear in the opacities, is `value` times it.
             Eight of_n[3], of_u[3], of_v[3];
             Eight area = t.area;
-            for (int lane = 0; lane < EIGHT; ++lane) area[lane] = area[lane] > 0 ? area[lane] : 1;  // its product is 0, too
+            for (int lane = 0; lane < EIGHT; ++lane)
+                area[lane] = area[lane] > 0 ? area[lane] : 1;  // its product is 0, too
             for (int j = 0; j < 3; ++j) of_n[j] = value * fan.share / area * t.n[j];
             cross(t.v, of_n, of_u);
             cross(of_n, t.u, of_v);
@@ -353,7 +378,8 @@ class FanFilter {
 
     void add_position(int32_t v, double x, double y, double z, const MsVertexGradients &out) const {
         const double *m = projection_.m;
-        for (int j = 0; j < 3; ++j) out.vertices[3 * (int64_t)v + j] += (float)(m[j] * x + m[4 + j] * y + m[8 + j] * z);
+        for (int j = 0; j < 3; ++j)
+            out.vertices[3 * (int64_t)v + j] += (float)(m[j] * x + m[4 + j] * y + m[8 + j] * z);
     }
 
     static double total(const Eight &lanes) {
@@ -368,8 +394,8 @@ class FanFilter {
     }
     // a b a of symmetric matrices.
     static void between(const double a[3], const double b[3], double out[3]) {
-        const double p = a[0] * b[0] + a[1] * b[1], q = a[0] * b[1] + a[1] * b[2], r = a[1] * b[0] + a[2] * b[1],
-                     t = a[1] * b[1] + a[2] * b[2];
+        const double p = a[0] * b[0] + a[1] * b[1], q = a[0] * b[1] + a[1] * b[2],
+                     r = a[1] * b[0] + a[2] * b[1], t = a[1] * b[1] + a[2] * b[2];
         out[0] = p * a[0] + q * a[1];
         out[1] = p * a[1] + q * a[2];
         out[2] = r * a[1] + t * a[2];

@@ -1,14 +1,16 @@
 // The way back: from the gradient of a picture to those of the vertices.
 //
-// With what stands behind fragment k, B_k = a_{k+1} c_{k+1} + (1 - a_{k+1}) B_{k+1} and B = background at the end,
+// With what stands behind fragment k, B_k = a_{k+1} c_{k+1} + (1 - a_{k+1}) B_{k+1} and B = background at the
+// end,
 //     dC/dc_k = T_k a_k,  dC/da_k = T_k (c_k - B_k),
 // found from back to front, so that nothing is divided by 1 - a and a = 1 needs no exception.
 //
-// Values are v = (sum_k s_k v_k) / (sum_k s_k) with s = A p, p = (x, y, 1), A the inverse of the matrix V of the corners in
-// homogeneous sample coordinates. As ds = -A dV s, a gradient g of v gives, summed over samples p at depth z = 1 / sum s,
+// Values are v = (sum_k s_k v_k) / (sum_k s_k) with s = A p, p = (x, y, 1), A the inverse of the matrix V of
+// the corners in homogeneous sample coordinates. As ds = -A dV s, a gradient g of v gives, summed over
+// samples p at depth z = 1 / sum s,
 //     dL/dv_k = A_k . sum z g p,  dL/dV = -A^T G A^T,  G_k = sum z g (v_k - v) p^T.
-// So of every triangle only sums of z g and z g v times 1, x and y are needed. Which triangles a sample sees, and in which
-// order, is constant.
+// So of every triangle only sums of z g and z g v times 1, x and y are needed. Which triangles a sample sees,
+// and in which order, is constant.
 #pragma once
 
 #include "mesh_tile.h"
@@ -37,14 +39,26 @@ struct TileGradients {
 
 class GradientTile {
   public:
-    GradientTile(const Scene &scene, const MsOptions &options, const MsCamera &camera, const MsPictureGradient &given)
-        : scene_(scene), mesh_(scene.mesh), grid_(scene.grid), options_(options), camera_(camera), given_(given),
-          extra_(given.attributes ? mesh_.attribute_count : 0), towards_extra_((size_t)extra_ * SAMPLES), fragments_(CHUNK), lit_(CHUNK),
-          depths_(extra_ ? CHUNK : 0), at_(CHUNK), corner_extras_(3 * extra_) {
+    GradientTile(const Scene &scene, const MsOptions &options, const MsCamera &camera,
+                 const MsPictureGradient &given)
+        : scene_(scene),
+          mesh_(scene.mesh),
+          grid_(scene.grid),
+          options_(options),
+          camera_(camera),
+          given_(given),
+          extra_(given.attributes ? mesh_.attribute_count : 0),
+          towards_extra_((size_t)extra_ * SAMPLES),
+          fragments_(CHUNK),
+          lit_(CHUNK),
+          depths_(extra_ ? CHUNK : 0),
+          at_(CHUNK),
+          corner_extras_(3 * extra_) {
         // A filter goes on from gradients in camera space.
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
-                rotation_[3 * i + j] = scene.filtered ? (float)(i == j) : (float)scene.projection.m[4 * i + j];
+                rotation_[3 * i + j] =
+                    scene.filtered ? (float)(i == j) : (float)scene.projection.m[4 * i + j];
     }
 
     void run(int tile_x, int tile_y, const PackedLog &log, TileGradients &out) {
@@ -68,7 +82,8 @@ class GradientTile {
   private:
     static constexpr int64_t CHUNK = 1024;
 
-    // Positions count from a place of the triangle's own, close to it and to the tile: else small triangles would lose digits.
+    // Positions count from a place of the triangle's own, close to it and to the tile: else small triangles
+    // would lose digits.
     struct Prepared {
         alignas(64) float a[4], b[4], c[4], low[4], high[4], first[4];  // of RGBA / depth; of RGBA
         float qa, qb, qc, q_min;
@@ -80,16 +95,16 @@ class GradientTile {
     };
     // What only the corners of a few triangles need, side by side.
     struct Corners {
-        Lanes s[3][3];          // [corner]: a, b, c of 1 / depth times its weight: the matrix A
-        Lanes apart[2][4];      // RGBA of the other two minus that of the first
+        Lanes s[3][3];      // [corner]: a, b, c of 1 / depth times its weight: the matrix A
+        Lanes apart[2][4];  // RGBA of the other two minus that of the first
         int32_t vertex[3][LANES];
     };
     // An entry of the log at the samples of its block.
     struct Fragments {
         Lanes rgba[4];   // where it has a piece
         Lanes light;     // depth; then times the light that reaches it
-        Lanes contrast;  // its colour, and what else is asked for, times the gradient of the sample's; then less the same of
-                         // what is seen behind
+        Lanes contrast;  // its colour, and what else is asked for, times the gradient of the sample's; then
+                         // less the same of what is seen behind
     };
     // The entry they belong to, and the samples where light reaches them.
     struct Lit {
@@ -110,7 +125,8 @@ class GradientTile {
             for (int x = 0; x < area_.columns; ++x) {
                 const int sample = TileArea::number(x, y);
                 const int64_t pixel = (int64_t)((area_.y0 + y) / s) * camera_.width + (area_.x0 + x) / s;
-                const float *background = options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
+                const float *background =
+                    options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
                 float end = given_.alpha ? -given_.alpha[pixel] * share : 0;
                 any |= end != 0;
                 for (int c = 0; c < 3; ++c) {
@@ -179,7 +195,8 @@ class GradientTile {
         Lanes mixed[4];
         auto mix = [&](int j) {
             for (int c = 0; c < 4; ++c)
-                mixed[c] = mul_add(corners.s[0][j], rgba[0][c], mul_add(corners.s[1][j], rgba[1][c], corners.s[2][j] * rgba[2][c]));
+                mixed[c] = mul_add(corners.s[0][j], rgba[0][c],
+                                   mul_add(corners.s[1][j], rgba[1][c], corners.s[2][j] * rgba[2][c]));
             return mixed;
         };
         put(mix(0), &Prepared::a);
@@ -190,8 +207,10 @@ class GradientTile {
         put(mixed, &Prepared::low);
         for (int c = 0; c < 4; ++c) mixed[c] = most(most(rgba[0][c], rgba[1][c]), rgba[2][c]);
         put(mixed, &Prepared::high);
-        put_columns(load_lanes(t.qa), load_lanes(t.qb), load_lanes(t.qc), load_lanes(t.q_min), [&](int k) { return &first[k].qa; });
-        put_columns(load_lanes(t.q_max), load_lanes(origin_x_), load_lanes(origin_y_), lanes(0), [&](int k) { return &first[k].q_max; });
+        put_columns(load_lanes(t.qa), load_lanes(t.qb), load_lanes(t.qc), load_lanes(t.q_min),
+                    [&](int k) { return &first[k].qa; });
+        put_columns(load_lanes(t.q_max), load_lanes(origin_x_), load_lanes(origin_y_), lanes(0),
+                    [&](int k) { return &first[k].q_max; });
         std::fill(&moments_[begin], &moments_[begin] + held, Moments{});
         for (int k = 0; k < held; ++k) {
             for (int c = 0; c < extra_; ++c) {
@@ -225,7 +244,8 @@ class GradientTile {
                 vertex[i][k] = corner[i];
             }
         }
-        // Whole numbers near the middle of the corners in front: the distances of samples from them are exact.
+        // Whole numbers near the middle of the corners in front: the distances of samples from them are
+        // exact.
         auto middle = [&](double p[3][LANES], float *origin) {
             for (int k = 0; k < LANES; ++k) {
                 double sum = 0, count = 0;
@@ -244,14 +264,16 @@ class GradientTile {
         for (int k = 0; k < held; ++k) {
             if (t.w[0][k] > 0 && t.w[1][k] > 0 && t.w[2][k] > 0) continue;
             Vec3 v[3];
-            scene_.homogeneous(mesh_.faces + 3 * (int64_t)faces[k], area_.x0 + origin_x_[k], area_.y0 + origin_y_[k], v);
+            scene_.homogeneous(mesh_.faces + 3 * (int64_t)faces[k], area_.x0 + origin_x_[k],
+                               area_.y0 + origin_y_[k], v);
             t.set_up_crossing(k, v, scene_.projection.near);
         }
     }
 
     // Fills in what does not depend on the order; returns the depth.
     template <bool EXTRA>
-    Lanes evaluate(int block, const Lanes &lane_x, const Lanes &lane_y, const TileLog::Entry entry, Fragments &f) {
+    Lanes evaluate(int block, const Lanes &lane_x, const Lanes &lane_y, const TileLog::Entry entry,
+                   Fragments &f) {
         const PackedLog::Numbered *piece = pieces_ + entry.first;
         Lanes q, linear[4];
         const Prepared *t = &triangles_[piece->number()];
@@ -275,24 +297,29 @@ class GradientTile {
         const Lanes z = f.light = reciprocal(clamp(q, lanes(q_min), lanes(q_max)));
         for (int c = 0; c < 4; ++c) f.rgba[c] = clamp(linear[c] * z, lanes(low[c]), lanes(high[c]));
         const float *g = towards_[0] + block * LANES;
-        f.contrast = mul_add(f.rgba[0], load_lanes(g), mul_add(f.rgba[1], load_lanes(g + SAMPLES), f.rgba[2] * load_lanes(g + 2 * SAMPLES)));
+        f.contrast =
+            mul_add(f.rgba[0], load_lanes(g),
+                    mul_add(f.rgba[1], load_lanes(g + SAMPLES), f.rgba[2] * load_lanes(g + 2 * SAMPLES)));
         if (!EXTRA) return z;
         for (uint32_t i = 0; i < entry.count; ++i) {
             t = &triangles_[piece[i].number()];
             const Lanes x = lane_x - lanes(t->x0), y = lane_y - lanes(t->y0);
             for (int c = 0; c < extra_; ++c)
-                f.contrast = f.contrast + only(piece[i].lanes, extra_value(piece[i].number(), c, x, y, z) * load_lanes(towards_extra(c, block)));
+                f.contrast = f.contrast + only(piece[i].lanes, extra_value(piece[i].number(), c, x, y, z) *
+                                                                   load_lanes(towards_extra(c, block)));
         }
         return z;
     }
 
-    // Goes through the steps of one block. The light that reaches each fragment is found from the front, what is seen behind
-    // it from the back; then entries are taken whole. Of many steps, this is done a chunk at a time.
+    // Goes through the steps of one block. The light that reaches each fragment is found from the front, what
+    // is seen behind it from the back; then entries are taken whole. Of many steps, this is done a chunk at a
+    // time.
     template <bool EXTRA>
     void block_back(int block) {
         const int64_t chunks = (step_count_ + CHUNK - 1) / CHUNK;
         const Lanes enough = lanes(options_.min_transmittance);
-        const Lanes lane_x = TileArea::lane_x() + lanes(TileArea::block_x(block)), lane_y = TileArea::lane_y() + lanes(TileArea::block_y(block));
+        const Lanes lane_x = TileArea::lane_x() + lanes(TileArea::block_x(block)),
+                    lane_y = TileArea::lane_y() + lanes(TileArea::block_y(block));
         auto end = [&](int64_t chunk) { return std::min(step_count_, (chunk + 1) * CHUNK); };
         // Entries get places in fragments_ chunk by chunk: what is below `used` is of an earlier one.
         places_.assign(entries_.size(), 0);
@@ -312,7 +339,8 @@ class GradientTile {
                 count += fresh;
             }
             for (uint32_t i = 0; i < count; ++i) {
-                const Lanes depth = evaluate<EXTRA>(block, lane_x, lane_y, entries_[lit_[i].entry], fragments_[i]);
+                const Lanes depth =
+                    evaluate<EXTRA>(block, lane_x, lane_y, entries_[lit_[i].entry], fragments_[i]);
                 if (EXTRA) depths_[i] = depth;
             }
             for (int64_t i = 0; i < n; ++i) {
@@ -349,7 +377,8 @@ class GradientTile {
         const TileLog::Entry entry = entries_[lit.entry];
         const Lanes light = only(lit.lanes, f.light), opaque = light * f.rgba[3];
         const float *g = towards_[0] + block * LANES;
-        const Lanes all[4] = {opaque * load_lanes(g), opaque * load_lanes(g + SAMPLES), opaque * load_lanes(g + 2 * SAMPLES), light * f.contrast};
+        const Lanes all[4] = {opaque * load_lanes(g), opaque * load_lanes(g + SAMPLES),
+                              opaque * load_lanes(g + 2 * SAMPLES), light * f.contrast};
         for (uint32_t i = entry.first; i < entry.first + entry.count; ++i) {
             const PackedLog::Numbered piece = pieces_[i];
             const uint32_t triangle = piece.number();
@@ -363,7 +392,8 @@ class GradientTile {
                 for (int c = 0; c < extra_; ++c) {
                     const size_t plane = (size_t)triangle * extra_ + c;
                     const Lanes sum = only(piece.lanes, opaque * load_lanes(towards_extra(c, block)));
-                    v = v + sum * (extra_value(triangle, c, x, y, depths_[place]) - lanes(planes_[plane].first));
+                    v = v +
+                        sum * (extra_value(triangle, c, x, y, depths_[place]) - lanes(planes_[plane].first));
                     float *to = &extra_sums_[plane * 3];
                     to[0] += ::ms::sum(sum * x);
                     to[1] += ::ms::sum(sum * y);
@@ -380,7 +410,9 @@ class GradientTile {
         }
     }
 
-    const float *towards_extra(int c, int block) const { return &towards_extra_[(size_t)c * SAMPLES + block * LANES]; }
+    const float *towards_extra(int c, int block) const {
+        return &towards_extra_[(size_t)c * SAMPLES + block * LANES];
+    }
     Lanes extra_value(uint32_t place, int c, const Lanes &x, const Lanes &y, const Lanes &z) const {
         const Plane &p = planes_[(size_t)place * extra_ + c];
         return clamp(((lanes(p.a) * x + lanes(p.b) * y) + lanes(p.c)) * z, lanes(p.low), lanes(p.high));
@@ -389,14 +421,16 @@ class GradientTile {
     // From sums over samples to the corners, and from corners to vertices.
     void finish(size_t count, TileGradients &out) {
         out.make_room(count + count / 2, extra_);  // of a mesh of fans; else it will grow
-        for (size_t begin = 0; begin < count; begin += LANES) finish_batch(begin, (int)std::min<size_t>(LANES, count - begin), out);
+        for (size_t begin = 0; begin < count; begin += LANES)
+            finish_batch(begin, (int)std::min<size_t>(LANES, count - begin), out);
     }
 
     void finish_batch(size_t begin, int held, TileGradients &out) {
         const Corners &corners = corners_[begin / LANES];
         const auto &s = corners.s;
         Lanes moments[4][4];
-        for (int c = 0; c < 4; ++c) get_columns([&](int i) { return moments_[begin + i].sum[c]; }, moments[c]);
+        for (int c = 0; c < 4; ++c)
+            get_columns([&](int i) { return moments_[begin + i].sum[c]; }, moments[c]);
         // Of x, y and 1, in this order.
         Lanes of_rgba[4][3], g[3][3];
         for (int c = 0; c < 4; ++c)
@@ -406,7 +440,8 @@ class GradientTile {
             g[0][j] = lanes(0) - moments[(j + 1) % 3][3];
             for (int k = 1; k < 3; ++k) {
                 g[k][j] = g[0][j];
-                for (int c = 0; c < 4; ++c) g[k][j] = mul_add(corners.apart[k - 1][c], of_rgba[c][j], g[k][j]);
+                for (int c = 0; c < 4; ++c)
+                    g[k][j] = mul_add(corners.apart[k - 1][c], of_rgba[c][j], g[k][j]);
             }
         }
         for (int c = 0; c < extra_; ++c) {
@@ -420,7 +455,8 @@ class GradientTile {
                 corner_extras_[k * extra_ + c] = dot(s[k], sums);
                 alignas(64) float apart[LANES] = {};
                 for (int i = 0; i < held; ++i)
-                    apart[i] = mesh_.attributes[(int64_t)corners.vertex[k][i] * extra_ + c] - planes_[(begin + i) * extra_ + c].first;
+                    apart[i] = mesh_.attributes[(int64_t)corners.vertex[k][i] * extra_ + c] -
+                               planes_[(begin + i) * extra_ + c].first;
                 for (int j = 0; j < 3; ++j) g[k][j] = mul_add(load_lanes(apart), sums[j], g[k][j]);
             }
         }
@@ -433,8 +469,8 @@ class GradientTile {
         }
         TileGradients::Sum sums[3][LANES];
         for (int k = 0; k < 3; ++k) {
-            put_columns(dot(s[k], of_rgba[0]), dot(s[k], of_rgba[1]), dot(s[k], of_rgba[2]), dot(s[k], of_rgba[3]),
-                        [&](int i) { return sums[k][i].rgba; });
+            put_columns(dot(s[k], of_rgba[0]), dot(s[k], of_rgba[1]), dot(s[k], of_rgba[2]),
+                        dot(s[k], of_rgba[3]), [&](int i) { return sums[k][i].rgba; });
             Lanes d[3] = {lanes(0), lanes(0), lanes(0)};
             for (int i = 0; i < 3; ++i) {
                 const Lanes h = dot(g[i], s[k]);
@@ -444,7 +480,8 @@ class GradientTile {
             const Lanes x = d[0] * lanes((float)pr.fx), y = d[1] * lanes((float)pr.fy);
             Lanes world[3];
             for (int j = 0; j < 3; ++j)
-                world[j] = mul_add(lanes(rotation_[j]), x, mul_add(lanes(rotation_[3 + j]), y, lanes(rotation_[6 + j]) * z));
+                world[j] = mul_add(lanes(rotation_[j]), x,
+                                   mul_add(lanes(rotation_[3 + j]), y, lanes(rotation_[6 + j]) * z));
             put_columns(world[0], world[1], world[2], lanes(0), [&](int i) { return sums[k][i].position; });
         }
         out.make_room(3 * LANES, extra_);
@@ -455,7 +492,8 @@ class GradientTile {
     // Triangles of a fan come close together, so that a corner is mostly a vertex that was just met.
     void add_corner(int32_t vertex, const TileGradients::Sum &sum, int corner, int lane, TileGradients &out) {
         uint32_t &met = met_[(uint32_t)vertex % MET];
-        // Whether it was is hard to predict: no branch. What is read where it was not need not be a number, and counts as 0.
+        // Whether it was is hard to predict: no branch. What is read where it was not need not be a number,
+        // and counts as 0.
         const uint32_t known = met < out.count ? met : 0, next = (uint32_t)out.count;
         const bool again = (met < out.count) & (out.vertices[known] == vertex);
         const uint32_t place = met = again ? known : next;
@@ -470,7 +508,9 @@ class GradientTile {
         }
     }
 
-    static Lanes dot(const Lanes a[3], const Lanes b[3]) { return mul_add(a[0], b[0], mul_add(a[1], b[1], a[2] * b[2])); }
+    static Lanes dot(const Lanes a[3], const Lanes b[3]) {
+        return mul_add(a[0], b[0], mul_add(a[1], b[1], a[2] * b[2]));
+    }
 
     const Scene &scene_;
     const MsMesh &mesh_;
@@ -478,7 +518,7 @@ class GradientTile {
     const MsOptions &options_;
     const MsCamera &camera_;
     const MsPictureGradient &given_;
-    const int extra_;  // channels of attributes
+    const int extra_;    // channels of attributes
     float rotation_[9];  // from the space of the gradients to that of the camera
     TileArea area_;
     alignas(64) float towards_[3][SAMPLES];  // gradient of each sample's colour
@@ -506,8 +546,8 @@ class GradientTile {
     uint32_t met_[MET] = {};  // where in the sums of a tile a vertex may be; its number is looked at there
 };
 
-// Adds the gradients of all tiles to those of the vertices, always in the order of the tiles: the result does not depend on
-// the number of threads.
+// Adds the gradients of all tiles to those of the vertices, always in the order of the tiles: the result does
+// not depend on the number of threads.
 class VertexGradients {
   public:
     VertexGradients(const MsMesh &mesh, const MsVertexGradients &out, int attributes, int threads)
@@ -515,7 +555,8 @@ class VertexGradients {
 
     void add(const TileGradients *tiles, int count) {
         on_threads(threads_, [&](int thread) {
-            const int64_t begin = mesh_.vertex_count * thread / threads_, end = mesh_.vertex_count * (thread + 1) / threads_;
+            const int64_t begin = mesh_.vertex_count * thread / threads_,
+                          end = mesh_.vertex_count * (thread + 1) / threads_;
             for (int i = 0; i < count; ++i) {
                 const TileGradients &tile = tiles[i];
                 for (size_t place = 0; place < tile.count; ++place) {
@@ -529,7 +570,8 @@ class VertexGradients {
                     const TileGradients::Sum &sum = tile.sums[place];
                     for (int j = 0; j < 3; ++j) out_.vertices[3 * v + j] += sum.position[j];
                     store4(out_.colors + 4 * v, load4(out_.colors + 4 * v) + load4(sum.rgba));
-                    for (int c = 0; c < attributes_; ++c) out_.attributes[v * attributes_ + c] += tile.attributes[place * attributes_ + c];
+                    for (int c = 0; c < attributes_; ++c)
+                        out_.attributes[v * attributes_ + c] += tile.attributes[place * attributes_ + c];
                 }
             }
         });

@@ -16,29 +16,34 @@ namespace ms {
 constexpr int TILE = 16;  // samples a side; fixed, so that rounding does not depend on the vector width
 
 struct Grid {
-    int samples;       // a pixel side
-    int width, height; // in samples
-    int side;          // samples a tile side in use: the largest multiple of `samples` up to TILE
+    int samples;        // a pixel side
+    int width, height;  // in samples
+    int side;           // samples a tile side in use: the largest multiple of `samples` up to TILE
     int tiles_x, tiles_y;
 
     Grid(const MsCamera &camera, int samples)
-        : samples(samples), width(camera.width * samples), height(camera.height * samples),
-          side(TILE / samples * samples), tiles_x((width + side - 1) / side), tiles_y((height + side - 1) / side) {}
+        : samples(samples),
+          width(camera.width * samples),
+          height(camera.height * samples),
+          side(TILE / samples * samples),
+          tiles_x((width + side - 1) / side),
+          tiles_y((height + side - 1) / side) {}
     int64_t tiles() const { return (int64_t)tiles_x * tiles_y; }
 
-    // The column or row of tiles of a sample: its place / side, without the division, which takes longer than all else that
-    // is asked of a small triangle.
+    // The column or row of tiles of a sample: its place / side, without the division, which takes longer than
+    // all else that is asked of a small triangle.
     int tile_of(int place) const { return (int)((uint64_t)place * share_ >> 32); }
 
-    // Tiles are numbered down and then across strips of a few rows, so that what one tile reads is still at hand for its
-    // neighbours in both directions.
+    // Tiles are numbered down and then across strips of a few rows, so that what one tile reads is still at
+    // hand for its neighbours in both directions.
     static constexpr int STRIP = 4;
     int64_t tile(int x, int y) const {
         const int first = y / STRIP * STRIP;
         return (int64_t)first * tiles_x + (int64_t)x * std::min(STRIP, tiles_y - first) + (y - first);
     }
     void place(int64_t tile, int &x, int &y) const {
-        const int first = (int)(tile / ((int64_t)STRIP * tiles_x)) * STRIP, rows = std::min(STRIP, tiles_y - first);
+        const int first = (int)(tile / ((int64_t)STRIP * tiles_x)) * STRIP,
+                  rows = std::min(STRIP, tiles_y - first);
         const int64_t rest = tile - (int64_t)first * tiles_x;
         x = (int)(rest / rows);
         y = first + (int)(rest % rows);
@@ -100,8 +105,8 @@ inline void sort_items(std::vector<Item> &items) {
     items.swap(sorted);
 }
 
-// Tile lists for a run of consecutive tiles, in the order of the items. Long lists are made a run of tiles at a
-// time, so that memory stays bounded however many tiles the items cover.
+// Tile lists for a run of consecutive tiles, in the order of the items. Long lists are made a run of tiles at
+// a time, so that memory stays bounded however many tiles the items cover.
 class TileLists {
   public:
     TileLists(const Grid &grid, const std::vector<Item> &items, int threads)
@@ -142,9 +147,11 @@ class TileLists {
             int64_t a = bound(total * thread / n), b = bound(total * (thread + 1) / n);
             if (a >= b) return;
             constexpr int strip = Grid::STRIP;
-            const int strip_a = (int)(a / ((int64_t)strip * grid_.tiles_x)), strip_b = (int)((b - 1) / ((int64_t)strip * grid_.tiles_x));
+            const int strip_a = (int)(a / ((int64_t)strip * grid_.tiles_x)),
+                      strip_b = (int)((b - 1) / ((int64_t)strip * grid_.tiles_x));
             for (const Item &item : items_) {
-                const int y0 = std::max<int>(item.y0, strip_a * strip), y1 = std::min<int>(item.y1, strip_b * strip + strip - 1);
+                const int y0 = std::max<int>(item.y0, strip_a * strip),
+                          y1 = std::min<int>(item.y1, strip_b * strip + strip - 1);
                 for (int y = y0; y <= y1; ++y) {
                     const int64_t step = std::min(strip, grid_.tiles_y - y / strip * strip);
                     int64_t tile = grid_.tile(item.x0, y);

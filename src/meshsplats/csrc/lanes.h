@@ -1,5 +1,5 @@
-// The 16 samples of a block, one number each. Operations are those of the vectors they consist of, in the same order
-// at every vector width.
+// The 16 samples of a block, one number each. Operations are those of the vectors they consist of, in the
+// same order at every vector width.
 #pragma once
 
 #include <cstring>
@@ -33,18 +33,18 @@ inline void store_lanes(float *p, const Lanes &a) {
     for (int i = 0; i < PARTS; ++i) store(p + i * W, a.part[i]);
 }
 
-#define MS_LANES(name, expression)                                    \
-    inline Lanes name(const Lanes &a, const Lanes &b) {               \
-        Lanes r;                                                      \
-        for (int i = 0; i < PARTS; ++i) {                             \
-            const vf x = a.part[i], y = b.part[i];                    \
-            r.part[i] = expression;                                   \
-        }                                                             \
-        return r;                                                     \
+#define MS_LANES(name, expression)                      \
+    inline Lanes name(const Lanes &a, const Lanes &b) { \
+        Lanes r;                                        \
+        for (int i = 0; i < PARTS; ++i) {               \
+            const vf x = a.part[i], y = b.part[i];      \
+            r.part[i] = expression;                     \
+        }                                               \
+        return r;                                       \
     }
 MS_LANES(operator+, x + y)
 MS_LANES(operator-, x - y)
-MS_LANES(operator*, x * y)
+MS_LANES(operator*, x *y)
 MS_LANES(operator/, x / y)
 MS_LANES(least, vmin(x, y))
 MS_LANES(most, vmax(x, y))
@@ -134,7 +134,8 @@ inline Lanes add_rows(const Lanes terms[4]) {
         const __m512 a = terms[2 * i].part[0], b = terms[2 * i + 1].part[0];
         half[i] = _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xEE));
     }
-    r.part[0] = _mm512_add_ps(_mm512_shuffle_f32x4(half[0], half[1], 0x88), _mm512_shuffle_f32x4(half[0], half[1], 0xDD));
+    r.part[0] = _mm512_add_ps(_mm512_shuffle_f32x4(half[0], half[1], 0x88),
+                              _mm512_shuffle_f32x4(half[0], half[1], 0xDD));
 #else
     f4 sums[4];
     for (int i = 0; i < 4; ++i) {
@@ -156,12 +157,14 @@ inline Lanes add_columns(const Lanes terms[4]) {
         const __m512 a = terms[2 * i].part[0], b = terms[2 * i + 1].part[0];
         half[i] = _mm512_add_ps(_mm512_shuffle_ps(a, b, 0x44), _mm512_shuffle_ps(a, b, 0xEE));
     }
-    r.part[0] = _mm512_add_ps(_mm512_shuffle_ps(half[0], half[1], 0x88), _mm512_shuffle_ps(half[0], half[1], 0xDD));
+    r.part[0] =
+        _mm512_add_ps(_mm512_shuffle_ps(half[0], half[1], 0x88), _mm512_shuffle_ps(half[0], half[1], 0xDD));
 #else
     float sums[LANES], v[LANES];
     for (int j = 0; j < 4; ++j) {
         store_lanes(v, terms[j]);
-        for (int i = 0; i < 4; ++i) sums[4 * i + j] = (v[4 * i] + v[4 * i + 2]) + (v[4 * i + 1] + v[4 * i + 3]);
+        for (int i = 0; i < 4; ++i)
+            sums[4 * i + j] = (v[4 * i] + v[4 * i + 2]) + (v[4 * i + 1] + v[4 * i + 3]);
     }
     r = load_lanes(sums);
 #endif

@@ -14,8 +14,8 @@
 
 namespace ms {
 
-// Blocks that the last picture needed and the next one will need again: a system gives memory as zeros, page by page, which
-// takes longer than writing to it.
+// Blocks that the last picture needed and the next one will need again: a system gives memory as zeros, page
+// by page, which takes longer than writing to it.
 class Blocks {
   public:
     static constexpr std::size_t PAGE = (std::size_t)2 << 20;
@@ -39,8 +39,8 @@ class Blocks {
         if (size < PAGE) return ::operator new(size, std::align_val_t(64));
         void *p = ::operator new(size, std::align_val_t(PAGE));
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-        // With small pages, every access far from the last waits for the page's address too. (This is advice: where it is not
-        // taken, pages stay small.)
+        // With small pages, every access far from the last waits for the page's address too. (This is advice:
+        // where it is not taken, pages stay small.)
         madvise(p, size, MADV_HUGEPAGE);
 #endif
         return p;
@@ -79,7 +79,9 @@ class Blocks {
         while (step * 16 <= bytes) step *= 2;
         return (bytes + step - 1) / step * step;
     }
-    static void release(void *p, std::size_t size) noexcept { ::operator delete(p, std::align_val_t(size < PAGE ? 64 : PAGE)); }
+    static void release(void *p, std::size_t size) noexcept {
+        ::operator delete(p, std::align_val_t(size < PAGE ? 64 : PAGE));
+    }
     void drop() noexcept {
         for (const Block &block : blocks_) release(block.p, block.size);
         blocks_.clear();
@@ -102,13 +104,21 @@ struct LargeMemory {
     void deallocate(T *p, std::size_t n) noexcept { Blocks::give(p, n * sizeof(T)); }
     // Numbers that are about to be written are not written as zeros first, by one thread.
     template <class U>
-    void construct(U *p) { ::new ((void *)p) U; }
+    void construct(U *p) {
+        ::new ((void *)p) U;
+    }
     template <class U, class... Given>
-    void construct(U *p, Given &&...given) { ::new ((void *)p) U(std::forward<Given>(given)...); }
+    void construct(U *p, Given &&...given) {
+        ::new ((void *)p) U(std::forward<Given>(given)...);
+    }
     template <class U>
-    bool operator==(const LargeMemory<U> &) const { return true; }
+    bool operator==(const LargeMemory<U> &) const {
+        return true;
+    }
     template <class U>
-    bool operator!=(const LargeMemory<U> &) const { return false; }
+    bool operator!=(const LargeMemory<U> &) const {
+        return false;
+    }
 };
 
 template <class T>

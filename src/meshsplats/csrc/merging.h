@@ -20,7 +20,7 @@ struct MsNearest {
     int32_t neighbours, threads;  // neighbours: at most count - 1
     const double *points;         // xyz
     int32_t *order;               // (count,): the points sorted so that neighbours lie close to each other
-    int32_t *nearest;             // (count, neighbours): of point order[i], as places in that order, nearest first
+    int32_t *nearest;  // (count, neighbours): of point order[i], as places in that order, nearest first
 };
 
 struct MsMerging {
@@ -29,11 +29,11 @@ struct MsMerging {
     const double *means;        // xyz
     const double *covariances;  // xx xy xz yy yz zz
     const double *masses;
-    const double *colors;       // RGB
-    const int32_t *nearest;     // (count, neighbours)
+    const double *colors;    // RGB
+    const int32_t *nearest;  // (count, neighbours)
     double color_weight;
-    int32_t *group;             // (count,): the lowest number of those that became one
-    int64_t left;               // groups: more than wanted if no neighbours are left to be merged
+    int32_t *group;  // (count,): the lowest number of those that became one
+    int64_t left;    // groups: more than wanted if no neighbours are left to be merged
 };
 
 }  // extern "C"
@@ -50,10 +50,12 @@ class PointTree {
         for (int64_t cells = 1; count / cells > FEW; cells *= 2) levels_++;
         cells_.resize((std::size_t)1 << levels_);
         divide(points, 0, count, 1, 0);
-        for (int64_t i = 0; i < count; ++i) places_[i] = {points[3 * order[i]], points[3 * order[i] + 1], points[3 * order[i] + 2]};
+        for (int64_t i = 0; i < count; ++i)
+            places_[i] = {points[3 * order[i]], points[3 * order[i] + 1], points[3 * order[i] + 2]};
     }
 
-    // The nearest of the points to the one at `place`, itself left out; equally near ones in the tree's order.
+    // The nearest of the points to the one at `place`, itself left out; equally near ones in the tree's
+    // order.
     void nearest(int32_t place, int32_t *out, double *distances, int count) const {
         std::fill_n(distances, count, std::numeric_limits<double>::infinity());
         double outside[3] = {0, 0, 0};
@@ -93,8 +95,8 @@ class PointTree {
     }
 
     // `outside`: how far the query lies outside the cell along each axis, `square` the sum of their squares.
-    void search(int64_t begin, int64_t end, std::size_t cell, int level, const Point &query, int32_t self, double square,
-                double *outside, int32_t *out, double *distances, int count) const {
+    void search(int64_t begin, int64_t end, std::size_t cell, int level, const Point &query, int32_t self,
+                double square, double *outside, int32_t *out, double *distances, int count) const {
         if (level == levels_) {
             for (int64_t i = begin; i < end; ++i) {
                 if (i == self) continue;
@@ -109,8 +111,8 @@ class PointTree {
         const double across = query.at[axis] - cells_[cell].border;
         const bool upper = across >= 0;
         auto descend = [&](bool up, double distance) {
-            search(up ? middle : begin, up ? end : middle, 2 * cell + up, level + 1, query, self, distance, outside, out,
-                   distances, count);
+            search(up ? middle : begin, up ? end : middle, 2 * cell + up, level + 1, query, self, distance,
+                   outside, out, distances, count);
         };
         descend(upper, square);
         const double before = outside[axis], further = square - before * before + across * across;
@@ -122,7 +124,9 @@ class PointTree {
     }
 
     static void insert(int32_t number, double distance, int32_t *out, double *distances, int count) {
-        auto after = [&](int i) { return distance < distances[i] || (distance == distances[i] && number < out[i]); };
+        auto after = [&](int i) {
+            return distance < distances[i] || (distance == distances[i] && number < out[i]);
+        };
         int i = count - 1;
         if (!after(i)) return;
         for (; i > 0 && after(i - 1); --i) distances[i] = distances[i - 1], out[i] = out[i - 1];
@@ -147,12 +151,15 @@ inline void find_nearest(const MsNearest &n) {
     });
 }
 
-// Merges pairs of neighbours, always the pair whose merging costs least, until as many are left as are wanted.
+// Merges pairs of neighbours, always the pair whose merging costs least, until as many are left as are
+// wanted.
 //
-// The cost is Runnalls' bound on the information lost by a merged pair (IEEE Trans. Aerospace 43, 2007, eq. 16), with the
-// mean area of the projections in place of the volume, and the variance of the colours beside it:
+// The cost is Runnalls' bound on the information lost by a merged pair (IEEE Trans. Aerospace 43, 2007, eq.
+// 16), with the mean area of the projections in place of the volume, and the variance of the colours beside
+// it:
 //     m/2 log e(S) - ma/2 log e(Sa) - mb/2 log e(Sb) + color_weight ma mb / m |ca - cb|^2,
-// with masses m = ma + mb and e the sum of the products of two variances each, whose root is that area but for a factor.
+// with masses m = ma + mb and e the sum of the products of two variances each, whose root is that area but
+// for a factor.
 class Merging {
   public:
     explicit Merging(const MsMerging &given)
@@ -243,7 +250,8 @@ class Merging {
         }
         for (int i = 0, k = 0; i < 3; ++i)
             for (int j = i; j < 3; ++j, ++k)
-                s.covariance[k] = wa * a.covariance[k] + wb * b.covariance[k] + wa * wb * (apart[i] * apart[j]);
+                s.covariance[k] =
+                    wa * a.covariance[k] + wb * b.covariance[k] + wa * wb * (apart[i] * apart[j]);
         s.half_log = half_log(s.covariance);
         return s;
     }
@@ -268,8 +276,9 @@ class Merging {
                 for (int32_t j = 0; j < k; ++j) {
                     const int32_t other = given_.nearest[i * k + j];
                     if (other < 0 || other >= n || other == i)
-                        throw std::invalid_argument("neighbour " + std::to_string(other) + " of " + std::to_string(i) +
-                                                    " is not another of " + std::to_string(n));
+                        throw std::invalid_argument("neighbour " + std::to_string(other) + " of " +
+                                                    std::to_string(i) + " is not another of " +
+                                                    std::to_string(n));
                     const int32_t *back = given_.nearest + (int64_t)other * k;
                     body((int32_t)i, other);
                     if (std::find(back, back + k, (int32_t)i) == back + k) body(other, (int32_t)i);
@@ -309,7 +318,8 @@ class Merging {
         for (int32_t i = 0; i < list.length; ++i) {
             const int32_t other = links_[list.begin + i];
             const double found = cost(a, other);
-            if (found < best.cost || (found == best.cost && other < best.partner)) best.cost = found, best.partner = other;
+            if (found < best.cost || (found == best.cost && other < best.partner))
+                best.cost = found, best.partner = other;
         }
         if (best.partner >= 0) best.partner_merged = splats_[best.partner].merged;
         return best;
@@ -355,7 +365,8 @@ class Merging {
         set_best(a, best);
     }
 
-    // Those in around_ as the list of `a`: in the longer of both lists' places if they fit, else in a new one.
+    // Those in around_ as the list of `a`: in the longer of both lists' places if they fit, else in a new
+    // one.
     void keep_list(int32_t a, int32_t b) {
         const int32_t length = (int32_t)around_.size();
         List place = lists_[a].space >= lists_[b].space ? lists_[a] : lists_[b];
@@ -371,7 +382,9 @@ class Merging {
     }
 
     void forget_stale() {
-        auto stale = [&](const Entry &e) { return owner_[e.splat] != e.splat || e.version != best_[e.splat].version; };
+        auto stale = [&](const Entry &e) {
+            return owner_[e.splat] != e.splat || e.version != best_[e.splat].version;
+        };
         queue_.erase(std::remove_if(queue_.begin(), queue_.end(), stale), queue_.end());
         std::make_heap(queue_.begin(), queue_.end());
     }

@@ -1,7 +1,8 @@
 // Finds the fragments of one tile and hands them on in exact order, front to back.
 //
-// Groups of triangles come nearest first. Their fragments wait in a sorted list for each block of samples; what is
-// nearer than anything still to come is blended, so the result does not depend on the order in which triangles arrive.
+// Groups of triangles come nearest first. Their fragments wait in a sorted list for each block of samples;
+// what is nearer than anything still to come is blended, so the result does not depend on the order in which
+// triangles arrive.
 #pragma once
 
 #include "picture.h"
@@ -27,11 +28,13 @@ class MeshTile {
         for (int block = 0; block < BLOCKS; ++block) {
             if (blend_.open(block)) takes_ |= 1u << block;
         }
-        // Groups come in the order of depth, which is no order in memory: data is asked for some groups ahead.
+        // Groups come in the order of depth, which is no order in memory: data is asked for some groups
+        // ahead.
         for (int64_t i = 0; i < std::min<int64_t>(length, FACES_AHEAD); ++i) ask_for_faces(list, i);
         for (int64_t i = 0; i < std::min<int64_t>(length, CORNERS_AHEAD); ++i) ask_for_corners(list, i);
         for (int64_t i = 0; i < length && takes_; ++i) {
-            if (i + BOXES_AHEAD < length) __builtin_prefetch(scene_.boxes.data() + list[i + BOXES_AHEAD].first);
+            if (i + BOXES_AHEAD < length)
+                __builtin_prefetch(scene_.boxes.data() + list[i + BOXES_AHEAD].first);
             if (i + FACES_AHEAD < length) ask_for_faces(list, i + FACES_AHEAD);
             if (i + CORNERS_AHEAD < length) ask_for_corners(list, i + CORNERS_AHEAD);
             hold_run(list[i], touching_[i % RING]);
@@ -57,9 +60,11 @@ class MeshTile {
     void ask_for_faces(const Entry *list, int64_t i) {
         touching_[i % RING] = touching(list[i]);
         const char *faces = (const char *)(mesh_.faces + 3 * (int64_t)list[i].first);
-        for (int64_t byte = 0; byte < list[i].length * (int64_t)(3 * sizeof(int32_t)); byte += 64) __builtin_prefetch(faces + byte);
+        for (int64_t byte = 0; byte < list[i].length * (int64_t)(3 * sizeof(int32_t)); byte += 64)
+            __builtin_prefetch(faces + byte);
     }
-    // (GCC takes a function that only prefetches for one without effect, and drops calls that it does not inline first.)
+    // (GCC takes a function that only prefetches for one without effect, and drops calls that it does not
+    // inline first.)
     __attribute__((always_inline)) void ask_for_corners(const Entry *list, int64_t i) {
         for (uint64_t rest = touching_[i % RING]; rest; rest &= rest - 1) {
             const int32_t *face = mesh_.faces + 3 * ((int64_t)list[i].first + __builtin_ctzll(rest));
@@ -78,14 +83,16 @@ class MeshTile {
             takes_ &= ~(1u << block);
             waiting.clear();
         }
-        // A pile of triangles that all begin near the camera, where nothing can be blended before the last has come,
-        // would fill the memory.
+        // A pile of triangles that all begin near the camera, where nothing can be blended before the last
+        // has come, would fill the memory.
         if (waiting.many()) blend_.drop_hidden(block, waiting);
     }
 
-    // Triangles gather until there are enough to make ready side by side; those of a run stay together if they can.
+    // Triangles gather until there are enough to make ready side by side; those of a run stay together if
+    // they can.
     void hold_run(const Entry &run, uint64_t touching) {
-        if (held_ + __builtin_popcountll(touching) > Triangles::N && held_ > 0 && !add_and_flush(run.key)) return;
+        if (held_ + __builtin_popcountll(touching) > Triangles::N && held_ > 0 && !add_and_flush(run.key))
+            return;
         for (; touching; touching &= touching - 1) {
             if (held_ == Triangles::N && !add_and_flush(run.key)) return;
             hold(run.first, run.first + __builtin_ctzll(touching));
@@ -106,7 +113,8 @@ class MeshTile {
         run_[held_++] = run;
     }
 
-    // Nothing of the groups to come is nearer than `nearest_to_come`. False when no block takes light any more.
+    // Nothing of the groups to come is nearer than `nearest_to_come`. False when no block takes light any
+    // more.
     bool add_and_flush(float nearest_to_come) {
         add_held();
         for (; full_; full_ &= full_ - 1) flush(__builtin_ctz(full_), nearest_to_come);
@@ -117,7 +125,8 @@ class MeshTile {
         Triangles &t = triangles_;
         t.set_up_in_front();
         unsigned crossing = 0;
-        for (int k = 0; k < held_; ++k) crossing |= (unsigned)(!(t.w[0][k] > 0) | !(t.w[1][k] > 0) | !(t.w[2][k] > 0)) << k;
+        for (int k = 0; k < held_; ++k)
+            crossing |= (unsigned)(!(t.w[0][k] > 0) | !(t.w[1][k] > 0) | !(t.w[2][k] > 0)) << k;
         for (unsigned rest = crossing; rest; rest &= rest - 1) {
             int k = __builtin_ctz(rest);
             Vec3 v[3];
@@ -134,14 +143,16 @@ class MeshTile {
         held_ = 0;
     }
 
-    // The functions of a triangle that samples need, each as (a x + b y inside a block) + (a x + b y + c at its corner).
+    // The functions of a triangle that samples need, each as (a x + b y inside a block) + (a x + b y + c at
+    // its corner).
     struct Functions {
-        Lanes inside[8];  // edges, 1 / depth, RGBA / depth
-        Lanes corner[8];  // by block
+        Lanes inside[8];                    // edges, 1 / depth, RGBA / depth
+        Lanes corner[8];                    // by block
         alignas(16) float low[4], high[4];  // range of RGBA over the corners
     };
 
-    // Adds the fragments of the held triangles [begin, end), of one run, to the lists of the blocks they touch.
+    // Adds the fragments of the held triangles [begin, end), of one run, to the lists of the blocks they
+    // touch.
     template <bool GENERAL>
     void add_run(int begin, int end, unsigned crossing) {
         const Triangles &t = triangles_;
@@ -169,14 +180,16 @@ class MeshTile {
             int32_t face = 0;
             uint32_t first_piece = found ? found->piece_count : 0, pieces = 0;
             auto add = [&] {
-                waiting.add(covered, face, GENERAL && blend_.needs_weights() ? &weights : nullptr, first_piece, pieces);
+                waiting.add(covered, face, GENERAL && blend_.needs_weights() ? &weights : nullptr,
+                            first_piece, pieces);
                 first_piece += pieces;
             };
             for (unsigned rest = touching[block]; rest; rest &= rest - 1) {
                 const int k = __builtin_ctz(rest);
                 const Functions &of = functions_[k];
                 unsigned inside = open;
-                for (int i = 0; i < 3; ++i) inside &= at_least(of.inside[i] + corner(of, i, block), lanes(t.threshold[i][k]));
+                for (int i = 0; i < 3; ++i)
+                    inside &= at_least(of.inside[i] + corner(of, i, block), lanes(t.threshold[i][k]));
                 Lanes q = of.inside[3] + corner(of, 3, block);
                 if (GENERAL && crossing >> k & 1) inside &= at_least(lanes(t.q_max[k]), q);
                 if (!inside) continue;
@@ -204,7 +217,8 @@ class MeshTile {
                     const float x = TileArea::block_x(block), y = TileArea::block_y(block);
                     weights.z = pick(inside, z, weights.z);
                     for (int i = 0; i < 3; ++i) {
-                        const Lanes b = (lanes(t.sa[i][k]) * TileArea::lane_x() + lanes(t.sb[i][k]) * TileArea::lane_y()) +
+                        const Lanes b = (lanes(t.sa[i][k]) * TileArea::lane_x() +
+                                         lanes(t.sb[i][k]) * TileArea::lane_y()) +
                                         lanes(t.sa[i][k] * x + (t.sb[i][k] * y + t.sc[i][k]));
                         weights.b[i] = pick(inside, b * z, weights.b[i]);
                     }
@@ -216,14 +230,17 @@ class MeshTile {
         }
     }
 
-    static Lanes corner(const Functions &of, int function, int block) { return lanes(((const float *)&of.corner[function])[block]); }
+    static Lanes corner(const Functions &of, int function, int block) {
+        return lanes(((const float *)&of.corner[function])[block]);
+    }
 
     // What the fragments of triangle k are sorted by, where 1 / depth is q.
     Lanes key(int k, int block, const Lanes &q) const {
         const int32_t group = mesh_.depth_group ? mesh_.depth_group[triangles_.face[k]] : -1;
         if (group < 0) return q;
         const DepthPlane &plane = scene_.planes[group];
-        const double corner = plane.q.c + plane.q.a * (area_.x0 + TileArea::block_x(block)) + plane.q.b * (area_.y0 + TileArea::block_y(block));
+        const double corner = plane.q.c + plane.q.a * (area_.x0 + TileArea::block_x(block)) +
+                              plane.q.b * (area_.y0 + TileArea::block_y(block));
         const Lanes common = lanes((float)plane.q.a) * TileArea::lane_x() +
                              (lanes((float)plane.q.b) * TileArea::lane_y() + lanes((float)corner));
         return clamp(common, lanes(plane.q_min), lanes(plane.q_max));
@@ -236,7 +253,8 @@ class MeshTile {
         const f4 high = max4(max4(c[0], c[1]), c[2]);
         if (!(t.area[k] > 0) || (!(high[3] > 0) && !blend_.keeps_invisible())) return 0;
         Functions &of = functions_[k];
-        const Lanes x = TileArea::lane_x(), y = TileArea::lane_y(), block_x = TileArea::blocks_x(), block_y = TileArea::blocks_y();
+        const Lanes x = TileArea::lane_x(), y = TileArea::lane_y(), block_x = TileArea::blocks_x(),
+                    block_y = TileArea::blocks_y();
         auto split = [&](int i, float a, float b, float c) {
             const Lanes va = lanes(a), vb = lanes(b);
             of.inside[i] = va * x + vb * y;
@@ -253,7 +271,7 @@ class MeshTile {
         if (!blocks) return 0;
         split(3, t.qa[k], t.qb[k], t.qc[k]);
         alignas(16) float plane[3][4];
-        const float(*const s[3])[Triangles::N] = {t.sa, t.sb, t.sc};
+        const float (*const s[3])[Triangles::N] = {t.sa, t.sb, t.sc};
         for (int i = 0; i < 3; ++i)
             store4(plane[i], set4(s[i][0][k]) * c[0] + set4(s[i][1][k]) * c[1] + set4(s[i][2][k]) * c[2]);
         for (int i = 0; i < 4; ++i) split(4 + i, plane[0][i], plane[1][i], plane[2][i]);
@@ -269,7 +287,7 @@ class MeshTile {
     TileArea area_;
     uint64_t touching_[RING];  // of the groups to come
     Triangles triangles_;
-    int held_;                 // triangles gathered
+    int held_;  // triangles gathered
     int32_t run_[Triangles::N];
     Functions functions_[Triangles::N];
     Waiting waiting_[BLOCKS];

@@ -1,4 +1,5 @@
-// Work sharing over std::thread. Items are taken one by one from a counter, so threads never wait for each other.
+// Work sharing over std::thread. Items are taken one by one from a counter, so threads never wait for each
+// other.
 #pragma once
 
 #include <algorithm>
@@ -11,7 +12,8 @@
 
 namespace ms {
 
-// Calls work(thread number) on `threads` threads; an exception in one is thrown again here once all have ended.
+// Calls work(thread number) on `threads` threads; an exception in one is thrown again here once all have
+// ended.
 template <class Work>
 void on_threads(int threads, Work work) {
     if (threads <= 1) return work(0);

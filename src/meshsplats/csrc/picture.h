@@ -24,12 +24,19 @@ struct Extras {
 
 class PictureTile {
   public:
-    PictureTile(const Scene &scene, const MsOptions &options, const MsPicture &picture, const MsCamera &camera)
-        : scene_(scene), grid_(scene.grid), options_(options), picture_(picture), camera_(camera),
-          extras_(picture, scene.mesh), sums_((size_t)SAMPLES * extras_.channels) {}
+    PictureTile(const Scene &scene, const MsOptions &options, const MsPicture &picture,
+                const MsCamera &camera)
+        : scene_(scene),
+          grid_(scene.grid),
+          options_(options),
+          picture_(picture),
+          camera_(camera),
+          extras_(picture, scene.mesh),
+          sums_((size_t)SAMPLES * extras_.channels) {}
 
-    // From now on keeps a log of what is blended in the tile. Then triangles without opacity count too, and what lies behind an
-    // opaque one is followed as if it let some light through: for gradients, that is what making it translucent shows.
+    // From now on keeps a log of what is blended in the tile. Then triangles without opacity count too, and
+    // what lies behind an opaque one is followed as if it let some light through: for gradients, that is what
+    // making it translucent shows.
     void record() { log_ = std::make_unique<TileLog>(); }
     const TileLog &log() const { return *log_; }
     // Where to note which triangle covers what, or null.
@@ -69,7 +76,8 @@ class PictureTile {
         uint32_t open = open_[block];
         int left[LANES];
         for (int i = 0; i < LANES; ++i)
-            left[i] = options_.max_layers ? options_.max_layers - layers_[block * LANES + i] : waiting.count();
+            left[i] =
+                options_.max_layers ? options_.max_layers - layers_[block * LANES + i] : waiting.count();
         waiting.keep(open, [&](int entry, uint32_t ready) {
             const Lanes alpha = waiting.fragments(entry).rgba[3];
             const uint32_t seen = ready & open & (log_ ? ~0u : greater(alpha, lanes(0)));
@@ -97,8 +105,10 @@ class PictureTile {
                         through += through_[sample];
                     }
                 through *= share;
-                const float *background = options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
-                for (int c = 0; c < 3; ++c) picture_.color[3 * pixel + c] = color[c] * share + through * background[c];
+                const float *background =
+                    options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
+                for (int c = 0; c < 3; ++c)
+                    picture_.color[3 * pixel + c] = color[c] * share + through * background[c];
                 picture_.alpha[pixel] = 1 - through;
                 if (!extras_.any) continue;
                 auto average = [&](float *out, int channel, int channels) {
@@ -106,13 +116,15 @@ class PictureTile {
                         float sum = 0;
                         for (int j = 0; j < s; ++j)
                             for (int i = 0; i < s; ++i)
-                                sum += sums_[(size_t)TileArea::number(x + i, y + j) * extras_.channels + channel + c];
+                                sum += sums_[(size_t)TileArea::number(x + i, y + j) * extras_.channels +
+                                             channel + c];
                         out[pixel * channels + c] = sum * share;
                     }
                 };
                 if (extras_.depth >= 0) average(picture_.depth, extras_.depth, 1);
                 if (extras_.normals >= 0) average(picture_.normals, extras_.normals, 3);
-                if (extras_.attributes >= 0) average(picture_.attributes, extras_.attributes, scene_.mesh.attribute_count);
+                if (extras_.attributes >= 0)
+                    average(picture_.attributes, extras_.attributes, scene_.mesh.attribute_count);
             }
         }
     }
@@ -162,13 +174,15 @@ class PictureTile {
                 for (uint32_t i = 0; i < waiting.pieces(entry); ++i) {
                     for (uint32_t part = piece[i].lanes & seen; part; part &= part - 1) {
                         const int lane = __builtin_ctz(part);
-                        add_extras(block * LANES + lane, pieces_.triangles[piece[i].triangle].face, waiting.weights(entry), lane, weights[lane]);
+                        add_extras(block * LANES + lane, pieces_.triangles[piece[i].triangle].face,
+                                   waiting.weights(entry), lane, weights[lane]);
                     }
                 }
             }
             if (options_.max_layers) {
                 for (uint32_t rest = seen; rest; rest &= rest - 1)
-                    if (++layers_[block * LANES + __builtin_ctz(rest)] >= options_.max_layers) open &= ~(rest & -rest);
+                    if (++layers_[block * LANES + __builtin_ctz(rest)] >= options_.max_layers)
+                        open &= ~(rest & -rest);
             }
         });
         open_[block] = open;
@@ -194,9 +208,11 @@ class PictureTile {
             double n[3] = {0, 0, 0};
             if (mesh.normals) {
                 for (int k = 0; k < 3; ++k)
-                    for (int c = 0; c < 3; ++c) n[c] += (double)b[k] * mesh.normals[3 * (int64_t)corner[k] + c];
+                    for (int c = 0; c < 3; ++c)
+                        n[c] += (double)b[k] * mesh.normals[3 * (int64_t)corner[k] + c];
             } else {
-                const float *p = mesh.vertices + 3 * (int64_t)corner[0], *q = mesh.vertices + 3 * (int64_t)corner[1],
+                const float *p = mesh.vertices + 3 * (int64_t)corner[0],
+                            *q = mesh.vertices + 3 * (int64_t)corner[1],
                             *r = mesh.vertices + 3 * (int64_t)corner[2];
                 double u[3], v[3];
                 for (int k = 0; k < 3; ++k) {
@@ -208,7 +224,8 @@ class PictureTile {
             }
             // The ray through the sample, in the world.
             const Projection &pr = scene_.projection;
-            double ray[3] = {((double)area_.x0 + x - pr.cx) / pr.fx, ((double)area_.y0 + y - pr.cy) / pr.fy, 1};
+            double ray[3] = {((double)area_.x0 + x - pr.cx) / pr.fx, ((double)area_.y0 + y - pr.cy) / pr.fy,
+                             1};
             double along = 0, length = 0;
             for (int k = 0; k < 3; ++k) {
                 along += n[k] * (pr.m[k] * ray[0] + pr.m[4 + k] * ray[1] + pr.m[8 + k] * ray[2]);
@@ -223,7 +240,8 @@ class PictureTile {
             int channels = mesh.attribute_count;
             for (int c = 0; c < channels; ++c) {
                 float value = 0;
-                for (int k = 0; k < 3; ++k) value += b[k] * mesh.attributes[(int64_t)corner[k] * channels + c];
+                for (int k = 0; k < 3; ++k)
+                    value += b[k] * mesh.attributes[(int64_t)corner[k] * channels + c];
                 sum[extras_.attributes + c] += weight * value;
             }
         }

@@ -26,12 +26,14 @@ class TileNumber {
   private:
     friend class TileBox;
     static constexpr uint64_t HALF = 0x8000;
-    static uint64_t four(uint64_t a, uint64_t b, uint64_t c, uint64_t d) { return a | b << 16 | c << 32 | d << 48; }
+    static uint64_t four(uint64_t a, uint64_t b, uint64_t c, uint64_t d) {
+        return a | b << 16 | c << 32 | d << 48;
+    }
     uint64_t bits_;
 };
 
-// The tiles that one triangle may touch, inclusive; none where x0 > x1. Four comparisons are one addition: each of its
-// quarters reaches HALF where x0 <= x, x <= x1, y0 <= y and y <= y1.
+// The tiles that one triangle may touch, inclusive; none where x0 > x1. Four comparisons are one addition:
+// each of its quarters reaches HALF where x0 <= x, x <= x1, y0 <= y and y <= y1.
 class TileBox {
   public:
     TileBox() = default;
@@ -52,7 +54,7 @@ struct Scene {
     bool filtered;
     std::vector<int32_t> group_start;  // triangles [group_start[g], group_start[g + 1]) are one group
     std::vector<DepthPlane> planes;    // by depth group
-    Large<TileBox> boxes;        // by triangle
+    Large<TileBox> boxes;              // by triangle
     std::vector<Item> items;           // groups that may cover samples, nearest first
 
     // Items are needed to draw; without, just to follow a log. `known` is the filter of the same picture.
@@ -62,10 +64,12 @@ struct Scene {
         if (!known) {
             projected_.resize(mesh.vertex_count);
             parallel_blocks(threads, mesh.vertex_count, 1 << 16, [&](int64_t a, int64_t b, int) {
-                for (int64_t i = a; i < b; ++i) projected_[i] = projection.project(projection.to_camera(mesh.vertices + 3 * i));
+                for (int64_t i = a; i < b; ++i)
+                    projected_[i] = projection.project(projection.to_camera(mesh.vertices + 3 * i));
             });
             if (filtered) {
-                filter = std::make_unique<FanFilter>(mesh, projection, grid.samples, std::move(projected_), threads);
+                filter = std::make_unique<FanFilter>(mesh, projection, grid.samples, std::move(projected_),
+                                                     threads);
                 known = filter.get();
             }
         }
@@ -76,7 +80,8 @@ struct Scene {
         find_items(threads);
     }
 
-    // The corners of a triangle in camera space, x and y in samples times depth (see triangle.h), moved by (x0, y0).
+    // The corners of a triangle in camera space, x and y in samples times depth (see triangle.h), moved by
+    // (x0, y0).
     void homogeneous(const int32_t *face, double x0, double y0, Vec3 out[3]) const {
         for (int k = 0; k < 3; ++k) {
             const Projected &p = vertices[face[k]];
@@ -85,8 +90,8 @@ struct Scene {
                 continue;
             }
             Vec3 c = projection.to_camera(mesh.vertices + 3 * (int64_t)face[k]);
-            out[k] = {projection.fx * c.x + (projection.cx - x0) * c.z, projection.fy * c.y + (projection.cy - y0) * c.z,
-                      c.z};
+            out[k] = {projection.fx * c.x + (projection.cx - x0) * c.z,
+                      projection.fy * c.y + (projection.cy - y0) * c.z, c.z};
         }
     }
 
@@ -148,7 +153,8 @@ struct Scene {
             if (largest[g].face < 0) continue;
             Vec3 v[3];
             homogeneous(mesh.faces + 3 * largest[g].face, 0, 0, v);
-            double det = v[0].x * (v[1].y * v[2].z - v[2].y * v[1].z) - v[0].y * (v[1].x * v[2].z - v[2].x * v[1].z) +
+            double det = v[0].x * (v[1].y * v[2].z - v[2].y * v[1].z) -
+                         v[0].y * (v[1].x * v[2].z - v[2].x * v[1].z) +
                          v[0].z * (v[1].x * v[2].y - v[2].x * v[1].y);
             Linear q{0, 0, 0};
             for (int i = 0; i < 3; ++i) {
@@ -159,7 +165,8 @@ struct Scene {
             }
             q = {q.a / det, q.b / det, q.c / det};
             // A plane seen edge on has no depth of its own on the picture: its nearest point stands for it.
-            if (!std::isfinite(q.a) || !std::isfinite(q.b) || !std::isfinite(q.c)) q = {0, 0, planes[g].q_max};
+            if (!std::isfinite(q.a) || !std::isfinite(q.b) || !std::isfinite(q.c))
+                q = {0, 0, planes[g].q_max};
             planes[g].q = q;
         }
     }
@@ -185,7 +192,8 @@ struct Scene {
         sort_items(items);
     }
 
-    // The tiles of a group and of each of its triangles, and its nearest point; false if it covers no sample centre.
+    // The tiles of a group and of each of its triangles, and its nearest point; false if it covers no sample
+    // centre.
     bool bound(int64_t group, Item &item) {
         constexpr double inf = std::numeric_limits<double>::infinity();
         double key = 0;
@@ -218,12 +226,14 @@ struct Scene {
                     const Vec3 &a = v[k], &b = v[(k + 1) % 3];
                     if ((p[k]->w > 0) == (p[(k + 1) % 3]->w > 0)) continue;
                     double t = (projection.near - a.z) / (b.z - a.z);
-                    include((a.x + t * (b.x - a.x)) / projection.near, (a.y + t * (b.y - a.y)) / projection.near);
+                    include((a.x + t * (b.x - a.x)) / projection.near,
+                            (a.y + t * (b.y - a.y)) / projection.near);
                 }
                 nearest = 1 / projection.near;
             }
             int x0, x1, y0, y1;
-            if (!sample_range(lo[0], hi[0], grid.width, x0, x1) || !sample_range(lo[1], hi[1], grid.height, y0, y1))
+            if (!sample_range(lo[0], hi[0], grid.width, x0, x1) ||
+                !sample_range(lo[1], hi[1], grid.height, y0, y1))
                 continue;
             x0 = grid.tile_of(x0), x1 = grid.tile_of(x1), y0 = grid.tile_of(y0), y1 = grid.tile_of(y1);
             boxes[i] = TileBox(x0, x1, y0, y1);
@@ -235,7 +245,10 @@ struct Scene {
         }
         if (left > right) return false;
         item = {{(float)key, group_start[group], group_start[group + 1] - group_start[group]},
-                (uint16_t)left, (uint16_t)right, (uint16_t)top, (uint16_t)bottom};
+                (uint16_t)left,
+                (uint16_t)right,
+                (uint16_t)top,
+                (uint16_t)bottom};
         return true;
     }
 };

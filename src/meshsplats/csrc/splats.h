@@ -1,8 +1,9 @@
 // Draws Gaussian splats the way they were trained: whole splats in the order of their centres' depth.
 //
-// EWA projection (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting (Kerbl et al. 2023): widening of
-// the projected covariance, opacity below 1/255 skipped and at most 0.99, a sample ends before the splat that would
-// leave less than 1e-4 of the light. '2dgs' follows Huang et al. 2024: the ray meets the splat's plane.
+// EWA projection (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting (Kerbl et al. 2023):
+// widening of the projected covariance, opacity below 1/255 skipped and at most 0.99, a sample ends before
+// the splat that would leave less than 1e-4 of the light. '2dgs' follows Huang et al. 2024: the ray meets the
+// splat's plane.
 #pragma once
 
 #include <memory>
@@ -16,16 +17,16 @@ constexpr float ALPHA_CUT = 1.0f / 255, ALPHA_MOST = 0.99f, LIGHT_LEFT = 1e-4f;
 
 struct FlatSplat {
     double x, y;  // projected centre, samples
-    // The squared distance in standard deviations is (m[0] dx + m[1] dy)^2 + (m[2] dy)^2: a sum of squares stays exact
-    // for thin splats, where the usual quadratic form cancels. Not used by 2dgs.
+    // The squared distance in standard deviations is (m[0] dx + m[1] dy)^2 + (m[2] dy)^2: a sum of squares
+    // stays exact for thin splats, where the usual quadratic form cancels. Not used by 2dgs.
     double m[3];
     float low, high;  // rows reached
     float opacity;
     float rgb[3];
 };
 
-// 2dgs: the ray through the centre plus (dx, dy) meets the splat's plane at u = m[0] . (dx, dy, 1) / m[2] . (dx, dy, 1)
-// standard deviations along the first axis, v likewise with m[1], at the depth w . (u, v, 1).
+// 2dgs: the ray through the centre plus (dx, dy) meets the splat's plane at u = m[0] . (dx, dy, 1) / m[2] .
+// (dx, dy, 1) standard deviations along the first axis, v likewise with m[1], at the depth w . (u, v, 1).
 struct FlatPlane {
     double m[3][3];
     float w[3];
@@ -47,8 +48,8 @@ inline vf exp_negative(vf x) {
     return p * two;
 }
 
-// Display colour seen along the unit direction d: max(0, 1/2 + sum of coefficients times real spherical harmonics);
-// of degree 0 alone, the colour that a vertex can carry, at most 1.
+// Display colour seen along the unit direction d: max(0, 1/2 + sum of coefficients times real spherical
+// harmonics); of degree 0 alone, the colour that a vertex can carry, at most 1.
 inline void sh_color(const float *sh, int used, const double d[3], float rgb[3]) {
     double x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
     double basis[16];
@@ -69,7 +70,8 @@ inline void sh_color(const float *sh, int used, const double d[3], float rgb[3])
         basis[8] = 0.5 * c * (xx - yy);
     }
     if (used > 9) {
-        double c3 = 0.25 * std::sqrt(35 / (2 * pi)), c2 = 0.5 * std::sqrt(105 / pi), c1 = 0.25 * std::sqrt(21 / (2 * pi));
+        double c3 = 0.25 * std::sqrt(35 / (2 * pi)), c2 = 0.5 * std::sqrt(105 / pi),
+               c1 = 0.25 * std::sqrt(21 / (2 * pi));
         basis[9] = -c3 * y * (3 * xx - yy);
         basis[10] = c2 * x * y * z;
         basis[11] = -c1 * y * (4 * zz - xx - yy);
@@ -134,7 +136,8 @@ class SplatScene {
     double position_[3] = {0, 0, 0};
 
     bool project(int64_t i, FlatSplat &out, FlatPlane &on_plane, Item &item) const {
-        const float *mean = cloud_.means + 3 * i, *q = cloud_.quaternions + 4 * i, *scale = cloud_.scales + 3 * i;
+        const float *mean = cloud_.means + 3 * i, *q = cloud_.quaternions + 4 * i,
+                    *scale = cloud_.scales + 3 * i;
         Vec3 c = projection_.to_camera(mean);
         if (!(c.z >= projection_.near)) return false;
         double opacity = cloud_.opacities[i];
@@ -158,7 +161,8 @@ class SplatScene {
         bool visible = cloud_.kernel == 2 ? plane(c, axes, opacity, out, on_plane, lo, hi)
                                           : footprint(c, axes, opacity, out, lo, hi);
         int x0, x1, y0, y1;
-        if (!visible || !sample_range(lo[0], hi[0], grid_.width, x0, x1) || !sample_range(lo[1], hi[1], grid_.height, y0, y1))
+        if (!visible || !sample_range(lo[0], hi[0], grid_.width, x0, x1) ||
+            !sample_range(lo[1], hi[1], grid_.height, y0, y1))
             return false;
         out.opacity = (float)opacity;
         out.low = (float)lo[1];
@@ -172,18 +176,24 @@ class SplatScene {
         for (double &d : direction) d /= length;
         sh_color(cloud_.sh + 3 * (int64_t)cloud_.sh_stored * i, cloud_.sh_used, direction, out.rgb);
         item = {{(float)(1 / c.z), 0, 1},
-                (uint16_t)grid_.tile_of(x0), (uint16_t)grid_.tile_of(x1),
-                (uint16_t)grid_.tile_of(y0), (uint16_t)grid_.tile_of(y1)};
+                (uint16_t)grid_.tile_of(x0),
+                (uint16_t)grid_.tile_of(x1),
+                (uint16_t)grid_.tile_of(y0),
+                (uint16_t)grid_.tile_of(y1)};
         return true;
     }
 
-    bool footprint(const Vec3 &c, const double axes[3][3], double &opacity, FlatSplat &out, double lo[2], double hi[2]) const {
-        // The Jacobian of the projection, taken no farther than 0.3 of the half field of view outside the picture.
+    bool footprint(const Vec3 &c, const double axes[3][3], double &opacity, FlatSplat &out, double lo[2],
+                   double hi[2]) const {
+        // The Jacobian of the projection, taken no farther than 0.3 of the half field of view outside the
+        // picture.
         double s = grid_.samples, fx = camera_.fx, fy = camera_.fy;
         double margin_x = 0.15 * camera_.width / fx, margin_y = 0.15 * camera_.height / fy;
         auto limit = [](double v, double low, double high) { return v < low ? low : v > high ? high : v; };
-        double tx = limit(c.x / c.z, -camera_.cx / fx - margin_x, (camera_.width - camera_.cx) / fx + margin_x);
-        double ty = limit(c.y / c.z, -camera_.cy / fy - margin_y, (camera_.height - camera_.cy) / fy + margin_y);
+        double tx =
+            limit(c.x / c.z, -camera_.cx / fx - margin_x, (camera_.width - camera_.cx) / fx + margin_x);
+        double ty =
+            limit(c.y / c.z, -camera_.cy / fy - margin_y, (camera_.height - camera_.cy) / fy + margin_y);
         double jx[3], jy[3], cov[3] = {0, 0, 0}, det_before = 0;
         for (int k = 0; k < 3; ++k) {
             jx[k] = fx / c.z * (axes[0][k] - tx * axes[2][k]);
@@ -216,8 +226,8 @@ class SplatScene {
         return true;
     }
 
-    bool plane(const Vec3 &c, const double axes[3][3], double opacity, const FlatSplat &splat, FlatPlane &out, double lo[2],
-               double hi[2]) const {
+    bool plane(const Vec3 &c, const double axes[3][3], double opacity, const FlatSplat &splat, FlatPlane &out,
+               double lo[2], double hi[2]) const {
         // Columns of the map (u, v, 1) -> picture; x and y counted from the projected centre.
         double center[3] = {c.x, c.y, c.z}, row[3][3];
         for (int k = 0; k < 3; ++k) {
@@ -246,8 +256,10 @@ class SplatScene {
         for (int i = 0; i < 2; ++i) {
             double at = i ? splat.y : splat.x, middle = 0, half = std::numeric_limits<double>::infinity();
             if (d < 0) {
-                double cross = radius2 * (row[i][0] * row[2][0] + row[i][1] * row[2][1]) - row[i][2] * row[2][2];
-                double square = radius2 * (row[i][0] * row[i][0] + row[i][1] * row[i][1]) - row[i][2] * row[i][2];
+                double cross =
+                    radius2 * (row[i][0] * row[2][0] + row[i][1] * row[2][1]) - row[i][2] * row[2][2];
+                double square =
+                    radius2 * (row[i][0] * row[i][0] + row[i][1] * row[i][1]) - row[i][2] * row[i][2];
                 middle = cross / d;
                 half = std::sqrt(std::max(0.0, middle * middle - square / d));
             }
@@ -263,8 +275,14 @@ class SplatTile {
   public:
     SplatTile(const SplatScene &scene, const Grid &grid, const MsOptions &options, const MsPicture &picture,
               const MsCamera &camera, const MsSplats &cloud)
-        : scene_(scene), grid_(grid), options_(options), picture_(picture), camera_(camera), planar_(cloud.kernel == 2),
-          near_((float)camera.near), low_pass_(1 / std::max(cloud.dilation, 1e-6f) / (grid.samples * grid.samples)) {
+        : scene_(scene),
+          grid_(grid),
+          options_(options),
+          picture_(picture),
+          camera_(camera),
+          planar_(cloud.kernel == 2),
+          near_((float)camera.near),
+          low_pass_(1 / std::max(cloud.dilation, 1e-6f) / (grid.samples * grid.samples)) {
         for (int i = 0; i < TILE; ++i) center_[i] = i + 0.5f;
     }
 
@@ -321,7 +339,8 @@ class SplatTile {
 
     void add(int32_t number, int x0, int y0, int rows) {
         const FlatSplat &splat = scene_.splats[number];
-        // Counted from the tile's corner in double, so that what is left is small where the centre is far away.
+        // Counted from the tile's corner in double, so that what is left is small where the centre is far
+        // away.
         const double dx = x0 - splat.x, dy = y0 - splat.y;
         float a = 0, b = 0, c = 0, d = 0, e = 0;
         Plane plane;
@@ -407,7 +426,8 @@ class SplatTile {
                         sum[2] += blue_[j][i];
                         sum[3] += through_[j][i];
                     }
-                const float *background = options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
+                const float *background =
+                    options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
                 for (int c = 0; c < 3; ++c)
                     picture_.color[3 * pixel + c] = sum[c] * share + sum[3] * share * background[c];
                 picture_.alpha[pixel] = 1 - sum[3] * share;

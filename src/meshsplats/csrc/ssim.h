@@ -1,15 +1,15 @@
-// Sums of |x - y| and of SSIM (Wang et al. 2004) over two sets of pictures, and the gradient with respect to x.
-// SSIM costs most of the time and is left out where its rate is 0.
+// Sums of |x - y| and of SSIM (Wang et al. 2004) over two sets of pictures, and the gradient with respect to
+// x. SSIM costs most of the time and is left out where its rate is 0.
 //
-// Windows are 11 x 11 Gaussians, sigma 1.5, one a pixel; outside the picture, and where the mask is 0, are zeros. With
-// m = (x + y) / 2, d = x - y and G the window's mean, the usual quotient of SSIM is
+// Windows are 11 x 11 Gaussians, sigma 1.5, one a pixel; outside the picture, and where the mask is 0, are
+// zeros. With m = (x + y) / 2, d = x - y and G the window's mean, the usual quotient of SSIM is
 //     (1 - p^2 / B1) (1 - v / B2),  p = G d,        B1 = 2 (G m)^2 + p^2 / 2 + C1,
 //                                   v = G d^2 - p^2, B2 = 2 (G m^2 - (G m)^2) + v / 2 + C2.
 // In this form rounding is relative to 1 - SSIM, and four filtered rows are enough. B2 does not change when a
 // constant is taken from m; taking 1/2 keeps four times as many digits of the variance in bright parts.
 //
-// The window is separable. A tile goes down its rows once: rows are filtered across into a ring of 11, the ring is
-// filtered down, and the derivatives that come out go the same way through a second ring.
+// The window is separable. A tile goes down its rows once: rows are filtered across into a ring of 11, the
+// ring is filtered down, and the derivatives that come out go the same way through a second ring.
 #pragma once
 
 #include <cmath>
@@ -29,7 +29,7 @@ struct MsComparison {
     const uint8_t *mask;           // (count, height, width), 0: outside; or null
     float *gradient;               // of l1_rate * l1 + ssim_rate * ssim, like the pictures; or null
     float l1_rate, ssim_rate;
-    double l1, ssim;               // out: sums over channels and pixels inside
+    double l1, ssim;  // out: sums over channels and pixels inside
 };
 
 }  // extern "C"
@@ -37,9 +37,10 @@ struct MsComparison {
 namespace ms {
 
 class ComparisonTile {
-   public:
+  public:
     static constexpr int RADIUS = 5, TAPS = 2 * RADIUS + 1;
-    static constexpr int ROWS = 128, VALUES = 384;  // of a tile, at most; VALUES across, all channels of a pixel
+    static constexpr int ROWS = 128,
+                         VALUES = 384;  // of a tile, at most; VALUES across, all channels of a pixel
     static constexpr float C1 = 1e-4f, C2 = 9e-4f;
 
     explicit ComparisonTile(const MsComparison &all) : all_(all), step_(all.channels) {
@@ -60,7 +61,8 @@ class ComparisonTile {
             for (auto &row : slope_ring_) row.assign(3 * inner, 0);
     }
 
-    // Adds to sums[0] |x - y| and to sums[1] SSIM, for rows [top, bottom) and columns [left, right) of a picture.
+    // Adds to sums[0] |x - y| and to sums[1] SSIM, for rows [top, bottom) and columns [left, right) of a
+    // picture.
     void run(int64_t number, int top, int bottom, int left, int right, double *sums) {
         number_ = number, left_ = left, right_ = right;
         length_ = (right - left) * step_;
@@ -99,7 +101,7 @@ class ComparisonTile {
         sums[1] += ssim.total();
     }
 
-   private:
+  private:
     // One order of summation for every vector width.
     struct Sum {
         double part[16] = {};
@@ -153,7 +155,8 @@ class ComparisonTile {
         if (!all_.mask) return;
         for (int i = 0; i < to - from; ++i)
             if (!all_.mask[pixel + i])
-                for (auto *r : {&x_, &y_, &inside_}) std::fill_n(&(*r)[before + (int64_t)i * step_], step_, 0.0f);
+                for (auto *r : {&x_, &y_, &inside_})
+                    std::fill_n(&(*r)[before + (int64_t)i * step_], step_, 0.0f);
     }
 
     vf filter(const float *middle, int64_t stride) const {
@@ -186,8 +189,8 @@ class ComparisonTile {
         }
     }
 
-    // SSIM of the windows in a row, from 5 columns left of the tile to 5 right of it, and its derivatives with
-    // respect to p and G m (together, as they reach x), G d^2 and G m^2.
+    // SSIM of the windows in a row, from 5 columns left of the tile to 5 right of it, and its derivatives
+    // with respect to p and G m (together, as they reach x), G d^2 and G m^2.
     void compare(int row) {
         const float *rows[TAPS];
         ordered(ring_, row, rows);
@@ -225,7 +228,8 @@ class ComparisonTile {
             return;
         }
         const uint8_t *mask = all_.mask + (number_ * all_.height + row) * all_.width + from;
-        for (int i = 0; i < to - from; ++i) std::fill_n(out + (int64_t)i * step_, step_, mask[i] ? 1.0f : 0.0f);
+        for (int i = 0; i < to - from; ++i)
+            std::fill_n(out + (int64_t)i * step_, step_, mask[i] ? 1.0f : 0.0f);
     }
 
     void filter_slopes(int row) {
@@ -249,7 +253,8 @@ class ComparisonTile {
             const vf x = load(&x_[i]), y = load(&y_[i]), d = x - y, m = (x + y) * half - half;
             vf sum = (vf)((vi)(d > vf{}) & l1) - (vf)((vi)(d < vf{}) & l1);
             if (with_ssim)
-                sum += rate * (filter(rows, i) + two * d * filter(rows, i + inner_) + m * filter(rows, i + 2 * inner_));
+                sum += rate * (filter(rows, i) + two * d * filter(rows, i + inner_) +
+                               m * filter(rows, i + 2 * inner_));
             sum *= load(&inside_[i]);
             if (i + W <= length_)
                 store(out + i, sum);
@@ -281,8 +286,8 @@ inline void compare_pictures(MsComparison &all) {
         if (!workers[thread]) workers[thread] = std::make_unique<ComparisonTile>(all);
         const int64_t number = tile / across / down;
         const int top = (int)(tile / across % down) * high, left = (int)(tile % across) * wide;
-        workers[thread]->run(number, top, std::min(top + high, all.height), left, std::min(left + wide, all.width),
-                             &sums[2 * tile]);
+        workers[thread]->run(number, top, std::min(top + high, all.height), left,
+                             std::min(left + wide, all.width), &sums[2 * tile]);
     });
     all.l1 = all.ssim = 0;
     for (int64_t tile = 0; tile < tiles; ++tile) all.l1 += sums[2 * tile], all.ssim += sums[2 * tile + 1];

@@ -14,7 +14,9 @@ struct TileArea {
 
     TileArea() = default;
     TileArea(const Grid &grid, int tile_x, int tile_y)
-        : x0(tile_x * grid.side), y0(tile_y * grid.side), columns(std::min(grid.side, grid.width - x0)),
+        : x0(tile_x * grid.side),
+          y0(tile_y * grid.side),
+          columns(std::min(grid.side, grid.width - x0)),
           rows(std::min(grid.side, grid.height - y0)) {}
 
     static int number(int x, int y) { return (y / 4 * 4 + x / 4) * LANES + y % 4 * 4 + x % 4; }
@@ -35,11 +37,13 @@ struct TileArea {
     }
     // Its samples, from that corner.
     static Lanes lane_x() {
-        alignas(64) static const float x[LANES] = {.5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5};
+        alignas(64) static const float x[LANES] = {.5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5,
+                                                   .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5};
         return load_lanes(x);
     }
     static Lanes lane_y() {
-        alignas(64) static const float y[LANES] = {.5, .5, .5, .5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
+        alignas(64) static const float y[LANES] = {.5,  .5,  .5,  .5,  1.5, 1.5, 1.5, 1.5,
+                                                   2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
         return load_lanes(y);
     }
 

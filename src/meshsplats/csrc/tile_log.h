@@ -1,4 +1,5 @@
-// What was blended in a tile, in order: enough to go through its fragments again without finding or sorting them.
+// What was blended in a tile, in order: enough to go through its fragments again without finding or sorting
+// them.
 #pragma once
 
 #include <algorithm>
@@ -32,7 +33,8 @@ struct TilePieces {
     uint32_t triangle_count = 0, piece_count = 0;
 
     void make_room(size_t new_triangles, size_t new_pieces) {
-        if (triangles.size() < triangle_count + new_triangles) triangles.resize(2 * (triangle_count + new_triangles));
+        if (triangles.size() < triangle_count + new_triangles)
+            triangles.resize(2 * (triangle_count + new_triangles));
         if (pieces.size() < piece_count + new_pieces) pieces.resize(2 * (piece_count + new_pieces));
     }
     void clear() { triangle_count = piece_count = 0; }
@@ -54,7 +56,8 @@ struct TileLog {
 
         void make_room(size_t new_entries) {
             if (entries.size() < entry_count + new_entries) entries.resize(2 * (entry_count + new_entries));
-            if (steps.size() < step_count + LANES * new_entries) steps.resize(2 * (step_count + LANES * new_entries));
+            if (steps.size() < step_count + LANES * new_entries)
+                steps.resize(2 * (step_count + LANES * new_entries));
         }
     };
     Block blocks[BLOCKS];
@@ -72,12 +75,13 @@ class PackedLog {
         uint16_t low, high, lanes;
 
         Numbered() = default;
-        Numbered(uint32_t number, uint32_t lanes) : low((uint16_t)number), high((uint16_t)(number >> 16)), lanes((uint16_t)lanes) {}
+        Numbered(uint32_t number, uint32_t lanes)
+            : low((uint16_t)number), high((uint16_t)(number >> 16)), lanes((uint16_t)lanes) {}
         uint32_t number() const { return low | (uint32_t)high << 16; }
     };
 
-    // Into memory that reserve(bytes) gives and that stays the caller's; false where it gives none. Pieces of entries of which
-    // nothing was blended are left out.
+    // Into memory that reserve(bytes) gives and that stays the caller's; false where it gives none. Pieces of
+    // entries of which nothing was blended are left out.
     template <class Reserve>
     bool pack(const TileLog &log, TilePieces &found, Reserve &&reserve) {
         for (int i = 0; i < BLOCKS; ++i) {
@@ -90,7 +94,8 @@ class PackedLog {
         const Ends &all = ends_[BLOCKS - 1];
         // One more than there can be: each is written before it is known to be another one.
         const size_t most_faces = (size_t)std::min(all.pieces, found.triangle_count) + 1;
-        faces_ = (int32_t *)reserve(most_faces * sizeof(int32_t) + ((size_t)all.pieces + all.steps) * sizeof(Numbered) + all.entries);
+        faces_ = (int32_t *)reserve(most_faces * sizeof(int32_t) +
+                                    ((size_t)all.pieces + all.steps) * sizeof(Numbered) + all.entries);
         if (!faces_) return false;
         pieces_ = (Numbered *)(faces_ + most_faces);
         steps_ = pieces_ + all.pieces;
@@ -112,7 +117,8 @@ class PackedLog {
                     *piece++ = Numbered(triangle.place, found.pieces[k].lanes);
                 }
             }
-            for (uint32_t j = 0; j < block.step_count; ++j) *step++ = Numbered(block.steps[j].entry, block.steps[j].lanes);
+            for (uint32_t j = 0; j < block.step_count; ++j)
+                *step++ = Numbered(block.steps[j].entry, block.steps[j].lanes);
         }
         return true;
     }
@@ -130,8 +136,10 @@ class PackedLog {
             first += out[j].count;
         }
     }
-    const Numbered *pieces(int block) const { return pieces_ + before(block).pieces; }  // number: a place in faces()
-    const Numbered *steps(int block) const { return steps_ + before(block).steps; }     // number: an entry's
+    const Numbered *pieces(int block) const {
+        return pieces_ + before(block).pieces;
+    }  // number: a place in faces()
+    const Numbered *steps(int block) const { return steps_ + before(block).steps; }  // number: an entry's
     int64_t step_count(int block) const { return ends_[block].steps - before(block).steps; }
 
   private:
@@ -156,7 +164,8 @@ class PictureLog {
     void keep(int64_t tile, const TileLog &log, TilePieces &found) {
         if (left_ < 0) return;
         auto packed = std::make_unique<PackedLog>();
-        if (packed->pack(log, found, [&](size_t bytes) { return reserve(bytes); })) tiles_[tile] = std::move(packed);
+        if (packed->pack(log, found, [&](size_t bytes) { return reserve(bytes); }))
+            tiles_[tile] = std::move(packed);
     }
     const PackedLog *find(int64_t tile) const { return tiles_[tile].get(); }
     bool complete() const {

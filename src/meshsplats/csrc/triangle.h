@@ -1,10 +1,11 @@
 // The mathematics of one triangle: projection, edge functions, perspective-correct interpolation.
 //
-// With camera-space corners V_i and a ray through the sample point p, E_i(p) = p . (V_j x V_k) is linear on the
-// picture, vanishes on the edge opposite to corner i, and b_i = E_i / (E_0 + E_1 + E_2) is the perspective-correct
-// barycentric weight (Olano and Greer 1997). For corners in front of the camera E_i is the planar edge function of
-// the projected edge times z_j z_k. Swapping the ends of an edge negates its function to the last bit, whichever
-// triangle it belongs to, so that a sample on a shared edge falls to exactly one of the two.
+// With camera-space corners V_i and a ray through the sample point p, E_i(p) = p . (V_j x V_k) is linear on
+// the picture, vanishes on the edge opposite to corner i, and b_i = E_i / (E_0 + E_1 + E_2) is the
+// perspective-correct barycentric weight (Olano and Greer 1997). For corners in front of the camera E_i is
+// the planar edge function of the projected edge times z_j z_k. Swapping the ends of an edge negates its
+// function to the last bit, whichever triangle it belongs to, so that a sample on a shared edge falls to
+// exactly one of the two.
 #pragma once
 
 #include <cmath>
@@ -16,7 +17,8 @@
 
 namespace ms {
 
-// A projected vertex: samples from the top left corner, and 1 / depth (0 marks one nearer than the near plane).
+// A projected vertex: samples from the top left corner, and 1 / depth (0 marks one nearer than the near
+// plane).
 struct Projected {
     double x, y, w;
 };
@@ -31,7 +33,10 @@ struct Projection {
     double fx, fy, cx, cy, near;
 
     Projection(const MsCamera &camera, int samples)
-        : fx(camera.fx * samples), fy(camera.fy * samples), cx(camera.cx * samples), cy(camera.cy * samples),
+        : fx(camera.fx * samples),
+          fy(camera.fy * samples),
+          cx(camera.cx * samples),
+          cy(camera.cy * samples),
           near(camera.near) {
         for (int i = 0; i < 12; ++i) m[i] = camera.world_to_camera[i];
     }
@@ -65,11 +70,12 @@ struct Triangles {
 
     // Out.
     alignas(64) float ea[3][N], eb[3][N], ec[3][N];  // edge functions, positive inside
-    alignas(64) float threshold[3][N];   // 0 where samples on the edge belong to the triangle, else the least normal float
-    alignas(64) float qa[N], qb[N], qc[N];     // 1 / depth
-    alignas(64) float q_min[N], q_max[N];      // its range over the corners
+    alignas(64) float threshold[3][N];  // 0 where samples on the edge belong to the triangle, else the least
+                                        // normal float
+    alignas(64) float qa[N], qb[N], qc[N];           // 1 / depth
+    alignas(64) float q_min[N], q_max[N];            // its range over the corners
     alignas(64) float sa[3][N], sb[3][N], sc[3][N];  // b_i / depth
-    alignas(64) float area[N];           // 0: no area on the picture, nothing to draw
+    alignas(64) float area[N];                       // 0: no area on the picture, nothing to draw
 
     // For triangles wholly in front of the near plane; all N slots are computed, whatever they hold.
     void set_up_in_front() {
@@ -115,10 +121,11 @@ struct Triangles {
         }
     }
 
-    // For a triangle in slot t with one or two corners nearer than the near plane (their w is 0). `v` are all corners
-    // in camera space with x and y scaled to samples, (fx X + (cx - x0) Z, fy Y + (cy - y0) Z, Z).
+    // For a triangle in slot t with one or two corners nearer than the near plane (their w is 0). `v` are all
+    // corners in camera space with x and y scaled to samples, (fx X + (cx - x0) Z, fy Y + (cy - y0) Z, Z).
     void set_up_crossing(int t, const Vec3 v[3], double near) {
-        double det = v[0].x * (v[1].y * v[2].z - v[2].y * v[1].z) - v[0].y * (v[1].x * v[2].z - v[2].x * v[1].z) +
+        double det = v[0].x * (v[1].y * v[2].z - v[2].y * v[1].z) -
+                     v[0].y * (v[1].x * v[2].z - v[2].x * v[1].z) +
                      v[0].z * (v[1].x * v[2].y - v[2].x * v[1].y);
         double size = std::fabs(det), flip = det < 0 ? -1 : 1, scale = 1 / size, q[3] = {0, 0, 0};
         area[t] = size < 1e300 && size > 1e-300 ? 1.0f : 0.0f;

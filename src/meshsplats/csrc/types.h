@@ -13,8 +13,8 @@ struct MsCamera {
 };
 
 struct MsOptions {
-    int32_t samples;          // an s x s grid of samples in each pixel
-    int32_t max_layers;       // 0: all
+    int32_t samples;     // an s x s grid of samples in each pixel
+    int32_t max_layers;  // 0: all
     int32_t threads;
     float min_transmittance;  // a sample stops once less light than this comes through
     const float *background;  // RGB, one for all or one a pixel
@@ -31,7 +31,7 @@ struct MsMesh {
     const float *normals;        // or null: the faces' own
     const float *attributes;     // attribute_count numbers a vertex, or null
     int32_t attribute_count;
-    double filter_px2;           // variance of the low-pass filter of its fans; needs face_splat where it is not 0
+    double filter_px2;  // variance of the low-pass filter of its fans; needs face_splat where it is not 0
 };
 
 struct MsSplats {
@@ -40,11 +40,11 @@ struct MsSplats {
     const float *quaternions;  // wxyz
     const float *scales;
     const float *opacities;
-    const float *sh;           // (sh_stored, 3) a splat
-    int32_t sh_stored;         // coefficients a channel in the file
-    int32_t sh_used;           // coefficients a channel to be used
-    int32_t kernel;            // 0: 3dgs, 1: antialiased, 2: 2dgs
-    float dilation;            // px^2; 2dgs: variance of the low pass
+    const float *sh;    // (sh_stored, 3) a splat
+    int32_t sh_stored;  // coefficients a channel in the file
+    int32_t sh_used;    // coefficients a channel to be used
+    int32_t kernel;     // 0: 3dgs, 1: antialiased, 2: 2dgs
+    float dilation;     // px^2; 2dgs: variance of the low pass
 };
 
 struct MsPicture {

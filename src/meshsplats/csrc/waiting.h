@@ -10,8 +10,8 @@
 
 namespace ms {
 
-// A sample takes at most one fragment of an entry: where the triangles of a run lie side by side, as those of a fan, they
-// share it. Lanes are the samples of the block.
+// A sample takes at most one fragment of an entry: where the triangles of a run lie side by side, as those of
+// a fan, they share it. Lanes are the samples of the block.
 struct Fragments {
     Lanes key;      // 1 / depth by which they are sorted
     Lanes rgba[4];  // finite in every lane
@@ -44,9 +44,11 @@ class Waiting {
         }
         return fragments_[count_];
     }
-    // Adds that entry. `face` is its first face; entries of a run follow each other in the order of their faces. Weights may
-    // be null, and pieces [first_piece, first_piece + pieces) of those found in the tile none.
-    void add(uint32_t covered, int32_t face, const FragmentWeights *weights, uint32_t first_piece, uint32_t pieces) {
+    // Adds that entry. `face` is its first face; entries of a run follow each other in the order of their
+    // faces. Weights may be null, and pieces [first_piece, first_piece + pieces) of those found in the tile
+    // none.
+    void add(uint32_t covered, int32_t face, const FragmentWeights *weights, uint32_t first_piece,
+             uint32_t pieces) {
         if (weights) {
             weights_.resize(entries_.size());
             weights_[count_] = *weights;
@@ -59,8 +61,8 @@ class Waiting {
         limit_ = ENTRIES;
     }
 
-    // Calls blend(entry, lanes) for all that is nearer than `nearest_to_come`, at every lane nearest first, of equal keys
-    // the lower face first. `open` are the lanes that take light; `blend` may close some.
+    // Calls blend(entry, lanes) for all that is nearer than `nearest_to_come`, at every lane nearest first,
+    // of equal keys the lower face first. `open` are the lanes that take light; `blend` may close some.
     template <class Blend>
     void take(float nearest_to_come, const uint32_t &open, Blend &&blend) {
         const Lanes limit = lanes(nearest_to_come);
@@ -133,7 +135,8 @@ class Waiting {
             in_order(n, blend);
     }
 
-    // Where each of the n active entries comes in the order of each lane, and the entries by the mean of that.
+    // Where each of the n active entries comes in the order of each lane, and the entries by the mean of
+    // that.
     struct Order {
         Lanes rank[MOST_TO_RANK];
         int entry[MOST_TO_RANK];
@@ -143,9 +146,11 @@ class Waiting {
     template <int N>
     void rank(const int n, Order &order) const {
         Lanes key[N], rank[N];
-        // By lane, how many come before; lanes that an entry does not cover have keys of their own below all others.
+        // By lane, how many come before; lanes that an entry does not cover have keys of their own below all
+        // others.
         for (int i = 0; i < N; ++i) {
-            key[i] = i < n ? pick(active_[i].lanes, fragments_[active_[i].entry].key, lanes(-1.0f - i)) : lanes(-1.0f - i);
+            key[i] = i < n ? pick(active_[i].lanes, fragments_[active_[i].entry].key, lanes(-1.0f - i))
+                           : lanes(-1.0f - i);
             rank[i] = lanes(0);
         }
         uint32_t ties = 0;
@@ -175,13 +180,14 @@ class Waiting {
         }
         const Lanes means = load_lanes(mean);
         for (int i = 0; i < n; ++i) {
-            const unsigned before = greater(lanes(mean[i]), means) | (equal(lanes(mean[i]), means) & ((1u << i) - 1));
+            const unsigned before =
+                greater(lanes(mean[i]), means) | (equal(lanes(mean[i]), means) & ((1u << i) - 1));
             order.entry[__builtin_popcount(before)] = i;
         }
     }
 
-    // Neighbouring samples nearly always agree on the order of two triangles, so mostly whole entries follow each other;
-    // where they pierce each other, only some of their lanes are due at a time.
+    // Neighbouring samples nearly always agree on the order of two triangles, so mostly whole entries follow
+    // each other; where they pierce each other, only some of their lanes are due at a time.
     template <class Blend>
     void in_order(const int n, Blend &blend) {
         Order order;
@@ -212,7 +218,8 @@ class Waiting {
     void nearest_first(int n, const uint32_t &open, Blend &blend) {
         constexpr float NONE = -1, DONE = -2;
         if (left_.size() < (size_t)n) left_.resize(n);
-        for (int i = 0; i < n; ++i) left_[i] = pick(active_[i].lanes, fragments_[active_[i].entry].key, lanes(DONE));
+        for (int i = 0; i < n; ++i)
+            left_[i] = pick(active_[i].lanes, fragments_[active_[i].entry].key, lanes(DONE));
         for (int round = 1;; ++round) {
             Lanes nearest = lanes(NONE), which = lanes(0);
             for (int i = 0; i < n; ++i) {
@@ -269,7 +276,8 @@ class Waiting {
             list.clear();
             for (int i = 0; i < n; ++i) {
                 const Active &a = active_[i];
-                if (a.lanes & bit) list.push_back({lane_of(fragments_[a.entry].key, lane), entries_[a.entry].face, a.entry});
+                if (a.lanes & bit)
+                    list.push_back({lane_of(fragments_[a.entry].key, lane), entries_[a.entry].face, a.entry});
             }
             std::sort(list.begin(), list.end(), [](const Fragment &a, const Fragment &b) {
                 return a.key != b.key ? a.key > b.key : a.face < b.face;
