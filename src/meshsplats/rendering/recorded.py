@@ -66,7 +66,7 @@ class RecordedPicture:
         self.color = np.empty((h, w, 3), np.float32)
         self.alpha = np.empty((h, w), np.float32)
         self.attributes = np.empty((h, w, width), np.float32)
-        picture = core.PictureStruct(
+        picture = core.ImageStruct(
             keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
         )
         self._log = ctypes.c_void_p()
@@ -90,7 +90,7 @@ class RecordedPicture:
 
     def __del__(self) -> None:
         if getattr(self, "_log", None):
-            core.load_core().ms_forget(self._log)
+            core.load_core().ms_free_tape(self._log)
             self._log = ctypes.c_void_p()
 
     def back(
@@ -114,13 +114,13 @@ class RecordedPicture:
             raise ValueError("the picture was drawn without a log: there is no way back")
         if attributes is not None and not self._mesh.attribute_count:
             attributes = None
-        given = core.PictureGradientStruct(core.pointer(color), core.pointer(alpha), core.pointer(attributes))
+        given = core.ImageGradientsStruct(core.pointer(color), core.pointer(alpha), core.pointer(attributes))
         out = core.VertexGradientsStruct(
             core.pointer(vertices),
             core.pointer(colors),
             None if attributes is None else core.pointer(vertex_attributes),
         )
-        core.call("ms_rasterize_back", self._mesh, self._camera, self._options, self._log, given, out)
+        core.call("ms_rasterize_backward", self._mesh, self._camera, self._options, self._log, given, out)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """(v, k) float32: for each vertex the sum of ``values`` (h, w, k) by the weights with which it is
