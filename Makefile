@@ -8,7 +8,8 @@ PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 py
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
-BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(wildcard src/meshsplats/csrc/*)
+CORE_SOURCES := $(wildcard src/meshsplats/csrc/*)
+BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(CORE_SOURCES)
 
 # Blender's Python module exists for one version of Python only, and each version of it lives in a place of its own.
 BLENDER_VENV ?= .venv-blender
@@ -31,7 +32,7 @@ help:
 	@echo 'make test    the tests'
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
-	@echo 'make lint    ruff and mypy (make format tidies the source)'
+	@echo 'make lint    ruff, mypy and clang-format (make format tidies the source)'
 	@echo 'make clean   removes everything that these made'
 
 $(BIN)/python:
@@ -105,10 +106,12 @@ test-blender: $(BPY:%=$(BLENDER_VENV)/%/installed)
 lint: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
+	$(BIN)/clang-format --dry-run --Werror $(CORE_SOURCES)
 
 format: $(VENV)/installed-dev
 	$(BIN)/python -m ruff format .
 	$(BIN)/python -m ruff check --fix .
+	$(BIN)/clang-format -i $(CORE_SOURCES)
 
 clean:
 	rm -rf $(VENV) $(LOWEST_VENV) $(BLENDER_VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -13,7 +13,7 @@ import numpy as np
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
 
-INTERFACE_VERSION = 3
+INTERFACE_VERSION = 4
 
 
 class CameraStruct(ctypes.Structure):
@@ -71,7 +71,7 @@ class SplatsStruct(ctypes.Structure):
     ]
 
 
-class PictureStruct(ctypes.Structure):
+class ImageStruct(ctypes.Structure):
     _fields_ = [
         ("color", c_void_p),
         ("alpha", c_void_p),
@@ -82,7 +82,7 @@ class PictureStruct(ctypes.Structure):
     ]
 
 
-class PictureGradientStruct(ctypes.Structure):
+class ImageGradientsStruct(ctypes.Structure):
     _fields_ = [("color", c_void_p), ("alpha", c_void_p), ("attributes", c_void_p)]
 
 
@@ -150,13 +150,13 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
     message = [c_char_p, c_int]
     mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
     signatures: dict[str, list] = {
-        "ms_render_mesh": [*mesh_and_camera, POINTER(PictureStruct)],
-        "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(PictureStruct)],
-        "ms_rasterize": [*mesh_and_camera, POINTER(PictureStruct), c_int64, POINTER(c_void_p)],
-        "ms_rasterize_back": [
+        "ms_render_mesh": [*mesh_and_camera, POINTER(ImageStruct)],
+        "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(ImageStruct)],
+        "ms_rasterize": [*mesh_and_camera, POINTER(ImageStruct), c_int64, POINTER(c_void_p)],
+        "ms_rasterize_backward": [
             *mesh_and_camera,
             c_void_p,
-            POINTER(PictureGradientStruct),
+            POINTER(ImageGradientsStruct),
             POINTER(VertexGradientsStruct),
         ],
     }
@@ -164,8 +164,8 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
         function = getattr(library, name)
         function.restype = c_int
         function.argtypes = arguments + message
-    library.ms_forget.restype = None
-    library.ms_forget.argtypes = [c_void_p]
+    library.ms_free_tape.restype = None
+    library.ms_free_tape.argtypes = [c_void_p]
     return library
 
 
