@@ -289,10 +289,10 @@ def test_bad_steps_change_nothing():
         (np.array([0, 1]), TypeError, "got int64"),
         (np.zeros(4, bool), ValueError, r"shape \(5,\), got \(4,\)"),
         (np.zeros((1, 1), np.int32), ValueError, r"shape \(n,\), got \(1, 1\)"),
-        (np.array([0, 1, 5], np.int32), ValueError, r"lie in \[0, 5\), got 5 at place 2"),
-        (np.array([-1, 1], np.int32), ValueError, r"got -1 at place 0"),
-        (np.array([0, 2, 2], np.int32), ValueError, r"must increase .* got 2 at place 2"),
-        (np.array([3, 1], np.int32), ValueError, r"got 1 at place 1"),
+        (np.array([0, 1, 5], np.int32), ValueError, r"lie in \[0, 5\), got 5 at index 2"),
+        (np.array([-1, 1], np.int32), ValueError, r"got -1 at index 0"),
+        (np.array([0, 2, 2], np.int32), ValueError, r"must increase .* got 2 at index 2"),
+        (np.array([3, 1], np.int32), ValueError, r"got 1 at index 1"),
     ]:
         with pytest.raises(error, match=match):
             adam.step(gradient, rows)

@@ -23,8 +23,8 @@ class ComparisonStruct(ctypes.Structure):
         ("width", c_int32),
         ("channels", c_int32),
         ("threads", c_int32),
-        ("picture", c_void_p),
-        ("truth", c_void_p),
+        ("image", c_void_p),
+        ("target", c_void_p),
         ("mask", c_void_p),
         ("gradient", c_void_p),
         ("l1_rate", c_float),
@@ -50,8 +50,8 @@ class AdamStruct(ctypes.Structure):
         ("chosen_count", c_int64),
         ("mask", c_void_p),
         ("step", c_float),
-        ("beta1_rest", c_float),
-        ("beta2_rest", c_float),
+        ("one_minus_beta1", c_float),
+        ("one_minus_beta2", c_float),
         ("epsilon", c_float),
         ("low", c_float),
         ("high", c_float),
@@ -92,14 +92,14 @@ def compare_images(
         width=width,
         channels=channels,
         threads=threads or processors(),
-        picture=pointer(pictures),
-        truth=pointer(truths),
+        image=pointer(pictures),
+        target=pointer(truths),
         mask=pointer(mask),
         gradient=pointer(result),
         l1_rate=l1_rate,
         ssim_rate=ssim_rate,
     )
-    run("ms_compare_pictures", comparison)
+    run("ms_compare_images", comparison)
     return Comparison(comparison.l1, comparison.ssim, result)
 
 
@@ -139,8 +139,8 @@ def adam_rows(
         chosen_count=0 if chosen is None else len(chosen),
         mask=pointer(mask),
         step=step,
-        beta1_rest=1 - betas[0],
-        beta2_rest=1 - betas[1],
+        one_minus_beta1=1 - betas[0],
+        one_minus_beta2=1 - betas[1],
         epsilon=eps,
         low=bounds[0],
         high=bounds[1],

@@ -13,7 +13,7 @@ import numpy as np
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
 
-INTERFACE_VERSION = 3
+INTERFACE_VERSION = 4
 
 
 class CameraStruct(ctypes.Structure):
@@ -71,7 +71,7 @@ class SplatsStruct(ctypes.Structure):
     ]
 
 
-class PictureStruct(ctypes.Structure):
+class ImageStruct(ctypes.Structure):
     _fields_ = [
         ("color", c_void_p),
         ("alpha", c_void_p),
@@ -82,7 +82,7 @@ class PictureStruct(ctypes.Structure):
     ]
 
 
-class PictureGradientStruct(ctypes.Structure):
+class ImageGradientsStruct(ctypes.Structure):
     _fields_ = [("color", c_void_p), ("alpha", c_void_p), ("attributes", c_void_p)]
 
 
@@ -112,9 +112,10 @@ def library_path(variant: str) -> Path | None:
 
 
 def available_variants() -> list[str]:
-    """The variants that were built and that this processor runs, best first."""
+    """The variants that were built and that this processor runs, best first; none where MESHSPLATS_LIBRARY
+    takes their place."""
     baseline = library_path("baseline")
-    if baseline is None:
+    if baseline is None or os.environ.get("MESHSPLATS_LIBRARY"):
         return []
     library = ctypes.CDLL(str(baseline))
     library.ms_best_variant.restype = c_char_p
@@ -126,10 +127,13 @@ def available_variants() -> list[str]:
 @cache
 def load_core(variant: str | None = None) -> ctypes.CDLL:
     """The core's library; the best variant, or the one named by MESHSPLATS_VARIANT, unless another is asked
-    for.
+    for. MESHSPLATS_LIBRARY, the path of a library, takes the place of both: for developers, to run a core
+    built with sanitizers.
 
     Raises ImportError if the core was not built, ValueError if the processor cannot run the variant.
     """
+    if variant is None and (path := os.environ.get("MESHSPLATS_LIBRARY")):
+        return _checked(ctypes.CDLL(path))
     available = available_variants()
     if not available:
         raise ImportError(
@@ -141,7 +145,11 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
         raise ValueError(
             f"the core has no variant {wanted!r} that runs here; available: {', '.join(available)}"
         )
-    library = ctypes.CDLL(str(library_path(wanted)))
+    return _checked(ctypes.CDLL(str(library_path(wanted))))
+
+
+def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
+    """The library with the signatures of its functions. Raises ImportError if its interface is another."""
     library.ms_variant.restype = c_char_p
     if library.ms_interface_version() != INTERFACE_VERSION:
         raise ImportError(
@@ -150,13 +158,13 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
     message = [c_char_p, c_int]
     mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
     signatures: dict[str, list] = {
-        "ms_render_mesh": [*mesh_and_camera, POINTER(PictureStruct)],
-        "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(PictureStruct)],
-        "ms_rasterize": [*mesh_and_camera, POINTER(PictureStruct), c_int64, POINTER(c_void_p)],
-        "ms_rasterize_back": [
+        "ms_render_mesh": [*mesh_and_camera, POINTER(ImageStruct)],
+        "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(ImageStruct)],
+        "ms_rasterize": [*mesh_and_camera, POINTER(ImageStruct), c_int64, POINTER(c_void_p)],
+        "ms_rasterize_backward": [
             *mesh_and_camera,
             c_void_p,
-            POINTER(PictureGradientStruct),
+            POINTER(ImageGradientsStruct),
             POINTER(VertexGradientsStruct),
         ],
     }
@@ -164,8 +172,8 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
         function = getattr(library, name)
         function.restype = c_int
         function.argtypes = arguments + message
-    library.ms_forget.restype = None
-    library.ms_forget.argtypes = [c_void_p]
+    library.ms_free_tape.restype = None
+    library.ms_free_tape.argtypes = [c_void_p]
     return library
 
 

@@ -74,7 +74,7 @@ class MergingStruct(ctypes.Structure):
         ("nearest", c_void_p),
         ("color_weight", c_double),
         ("group", c_void_p),
-        ("left", c_int64),
+        ("remaining", c_int64),
     ]
 
 
@@ -251,7 +251,7 @@ def _merge_neighbours(moments: _Moments, count: int, threads: int) -> tuple[np.n
     first, group = np.unique(group, return_index=True, return_inverse=True)[1:]
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    return rank[group], merging.left
+    return rank[group], merging.remaining
 
 
 class _Moments(NamedTuple):

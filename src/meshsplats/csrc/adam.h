@@ -1,5 +1,5 @@
-// A step of Adam (Kingma & Ba 2015) on some rows of an array: rows left out keep their values and moments.
-// The operations and their order are those of torch.optim.SparseAdam.
+// Adam (Kingma & Ba 2015) on selected rows of an array. The operations and their order are those of
+// torch.optim.SparseAdam: rows that are not selected keep their values and moments.
 #pragma once
 
 #include <cmath>
@@ -14,28 +14,30 @@ extern "C" {
 struct MsAdam {
     int64_t rows;
     int32_t columns, threads;
-    float *values, *mean, *square;  // (rows, columns): what is optimised and its first and second moment
+    float *values, *mean, *square;  // (rows, columns): parameters, first and second moments; in and out
     const float *gradient;          // (rows, columns)
-    const float *scale;             // (rows,), times the step; or null
-    const int32_t *chosen;          // row numbers, increasing; or null
+    const float *scale;             // (rows,) factors of the step size, or null
+    const int32_t *chosen;          // (chosen_count,) increasing row indices, or null
     int64_t chosen_count;
-    const uint8_t *mask;            // (rows,), 0: left out; or null. Without both every row is taken
-    float step, beta1_rest, beta2_rest, epsilon;  // step: rate and bias corrections; the others: 1 - beta
-    float low, high;                // values end within these
+    const uint8_t *mask;  // (rows,) nonzero for selected rows, or null. Without both all rows are selected.
+    float step;           // learning rate with bias corrections
+    float one_minus_beta1, one_minus_beta2, epsilon;
+    float low, high;  // values are clamped to this range
 };
 
 }  // extern "C"
 
 namespace ms {
 
-// Rows [begin, end), which lie one after another.
-inline void adam_run(const MsAdam &a, int64_t begin, int64_t end) {
-    constexpr int BLOCK = 256;  // values
+// One step for the rows [begin, end).
+inline void adam_range(const MsAdam &a, int64_t begin, int64_t end) {
+    MS_ASSERT(begin >= 0 && begin <= end && end <= a.rows && a.columns >= 1);
+    constexpr int BLOCK = 256;  // values: whole rows, or a part of a long one
     float steps[BLOCK];
-    const int64_t per_block = a.columns >= BLOCK ? 1 : BLOCK / a.columns;
+    const int64_t rows_per_block = a.columns >= BLOCK ? 1 : BLOCK / a.columns;
     std::fill_n(steps, BLOCK, a.step);
-    for (int64_t row = begin; row < end; row += per_block) {
-        const int64_t rows = std::min(per_block, end - row);
+    for (int64_t row = begin; row < end; row += rows_per_block) {
+        const int64_t rows = std::min(rows_per_block, end - row);
         for (int64_t first = row * a.columns, last = (row + rows) * a.columns; first < last; first += BLOCK) {
             const int n = (int)std::min<int64_t>(BLOCK, last - first);
             if (a.scale)
@@ -48,8 +50,8 @@ inline void adam_run(const MsAdam &a, int64_t begin, int64_t end) {
             const float *__restrict gradient = a.gradient + first;
             for (int i = 0; i < n; ++i) {
                 const float g = gradient[i];
-                mean[i] += (g - mean[i]) * a.beta1_rest;
-                square[i] += (g * g - square[i]) * a.beta2_rest;
+                mean[i] += (g - mean[i]) * a.one_minus_beta1;
+                square[i] += (g * g - square[i]) * a.one_minus_beta2;
                 const float value = values[i] - steps[i] * (mean[i] / (std::sqrt(square[i]) + a.epsilon));
                 values[i] = value < a.low ? a.low : value > a.high ? a.high : value;
             }
@@ -57,44 +59,44 @@ inline void adam_run(const MsAdam &a, int64_t begin, int64_t end) {
     }
 }
 
-// The first place from `at` on where the mask is not 0, or `end`.
-inline int64_t skip_zeros(const uint8_t *mask, int64_t at, int64_t end) {
+// The first index from `i` on where the mask is not 0, or `end`.
+inline int64_t skip_zeros(const uint8_t *mask, int64_t i, int64_t end) {
     uint64_t eight;
-    while (at + 8 <= end && (std::memcpy(&eight, mask + at, 8), eight == 0)) at += 8;
-    while (at < end && !mask[at]) ++at;
-    return at;
+    while (i + 8 <= end && (std::memcpy(&eight, mask + i, 8), eight == 0)) i += 8;
+    while (i < end && !mask[i]) ++i;
+    return i;
 }
 
-// Calls adam_run for each unbroken run of rows. Throws before any value changes if row numbers are not increasing
-// numbers of rows.
+// One step for all selected rows. Throws before any value changes if the row indices are out of range or do
+// not increase.
 inline void adam_rows(const MsAdam &a) {
-    constexpr int64_t SHARE = 8192;  // rows
+    constexpr int64_t BLOCK = 8192;  // rows or row indices
     if (a.chosen) {
         for (int64_t i = 0; i < a.chosen_count; ++i)
             if (a.chosen[i] < 0 || a.chosen[i] >= a.rows || (i && a.chosen[i] <= a.chosen[i - 1]))
-                throw std::invalid_argument("row numbers must increase and lie in [0, " + std::to_string(a.rows) +
-                                            "), got " + std::to_string(a.chosen[i]) + " at place " +
-                                            std::to_string(i));
-        parallel_blocks(a.threads, a.chosen_count, SHARE, [&](int64_t begin, int64_t end, int) {
+                throw std::invalid_argument("row indices must increase and lie in [0, " +
+                                            std::to_string(a.rows) + "), got " + std::to_string(a.chosen[i]) +
+                                            " at index " + std::to_string(i));
+        parallel_blocks(a.threads, a.chosen_count, BLOCK, [&](int64_t begin, int64_t end, int) {
             for (int64_t i = begin, next; i < end; i = next) {
                 for (next = i + 1; next < end && a.chosen[next] == a.chosen[next - 1] + 1;) ++next;
-                adam_run(a, a.chosen[i], a.chosen[next - 1] + 1);
+                adam_range(a, a.chosen[i], a.chosen[next - 1] + 1);
             }
         });
     } else if (a.mask) {
-        parallel_blocks(a.threads, a.rows, SHARE, [&](int64_t begin, int64_t end, int) {
+        parallel_blocks(a.threads, a.rows, BLOCK, [&](int64_t begin, int64_t end, int) {
             for (int64_t row = begin, next; row < end; row = next) {
                 if (!a.mask[row]) {
                     next = skip_zeros(a.mask, row, end);
                     continue;
                 }
                 for (next = row + 1; next < end && a.mask[next];) ++next;
-                adam_run(a, row, next);
+                adam_range(a, row, next);
             }
         });
     } else {
-        parallel_blocks(a.threads, a.rows, SHARE,
-                        [&](int64_t begin, int64_t end, int) { adam_run(a, begin, end); });
+        parallel_blocks(a.threads, a.rows, BLOCK,
+                        [&](int64_t begin, int64_t end, int) { adam_range(a, begin, end); });
     }
 }
 

@@ -1,4 +1,5 @@
-// The plain C interface of the core: checks, memory and Python stay outside (rendering/core.py).
+// The plain C interface of the core. Validation, memory of results and Python stay outside
+// (rendering/core.py).
 #include <cstdio>
 #include <memory>
 #include <new>
@@ -18,9 +19,11 @@
 
 namespace {
 
-// Calls draw(worker, tile, list, length) for every tile, with one worker a thread; returns the number of fragments blended.
-template <class MakeWorker, class Draw>
-int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int threads, MakeWorker make_worker, Draw draw) {
+// Calls render(worker, tile, list, length) for every tile, with one worker per thread; returns the number of
+// fragments blended.
+template <class MakeWorker, class Render>
+int64_t render_tiles(const ms::Grid &grid, const std::vector<ms::BinItem> &items, int threads,
+                     MakeWorker make_worker, Render render) {
     threads = (int)std::min<int64_t>(threads, grid.tiles());
     std::vector<decltype(make_worker())> workers(threads);
     ms::TileLists lists(grid, items, threads);
@@ -29,7 +32,7 @@ int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int
         ms::on_threads(threads, [&](int thread) {
             if (!workers[thread]) workers[thread] = make_worker();
             for (int64_t tile; (tile = next.fetch_add(1)) < lists.end();)
-                draw(*workers[thread], tile, lists.list(tile), lists.length(tile));
+                render(*workers[thread], tile, lists.list(tile), lists.length(tile));
         });
     }
     int64_t fragments = 0;
@@ -39,121 +42,164 @@ int64_t draw_tiles(const ms::Grid &grid, const std::vector<ms::Item> &items, int
 }
 
 template <class Worker>
-void draw_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::Entry *list, int64_t length) {
+void render_tile(const ms::Grid &grid, Worker &worker, int64_t tile, const ms::TileEntry *list,
+                 int64_t length) {
     int x, y;
-    grid.place(tile, x, y);
-    worker.draw(x, y, list, length);
+    grid.tile_position(tile, x, y);
+    worker.render(x, y, list, length);
 }
 
-using PictureWorker = ms::MeshTile<ms::PictureTile>;
-
-int64_t draw_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera, const MsOptions &options,
-                  const MsPicture &picture, ms::PictureLog *log) {
-    return draw_tiles(
+// Forward pass; records on `tape` if it is not null.
+int64_t render_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera &camera,
+                    const MsOptions &options, const MsImage &image, ms::Tape *tape) {
+    return render_tiles(
         grid, scene.items, options.threads,
         [&] {
-            auto worker = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, picture, camera));
-            if (log) worker->blend().record();
+            auto worker = std::make_unique<ms::MeshTile>(scene, ms::ImageTile(scene, options, image, camera));
+            if (tape) worker->image().record_tape();
             return worker;
         },
-        [&](PictureWorker &worker, int64_t tile, const ms::Entry *list, int64_t length) {
-            draw_tile(grid, worker, tile, list, length);
-            if (log) log->keep(tile, worker.blend().log(), *worker.blend().pieces());
+        [&](ms::MeshTile &worker, int64_t tile, const ms::TileEntry *list, int64_t length) {
+            render_tile(grid, worker, tile, list, length);
+            if (tape) tape->record(tile, worker.image().tape(), *worker.image().coverage());
         });
 }
 
-// What the way back needs.
-struct Record {
-    ms::PictureLog log;
-    std::unique_ptr<ms::FanFilter> filter;  // or none
+// What the backward pass needs of the forward pass.
+struct ForwardRecord {
+    ms::Tape tape;
+    std::unique_ptr<ms::FanFilter> filter;  // or null
 };
 
-// Goes back through all tiles: those with a log follow it, others are drawn once more.
-void go_back(const MsMesh &mesh, const MsCamera &camera, const MsOptions &options, const Record &record,
-             const MsPictureGradient &given, const MsVertexGradients &out) {
-    const ms::PictureLog &log = record.log;
-    const ms::FanFilter *filter = record.filter.get();
-    const ms::Grid grid(camera, options.samples);
-    const bool redraws = !log.complete();
-    const ms::Scene scene(mesh, camera, grid, options.threads, redraws, filter);
-    const int threads = (int)std::min<int64_t>(options.threads, grid.tiles());
-    const int channels = given.attributes ? mesh.attribute_count : 0;
-    const MsPicture nothing{};  // what is drawn once more is only logged
-    std::vector<float> moved(filter ? 3 * mesh.vertex_count : 0);
-    const MsVertexGradients of_drawn{filter ? moved.data() : out.vertices, out.colors, out.attributes};
-    ms::VertexGradients sum(mesh, of_drawn, channels, threads);
+// The backward pass of all tiles. Tiles whose tapes exceeded the budget are rendered again.
+class BackwardPass {
+  public:
+    BackwardPass(const MsMesh &mesh, const MsCamera &camera, const MsOptions &options,
+                 const ForwardRecord &record, const MsImageGradients &image_gradients,
+                 const MsVertexGradients &out)
+        : camera_(camera),
+          options_(options),
+          tape_(record.tape),
+          filter_(record.filter.get()),
+          image_gradients_(image_gradients),
+          out_(out),
+          grid_(camera, options.samples),
+          scene_(mesh, camera, grid_, options.threads, !tape_.complete(), filter_),
+          threads_((int)std::min<int64_t>(options.threads, grid_.tiles())),
+          filtered_positions_(filter_ ? 3 * mesh.vertex_count : 0),
+          tile_target_{filter_ ? filtered_positions_.data() : out.vertices, out.colors, out.attributes},
+          sum_(mesh, tile_target_, image_gradients.attributes ? mesh.attribute_count : 0, threads_),
+          wave_(WAVE),
+          workers_(threads_) {}
 
-    // Gradients of a few tiles at a time wait to be added in order: of so few that they need little memory, but enough for
-    // threads not to wait for each other.
-    constexpr int WAVE = 256;
-    const int64_t wave_triangles = (int64_t)threads << 17;
-    std::vector<ms::TileGradients> waiting(WAVE);
+    void run() {
+        if (tape_.complete()) {
+            run_tiles(0, grid_.tiles(), nullptr);
+        } else {
+            ms::TileLists lists(grid_, scene_.items, threads_);
+            while (lists.next()) run_tiles(lists.begin(), lists.end(), &lists);
+        }
+        if (filter_) filter_->backward(filtered_positions_.data(), out_, options_.threads);
+    }
+
+  private:
+    // Tile gradients wait to be added in order. A wave of tiles is short enough for their memory to stay
+    // small, and long enough for threads not to wait for each other.
+    static constexpr int WAVE = 256;                             // tiles
+    static constexpr int64_t WAVE_TRIANGLES = (int64_t)1 << 17;  // per thread
+
     struct Worker {
-        ms::GradientTile back;
-        std::unique_ptr<PictureWorker> again;
-        ms::PackedLog packed;
-        ms::Large<unsigned char> memory;  // of that
+        ms::GradientTile gradient;
+        std::unique_ptr<ms::MeshTile> forward;  // to render tiles again
+        ms::PackedTape tape;                    // of such a tile
+        ms::PooledVector<unsigned char> tape_memory;
     };
-    std::vector<std::unique_ptr<Worker>> workers(threads);
-    auto run = [&](int64_t begin, int64_t end, ms::TileLists *lists) {
-        for (int64_t wave = begin; wave < end;) {
-            int count = 0;
-            for (int64_t triangles = 0; count < WAVE && wave + count < end && (count < threads || triangles < wave_triangles); ++count) {
-                const ms::PackedLog *entries = log.find(wave + count);
-                triangles += entries ? (int64_t)entries->face_count() : lists->length(wave + count);
-            }
+
+    // The tiles [begin, end). `lists` are their tile lists, or null if all of them have tapes.
+    void run_tiles(int64_t begin, int64_t end, ms::TileLists *lists) {
+        while (begin < end) {
+            const int count = wave_size(begin, end, lists);
             std::atomic<int> next{0};
-            ms::on_threads(threads, [&](int thread) {
-                auto &worker = workers[thread];
+            ms::on_threads(threads_, [&](int thread) {
+                auto &worker = workers_[thread];
                 if (!worker)
-                    worker.reset(new Worker{ms::GradientTile(scene, options, camera, given), nullptr, {}, {}});
+                    worker.reset(new Worker{
+                        ms::GradientTile(scene_, options_, camera_, image_gradients_), nullptr, {}, {}});
                 for (int i; (i = next.fetch_add(1)) < count;) {
-                    const int64_t tile = wave + i;
-                    const ms::PackedLog *entries = log.find(tile);
-                    if (!entries) {
-                        if (!worker->again) {
-                            worker->again = std::make_unique<PictureWorker>(scene, ms::PictureTile(scene, options, nothing, camera));
-                            worker->again->blend().record();
-                        }
-                        draw_tile(grid, *worker->again, tile, lists->list(tile), lists->length(tile));
-                        worker->packed.pack(worker->again->blend().log(), *worker->again->blend().pieces(), [&](size_t bytes) {
-                            worker->memory.resize(bytes);
-                            return worker->memory.data();
-                        });
-                        entries = &worker->packed;
-                    }
+                    const int64_t tile = begin + i;
+                    const ms::PackedTape *tape = tape_.find(tile);
+                    if (!tape) tape = &render_again(*worker, tile, *lists);
                     int x, y;
-                    grid.place(tile, x, y);
-                    worker->back.run(x, y, *entries, waiting[i]);
+                    grid_.tile_position(tile, x, y);
+                    worker->gradient.backward(x, y, *tape, wave_[i]);
                 }
             });
-            sum.add(waiting.data(), count);
-            wave += count;
+            sum_.add(wave_.data(), count);
+            begin += count;
         }
-    };
-    if (redraws) {
-        ms::TileLists lists(grid, scene.items, threads);
-        while (lists.next()) run(lists.begin(), lists.end(), &lists);
-    } else {
-        run(0, grid.tiles(), nullptr);
     }
-    if (filter) filter->back(moved.data(), out, options.threads);
-}
 
+    // Number of tiles from `begin` on whose gradients are added together, at least 1.
+    int wave_size(int64_t begin, int64_t end, const ms::TileLists *lists) const {
+        int count = 0;
+        for (int64_t triangles = 0; count < WAVE && begin + count < end &&
+                                    (count < threads_ || triangles < threads_ * WAVE_TRIANGLES);
+             ++count) {
+            const ms::PackedTape *tape = tape_.find(begin + count);
+            triangles += tape ? (int64_t)tape->face_count() : lists->length(begin + count);
+        }
+        return count;
+    }
+
+    const ms::PackedTape &render_again(Worker &worker, int64_t tile, const ms::TileLists &lists) const {
+        if (!worker.forward) {
+            worker.forward =
+                std::make_unique<ms::MeshTile>(scene_, ms::ImageTile(scene_, options_, no_image_, camera_));
+            worker.forward->image().record_tape();
+        }
+        render_tile(grid_, *worker.forward, tile, lists.list(tile), lists.length(tile));
+        worker.tape.pack(worker.forward->image().tape(), *worker.forward->image().coverage(),
+                         [&](size_t bytes) {
+                             worker.tape_memory.resize(bytes);
+                             return worker.tape_memory.data();
+                         });
+        return worker.tape;
+    }
+
+    const MsCamera &camera_;
+    const MsOptions &options_;
+    const ms::Tape &tape_;
+    const ms::FanFilter *filter_;  // or null
+    const MsImageGradients &image_gradients_;
+    const MsVertexGradients &out_;
+    const MsImage no_image_{};
+    const ms::Grid grid_;
+    const ms::Scene scene_;
+    const int threads_;
+    std::vector<float> filtered_positions_;  // gradients in camera space, if there is a filter
+    const MsVertexGradients tile_target_;    // where the gradients of tiles are added
+    ms::VertexGradients sum_;
+    std::vector<ms::TileGradients> wave_;
+    std::vector<std::unique_ptr<Worker>> workers_;
+};
+
+enum Status { OK = 0, OUT_OF_MEMORY = 1, FAILED = 2, SHARED_VERTICES = 3 };
+
+// Turns exceptions into a status and a message.
 template <class Body>
 int guarded(char *message, int size, Body body) {
     try {
         body();
-        return 0;
+        return OK;
     } catch (const std::bad_alloc &) {
         std::snprintf(message, size, "not enough memory");
-        return 1;
+        return OUT_OF_MEMORY;
     } catch (const ms::SharedVertices &e) {
         std::snprintf(message, size, "%s", e.what());
-        return 3;
+        return SHARED_VERTICES;
     } catch (const std::exception &e) {
         std::snprintf(message, size, "%s", e.what());
-        return 2;
+        return FAILED;
     }
 }
 
@@ -161,16 +207,18 @@ int guarded(char *message, int size, Body body) {
 
 extern "C" {
 
-MS_EXPORT int ms_interface_version() { return 3; }
+// To be raised with every change of a structure or function.
+MS_EXPORT int ms_interface_version() { return 4; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 
-// The best variant this processor runs.
+// The best variant that this processor runs.
 MS_EXPORT const char *ms_best_variant() {
 #if defined(__x86_64__)
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+        __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
+        __builtin_cpu_supports("avx512vl"))
         return "v4";
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
         __builtin_cpu_supports("bmi2"))
@@ -179,55 +227,58 @@ MS_EXPORT const char *ms_best_variant() {
     return "baseline";
 }
 
-// All functions from here on return 0, or 1 (memory), 3 (splats that share vertices cannot be filtered) or 2 (other) with a
-// message.
-MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, MsPicture *picture,
-                             char *message, int message_size) {
+// All functions below return a Status and, unless it is OK, write a message of at most message_size bytes.
+
+MS_EXPORT int ms_render_mesh(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
+                             MsImage *image, char *message, int message_size) {
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
-        picture->fragments = draw_mesh(scene, grid, *camera, *options, *picture, nullptr);
+        image->fragments = render_mesh(scene, grid, *camera, *options, *image, nullptr);
     });
 }
 
-// The same, with a log of at most `budget` bytes to go back by, which ms_forget frees.
-MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, MsPicture *picture,
-                           int64_t budget, void **log, char *message, int message_size) {
+// Like ms_render_mesh, and records a tape of at most `budget` bytes for ms_rasterize_backward. Release it
+// with ms_free_tape. The arrays of the mesh must not change or move in between.
+MS_EXPORT int ms_rasterize(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
+                           MsImage *image, int64_t budget, void **tape, char *message, int message_size) {
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::Scene scene(*mesh, *camera, grid, options->threads);
-        std::unique_ptr<Record> kept(new Record{{grid.tiles(), budget}, nullptr});
-        picture->fragments = draw_mesh(scene, grid, *camera, *options, *picture, &kept->log);
-        kept->filter = std::move(scene.filter);
-        *log = kept.release();
+        std::unique_ptr<ForwardRecord> record(new ForwardRecord{{grid.tiles(), budget}, nullptr});
+        image->fragments = render_mesh(scene, grid, *camera, *options, *image, &record->tape);
+        record->filter = std::move(scene.filter);
+        *tape = record.release();
     });
 }
 
-MS_EXPORT int ms_rasterize_back(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options, const void *log,
-                                const MsPictureGradient *given, const MsVertexGradients *out, char *message,
-                                int message_size) {
-    return guarded(message, message_size,
-                   [&] { go_back(*mesh, *camera, *options, *(const Record *)log, *given, *out); });
+// Adds the gradients of the vertices to `out`. Mesh, camera and options must be those of ms_rasterize.
+MS_EXPORT int ms_rasterize_backward(const MsMesh *mesh, const MsCamera *camera, const MsOptions *options,
+                                    const void *tape, const MsImageGradients *image_gradients,
+                                    const MsVertexGradients *out, char *message, int message_size) {
+    return guarded(message, message_size, [&] {
+        BackwardPass(*mesh, *camera, *options, *(const ForwardRecord *)tape, *image_gradients, *out).run();
+    });
 }
 
-MS_EXPORT void ms_forget(void *log) { delete (Record *)log; }
+MS_EXPORT void ms_free_tape(void *tape) { delete (ForwardRecord *)tape; }
 
 MS_EXPORT int ms_render_splats(const MsSplats *splats, const MsCamera *camera, const MsOptions *options,
-                               MsPicture *picture, char *message, int message_size) {
+                               MsImage *image, char *message, int message_size) {
     return guarded(message, message_size, [&] {
         ms::Grid grid(*camera, options->samples);
         ms::SplatScene scene(*splats, *camera, grid, options->threads);
-        picture->fragments = draw_tiles(
+        image->fragments = render_tiles(
             grid, scene.items, options->threads,
-            [&] { return std::make_unique<ms::SplatTile>(scene, grid, *options, *picture, *camera, *splats); },
-            [&](ms::SplatTile &worker, int64_t tile, const ms::Entry *list, int64_t length) {
-                draw_tile(grid, worker, tile, list, length);
+            [&] { return std::make_unique<ms::SplatTile>(scene, grid, *options, *image, *camera, *splats); },
+            [&](ms::SplatTile &worker, int64_t tile, const ms::TileEntry *list, int64_t length) {
+                render_tile(grid, worker, tile, list, length);
             });
     });
 }
 
-MS_EXPORT int ms_compare_pictures(MsComparison *comparison, char *message, int message_size) {
-    return guarded(message, message_size, [&] { ms::compare_pictures(*comparison); });
+MS_EXPORT int ms_compare_images(MsComparison *comparison, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::compare_images(*comparison); });
 }
 
 MS_EXPORT int ms_adam_rows(const MsAdam *adam, char *message, int message_size) {

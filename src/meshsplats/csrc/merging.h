@@ -1,4 +1,4 @@
-// Gaussians merged pair by pair, the cheapest pair first, and the search for their neighbours.
+// Greedy pairwise merging of Gaussians, and the nearest-neighbour search that it starts from.
 #pragma once
 
 #include <algorithm>
@@ -10,57 +10,64 @@
 #include <utility>
 #include <vector>
 
-#include "large.h"
 #include "parallel.h"
+#include "pooled_vector.h"
 
 extern "C" {
 
 struct MsNearest {
     int64_t count;
     int32_t neighbours, threads;  // neighbours: at most count - 1
-    const double *points;         // xyz
-    int32_t *order;               // (count,): the points sorted so that neighbours lie close to each other
-    int32_t *nearest;             // (count, neighbours): of point order[i], as places in that order, nearest first
+    const double *points;         // (count, 3)
+    int32_t *order;               // out: (count,) a permutation of the points that is coherent in space
+    int32_t *nearest;  // out: (count, neighbours) positions in `order` of the points nearest to order[i],
+                       // nearest first
 };
 
 struct MsMerging {
     int64_t count, wanted;
     int32_t neighbours, threads;
-    const double *means;        // xyz
-    const double *covariances;  // xx xy xz yy yz zz
-    const double *masses;
-    const double *colors;       // RGB
-    const int32_t *nearest;     // (count, neighbours)
+    const double *means;        // (count, 3)
+    const double *covariances;  // (count, 6): xx xy xz yy yz zz
+    const double *masses;       // (count,)
+    const double *colors;       // (count, 3) RGB
+    const int32_t *nearest;     // (count, neighbours) indices
     double color_weight;
-    int32_t *group;             // (count,): the lowest number of those that became one
-    int64_t left;               // groups: more than wanted if no neighbours are left to be merged
+    int32_t *group;     // out: (count,) the lowest index in the group that each became part of
+    int64_t remaining;  // out: number of groups; more than wanted if neighbours ran out
 };
 
 }  // extern "C"
 
 namespace ms {
 
-// A k-d tree over points: cells halved across their longest side until few points are left in each.
-class PointTree {
+// A balanced k-d tree (Bentley 1975): cells are split at the median along their longest side. Cell c has the
+// halves 2 c and 2 c + 1; the root is cell 1. Each cell is a range of the sorted points.
+class KdTree {
   public:
-    static constexpr int FEW = 8;
-
-    PointTree(const double *points, int64_t count, int32_t *order) : order_(order), places_(count) {
+    // Writes the permutation that sorts the points into cells to `order`, (count,).
+    KdTree(const double *points, int64_t count, int32_t *order) : order_(order), sorted_(count) {
+        MS_ASSERT(count >= 0 && count <= INT32_MAX);
         for (int64_t i = 0; i < count; ++i) order[i] = (int32_t)i;
-        for (int64_t cells = 1; count / cells > FEW; cells *= 2) levels_++;
+        for (int64_t cells = 1; count / cells > LEAF_SIZE; cells *= 2) levels_++;
         cells_.resize((std::size_t)1 << levels_);
-        divide(points, 0, count, 1, 0);
-        for (int64_t i = 0; i < count; ++i) places_[i] = {points[3 * order[i]], points[3 * order[i] + 1], points[3 * order[i] + 2]};
+        split(points, 0, count, 1, 0);
+        for (int64_t i = 0; i < count; ++i)
+            sorted_[i] = {points[3 * order[i]], points[3 * order[i] + 1], points[3 * order[i] + 2]};
     }
 
-    // The nearest of the points to the one at `place`, itself left out; equally near ones in the tree's order.
-    void nearest(int32_t place, int32_t *out, double *distances, int count) const {
+    // The `count` points nearest to the sorted point `self`, except itself, as indices of sorted points and
+    // squared distances, ascending; of equal distances the lower index first. `nearest` must hold INT32_MAX.
+    void find_nearest(int32_t self, int32_t *nearest, double *distances, int count) const {
+        MS_ASSERT(self >= 0 && self < (int64_t)sorted_.size() && count >= 1);
         std::fill_n(distances, count, std::numeric_limits<double>::infinity());
-        double outside[3] = {0, 0, 0};
-        search(0, (int64_t)places_.size(), 1, 0, places_[place], place, 0, outside, out, distances, count);
+        Search search{sorted_[self], self, {0, 0, 0}, nearest, distances, count};
+        visit(0, (int64_t)sorted_.size(), 1, 0, 0, search);
     }
 
   private:
+    static constexpr int LEAF_SIZE = 8;
+
     struct Point {
         double at[3];
     };
@@ -68,8 +75,29 @@ class PointTree {
         int axis;
         double border;
     };
+    struct Search {
+        Point query;
+        int32_t self;
+        double outside[3];  // distance from the query to the current cell along each axis
+        int32_t *nearest;   // the best so far
+        double *distances;
+        int count;
 
-    void divide(const double *points, int64_t begin, int64_t end, std::size_t cell, int level) {
+        // Inserts a point by insertion sort, if it is among the nearest.
+        void insert(int32_t index, double distance) {
+            auto comes_before = [&](int i) {
+                return distance < distances[i] || (distance == distances[i] && index < nearest[i]);
+            };
+            int i = count - 1;
+            if (!comes_before(i)) return;
+            for (; i > 0 && comes_before(i - 1); --i)
+                distances[i] = distances[i - 1], nearest[i] = nearest[i - 1];
+            distances[i] = distance;
+            nearest[i] = index;
+        }
+    };
+
+    void split(const double *points, int64_t begin, int64_t end, std::size_t cell, int level) {
         if (level == levels_) return;
         double low[3], high[3];
         for (int k = 0; k < 3; ++k) low[k] = std::numeric_limits<double>::infinity(), high[k] = -low[k];
@@ -88,19 +116,22 @@ class PointTree {
             return x < y || (x == y && a < b);
         });
         cells_[cell] = {axis, points[3 * (int64_t)order_[middle] + axis]};
-        divide(points, begin, middle, 2 * cell, level + 1);
-        divide(points, middle, end, 2 * cell + 1, level + 1);
+        split(points, begin, middle, 2 * cell, level + 1);
+        split(points, middle, end, 2 * cell + 1, level + 1);
     }
 
-    // `outside`: how far the query lies outside the cell along each axis, `square` the sum of their squares.
-    void search(int64_t begin, int64_t end, std::size_t cell, int level, const Point &query, int32_t self, double square,
-                double *outside, int32_t *out, double *distances, int count) const {
+    // Visits a cell whose squared distance to the query is `distance`: first the half that holds the query,
+    // then the other one if it may hold a point that is near enough (incremental distances, Arya & Mount
+    // 1993).
+    void visit(int64_t begin, int64_t end, std::size_t cell, int level, double distance,
+               Search &search) const {
+        const Point &query = search.query;
         if (level == levels_) {
             for (int64_t i = begin; i < end; ++i) {
-                if (i == self) continue;
-                const double x = places_[i].at[0] - query.at[0], y = places_[i].at[1] - query.at[1],
-                             z = places_[i].at[2] - query.at[2];
-                insert((int32_t)i, x * x + y * y + z * z, out, distances, count);
+                if (i == search.self) continue;
+                const double x = sorted_[i].at[0] - query.at[0], y = sorted_[i].at[1] - query.at[1],
+                             z = sorted_[i].at[2] - query.at[2];
+                search.insert((int32_t)i, x * x + y * y + z * z);
             }
             return;
         }
@@ -108,210 +139,223 @@ class PointTree {
         const int axis = cells_[cell].axis;
         const double across = query.at[axis] - cells_[cell].border;
         const bool upper = across >= 0;
-        auto descend = [&](bool up, double distance) {
-            search(up ? middle : begin, up ? end : middle, 2 * cell + up, level + 1, query, self, distance, outside, out,
-                   distances, count);
+        auto descend = [&](bool up, double half_distance) {
+            visit(up ? middle : begin, up ? end : middle, 2 * cell + up, level + 1, half_distance, search);
         };
-        descend(upper, square);
-        const double before = outside[axis], further = square - before * before + across * across;
-        // A little less: rounding must not leave out one that is as near.
-        if (further * (1 - 1e-12) > distances[count - 1]) return;
-        outside[axis] = across;
+        descend(upper, distance);
+        const double before = search.outside[axis], further = distance - before * before + across * across;
+        // The margin keeps rounding from missing a point at an equal distance.
+        if (further * (1 - 1e-12) > search.distances[search.count - 1]) return;
+        search.outside[axis] = across;
         descend(!upper, further);
-        outside[axis] = before;
-    }
-
-    static void insert(int32_t number, double distance, int32_t *out, double *distances, int count) {
-        auto after = [&](int i) { return distance < distances[i] || (distance == distances[i] && number < out[i]); };
-        int i = count - 1;
-        if (!after(i)) return;
-        for (; i > 0 && after(i - 1); --i) distances[i] = distances[i - 1], out[i] = out[i - 1];
-        distances[i] = distance;
-        out[i] = number;
+        search.outside[axis] = before;
     }
 
     int32_t *order_;
     int levels_ = 0;
-    std::vector<Cell> cells_;  // of cell c, halves are 2 c and 2 c + 1
-    Large<Point> places_;
+    std::vector<Cell> cells_;
+    PooledVector<Point> sorted_;
 };
 
 inline void find_nearest(const MsNearest &n) {
-    const PointTree tree(n.points, n.count, n.order);
+    MS_ASSERT(n.neighbours >= 1 && n.neighbours < n.count);
+    const KdTree tree(n.points, n.count, n.order);
     parallel_blocks(n.threads, n.count, 1024, [&](int64_t begin, int64_t end, int) {
         std::vector<double> distances(n.neighbours);
         for (int64_t i = begin; i < end; ++i) {
-            std::fill_n(n.nearest + i * n.neighbours, n.neighbours, std::numeric_limits<int32_t>::max());
-            tree.nearest((int32_t)i, n.nearest + i * n.neighbours, distances.data(), n.neighbours);
+            int32_t *nearest = n.nearest + i * n.neighbours;
+            std::fill_n(nearest, n.neighbours, std::numeric_limits<int32_t>::max());
+            tree.find_nearest((int32_t)i, nearest, distances.data(), n.neighbours);
         }
     });
 }
 
-// Merges pairs of neighbours, always the pair whose merging costs least, until as many are left as are wanted.
+// Merges the pair of neighbours with the lowest cost until `wanted` splats are left.
 //
-// The cost is Runnalls' bound on the information lost by a merged pair (IEEE Trans. Aerospace 43, 2007, eq. 16), with the
-// mean area of the projections in place of the volume, and the variance of the colours beside it:
+// The cost is Runnalls' bound on the information that merging a pair loses (IEEE Trans. Aerospace and
+// Electronic Systems 43, 2007, eq. 16), with the mean area of the projections in place of the volume, plus
+// the variance of the colours:
 //     m/2 log e(S) - ma/2 log e(Sa) - mb/2 log e(Sb) + color_weight ma mb / m |ca - cb|^2,
-// with masses m = ma + mb and e the sum of the products of two variances each, whose root is that area but for a factor.
+// with masses m = ma + mb and e(S) the second elementary symmetric polynomial of the variances (principal
+// minors of S summed); up to a factor, its square root is that area.
+//
+// Each splat keeps its cheapest partner in a heap. Entries are not updated but checked when they come to the
+// top: an outdated one is dropped or replaced. That is correct because merging makes neighbours more
+// expensive, so an outdated entry comes too early, never too late.
 class Merging {
   public:
-    explicit Merging(const MsMerging &given)
-        : given_(given), splats_(given.count), owner_(given.count), best_(given.count), lists_(given.count) {
-        const int64_t n = given.count;
+    explicit Merging(const MsMerging &input)
+        : input_(input), splats_(input.count), parent_(input.count), best_(input.count), lists_(input.count) {
+        const int64_t n = input.count;
+        MS_ASSERT(n >= 0 && n <= INT32_MAX && input.wanted >= 1 && input.neighbours >= 0);
         for (int64_t i = 0; i < n; ++i) {
+            MS_ASSERT(input.masses[i] >= 0);
             Splat &s = splats_[i];
-            std::copy_n(given.means + 3 * i, 3, s.mean);
-            std::copy_n(given.covariances + 6 * i, 6, s.covariance);
-            std::copy_n(given.colors + 3 * i, 3, s.color);
-            s.mass = given.masses[i];
-            s.half_log = half_log(s.covariance);
-            owner_[i] = (int32_t)i;
-            best_[i] = {0, -1, 0, 0};
+            std::copy_n(input.means + 3 * i, 3, s.mean);
+            std::copy_n(input.covariances + 6 * i, 6, s.covariance);
+            std::copy_n(input.colors + 3 * i, 3, s.color);
+            s.mass = input.masses[i];
+            s.half_log_area = half_log_area(s.covariance);
+            parent_[i] = (int32_t)i;
+            best_[i] = {0, NONE, 0, 0};
         }
-        link();
+        link_neighbours();
     }
 
-    // Numbers of those that each became part of, the lowest of them; returns how many are left.
+    // Writes the lowest index of its group for each splat, (count,); returns the number of groups.
     int64_t run(int32_t *group) {
-        const int64_t n = given_.count;
-        parallel_blocks(given_.threads, n, 1024, [&](int64_t begin, int64_t end, int) {
-            for (int64_t i = begin; i < end; ++i) best_[i] = cheapest((int32_t)i);
+        const int64_t n = input_.count;
+        parallel_blocks(input_.threads, n, 1024, [&](int64_t begin, int64_t end, int) {
+            for (int64_t i = begin; i < end; ++i) best_[i] = cheapest_partner((int32_t)i);
         });
         for (int64_t i = 0; i < n; ++i)
-            if (best_[i].partner >= 0) queue_.push_back({best_[i].cost, (int32_t)i, 0});
-        std::make_heap(queue_.begin(), queue_.end());
-        int64_t left = n;
-        while (left > given_.wanted && !queue_.empty()) {
-            std::pop_heap(queue_.begin(), queue_.end());
-            const Entry entry = queue_.back();
-            queue_.pop_back();
-            const int32_t a = entry.splat;
-            if (owner_[a] != a || entry.version != best_[a].version) continue;
-            const int32_t b = best_[a].partner;
-            // Merging makes neighbours dearer: what is out of date comes too early, and is put back.
-            if (owner_[b] != b || splats_[b].merged != best_[a].partner_merged) {
-                tidy(a);
-                set_best(a, cheapest(a));
+            if (best_[i].partner != NONE) heap_.push_back({best_[i].cost, (int32_t)i, 0});
+        std::make_heap(heap_.begin(), heap_.end());
+        int64_t remaining = n;
+        while (remaining > input_.wanted && !heap_.empty()) {
+            std::pop_heap(heap_.begin(), heap_.end());
+            const HeapEntry entry = heap_.back();
+            heap_.pop_back();
+            if (is_outdated(entry)) continue;
+            const int32_t a = entry.splat, b = best_[a].partner;
+            if (!is_root(b) || splats_[b].merges != best_[a].partner_merges) {
+                update_neighbours(a);
+                set_best(a, cheapest_partner(a));
                 continue;
             }
             merge(std::min(a, b), std::max(a, b));
-            --left;
-            if ((int64_t)queue_.size() > 4 * n) forget_stale();
+            --remaining;
+            if ((int64_t)heap_.size() > MAX_HEAP_RATIO * n) drop_outdated();
         }
-        for (int64_t i = 0; i < n; ++i) group[i] = find((int32_t)i);
-        return left;
+        for (int64_t i = 0; i < n; ++i) group[i] = find_root((int32_t)i);
+        return remaining;
     }
 
   private:
-    static constexpr int MOST = 24;  // neighbours of a merged splat, of which the dearest are forgotten
+    static constexpr int32_t NONE = -1;
+    static constexpr int MAX_NEIGHBOURS = 24;  // of a merged splat: the cheapest ones
+    static constexpr int64_t MAX_HEAP_RATIO = 4;
 
     struct Splat {
-        double mean[3], covariance[6], color[3], mass, half_log;
-        int32_t merged = 0;  // times
+        double mean[3], covariance[6], color[3], mass, half_log_area;
+        int32_t merges = 0;  // number of merges that made this splat
     };
     struct Best {
         double cost;
-        int32_t partner, partner_merged, version;
+        int32_t partner;  // or NONE
+        int32_t partner_merges;
+        int32_t version;  // counts the changes: older heap entries are outdated
     };
-    struct Entry {
+    struct HeapEntry {
         double cost;
         int32_t splat, version;
-        bool operator<(const Entry &other) const {  // the cheapest on top
+        bool operator<(const HeapEntry &other) const {  // std heaps have the greatest on top: the cheapest
             return cost != other.cost ? cost > other.cost : splat > other.splat;
         }
     };
-    struct List {
-        int64_t begin;
-        int32_t length, space;
+    struct NeighbourList {
+        int64_t begin;  // in links_
+        int32_t length, capacity;
     };
 
-    static double half_log(const double *c) {
+    // log e(S) / 2, see above.
+    static double half_log_area(const double *c) {
         const double area = c[0] * c[3] + c[0] * c[5] + c[3] * c[5] - c[1] * c[1] - c[2] * c[2] - c[4] * c[4];
         return 0.5 * std::log(std::max(area, 1e-300));
     }
 
-    // Moments of both together; of two without mass, those of the first.
-    static Splat together(const Splat &a, const Splat &b) {
+    // Moment matching: mass, mean, covariance and mean colour of both. If both have no mass, those of the
+    // first.
+    static Splat moments(const Splat &a, const Splat &b) {
         Splat s;
         s.mass = a.mass + b.mass;
         const double wb = s.mass > 0 ? b.mass / s.mass : 0, wa = 1 - wb;
-        double apart[3];
+        double delta[3];
         for (int k = 0; k < 3; ++k) {
-            apart[k] = b.mean[k] - a.mean[k];
-            s.mean[k] = a.mean[k] + wb * apart[k];
+            delta[k] = b.mean[k] - a.mean[k];
+            s.mean[k] = a.mean[k] + wb * delta[k];
             s.color[k] = wa * a.color[k] + wb * b.color[k];
         }
         for (int i = 0, k = 0; i < 3; ++i)
             for (int j = i; j < 3; ++j, ++k)
-                s.covariance[k] = wa * a.covariance[k] + wb * b.covariance[k] + wa * wb * (apart[i] * apart[j]);
-        s.half_log = half_log(s.covariance);
+                s.covariance[k] =
+                    wa * a.covariance[k] + wb * b.covariance[k] + wa * wb * (delta[i] * delta[j]);
+        s.half_log_area = half_log_area(s.covariance);
         return s;
     }
 
+    // Symmetric to the last bit.
     double cost(int32_t first, int32_t second) const {
         const Splat &a = splats_[std::min(first, second)], &b = splats_[std::max(first, second)];
-        const Splat s = together(a, b);
+        const Splat s = moments(a, b);
         if (!(s.mass > 0)) return 0;
         double color = 0;
         for (int k = 0; k < 3; ++k) color += (a.color[k] - b.color[k]) * (a.color[k] - b.color[k]);
-        const double spread = a.mass * (s.half_log - a.half_log) + b.mass * (s.half_log - b.half_log);
-        return std::max(spread, 0.0) + given_.color_weight * (a.mass * b.mass / s.mass) * color;
+        const double growth =
+            a.mass * (s.half_log_area - a.half_log_area) + b.mass * (s.half_log_area - b.half_log_area);
+        return std::max(growth, 0.0) + input_.color_weight * (a.mass * b.mass / s.mass) * color;
     }
 
-    // Neighbours are so on both sides.
-    void link() {
-        const int64_t n = given_.count;
-        const int32_t k = given_.neighbours;
-        Large<int32_t> counts(n, 0);
-        auto each = [&](auto body) {
+    // Makes the neighbour relation symmetric and stores it as lists. Throws if an index is out of range.
+    void link_neighbours() {
+        const int64_t n = input_.count;
+        const int32_t k = input_.neighbours;
+        PooledVector<int32_t> counts(n, 0);
+        auto for_each_link = [&](auto body) {
             for (int64_t i = 0; i < n; ++i)
                 for (int32_t j = 0; j < k; ++j) {
-                    const int32_t other = given_.nearest[i * k + j];
+                    const int32_t other = input_.nearest[i * k + j];
                     if (other < 0 || other >= n || other == i)
-                        throw std::invalid_argument("neighbour " + std::to_string(other) + " of " + std::to_string(i) +
-                                                    " is not another of " + std::to_string(n));
-                    const int32_t *back = given_.nearest + (int64_t)other * k;
+                        throw std::invalid_argument("neighbour " + std::to_string(other) + " of " +
+                                                    std::to_string(i) + " is not another of " +
+                                                    std::to_string(n));
                     body((int32_t)i, other);
-                    if (std::find(back, back + k, (int32_t)i) == back + k) body(other, (int32_t)i);
+                    const int32_t *others = input_.nearest + (int64_t)other * k;
+                    if (std::find(others, others + k, (int32_t)i) == others + k) body(other, (int32_t)i);
                 }
         };
-        each([&](int32_t from, int32_t) { ++counts[from]; });
+        for_each_link([&](int32_t from, int32_t) { ++counts[from]; });
         int64_t total = 0;
         for (int64_t i = 0; i < n; ++i) {
             lists_[i] = {total, 0, counts[i]};
             total += counts[i];
         }
         links_.resize(total);
-        each([&](int32_t from, int32_t to) { links_[lists_[from].begin + lists_[from].length++] = to; });
+        for_each_link(
+            [&](int32_t from, int32_t to) { links_[lists_[from].begin + lists_[from].length++] = to; });
     }
 
-    int32_t find(int32_t i) {
-        while (owner_[i] != i) {
-            owner_[i] = owner_[owner_[i]];
-            i = owner_[i];
+    // Union-find with path halving. The root of a group is its lowest index.
+    bool is_root(int32_t i) const { return parent_[i] == i; }
+    int32_t find_root(int32_t i) {
+        while (!is_root(i)) {
+            parent_[i] = parent_[parent_[i]];
+            i = parent_[i];
         }
         return i;
     }
 
-    // Neighbours of `a` that were merged are replaced by what they became, each once.
-    void tidy(int32_t a) {
-        List &list = lists_[a];
+    // Replaces merged neighbours of `a` by their groups, each once.
+    void update_neighbours(int32_t a) {
+        NeighbourList &list = lists_[a];
         int32_t *begin = links_.data() + list.begin, *end = begin + list.length;
-        for (int32_t *i = begin; i < end; ++i) *i = find(*i);
+        for (int32_t *i = begin; i < end; ++i) *i = find_root(*i);
         std::sort(begin, end);
         end = std::remove(begin, std::unique(begin, end), a);
         list.length = (int32_t)(end - begin);
     }
 
-    Best cheapest(int32_t a) const {
-        Best best{std::numeric_limits<double>::infinity(), -1, 0, best_[a].version};
-        const List &list = lists_[a];
+    // Of equal costs the partner with the lowest index.
+    Best cheapest_partner(int32_t a) const {
+        Best best{std::numeric_limits<double>::infinity(), NONE, 0, best_[a].version};
+        const NeighbourList &list = lists_[a];
         for (int32_t i = 0; i < list.length; ++i) {
             const int32_t other = links_[list.begin + i];
-            const double found = cost(a, other);
-            if (found < best.cost || (found == best.cost && other < best.partner)) best.cost = found, best.partner = other;
+            const double price = cost(a, other);
+            if (price < best.cost || (price == best.cost && other < best.partner))
+                best.cost = price, best.partner = other;
         }
-        if (best.partner >= 0) best.partner_merged = splats_[best.partner].merged;
+        if (best.partner != NONE) best.partner_merges = splats_[best.partner].merges;
         return best;
     }
 
@@ -319,76 +363,86 @@ class Merging {
         const int32_t version = best_[a].version + 1;
         best_[a] = best;
         best_[a].version = version;
-        if (best.partner < 0) return;
-        queue_.push_back({best.cost, a, version});
-        std::push_heap(queue_.begin(), queue_.end());
+        if (best.partner == NONE) return;
+        heap_.push_back({best.cost, a, version});
+        std::push_heap(heap_.begin(), heap_.end());
     }
 
+    // Merges b into a.
     void merge(int32_t a, int32_t b) {
-        const int32_t merged = splats_[a].merged + 1;
-        splats_[a] = together(splats_[a], splats_[b]);
-        splats_[a].merged = merged;
-        owner_[b] = a;
-
-        around_.clear();
-        for (int32_t from : {a, b})
-            for (int32_t i = 0; i < lists_[from].length; ++i) {
-                const int32_t other = find(links_[lists_[from].begin + i]);
-                if (other != a) around_.push_back({0, other});
-            }
-        auto by_number = [](const auto &x, const auto &y) { return x.second < y.second; };
-        auto same = [](const auto &x, const auto &y) { return x.second == y.second; };
-        std::sort(around_.begin(), around_.end(), by_number);
-        around_.erase(std::unique(around_.begin(), around_.end(), same), around_.end());
-        for (auto &[price, other] : around_) price = cost(a, other);
-        if (around_.size() > MOST) {
-            std::nth_element(around_.begin(), around_.begin() + MOST, around_.end());
-            around_.resize(MOST);
-        }
-        keep_list(a, b);
-        // A pair of it that is cheaper than its neighbour's best is found from this side.
-        Best best{std::numeric_limits<double>::infinity(), -1, 0, 0};
-        for (const auto &[price, other] : around_) {
+        MS_ASSERT(a < b && is_root(a) && is_root(b));
+        const int32_t merges = splats_[a].merges + 1;
+        splats_[a] = moments(splats_[a], splats_[b]);
+        splats_[a].merges = merges;
+        parent_[b] = a;
+        collect_neighbours(a, b);
+        store_neighbours(a, b);
+        // Neighbours for which the merged splat is the cheapest partner need no update: it has the pair in
+        // its own entry.
+        Best best{std::numeric_limits<double>::infinity(), NONE, 0, 0};
+        for (const auto &[price, other] : neighbours_) {
             if (price < best.cost || (price == best.cost && other < best.partner))
-                best = {price, other, splats_[other].merged, 0};
+                best = {price, other, splats_[other].merges, 0};
         }
         set_best(a, best);
     }
 
-    // Those in around_ as the list of `a`: in the longer of both lists' places if they fit, else in a new one.
-    void keep_list(int32_t a, int32_t b) {
-        const int32_t length = (int32_t)around_.size();
-        List place = lists_[a].space >= lists_[b].space ? lists_[a] : lists_[b];
-        if (length > place.space) {
-            place.begin = (int64_t)links_.size();
-            place.space = MOST;
-            links_.resize(links_.size() + MOST);
+    // Fills neighbours_ with the cheapest neighbours of both, each once.
+    void collect_neighbours(int32_t a, int32_t b) {
+        neighbours_.clear();
+        for (int32_t from : {a, b})
+            for (int32_t i = 0; i < lists_[from].length; ++i) {
+                const int32_t other = find_root(links_[lists_[from].begin + i]);
+                if (other != a) neighbours_.push_back({0, other});
+            }
+        auto by_index = [](const auto &x, const auto &y) { return x.second < y.second; };
+        auto same = [](const auto &x, const auto &y) { return x.second == y.second; };
+        std::sort(neighbours_.begin(), neighbours_.end(), by_index);
+        neighbours_.erase(std::unique(neighbours_.begin(), neighbours_.end(), same), neighbours_.end());
+        for (auto &[price, other] : neighbours_) price = cost(a, other);
+        if (neighbours_.size() > MAX_NEIGHBOURS) {
+            std::nth_element(neighbours_.begin(), neighbours_.begin() + MAX_NEIGHBOURS, neighbours_.end());
+            neighbours_.resize(MAX_NEIGHBOURS);
         }
-        place.length = length;
-        for (int32_t i = 0; i < length; ++i) links_[place.begin + i] = around_[i].second;
-        lists_[a] = place;
+    }
+
+    // Stores neighbours_ as the list of a, in the larger of both lists' space if they fit, else in new space.
+    void store_neighbours(int32_t a, int32_t b) {
+        const int32_t length = (int32_t)neighbours_.size();
+        NeighbourList list = lists_[a].capacity >= lists_[b].capacity ? lists_[a] : lists_[b];
+        if (length > list.capacity) {
+            list.begin = (int64_t)links_.size();
+            list.capacity = MAX_NEIGHBOURS;
+            links_.resize(links_.size() + MAX_NEIGHBOURS);
+        }
+        list.length = length;
+        for (int32_t i = 0; i < length; ++i) links_[list.begin + i] = neighbours_[i].second;
+        lists_[a] = list;
         lists_[b] = {0, 0, 0};
     }
 
-    void forget_stale() {
-        auto stale = [&](const Entry &e) { return owner_[e.splat] != e.splat || e.version != best_[e.splat].version; };
-        queue_.erase(std::remove_if(queue_.begin(), queue_.end(), stale), queue_.end());
-        std::make_heap(queue_.begin(), queue_.end());
+    bool is_outdated(const HeapEntry &entry) const {
+        return !is_root(entry.splat) || entry.version != best_[entry.splat].version;
+    }
+    void drop_outdated() {
+        auto outdated = [&](const HeapEntry &entry) { return is_outdated(entry); };
+        heap_.erase(std::remove_if(heap_.begin(), heap_.end(), outdated), heap_.end());
+        std::make_heap(heap_.begin(), heap_.end());
     }
 
-    const MsMerging &given_;
-    Large<Splat> splats_;
-    Large<int32_t> owner_;  // itself, or one that it was merged into
-    Large<Best> best_;
-    Large<List> lists_;
-    Large<int32_t> links_;
-    std::vector<Entry> queue_;
-    std::vector<std::pair<double, int32_t>> around_;
+    const MsMerging &input_;
+    PooledVector<Splat> splats_;
+    PooledVector<int32_t> parent_;  // union-find: itself, or a splat that it was merged into
+    PooledVector<Best> best_;
+    PooledVector<NeighbourList> lists_;
+    PooledVector<int32_t> links_;
+    std::vector<HeapEntry> heap_;
+    std::vector<std::pair<double, int32_t>> neighbours_;  // cost and index; scratch of merge
 };
 
-inline void merge_pairs(MsMerging &given) {
-    Merging merging(given);
-    given.left = merging.run(given.group);
+inline void merge_pairs(MsMerging &input) {
+    Merging merging(input);
+    input.remaining = merging.run(input.group);
 }
 
 }  // namespace ms

@@ -1,66 +1,72 @@
-// Finds the fragments of one tile and hands them on in exact order, front to back.
+// Rasterizes a mesh into one tile: emits fragments in exact depth order at every sample.
 //
-// Groups of triangles come nearest first. Their fragments wait in a sorted list for each block of samples; what is
-// nearer than anything still to come is blended, so the result does not depend on the order in which triangles arrive.
+// The groups of the tile list come nearest first. Fragments wait in one queue per block until they are nearer
+// than everything still to come. So the result does not depend on the order in which triangles arrive.
 #pragma once
 
-#include "picture.h"
+#include "image_tile.h"
 
 namespace ms {
 
-// `Blend` takes the fragments: PictureTile, or GradientTile to go back.
-template <class Blend>
 class MeshTile {
   public:
-    MeshTile(const Scene &scene, Blend blend) : scene_(scene), mesh_(scene.mesh), blend_(std::move(blend)) {}
+    MeshTile(const Scene &scene, ImageTile image)
+        : scene_(scene), mesh_(scene.mesh), image_(std::move(image)) {}
 
-    int64_t fragments() const { return blend_.fragments(); }
-    Blend &blend() { return blend_; }
+    int64_t fragments() const { return image_.fragments(); }
+    ImageTile &image() { return image_; }
 
-    void draw(int tile_x, int tile_y, const Entry *list, int64_t length) {
+    void render(int tile_x, int tile_y, const TileEntry *list, int64_t length) {
         tile_x_ = tile_x;
         tile_y_ = tile_y;
         area_ = TileArea(scene_.grid, tile_x, tile_y);
-        blend_.begin(area_);
-        full_ = takes_ = 0;
-        held_ = 0;
+        image_.begin(area_);
+        active_blocks_ = full_blocks_ = 0;
+        batch_size_ = 0;
         for (int block = 0; block < BLOCKS; ++block) {
-            if (blend_.open(block)) takes_ |= 1u << block;
+            if (image_.active(block)) active_blocks_ |= 1u << block;
         }
-        // Groups come in the order of depth, which is no order in memory: data is asked for some groups ahead.
-        for (int64_t i = 0; i < std::min<int64_t>(length, FACES_AHEAD); ++i) ask_for_faces(list, i);
-        for (int64_t i = 0; i < std::min<int64_t>(length, CORNERS_AHEAD); ++i) ask_for_corners(list, i);
-        for (int64_t i = 0; i < length && takes_; ++i) {
-            if (i + BOXES_AHEAD < length) __builtin_prefetch(scene_.boxes.data() + list[i + BOXES_AHEAD].first);
-            if (i + FACES_AHEAD < length) ask_for_faces(list, i + FACES_AHEAD);
-            if (i + CORNERS_AHEAD < length) ask_for_corners(list, i + CORNERS_AHEAD);
-            hold_run(list[i], touching_[i % RING]);
+        // Depth order is random in memory: prefetch a few groups ahead.
+        for (int64_t i = 0; i < std::min<int64_t>(length, FACES_AHEAD); ++i) prefetch_faces(list, i);
+        for (int64_t i = 0; i < std::min<int64_t>(length, CORNERS_AHEAD); ++i) prefetch_corners(list, i);
+        for (int64_t i = 0; i < length && active_blocks_; ++i) {
+            MS_ASSERT(i == 0 || list[i].key <= list[i - 1].key);
+            if (i + BOXES_AHEAD < length)
+                __builtin_prefetch(scene_.boxes.data() + list[i + BOXES_AHEAD].first);
+            if (i + FACES_AHEAD < length) prefetch_faces(list, i + FACES_AHEAD);
+            if (i + CORNERS_AHEAD < length) prefetch_corners(list, i + CORNERS_AHEAD);
+            add_group(list[i], touching_[i % RING]);
         }
-        if (takes_) add_held();
-        for (int block = 0; block < BLOCKS; ++block) flush(block, -1);
-        blend_.finish();
+        if (active_blocks_) rasterize_batch();
+        for (int block = 0; block < BLOCKS; ++block) drain(block, -1);
+        image_.resolve();
     }
 
   private:
-    using Triangles = ms::Triangles<8>;
+    // Triangles that are set up together in SIMD lanes.
+    using Batch = TriangleSetup<8>;
 
+    // Prefetch distances in groups. RING is a power of two above all of them.
     static constexpr int BOXES_AHEAD = 12, FACES_AHEAD = 8, CORNERS_AHEAD = 3, RING = 16;
 
-    // Which triangles of a run may touch the tile: a bit each.
-    uint64_t touching(const Entry &run) const {
-        const TileBox *box = scene_.boxes.data() + run.first;
-        const TileNumber tile(tile_x_, tile_y_);
+    // The triangles of a group that may touch the tile, one bit each.
+    uint64_t touching_triangles(const TileEntry &group) const {
+        MS_ASSERT(group.length >= 1 && group.length <= 64);
+        MS_ASSERT(group.first >= 0 && group.first + group.length <= mesh_.face_count);
+        const TileBox *box = scene_.boxes.data() + group.first;
+        const TilePosition tile(tile_x_, tile_y_);
         uint64_t bits = 0;
-        for (int i = 0; i < run.length; ++i) bits |= (uint64_t)box[i].has(tile) << i;
+        for (int i = 0; i < group.length; ++i) bits |= (uint64_t)box[i].contains(tile) << i;
         return bits;
     }
-    void ask_for_faces(const Entry *list, int64_t i) {
-        touching_[i % RING] = touching(list[i]);
+    void prefetch_faces(const TileEntry *list, int64_t i) {
+        touching_[i % RING] = touching_triangles(list[i]);
         const char *faces = (const char *)(mesh_.faces + 3 * (int64_t)list[i].first);
-        for (int64_t byte = 0; byte < list[i].length * (int64_t)(3 * sizeof(int32_t)); byte += 64) __builtin_prefetch(faces + byte);
+        for (int64_t byte = 0; byte < list[i].length * (int64_t)(3 * sizeof(int32_t)); byte += CACHE_LINE)
+            __builtin_prefetch(faces + byte);
     }
-    // (GCC takes a function that only prefetches for one without effect, and drops calls that it does not inline first.)
-    __attribute__((always_inline)) void ask_for_corners(const Entry *list, int64_t i) {
+    // Always inlined: GCC takes a function that only prefetches for one without effect and drops calls of it.
+    __attribute__((always_inline)) void prefetch_corners(const TileEntry *list, int64_t i) {
         for (uint64_t rest = touching_[i % RING]; rest; rest &= rest - 1) {
             const int32_t *face = mesh_.faces + 3 * ((int64_t)list[i].first + __builtin_ctzll(rest));
             for (int k = 0; k < 3; ++k) {
@@ -70,211 +76,247 @@ class MeshTile {
         }
     }
 
-    void flush(int block, float nearest_to_come) {
-        Waiting &waiting = waiting_[block];
-        if (!waiting.count()) return;
-        blend_.blend(block, waiting, nearest_to_come);
-        if (!blend_.open(block)) {
-            takes_ &= ~(1u << block);
-            waiting.clear();
+    // Blends what is nearer than all groups to come.
+    void drain(int block, float nearest_to_come) {
+        FragmentQueue &queue = queues_[block];
+        if (!queue.count()) return;
+        image_.blend(block, queue, nearest_to_come);
+        if (!image_.active(block)) {
+            active_blocks_ &= ~(1u << block);
+            queue.clear();
         }
-        // A pile of triangles that all begin near the camera, where nothing can be blended before the last has come,
-        // would fill the memory.
-        if (waiting.many()) blend_.drop_hidden(block, waiting);
+        // Of many triangles that all begin near the camera, nothing can be blended before the last one:
+        // without culling, the queue would fill the memory.
+        if (queue.crowded()) image_.cull(block, queue);
     }
 
-    // Triangles gather until there are enough to make ready side by side; those of a run stay together if they can.
-    void hold_run(const Entry &run, uint64_t touching) {
-        if (held_ + __builtin_popcountll(touching) > Triangles::N && held_ > 0 && !add_and_flush(run.key)) return;
+    // Collects a batch before triangle set-up. Keeps the triangles of a group in one batch if they fit.
+    void add_group(const TileEntry &group, uint64_t touching) {
+        if (batch_size_ + __builtin_popcountll(touching) > Batch::N && batch_size_ > 0 &&
+            !rasterize_and_drain(group.key))
+            return;
         for (; touching; touching &= touching - 1) {
-            if (held_ == Triangles::N && !add_and_flush(run.key)) return;
-            hold(run.first, run.first + __builtin_ctzll(touching));
+            if (batch_size_ == Batch::N && !rasterize_and_drain(group.key)) return;
+            add_to_batch(group.first, group.first + __builtin_ctzll(touching));
         }
     }
 
-    void hold(int32_t run, int32_t face) {
-        Triangles &t = triangles_;
+    void add_to_batch(int32_t group, int32_t face) {
+        MS_ASSERT(batch_size_ < Batch::N);
+        Batch &t = batch_;
         const int32_t *corner = mesh_.faces + 3 * (int64_t)face;
         for (int k = 0; k < 3; ++k) {
             const Projected &p = scene_.vertices[corner[k]];
-            t.x[k][held_] = p.x - area_.x0;
-            t.y[k][held_] = p.y - area_.y0;
-            t.w[k][held_] = p.w;
-            t.rgba[k][held_] = mesh_.colors + 4 * (int64_t)corner[k];
+            t.x[k][batch_size_] = p.x - area_.x0;
+            t.y[k][batch_size_] = p.y - area_.y0;
+            t.w[k][batch_size_] = p.w;
+            t.rgba[k][batch_size_] = mesh_.colors + 4 * (int64_t)corner[k];
         }
-        t.face[held_] = face;
-        run_[held_++] = run;
+        t.face[batch_size_] = face;
+        group_[batch_size_++] = group;
     }
 
-    // Nothing of the groups to come is nearer than `nearest_to_come`. False when no block takes light any more.
-    bool add_and_flush(float nearest_to_come) {
-        add_held();
-        for (; full_; full_ &= full_ - 1) flush(__builtin_ctz(full_), nearest_to_come);
-        return takes_;
+    // Rasterizes the batch. No group to come is nearer than `nearest_to_come`. False if no block is active
+    // any more.
+    bool rasterize_and_drain(float nearest_to_come) {
+        rasterize_batch();
+        for (; full_blocks_; full_blocks_ &= full_blocks_ - 1)
+            drain(__builtin_ctz(full_blocks_), nearest_to_come);
+        return active_blocks_;
     }
 
-    void add_held() {
-        Triangles &t = triangles_;
-        t.set_up_in_front();
-        unsigned crossing = 0;
-        for (int k = 0; k < held_; ++k) crossing |= (unsigned)(!(t.w[0][k] > 0) | !(t.w[1][k] > 0) | !(t.w[2][k] > 0)) << k;
-        for (unsigned rest = crossing; rest; rest &= rest - 1) {
+    // Sets up the triangles of the batch, pushes their fragments and empties the batch.
+    void rasterize_batch() {
+        Batch &t = batch_;
+        t.set_up_visible();
+        unsigned clipped = 0;  // one bit per triangle
+        for (int k = 0; k < batch_size_; ++k) clipped |= (unsigned)t.is_clipped(k) << k;
+        for (unsigned rest = clipped; rest; rest &= rest - 1) {
             int k = __builtin_ctz(rest);
             Vec3 v[3];
-            scene_.homogeneous(mesh_.faces + 3 * (int64_t)t.face[k], area_.x0, area_.y0, v);
-            t.set_up_crossing(k, v, scene_.projection.near);
+            scene_.homogeneous_corners(mesh_.faces + 3 * (int64_t)t.face[k], area_.x0, area_.y0, v);
+            t.set_up_clipped(k, v, scene_.projection.near);
         }
-        for (int end, begin = 0; begin < held_; begin = end) {
-            for (end = begin + 1; end < held_ && run_[end] == run_[begin];) ++end;
-            if (crossing || mesh_.depth_group || blend_.needs_weights())
-                add_run<true>(begin, end, crossing);
+        for (int end, begin = 0; begin < batch_size_; begin = end) {
+            for (end = begin + 1; end < batch_size_ && group_[end] == group_[begin];) ++end;
+            if (clipped || mesh_.depth_group || image_.needs_weights())
+                rasterize_group<true>(begin, end, clipped);
             else
-                add_run<false>(begin, end, 0);
+                rasterize_group<false>(begin, end, 0);
         }
-        held_ = 0;
+        batch_size_ = 0;
     }
 
-    // The functions of a triangle that samples need, each as (a x + b y inside a block) + (a x + b y + c at its corner).
-    struct Functions {
-        Lanes inside[8];  // edges, 1 / depth, RGBA / depth
-        Lanes corner[8];  // by block
-        alignas(16) float low[4], high[4];  // range of RGBA over the corners
+    // The linear functions of a triangle. Each is the sum of its value at the corner of a block and of
+    // a x + b y relative to that corner, so that a sample costs one addition.
+    struct BlockFunctions {
+        enum { EDGE = 0, Q = 3, RGBA = 4, COUNT = 8 };  // edge functions, 1 / depth, RGBA / depth
+        Lanes at_sample[COUNT];                         // relative to the corner, one lane per sample
+        Lanes at_corner[COUNT];                         // one lane per block
+        alignas(16) float low[4], high[4];              // range of RGBA over the triangle's corners
+
+        void set(int function, float a, float b, float c) {
+            const Lanes va = broadcast(a), vb = broadcast(b);
+            at_sample[function] = va * TileArea::samples_x() + vb * TileArea::samples_y();
+            at_corner[function] = va * TileArea::blocks_x() + (vb * TileArea::blocks_y() + broadcast(c));
+        }
+        // Values at the samples of a block.
+        Lanes operator()(int function, int block) const {
+            return at_sample[function] + broadcast(((const float *)&at_corner[function])[block]);
+        }
     };
 
-    // Adds the fragments of the held triangles [begin, end), of one run, to the lists of the blocks they touch.
+    // Pushes the fragments of the triangles [begin, end) of the batch, all of one group, to the queues of the
+    // blocks that they touch. GENERAL: with clipped triangles, depth groups or extra outputs.
     template <bool GENERAL>
-    void add_run(int begin, int end, unsigned crossing) {
-        const Triangles &t = triangles_;
-        uint8_t touching[BLOCKS] = {};
-        TilePieces *found = blend_.pieces();
-        if (found) found->make_room(Triangles::N, Triangles::N * BLOCKS);
-        uint32_t number[Triangles::N];
+    void rasterize_group(int begin, int end, unsigned clipped) {
+        MS_ASSERT(begin < end && end <= batch_size_);
+        uint8_t triangles_of[BLOCKS] = {};  // one bit per triangle of the batch
+        static_assert(Batch::N <= 8);
+        TileCoverage *coverage = image_.coverage();
+        if (coverage) coverage->reserve(Batch::N, Batch::N * BLOCKS);
         unsigned blocks = 0;
         for (int k = begin; k < end; ++k) {
-            unsigned touched = prepare(k);
+            unsigned touched = set_up_functions(k);
             blocks |= touched;
-            if (found && touched) {
-                number[k] = found->triangle_count;
-                found->triangles[found->triangle_count++] = {t.face[k], TilePieces::NONE};
-            }
-            for (; touched; touched &= touched - 1) touching[__builtin_ctz(touched)] |= 1u << k;
+            if (coverage && touched) coverage_index_[k] = coverage->add_triangle(batch_.face[k]);
+            for (; touched; touched &= touched - 1) triangles_of[__builtin_ctz(touched)] |= 1u << k;
         }
         for (; blocks; blocks &= blocks - 1) {
             const int block = __builtin_ctz(blocks);
-            const unsigned open = blend_.open(block);
-            Waiting &waiting = waiting_[block];
-            Fragments *f = &waiting.next();
-            FragmentWeights weights{};
-            unsigned covered = 0;
-            int32_t face = 0;
-            uint32_t first_piece = found ? found->piece_count : 0, pieces = 0;
-            auto add = [&] {
-                waiting.add(covered, face, GENERAL && blend_.needs_weights() ? &weights : nullptr, first_piece, pieces);
-                first_piece += pieces;
-            };
-            for (unsigned rest = touching[block]; rest; rest &= rest - 1) {
-                const int k = __builtin_ctz(rest);
-                const Functions &of = functions_[k];
-                unsigned inside = open;
-                for (int i = 0; i < 3; ++i) inside &= at_least(of.inside[i] + corner(of, i, block), lanes(t.threshold[i][k]));
-                Lanes q = of.inside[3] + corner(of, 3, block);
-                if (GENERAL && crossing >> k & 1) inside &= at_least(lanes(t.q_max[k]), q);
-                if (!inside) continue;
-                if (covered & inside) {
-                    add();
-                    covered = pieces = 0;
-                    f = &waiting.next();
-                }
-                // What the first triangle of an entry has outside of itself is finite, too.
-                const unsigned put = covered ? inside : (1u << LANES) - 1;
-                q = clamp(q, lanes(t.q_min[k]), lanes(t.q_max[k]));
-                const Lanes z = lanes(1) / q;
-                f->key = pick(put, GENERAL ? key(k, block, q) : q, f->key);
-                for (int c = 0; c < 4; ++c) {
-                    const Lanes value = (of.inside[4 + c] + corner(of, 4 + c, block)) * z;
-                    f->rgba[c] = pick(put, clamp(value, lanes(of.low[c]), lanes(of.high[c])), f->rgba[c]);
-                }
-                if (!covered) face = t.face[k];
-                covered |= inside;
-                if (found) {
-                    found->pieces[found->piece_count++] = {number[k], inside};
-                    ++pieces;
-                }
-                if (GENERAL && blend_.needs_weights()) {
-                    const float x = TileArea::block_x(block), y = TileArea::block_y(block);
-                    weights.z = pick(inside, z, weights.z);
-                    for (int i = 0; i < 3; ++i) {
-                        const Lanes b = (lanes(t.sa[i][k]) * TileArea::lane_x() + lanes(t.sb[i][k]) * TileArea::lane_y()) +
-                                        lanes(t.sa[i][k] * x + (t.sb[i][k] * y + t.sc[i][k]));
-                        weights.b[i] = pick(inside, b * z, weights.b[i]);
-                    }
-                }
-            }
-            if (!covered) continue;
-            add();
-            full_ |= (unsigned)waiting.full() << block;
+            rasterize_block<GENERAL>(block, triangles_of[block], clipped, coverage);
         }
     }
 
-    static Lanes corner(const Functions &of, int function, int block) { return lanes(((const float *)&of.corner[function])[block]); }
-
-    // What the fragments of triangle k are sorted by, where 1 / depth is q.
-    Lanes key(int k, int block, const Lanes &q) const {
-        const int32_t group = mesh_.depth_group ? mesh_.depth_group[triangles_.face[k]] : -1;
-        if (group < 0) return q;
-        const DepthPlane &plane = scene_.planes[group];
-        const double corner = plane.q.c + plane.q.a * (area_.x0 + TileArea::block_x(block)) + plane.q.b * (area_.y0 + TileArea::block_y(block));
-        const Lanes common = lanes((float)plane.q.a) * TileArea::lane_x() +
-                             (lanes((float)plane.q.b) * TileArea::lane_y() + lanes((float)corner));
-        return clamp(common, lanes(plane.q_min), lanes(plane.q_max));
+    // Rasterizes some triangles of one group into a block. Triangles share a queue entry as long as they do
+    // not overlap.
+    template <bool GENERAL>
+    __attribute__((always_inline)) void rasterize_block(int block, unsigned triangles, unsigned clipped,
+                                                        TileCoverage *coverage) {
+        const Batch &t = batch_;
+        const LaneMask active = image_.active(block);
+        FragmentQueue &queue = queues_[block];
+        Fragments *f = &queue.next();
+        FragmentWeights weights{};
+        LaneMask covered = 0;  // by the triangles of the entry
+        int32_t first_face = 0;
+        uint32_t first_mask = coverage ? coverage->mask_count : 0, mask_count = 0;
+        auto push = [&] {
+            queue.push(covered, first_face, GENERAL && image_.needs_weights() ? &weights : nullptr,
+                       first_mask, mask_count);
+            first_mask += mask_count;
+        };
+        for (; triangles; triangles &= triangles - 1) {
+            const int k = __builtin_ctz(triangles);
+            const BlockFunctions &functions = functions_[k];
+            LaneMask inside = active;
+            for (int i = 0; i < 3; ++i)
+                inside &=
+                    greater_equal(functions(BlockFunctions::EDGE + i, block), broadcast(t.threshold[i][k]));
+            Lanes q = functions(BlockFunctions::Q, block);
+            if (GENERAL && clipped >> k & 1) inside &= greater_equal(broadcast(t.q_max[k]), q);
+            if (!inside) continue;
+            if (covered & inside) {
+                push();
+                covered = mask_count = 0;
+                f = &queue.next();
+            }
+            // The first triangle fills all lanes, so uncovered lanes are finite.
+            const LaneMask written = covered ? inside : ALL_LANES;
+            q = clamp(q, broadcast(t.q_min[k]), broadcast(t.q_max[k]));
+            const Lanes z = broadcast(1) / q;
+            f->key = select(written, GENERAL ? sort_key(k, block, q) : q, f->key);
+            for (int c = 0; c < 4; ++c) {
+                const Lanes value = functions(BlockFunctions::RGBA + c, block) * z;
+                f->rgba[c] =
+                    select(written, clamp(value, broadcast(functions.low[c]), broadcast(functions.high[c])),
+                           f->rgba[c]);
+            }
+            if (!covered) first_face = t.face[k];
+            covered |= inside;
+            if (coverage) {
+                coverage->add_mask(coverage_index_[k], inside);
+                ++mask_count;
+            }
+            if (GENERAL && image_.needs_weights()) set_weights(k, block, inside, z, weights);
+        }
+        if (!covered) return;
+        push();
+        full_blocks_ |= (unsigned)queue.full() << block;
     }
 
-    // Fills the functions of triangle k; returns the blocks it may touch.
-    unsigned prepare(int k) {
-        const Triangles &t = triangles_;
+    // Depth and barycentric weights of triangle k in the lanes `inside`.
+    void set_weights(int k, int block, LaneMask inside, const Lanes &z, FragmentWeights &weights) const {
+        const Batch &t = batch_;
+        const float x = TileArea::block_x(block), y = TileArea::block_y(block);
+        weights.z = select(inside, z, weights.z);
+        for (int i = 0; i < 3; ++i) {
+            const Lanes s = (broadcast(t.sa[i][k]) * TileArea::samples_x() +
+                             broadcast(t.sb[i][k]) * TileArea::samples_y()) +
+                            broadcast(t.sa[i][k] * x + (t.sb[i][k] * y + t.sc[i][k]));
+            weights.b[i] = select(inside, s * z, weights.b[i]);
+        }
+    }
+
+    // The sort key of triangle k where 1 / depth is q: that of its depth group, if it has one.
+    Lanes sort_key(int k, int block, const Lanes &q) const {
+        const int32_t group = mesh_.depth_group ? mesh_.depth_group[batch_.face[k]] : -1;
+        if (group < 0) return q;
+        MS_ASSERT(group < (int32_t)scene_.planes.size());
+        const DepthPlane &plane = scene_.planes[group];
+        const double corner = plane.q.c + plane.q.a * (area_.x0 + TileArea::block_x(block)) +
+                              plane.q.b * (area_.y0 + TileArea::block_y(block));
+        const Lanes key = broadcast((float)plane.q.a) * TileArea::samples_x() +
+                          (broadcast((float)plane.q.b) * TileArea::samples_y() + broadcast((float)corner));
+        return clamp(key, broadcast(plane.q_min), broadcast(plane.q_max));
+    }
+
+    // Sets up the functions of triangle k; returns the active blocks that it may touch, one bit each.
+    unsigned set_up_functions(int k) {
+        const Batch &t = batch_;
         const f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
         const f4 high = max4(max4(c[0], c[1]), c[2]);
-        if (!(t.area[k] > 0) || (!(high[3] > 0) && !blend_.keeps_invisible())) return 0;
-        Functions &of = functions_[k];
-        const Lanes x = TileArea::lane_x(), y = TileArea::lane_y(), block_x = TileArea::blocks_x(), block_y = TileArea::blocks_y();
-        auto split = [&](int i, float a, float b, float c) {
-            const Lanes va = lanes(a), vb = lanes(b);
-            of.inside[i] = va * x + vb * y;
-            of.corner[i] = va * block_x + (vb * block_y + lanes(c));
-        };
-        unsigned blocks = takes_;
+        if (!(t.valid[k] > 0) || (!(high[3] > 0) && !image_.keeps_transparent())) return 0;
+        BlockFunctions &functions = functions_[k];
+        unsigned blocks = active_blocks_;
         for (int i = 0; i < 3; ++i) {
             const float a = t.ea[i][k], b = t.eb[i][k];
-            split(i, a, b, t.ec[i][k]);
-            // No sample of a block exceeds its corner's value by more than this, rounding included.
+            functions.set(BlockFunctions::EDGE + i, a, b, t.ec[i][k]);
+            // Conservative test: no sample of a block exceeds the value at its corner by more, rounding
+            // included.
             const float most = std::max(a * 0.5f, a * 3.5f) + std::max(b * 0.5f, b * 3.5f);
-            blocks &= at_least(of.corner[i] + lanes(most), lanes(t.threshold[i][k]));
+            blocks &= greater_equal(functions.at_corner[BlockFunctions::EDGE + i] + broadcast(most),
+                                    broadcast(t.threshold[i][k]));
         }
         if (!blocks) return 0;
-        split(3, t.qa[k], t.qb[k], t.qc[k]);
-        alignas(16) float plane[3][4];
-        const float(*const s[3])[Triangles::N] = {t.sa, t.sb, t.sc};
+        functions.set(BlockFunctions::Q, t.qa[k], t.qb[k], t.qc[k]);
+        alignas(16) float plane[3][4];  // coefficients a, b, c of RGBA / depth
+        const float (*const s[3])[Batch::N] = {t.sa, t.sb, t.sc};
         for (int i = 0; i < 3; ++i)
             store4(plane[i], set4(s[i][0][k]) * c[0] + set4(s[i][1][k]) * c[1] + set4(s[i][2][k]) * c[2]);
-        for (int i = 0; i < 4; ++i) split(4 + i, plane[0][i], plane[1][i], plane[2][i]);
-        store4(of.low, min4(min4(c[0], c[1]), c[2]));
-        store4(of.high, high);
+        for (int i = 0; i < 4; ++i)
+            functions.set(BlockFunctions::RGBA + i, plane[0][i], plane[1][i], plane[2][i]);
+        store4(functions.low, min4(min4(c[0], c[1]), c[2]));
+        store4(functions.high, high);
         return blocks;
     }
 
+    static constexpr int CACHE_LINE = 64;
+
     const Scene &scene_;
     const MsMesh &mesh_;
-    Blend blend_;
+    ImageTile image_;
     int tile_x_, tile_y_;
     TileArea area_;
-    uint64_t touching_[RING];  // of the groups to come
-    Triangles triangles_;
-    int held_;                 // triangles gathered
-    int32_t run_[Triangles::N];
-    Functions functions_[Triangles::N];
-    Waiting waiting_[BLOCKS];
-    unsigned takes_;  // blocks that still take light
-    unsigned full_;   // blocks whose lists have become long
+    uint64_t touching_[RING];  // touching_triangles of the next groups
+    Batch batch_;
+    int batch_size_;
+    int32_t group_[Batch::N];             // first triangle of the group of each triangle
+    uint32_t coverage_index_[Batch::N];   // of each triangle, in the coverage of the tile
+    BlockFunctions functions_[Batch::N];  // of each triangle
+    FragmentQueue queues_[BLOCKS];
+    unsigned active_blocks_;  // blocks with active samples, one bit each
+    unsigned full_blocks_;    // blocks whose queues are full
 };
 
 }  // namespace ms

@@ -1,4 +1,4 @@
-// Work sharing over std::thread. Items are taken one by one from a counter, so threads never wait for each other.
+// Parallel loops over std::thread with dynamic scheduling: threads fetch work from an atomic counter.
 #pragma once
 
 #include <algorithm>
@@ -9,19 +9,23 @@
 #include <thread>
 #include <vector>
 
+#include "check.h"
+
 namespace ms {
 
-// Calls work(thread number) on `threads` threads; an exception in one is thrown again here once all have ended.
+// Calls work(thread) once for each thread index in [0, threads), in parallel. Joins all threads, then
+// rethrows the first exception.
 template <class Work>
 void on_threads(int threads, Work work) {
+    MS_ASSERT(threads >= 1);
     if (threads <= 1) return work(0);
     std::exception_ptr failure;
-    std::mutex guard;
-    auto run = [&](int number) {
+    std::mutex failure_mutex;
+    auto run = [&](int thread) {
         try {
-            work(number);
+            work(thread);
         } catch (...) {
-            std::lock_guard<std::mutex> lock(guard);
+            std::lock_guard<std::mutex> lock(failure_mutex);
             if (!failure) failure = std::current_exception();
         }
     };
@@ -31,17 +35,18 @@ void on_threads(int threads, Work work) {
     try {
         for (; started < threads; ++started) pool.emplace_back(run, started);
     } catch (...) {
-        // The system gives no more threads: this one does the others' share too.
+        // The system refuses more threads: this thread also does the work of the missing ones.
     }
     run(0);
-    for (int number = started; number < threads; ++number) run(number);
+    for (int thread = started; thread < threads; ++thread) run(thread);
     for (auto &t : pool) t.join();
     if (failure) std::rethrow_exception(failure);
 }
 
-// Calls body(begin, end, thread) on consecutive blocks of [0, count).
+// Calls body(begin, end, thread) for consecutive blocks of at most `block` indices that cover [0, count).
 template <class Body>
 void parallel_blocks(int threads, int64_t count, int64_t block, Body body) {
+    MS_ASSERT(count >= 0 && block >= 1);
     std::atomic<int64_t> next{0};
     threads = (int)std::max<int64_t>(1, std::min<int64_t>(threads, (count + block - 1) / block));
     on_threads(threads, [&](int thread) {

@@ -1,5 +1,6 @@
-// Vectors of W floats for a row of samples, and of 4 floats for one RGBA value.
-// Plain IEEE operations in a fixed order: every variant of the core computes the same bits.
+// SIMD vectors: vf holds W floats, the native width; f4 holds one RGBA value.
+// All operations are IEEE operations in a fixed order, so every variant of the core computes the same bits;
+// mul_add and reciprocal are the exceptions.
 #pragma once
 
 #if defined(__SSE2__)
@@ -35,10 +36,10 @@ inline f4 load4(const float *p) {
 }
 inline void store4(float *p, f4 v) { __builtin_memcpy(p, &v, sizeof v); }
 
-// 0 where not `chosen`, whatever v is.
-inline f4 only4(bool chosen, f4 v) {
+// v if `keep`, else 0, even if v is NaN.
+inline f4 masked4(bool keep, f4 v) {
     typedef int i4 __attribute__((vector_size(16)));
-    const int mask = -(int)chosen;
+    const int mask = -(int)keep;
     return (f4)((i4)v & i4{mask, mask, mask, mask});
 }
 
@@ -50,7 +51,7 @@ inline f4 min4(f4 a, f4 b) { return a < b ? a : b; }
 inline f4 max4(f4 a, f4 b) { return a > b ? a : b; }
 #endif
 
-// a b + c, in one rounding where the processor can: for what need not be the same on every processor.
+// a b + c, fused where the processor has FMA. Only for results that may differ between variants.
 #if defined(__AVX512F__)
 inline vf mul_add(vf a, vf b, vf c) { return _mm512_fmadd_ps(a, b, c); }
 #elif defined(__FMA__) && defined(__AVX2__)
@@ -59,7 +60,8 @@ inline vf mul_add(vf a, vf b, vf c) { return _mm256_fmadd_ps(a, b, c); }
 inline vf mul_add(vf a, vf b, vf c) { return a * b + c; }
 #endif
 
-// 1 / a for normal a, within a unit or two of the last place: also for what need not be the same everywhere.
+// 1 / a for normal a, within 2 ulp: estimate and one Newton step with AVX-512, else a division. Only for
+// results that may differ between variants.
 #if defined(__AVX512F__)
 inline vf reciprocal(vf a) {
     const vf r = _mm512_rcp14_ps(a);
@@ -69,55 +71,55 @@ inline vf reciprocal(vf a) {
 inline vf reciprocal(vf a) { return 1 / a; }
 #endif
 
-// Masks, one flag a lane.
+// Masks: one flag per lane. Comparisons with NaN are false.
 #if defined(__AVX512F__)
 typedef __mmask16 vm;
 inline vm greater(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GT_OQ); }
 inline vm equal(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_EQ_OQ); }
-inline vm not_less(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
-inline vm both(vm a, vm b) { return a & b; }
-inline vm not_mask(vm a) { return ~a; }
+inline vm greater_equal(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+inline vm mask_and(vm a, vm b) { return a & b; }
+inline vm mask_not(vm a) { return ~a; }
 inline unsigned bits(vm m) { return m; }
-inline vf pick(vm m, vf yes, vf no) { return _mm512_mask_blend_ps(m, no, yes); }
+inline vf select(vm m, vf yes, vf no) { return _mm512_mask_blend_ps(m, no, yes); }
 inline vf add_where(vf a, vm m, vf b) { return _mm512_mask_add_ps(a, m, a, b); }
 #else
 typedef int vm __attribute__((vector_size(4 * W)));
 inline vm greater(vf a, vf b) { return a > b; }
 inline vm equal(vf a, vf b) { return a == b; }
-inline vm not_less(vf a, vf b) { return a >= b; }
-inline vm both(vm a, vm b) { return a & b; }
-inline vm not_mask(vm a) { return ~a; }
+inline vm greater_equal(vf a, vf b) { return a >= b; }
+inline vm mask_and(vm a, vm b) { return a & b; }
+inline vm mask_not(vm a) { return ~a; }
 #if defined(__AVX2__)
 inline unsigned bits(vm m) { return _mm256_movemask_ps((__m256)m); }
-inline vf pick(vm m, vf yes, vf no) { return _mm256_blendv_ps(no, yes, (__m256)m); }
+inline vf select(vm m, vf yes, vf no) { return _mm256_blendv_ps(no, yes, (__m256)m); }
 #else
 #if defined(__SSE2__)
 inline unsigned bits(vm m) { return _mm_movemask_ps((__m128)m); }
 #else
 inline unsigned bits(vm m) { return (m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8); }
 #endif
-inline vf pick(vm m, vf yes, vf no) { return (vf)((m & (vm)yes) | (~m & (vm)no)); }
+inline vf select(vm m, vf yes, vf no) { return (vf)((m & (vm)yes) | (~m & (vm)no)); }
 #endif
 inline vf add_where(vf a, vm m, vf b) { return a + (vf)(m & (vm)b); }
 #endif
 
-// at_least(a, b): bit i is set where a[i] >= b[i].
+// If an operand of vmin or vmax is NaN, the result is b. Bit i of greater_equal_bits says a[i] >= b[i].
 #if defined(__AVX512F__)
 inline vf vmin(vf a, vf b) { return _mm512_min_ps(a, b); }
 inline vf vmax(vf a, vf b) { return _mm512_max_ps(a, b); }
-inline unsigned at_least(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
+inline unsigned greater_equal_bits(vf a, vf b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
 #elif defined(__AVX2__)
 inline vf vmin(vf a, vf b) { return _mm256_min_ps(a, b); }
 inline vf vmax(vf a, vf b) { return _mm256_max_ps(a, b); }
-inline unsigned at_least(vf a, vf b) { return _mm256_movemask_ps(_mm256_cmp_ps(a, b, _CMP_GE_OQ)); }
+inline unsigned greater_equal_bits(vf a, vf b) { return _mm256_movemask_ps(_mm256_cmp_ps(a, b, _CMP_GE_OQ)); }
 #elif defined(__SSE2__)
 inline vf vmin(vf a, vf b) { return _mm_min_ps(a, b); }
 inline vf vmax(vf a, vf b) { return _mm_max_ps(a, b); }
-inline unsigned at_least(vf a, vf b) { return _mm_movemask_ps(_mm_cmpge_ps(a, b)); }
+inline unsigned greater_equal_bits(vf a, vf b) { return _mm_movemask_ps(_mm_cmpge_ps(a, b)); }
 #else
 inline vf vmin(vf a, vf b) { return a < b ? a : b; }
 inline vf vmax(vf a, vf b) { return a > b ? a : b; }
-inline unsigned at_least(vf a, vf b) {
+inline unsigned greater_equal_bits(vf a, vf b) {
     auto m = a >= b;
     unsigned bits = 0;
     for (int i = 0; i < W; ++i) bits |= (unsigned)(m[i] & 1) << i;
@@ -125,12 +127,12 @@ inline unsigned at_least(vf a, vf b) {
 }
 #endif
 
-// A mask of the lanes whose bit is set.
+// mask_of: the mask of the lanes whose bit is set. masked: v in the lanes of the mask, 0 elsewhere.
 #if defined(__AVX512F__)
-inline vm where(unsigned bits) { return (__mmask16)bits; }
-inline vf only(vm m, vf v) { return _mm512_maskz_mov_ps(m, v); }
+inline vm mask_of(unsigned bits) { return (__mmask16)bits; }
+inline vf masked(vm m, vf v) { return _mm512_maskz_mov_ps(m, v); }
 #else
-inline vm where(unsigned bits) {
+inline vm mask_of(unsigned bits) {
 #if defined(__AVX2__)
     const vm flag = {1, 2, 4, 8, 16, 32, 64, 128};
 #else
@@ -138,7 +140,7 @@ inline vm where(unsigned bits) {
 #endif
     return (((int)bits - vm{}) & flag) == flag;
 }
-inline vf only(vm m, vf v) { return (vf)(m & (vm)v); }
+inline vf masked(vm m, vf v) { return (vf)(m & (vm)v); }
 #endif
 
 }  // namespace ms

@@ -1,8 +1,10 @@
-// Draws Gaussian splats the way they were trained: whole splats in the order of their centres' depth.
+// Renders Gaussian splats as they were trained: whole splats in the order of their centres' depths.
 //
-// EWA projection (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting (Kerbl et al. 2023): widening of
-// the projected covariance, opacity below 1/255 skipped and at most 0.99, a sample ends before the splat that would
-// leave less than 1e-4 of the light. '2dgs' follows Huang et al. 2024: the ray meets the splat's plane.
+// EWA splatting (Zwicker et al. 2001) with the conventions of 3D Gaussian Splatting (Kerbl et al. 2023): the
+// projected covariance is dilated, alpha below 1/255 is skipped and limited to 0.99, and a sample stops
+// before the splat that would leave a transmittance below 1e-4. The kernel 'antialiased' compensates opacity
+// for the dilation (Yu et al. 2024); '2dgs' intersects rays with the planes of flat splats (Huang et al.
+// 2024).
 #pragma once
 
 #include <memory>
@@ -12,26 +14,30 @@
 
 namespace ms {
 
-constexpr float ALPHA_CUT = 1.0f / 255, ALPHA_MOST = 0.99f, LIGHT_LEFT = 1e-4f;
+constexpr float MIN_ALPHA = 1.0f / 255, MAX_ALPHA = 0.99f, MIN_SPLAT_TRANSMITTANCE = 1e-4f;
 
-struct FlatSplat {
+enum Kernel { KERNEL_3DGS = 0, KERNEL_ANTIALIASED = 1, KERNEL_2DGS = 2 };
+
+struct ProjectedSplat {
     double x, y;  // projected centre, samples
-    // The squared distance in standard deviations is (m[0] dx + m[1] dy)^2 + (m[2] dy)^2: a sum of squares stays exact
-    // for thin splats, where the usual quadratic form cancels. Not used by 2dgs.
+    // At (dx, dy) from the centre, the squared Mahalanobis distance is (m[0] dx + m[1] dy)^2 + (m[2] dy)^2.
+    // The usual quadratic form cancels for thin splats; a sum of squares does not. Not used by 2dgs.
     double m[3];
-    float low, high;  // rows reached
+    float low, high;  // range of rows, samples
     float opacity;
     float rgb[3];
 };
 
-// 2dgs: the ray through the centre plus (dx, dy) meets the splat's plane at u = m[0] . (dx, dy, 1) / m[2] . (dx, dy, 1)
-// standard deviations along the first axis, v likewise with m[1], at the depth w . (u, v, 1).
-struct FlatPlane {
+// For 2dgs. The ray through the projected centre plus (dx, dy) meets the splat's plane at
+// u = m[0] . (dx, dy, 1) / m[2] . (dx, dy, 1) standard deviations along the first axis, v with m[1] along the
+// second axis, and at depth w . (u, v, 1).
+struct ProjectedPlane {
     double m[3][3];
     float w[3];
 };
 
-// exp of x <= 0, relative error about 2e-7; the same bits at every vector width.
+// exp(x) for x <= 0 with a relative error of about 2e-7: Cody-Waite range reduction and a Taylor polynomial
+// of degree 7. The same bits at every vector width.
 inline vf exp_negative(vf x) {
     typedef int32_t vi __attribute__((vector_size(4 * W)));
     x = vmax(x, set1(-87.0f));
@@ -42,14 +48,16 @@ inline vf exp_negative(vf x) {
     vf p = set1(1.0f / 5040);
     for (float c : {1.0f / 720, 1.0f / 120, 1.0f / 24, 1.0f / 6, 0.5f, 1.0f, 1.0f}) p = p * r + set1(c);
     vi bits = (n + 127) << 23;
-    vf two;
-    __builtin_memcpy(&two, &bits, sizeof two);
-    return p * two;
+    vf power_of_two;
+    __builtin_memcpy(&power_of_two, &bits, sizeof power_of_two);
+    return p * power_of_two;
 }
 
-// Display colour seen along the unit direction d: max(0, 1/2 + sum of coefficients times real spherical harmonics);
-// of degree 0 alone, the colour that a vertex can carry, at most 1.
+// Display colour along the unit direction d from the camera: 1/2 + sum of coefficients times real spherical
+// harmonics, at least 0. Of degree 0 alone it is also limited to 1, as a vertex colour is. `used` is 1, 4, 9
+// or 16.
 inline void sh_color(const float *sh, int used, const double d[3], float rgb[3]) {
+    MS_ASSERT(used == 1 || used == 4 || used == 9 || used == 16);
     double x = d[0], y = d[1], z = d[2], xx = x * x, yy = y * y, zz = z * z;
     double basis[16];
     const double pi = 3.14159265358979323846;
@@ -69,7 +77,8 @@ inline void sh_color(const float *sh, int used, const double d[3], float rgb[3])
         basis[8] = 0.5 * c * (xx - yy);
     }
     if (used > 9) {
-        double c3 = 0.25 * std::sqrt(35 / (2 * pi)), c2 = 0.5 * std::sqrt(105 / pi), c1 = 0.25 * std::sqrt(21 / (2 * pi));
+        double c3 = 0.25 * std::sqrt(35 / (2 * pi)), c2 = 0.5 * std::sqrt(105 / pi),
+               c1 = 0.25 * std::sqrt(21 / (2 * pi));
         basis[9] = -c3 * y * (3 * xx - yy);
         basis[10] = c2 * x * y * z;
         basis[11] = -c1 * y * (4 * zz - xx - yy);
@@ -87,30 +96,34 @@ inline void sh_color(const float *sh, int used, const double d[3], float rgb[3])
 
 class SplatScene {
   public:
-    std::vector<FlatSplat> splats;  // visible ones
-    std::vector<FlatPlane> planes;  // theirs, for 2dgs only
-    std::vector<Item> items;        // runs of one of `splats`, nearest first
+    std::vector<ProjectedSplat> splats;  // visible splats
+    std::vector<ProjectedPlane> planes;  // of the same splats, for 2dgs only
+    std::vector<BinItem> items;          // entries of one splat each, nearest first
 
     SplatScene(const MsSplats &cloud, const MsCamera &camera, const Grid &grid, int threads)
         : cloud_(cloud), camera_(camera), grid_(grid), projection_(camera, grid.samples) {
+        MS_ASSERT(cloud.count >= 0 && cloud.count <= INT32_MAX);
+        MS_ASSERT(cloud.kernel >= KERNEL_3DGS && cloud.kernel <= KERNEL_2DGS);
+        MS_ASSERT(cloud.sh_used <= cloud.sh_stored && cloud.dilation >= 0);
         for (int i = 0; i < 3; ++i)
-            for (int k = 0; k < 3; ++k) position_[i] -= projection_.m[4 * k + i] * projection_.m[4 * k + 3];
+            for (int k = 0; k < 3; ++k)
+                camera_center_[i] -= projection_.m[4 * k + i] * projection_.m[4 * k + 3];
         constexpr int64_t block = 1 << 13;
         struct Part {
-            std::vector<FlatSplat> splats;
-            std::vector<FlatPlane> planes;
-            std::vector<Item> items;
+            std::vector<ProjectedSplat> splats;
+            std::vector<ProjectedPlane> planes;
+            std::vector<BinItem> items;
         };
         std::vector<Part> parts((cloud.count + block - 1) / block);
-        parallel_blocks(threads, cloud.count, block, [&](int64_t a, int64_t b, int) {
-            Part &part = parts[a / block];
-            FlatSplat splat;
-            FlatPlane plane;
-            Item item;
-            for (int64_t i = a; i < b; ++i)
+        parallel_blocks(threads, cloud.count, block, [&](int64_t begin, int64_t end, int) {
+            Part &part = parts[begin / block];
+            ProjectedSplat splat;
+            ProjectedPlane plane;
+            BinItem item;
+            for (int64_t i = begin; i < end; ++i)
                 if (project(i, splat, plane, item)) {
                     part.splats.push_back(splat);
-                    if (cloud_.kernel == 2) part.planes.push_back(plane);
+                    if (cloud_.kernel == KERNEL_2DGS) part.planes.push_back(plane);
                     part.items.push_back(item);
                 }
         });
@@ -131,60 +144,77 @@ class SplatScene {
     const MsCamera &camera_;
     const Grid &grid_;
     Projection projection_;
-    double position_[3] = {0, 0, 0};
+    double camera_center_[3] = {0, 0, 0};  // world space
 
-    bool project(int64_t i, FlatSplat &out, FlatPlane &on_plane, Item &item) const {
-        const float *mean = cloud_.means + 3 * i, *q = cloud_.quaternions + 4 * i, *scale = cloud_.scales + 3 * i;
+    // The box in the image where alpha may reach MIN_ALPHA, samples.
+    struct Box {
+        double low[2], high[2];
+    };
+
+    // Projects splat i; false if it is not visible. The item's entry does not get its index.
+    bool project(int64_t i, ProjectedSplat &out, ProjectedPlane &plane, BinItem &item) const {
+        const float *mean = cloud_.means + 3 * i;
         Vec3 c = projection_.to_camera(mean);
         if (!(c.z >= projection_.near)) return false;
         double opacity = cloud_.opacities[i];
-        if (!(opacity >= ALPHA_CUT)) return false;
-
-        // The splat's axes in camera space, as columns scaled by the standard deviations.
-        double w = q[0], x = q[1], y = q[2], z = q[3];
-        double r[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
-                          {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
-                          {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}};
+        if (!(opacity >= MIN_ALPHA)) return false;
         double axes[3][3];
-        for (int row = 0; row < 3; ++row)
-            for (int col = 0; col < 3; ++col) {
-                axes[row][col] = 0;
-                for (int k = 0; k < 3; ++k) axes[row][col] += projection_.m[4 * row + k] * r[k][col];
-                axes[row][col] *= scale[col];
-            }
+        principal_axes(i, axes);
         out.x = projection_.fx * c.x / c.z + projection_.cx;
         out.y = projection_.fy * c.y / c.z + projection_.cy;
-        double lo[2], hi[2];
-        bool visible = cloud_.kernel == 2 ? plane(c, axes, opacity, out, on_plane, lo, hi)
-                                          : footprint(c, axes, opacity, out, lo, hi);
+        Box box;
+        bool visible = cloud_.kernel == KERNEL_2DGS ? project_plane(c, axes, opacity, out, plane, box)
+                                                    : project_covariance(c, axes, opacity, out, box);
         int x0, x1, y0, y1;
-        if (!visible || !sample_range(lo[0], hi[0], grid_.width, x0, x1) || !sample_range(lo[1], hi[1], grid_.height, y0, y1))
+        if (!visible || !sample_range(box.low[0], box.high[0], grid_.width, x0, x1) ||
+            !sample_range(box.low[1], box.high[1], grid_.height, y0, y1))
             return false;
         out.opacity = (float)opacity;
-        out.low = (float)lo[1];
-        out.high = (float)hi[1];
+        out.low = (float)box.low[1];
+        out.high = (float)box.high[1];
         double direction[3], length = 0;
         for (int k = 0; k < 3; ++k) {
-            direction[k] = mean[k] - position_[k];
+            direction[k] = mean[k] - camera_center_[k];
             length += direction[k] * direction[k];
         }
         length = std::sqrt(length);
         for (double &d : direction) d /= length;
         sh_color(cloud_.sh + 3 * (int64_t)cloud_.sh_stored * i, cloud_.sh_used, direction, out.rgb);
         item = {{(float)(1 / c.z), 0, 1},
-                (uint16_t)grid_.tile_of(x0), (uint16_t)grid_.tile_of(x1),
-                (uint16_t)grid_.tile_of(y0), (uint16_t)grid_.tile_of(y1)};
+                (uint16_t)grid_.tile_of(x0),
+                (uint16_t)grid_.tile_of(x1),
+                (uint16_t)grid_.tile_of(y0),
+                (uint16_t)grid_.tile_of(y1)};
         return true;
     }
 
-    bool footprint(const Vec3 &c, const double axes[3][3], double &opacity, FlatSplat &out, double lo[2], double hi[2]) const {
-        // The Jacobian of the projection, taken no farther than 0.3 of the half field of view outside the picture.
+    // The principal axes of splat i in camera space, as columns scaled by the standard deviations.
+    void principal_axes(int64_t i, double axes[3][3]) const {
+        const float *q = cloud_.quaternions + 4 * i, *scale = cloud_.scales + 3 * i;
+        double w = q[0], x = q[1], y = q[2], z = q[3];
+        double r[3][3] = {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)},
+                          {2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)},
+                          {2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)}};
+        for (int row = 0; row < 3; ++row)
+            for (int col = 0; col < 3; ++col) {
+                axes[row][col] = 0;
+                for (int k = 0; k < 3; ++k) axes[row][col] += projection_.m[4 * row + k] * r[k][col];
+                axes[row][col] *= scale[col];
+            }
+    }
+
+    // EWA: the affine approximation of the projection at the centre c. Lowers the opacity for 'antialiased'.
+    bool project_covariance(const Vec3 &c, const double axes[3][3], double &opacity, ProjectedSplat &out,
+                            Box &box) const {
+        // As in 3DGS, the Jacobian is evaluated at most 0.3 of the half field of view outside the image.
         double s = grid_.samples, fx = camera_.fx, fy = camera_.fy;
         double margin_x = 0.15 * camera_.width / fx, margin_y = 0.15 * camera_.height / fy;
-        auto limit = [](double v, double low, double high) { return v < low ? low : v > high ? high : v; };
-        double tx = limit(c.x / c.z, -camera_.cx / fx - margin_x, (camera_.width - camera_.cx) / fx + margin_x);
-        double ty = limit(c.y / c.z, -camera_.cy / fy - margin_y, (camera_.height - camera_.cy) / fy + margin_y);
-        double jx[3], jy[3], cov[3] = {0, 0, 0}, det_before = 0;
+        auto clamped = [](double v, double low, double high) { return v < low ? low : v > high ? high : v; };
+        double tx =
+            clamped(c.x / c.z, -camera_.cx / fx - margin_x, (camera_.width - camera_.cx) / fx + margin_x);
+        double ty =
+            clamped(c.y / c.z, -camera_.cy / fy - margin_y, (camera_.height - camera_.cy) / fy + margin_y);
+        double jx[3], jy[3], cov[3] = {0, 0, 0}, undilated_det = 0;
         for (int k = 0; k < 3; ++k) {
             jx[k] = fx / c.z * (axes[0][k] - tx * axes[2][k]);
             jy[k] = fy / c.z * (axes[1][k] - ty * axes[2][k]);
@@ -192,33 +222,38 @@ class SplatScene {
             cov[1] += jx[k] * jy[k];
             cov[2] += jy[k] * jy[k];
         }
-        // The determinant by Lagrange's identity: a sum of squares again.
+        // The determinant as a sum of squares, by Lagrange's identity.
         for (int k = 0; k < 3; ++k) {
             double area = jx[k] * jy[(k + 1) % 3] - jx[(k + 1) % 3] * jy[k];
-            det_before += area * area;
+            undilated_det += area * area;
         }
-        double widening = cloud_.dilation, det = det_before + widening * (cov[0] + cov[2] + widening);
-        cov[0] += widening;
-        cov[2] += widening;
+        double dilation = cloud_.dilation, det = undilated_det + dilation * (cov[0] + cov[2] + dilation);
+        cov[0] += dilation;
+        cov[2] += dilation;
         if (!(det > 0) || !std::isfinite(det)) return false;
-        if (cloud_.kernel == 1) {
-            opacity *= std::sqrt(std::max(0.0, det_before / det));
-            if (!(opacity >= ALPHA_CUT)) return false;
+        if (cloud_.kernel == KERNEL_ANTIALIASED) {
+            opacity *= std::sqrt(std::max(0.0, undilated_det / det));
+            if (!(opacity >= MIN_ALPHA)) return false;
         }
+        // A triangular factor of the inverse covariance.
         double along = 1 / (s * std::sqrt(cov[2])), across = along / std::sqrt(det);
         if (!std::isfinite(along) || !std::isfinite(across)) return false;
         out.m[0] = across * cov[2];
         out.m[1] = -across * cov[1];
         out.m[2] = along;
-        double radius2 = 2 * std::log(255 * opacity) + 1e-6;
+        double radius2 = squared_radius(opacity);
         double rx = s * std::sqrt(radius2 * cov[0]), ry = s * std::sqrt(radius2 * cov[2]);
-        lo[0] = out.x - rx, hi[0] = out.x + rx, lo[1] = out.y - ry, hi[1] = out.y + ry;
+        box.low[0] = out.x - rx, box.high[0] = out.x + rx;
+        box.low[1] = out.y - ry, box.high[1] = out.y + ry;
         return true;
     }
 
-    bool plane(const Vec3 &c, const double axes[3][3], double opacity, const FlatSplat &splat, FlatPlane &out, double lo[2],
-               double hi[2]) const {
-        // Columns of the map (u, v, 1) -> picture; x and y counted from the projected centre.
+    // Squared Mahalanobis distance at which alpha falls to MIN_ALPHA, and a little for rounding.
+    static double squared_radius(double opacity) { return 2 * std::log(255 * opacity) + 1e-6; }
+
+    bool project_plane(const Vec3 &c, const double axes[3][3], double opacity, const ProjectedSplat &splat,
+                       ProjectedPlane &out, Box &box) const {
+        // The homography (u, v, 1) -> image, relative to the projected centre.
         double center[3] = {c.x, c.y, c.z}, row[3][3];
         for (int k = 0; k < 3; ++k) {
             double column[3];
@@ -227,7 +262,7 @@ class SplatScene {
             row[1][k] = projection_.fy * column[1] + (projection_.cy - splat.y) * column[2];
             row[2][k] = column[2];
         }
-        // The inverse of that map, but for a factor, which is chosen to keep the numbers small.
+        // Its inverse up to a factor: the adjugate, divided by the largest element of its last row.
         double largest = 0;
         for (int k = 0; k < 3; ++k)
             for (int i = 0; i < 3; ++i) {
@@ -236,164 +271,193 @@ class SplatScene {
                 if (k == 2) largest = std::max(largest, std::fabs(out.m[k][i]));
             }
         if (largest > 0)
-            for (auto &numbers : out.m)
-                for (double &number : numbers) number /= largest;
+            for (auto &coefficients : out.m)
+                for (double &coefficient : coefficients) coefficient /= largest;
         for (int k = 0; k < 3; ++k) out.w[k] = (float)row[2][k];
-        // Box of the disc u^2 + v^2 <= radius^2 on the picture, and of the low pass round the centre.
-        double radius2 = 2 * std::log(255 * opacity) + 1e-6;
+        // Box of the projected disc u^2 + v^2 <= radius2 (a conic; unbounded if it reaches the camera plane),
+        // joined with that of the low-pass filter around the centre.
+        double radius2 = squared_radius(opacity);
         double low_pass = std::sqrt(radius2 * cloud_.dilation) * grid_.samples;
         double d = radius2 * (row[2][0] * row[2][0] + row[2][1] * row[2][1]) - row[2][2] * row[2][2];
         for (int i = 0; i < 2; ++i) {
-            double at = i ? splat.y : splat.x, middle = 0, half = std::numeric_limits<double>::infinity();
+            double origin = i ? splat.y : splat.x, middle = 0, half = std::numeric_limits<double>::infinity();
             if (d < 0) {
-                double cross = radius2 * (row[i][0] * row[2][0] + row[i][1] * row[2][1]) - row[i][2] * row[2][2];
-                double square = radius2 * (row[i][0] * row[i][0] + row[i][1] * row[i][1]) - row[i][2] * row[i][2];
+                double cross =
+                    radius2 * (row[i][0] * row[2][0] + row[i][1] * row[2][1]) - row[i][2] * row[2][2];
+                double square =
+                    radius2 * (row[i][0] * row[i][0] + row[i][1] * row[i][1]) - row[i][2] * row[i][2];
                 middle = cross / d;
                 half = std::sqrt(std::max(0.0, middle * middle - square / d));
             }
-            lo[i] = at + std::min(middle - half, -low_pass);
-            hi[i] = at + std::max(middle + half, low_pass);
+            box.low[i] = origin + std::min(middle - half, -low_pass);
+            box.high[i] = origin + std::max(middle + half, low_pass);
         }
         return true;
     }
 };
 
-// One tile of the picture of the splats.
+// Renders the splats into one tile. Samples are stored in rows.
 class SplatTile {
   public:
-    SplatTile(const SplatScene &scene, const Grid &grid, const MsOptions &options, const MsPicture &picture,
+    SplatTile(const SplatScene &scene, const Grid &grid, const MsOptions &options, const MsImage &image,
               const MsCamera &camera, const MsSplats &cloud)
-        : scene_(scene), grid_(grid), options_(options), picture_(picture), camera_(camera), planar_(cloud.kernel == 2),
-          near_((float)camera.near), low_pass_(1 / std::max(cloud.dilation, 1e-6f) / (grid.samples * grid.samples)) {
+        : scene_(scene),
+          grid_(grid),
+          options_(options),
+          image_(image),
+          camera_(camera),
+          planar_(cloud.kernel == KERNEL_2DGS),
+          near_((float)camera.near),
+          inverse_low_pass_(1 / std::max(cloud.dilation, 1e-6f) / (grid.samples * grid.samples)) {
         for (int i = 0; i < TILE; ++i) center_[i] = i + 0.5f;
     }
 
     int64_t fragments() const { return fragments_; }
 
-    void draw(int tile_x, int tile_y, const Entry *list, int64_t length) {
-        int x0 = tile_x * grid_.side, y0 = tile_y * grid_.side;
-        int columns = std::min(grid_.side, grid_.width - x0), rows = std::min(grid_.side, grid_.height - y0);
+    void render(int tile_x, int tile_y, const TileEntry *list, int64_t length) {
+        int x0 = tile_x * grid_.tile_side, y0 = tile_y * grid_.tile_side;
+        int columns = std::min(grid_.tile_side, grid_.width - x0),
+            rows = std::min(grid_.tile_side, grid_.height - y0);
+        MS_ASSERT(columns > 0 && rows > 0);
         for (int y = 0; y < TILE; ++y)
             for (int x = 0; x < TILE; ++x) {
                 red_[y][x] = green_[y][x] = blue_[y][x] = 0;
-                through_[y][x] = 1;
+                transmittance_[y][x] = 1;
             }
-        for (int y = 0; y < rows; ++y) open_[y] = (1u << columns) - 1;
+        for (int y = 0; y < rows; ++y) active_[y] = (1u << columns) - 1;
         for (int64_t i = 0; i < length; ++i) {
-            add(list[i].first, x0, y0, rows);
-            if ((i & 15) == 15) {
+            MS_ASSERT(i == 0 || list[i].key <= list[i - 1].key);
+            blend(list[i].first, x0, y0, rows);
+            if (i % SPLATS_PER_CHECK == SPLATS_PER_CHECK - 1) {
                 uint32_t any = 0;
-                for (int y = 0; y < rows; ++y) any |= open_[y];
+                for (int y = 0; y < rows; ++y) any |= active_[y];
                 if (!any) break;
             }
         }
-        finish(x0, y0, columns, rows);
+        resolve(x0, y0, columns, rows);
     }
 
   private:
+    static constexpr int SPLATS_PER_CHECK = 16;  // between checks whether the tile is finished
+
     const SplatScene &scene_;
     const Grid &grid_;
     const MsOptions &options_;
-    const MsPicture &picture_;
+    const MsImage &image_;
     const MsCamera &camera_;
     bool planar_;
-    float near_, low_pass_;
+    float near_, inverse_low_pass_;  // 1 / variance of the low-pass filter, 1 / square samples
     alignas(64) float center_[TILE];
-    alignas(64) float red_[TILE][TILE], green_[TILE][TILE], blue_[TILE][TILE], through_[TILE][TILE];
-    uint32_t open_[TILE];
+    alignas(64) float red_[TILE][TILE], green_[TILE][TILE], blue_[TILE][TILE], transmittance_[TILE][TILE];
+    uint32_t active_[TILE];  // by row, one bit per column
     int64_t fragments_ = 0;
 
-    // A FlatPlane counted from the corner of a tile, which is at (x, y) from the splat's centre.
-    struct Plane {
+    // A ProjectedSplat relative to the corner of a tile: u = a x + b y + c, v = d y + e, squared distance u^2
+    // + v^2.
+    struct TileSplat {
+        float a, b, c, d, e;
+    };
+    // A ProjectedPlane relative to the corner of a tile, which is at (x, y) from the projected centre.
+    struct TilePlane {
         float x, y, m[3][3], w[3];
     };
 
-    static vf pick(unsigned chosen, vf yes, vf no) {
+    static vf select_bits(unsigned chosen, vf yes, vf no) {
 #if defined(__AVX512F__)
-        return ms::pick((vm)chosen, yes, no);
+        return select((vm)chosen, yes, no);
 #else
         typedef int vi __attribute__((vector_size(4 * W)));
         vi lane;
         for (int i = 0; i < W; ++i) lane[i] = (chosen >> i & 1) ? -1 : 0;
-        return ms::pick((vm)lane, yes, no);
+        return select((vm)lane, yes, no);
 #endif
     }
 
-    void add(int32_t number, int x0, int y0, int rows) {
-        const FlatSplat &splat = scene_.splats[number];
-        // Counted from the tile's corner in double, so that what is left is small where the centre is far away.
+    // Blends one splat behind all earlier ones.
+    void blend(int32_t index, int x0, int y0, int rows) {
+        MS_ASSERT(index >= 0 && index < (int32_t)scene_.splats.size());
+        const ProjectedSplat &splat = scene_.splats[index];
+        // In double precision, because the offsets cancel where the centre is far away.
         const double dx = x0 - splat.x, dy = y0 - splat.y;
-        float a = 0, b = 0, c = 0, d = 0, e = 0;
-        Plane plane;
-        if (planar_) {
-            const FlatPlane &from = scene_.planes[number];
-            for (int k = 0; k < 3; ++k) {
-                plane.m[k][0] = (float)from.m[k][0];
-                plane.m[k][1] = (float)from.m[k][1];
-                plane.m[k][2] = (float)(from.m[k][0] * dx + from.m[k][1] * dy + from.m[k][2]);
-                plane.w[k] = from.w[k];
-            }
-            plane.x = (float)dx;
-            plane.y = (float)dy;
-        } else {
-            a = (float)splat.m[0];
-            b = (float)splat.m[1];
-            c = (float)(splat.m[0] * dx + splat.m[1] * dy);
-            d = (float)splat.m[2];
-            e = (float)(splat.m[2] * dy);
-        }
+        TileSplat flat{};
+        TilePlane plane;
+        if (planar_)
+            plane = plane_at(scene_.planes[index], dx, dy);
+        else
+            flat = splat_at(splat, dx, dy);
         vf opacity = set1(splat.opacity);
-        // A row more on either side, for rounding.
+        // One more row on either side, for rounding.
         int first = (int)std::min(std::max(splat.low - y0 - 1, 0.0f), (float)rows);
         int last = (int)std::max(std::min(splat.high - y0, rows - 1.0f), -1.0f);
         for (int y = first; y <= last; ++y) {
-            if (!open_[y]) continue;
-            const float v = d * (y + 0.5f) + e, row_u = b * (y + 0.5f) + c, row_v2 = v * v;
+            if (!active_[y]) continue;
+            const float v = flat.d * (y + 0.5f) + flat.e, row_u = flat.b * (y + 0.5f) + flat.c,
+                        row_v2 = v * v;
             for (int x = 0; x < TILE; x += W) {
-                unsigned open = (open_[y] >> x) & ((1u << W) - 1);
-                if (!open) continue;
+                unsigned active = (active_[y] >> x) & ((1u << W) - 1);
+                if (!active) continue;
                 vf power;
                 if (planar_) {
-                    power = on_plane(plane, load(center_ + x), y + 0.5f);
+                    power = plane_power(plane, load(center_ + x), y + 0.5f);
                 } else {
-                    vf u = set1(a) * load(center_ + x) + set1(row_u);
+                    vf u = set1(flat.a) * load(center_ + x) + set1(row_u);
                     power = set1(-0.5f) * (u * u + set1(row_v2));
                 }
-                // A bound cheaper than exp: below it alpha is under the cut.
-                open &= at_least(power, set1(-5.6f));
-                if (!open) continue;
-                vf alpha = vmin(opacity * exp_negative(power), set1(ALPHA_MOST));
-                open &= at_least(alpha, set1(ALPHA_CUT));
-                if (!open) continue;
-                vf through = load(through_[y] + x);
-                vf after = through * (set1(1.0f) - alpha);
-                unsigned blends = open & at_least(after, set1(LIGHT_LEFT));
-                open_[y] &= ~((open & ~blends) << x);
-                if (!blends) continue;
-                vf weight = pick(blends, through * alpha, set1(0.0f));
+                // Conservative and cheaper than exp: log(1/255) = -5.54.
+                active &= greater_equal_bits(power, set1(-5.6f));
+                if (!active) continue;
+                vf alpha = vmin(opacity * exp_negative(power), set1(MAX_ALPHA));
+                active &= greater_equal_bits(alpha, set1(MIN_ALPHA));
+                if (!active) continue;
+                vf transmittance = load(transmittance_[y] + x);
+                vf next = transmittance * (set1(1.0f) - alpha);
+                unsigned blended = active & greater_equal_bits(next, set1(MIN_SPLAT_TRANSMITTANCE));
+                active_[y] &= ~((active & ~blended) << x);
+                if (!blended) continue;
+                vf weight = select_bits(blended, transmittance * alpha, set1(0.0f));
                 store(red_[y] + x, load(red_[y] + x) + weight * set1(splat.rgb[0]));
                 store(green_[y] + x, load(green_[y] + x) + weight * set1(splat.rgb[1]));
                 store(blue_[y] + x, load(blue_[y] + x) + weight * set1(splat.rgb[2]));
-                store(through_[y] + x, pick(blends, after, through));
-                fragments_ += __builtin_popcount(blends);
+                store(transmittance_[y] + x, select_bits(blended, next, transmittance));
+                fragments_ += __builtin_popcount(blended);
             }
         }
     }
 
-    vf on_plane(const Plane &s, vf x, float y) const {
+    static TileSplat splat_at(const ProjectedSplat &splat, double dx, double dy) {
+        return {(float)splat.m[0], (float)splat.m[1], (float)(splat.m[0] * dx + splat.m[1] * dy),
+                (float)splat.m[2], (float)(splat.m[2] * dy)};
+    }
+    static TilePlane plane_at(const ProjectedPlane &from, double dx, double dy) {
+        TilePlane plane;
+        for (int k = 0; k < 3; ++k) {
+            plane.m[k][0] = (float)from.m[k][0];
+            plane.m[k][1] = (float)from.m[k][1];
+            plane.m[k][2] = (float)(from.m[k][0] * dx + from.m[k][1] * dy + from.m[k][2]);
+            plane.w[k] = from.w[k];
+        }
+        plane.x = (float)dx;
+        plane.y = (float)dy;
+        return plane;
+    }
+
+    // -1/2 the squared distance in the splat's plane, or to the centre in the image by the low-pass filter if
+    // that is less.
+    vf plane_power(const TilePlane &s, vf x, float y) const {
         vf p[3];
         for (int k = 0; k < 3; ++k) p[k] = set1(s.m[k][0]) * x + set1(s.m[k][1] * y + s.m[k][2]);
         vf u = p[0] / p[2], v = p[1] / p[2], square = u * u + v * v;
         vf depth = set1(s.w[0]) * u + set1(s.w[1]) * v + set1(s.w[2]);
         vf dx = x + set1(s.x);
         float dy = y + s.y;
-        vf low_pass = set1(low_pass_) * (dx * dx + set1(dy * dy));
-        // Where the ray meets no plane the square is no number, which is not less than anything.
-        vm met = both(not_less(depth, set1(near_)), greater(low_pass, square));
-        return set1(-0.5f) * ms::pick(met, square, low_pass);
+        vf low_pass = set1(inverse_low_pass_) * (dx * dx + set1(dy * dy));
+        // A ray parallel to the plane makes `square` NaN, and comparisons with NaN are false.
+        vm hit = mask_and(greater_equal(depth, set1(near_)), greater(low_pass, square));
+        return set1(-0.5f) * select(hit, square, low_pass);
     }
 
-    void finish(int x0, int y0, int columns, int rows) {
+    // Averages the samples of each pixel and writes the pixels.
+    void resolve(int x0, int y0, int columns, int rows) {
         int s = grid_.samples;
         float share = 1.0f / (s * s);
         for (int y = 0; y < rows; y += s)
@@ -405,12 +469,13 @@ class SplatTile {
                         sum[0] += red_[j][i];
                         sum[1] += green_[j][i];
                         sum[2] += blue_[j][i];
-                        sum[3] += through_[j][i];
+                        sum[3] += transmittance_[j][i];
                     }
-                const float *background = options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
+                const float *background =
+                    options_.background + (options_.background_per_pixel ? 3 * pixel : 0);
                 for (int c = 0; c < 3; ++c)
-                    picture_.color[3 * pixel + c] = sum[c] * share + sum[3] * share * background[c];
-                picture_.alpha[pixel] = 1 - sum[3] * share;
+                    image_.color[3 * pixel + c] = sum[c] * share + sum[3] * share * background[c];
+                image_.alpha[pixel] = 1 - sum[3] * share;
             }
     }
 };

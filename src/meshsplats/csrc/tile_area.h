@@ -1,4 +1,4 @@
-// The samples of a tile.
+// The samples of a tile: 16 blocks of 4 x 4 samples, one SIMD lane per sample.
 #pragma once
 
 #include "grid.h"
@@ -6,25 +6,31 @@
 
 namespace ms {
 
-// Samples are numbered by blocks of 4 x 4: sample = 16 block + 4 row + column.
+// Sample index in a tile: 16 block + 4 row + column, so that a block is contiguous.
 constexpr int SAMPLES = TILE * TILE, BLOCKS = SAMPLES / LANES;
 
 struct TileArea {
-    int x0, y0, columns, rows;  // in samples; columns and rows are those on the picture
+    int x0, y0;         // first sample of the tile
+    int columns, rows;  // size in samples, clipped to the image
 
     TileArea() = default;
     TileArea(const Grid &grid, int tile_x, int tile_y)
-        : x0(tile_x * grid.side), y0(tile_y * grid.side), columns(std::min(grid.side, grid.width - x0)),
-          rows(std::min(grid.side, grid.height - y0)) {}
+        : x0(tile_x * grid.tile_side),
+          y0(tile_y * grid.tile_side),
+          columns(std::min(grid.tile_side, grid.width - x0)),
+          rows(std::min(grid.tile_side, grid.height - y0)) {
+        MS_ASSERT(columns > 0 && columns <= TILE && rows > 0 && rows <= TILE);
+    }
 
-    static int number(int x, int y) { return (y / 4 * 4 + x / 4) * LANES + y % 4 * 4 + x % 4; }
+    // Between sample indices and columns and rows of the tile.
+    static int sample_index(int x, int y) { return (y / 4 * 4 + x / 4) * LANES + y % 4 * 4 + x % 4; }
     static int column(int sample) { return sample / LANES % 4 * 4 + sample % 4; }
     static int row(int sample) { return sample / (4 * LANES) * 4 + sample / 4 % 4; }
 
-    // Corner of a block.
+    // Corner of a block, relative to the tile.
     static float block_x(int block) { return 4.0f * (block % 4); }
     static float block_y(int block) { return 4.0f * (block / 4); }
-    // Of all blocks.
+    // The corners of all blocks, one lane per block.
     static Lanes blocks_x() {
         alignas(64) static const float x[BLOCKS] = {0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12, 0, 4, 8, 12};
         return load_lanes(x);
@@ -33,24 +39,26 @@ struct TileArea {
         alignas(64) static const float y[BLOCKS] = {0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12};
         return load_lanes(y);
     }
-    // Its samples, from that corner.
-    static Lanes lane_x() {
-        alignas(64) static const float x[LANES] = {.5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5};
+    // Sample centres relative to the corner of their block, one lane per sample.
+    static Lanes samples_x() {
+        alignas(64) static const float x[LANES] = {.5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5,
+                                                   .5, 1.5, 2.5, 3.5, .5, 1.5, 2.5, 3.5};
         return load_lanes(x);
     }
-    static Lanes lane_y() {
-        alignas(64) static const float y[LANES] = {.5, .5, .5, .5, 1.5, 1.5, 1.5, 1.5, 2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
+    static Lanes samples_y() {
+        alignas(64) static const float y[LANES] = {.5,  .5,  .5,  .5,  1.5, 1.5, 1.5, 1.5,
+                                                   2.5, 2.5, 2.5, 2.5, 3.5, 3.5, 3.5, 3.5};
         return load_lanes(y);
     }
 
-    // The samples of a block that are on the picture.
-    uint32_t lanes(int block) const {
-        uint32_t bits = 0;
+    // The lanes of a block that lie inside the image.
+    LaneMask valid_lanes(int block) const {
+        LaneMask valid = 0;
         for (int lane = 0; lane < LANES; ++lane) {
             int sample = block * LANES + lane;
-            if (column(sample) < columns && row(sample) < rows) bits |= 1u << lane;
+            if (column(sample) < columns && row(sample) < rows) valid |= 1u << lane;
         }
-        return bits;
+        return valid;
     }
 };
 

@@ -1,22 +1,27 @@
 // The mathematics of one triangle: projection, edge functions, perspective-correct interpolation.
 //
-// With camera-space corners V_i and a ray through the sample point p, E_i(p) = p . (V_j x V_k) is linear on the
-// picture, vanishes on the edge opposite to corner i, and b_i = E_i / (E_0 + E_1 + E_2) is the perspective-correct
-// barycentric weight (Olano and Greer 1997). For corners in front of the camera E_i is the planar edge function of
-// the projected edge times z_j z_k. Swapping the ends of an edge negates its function to the last bit, whichever
-// triangle it belongs to, so that a sample on a shared edge falls to exactly one of the two.
+// With camera-space corners V_i and the ray through the sample point p, E_i(p) = p . (V_j x V_k) is linear in
+// the image, vanishes on the edge opposite to corner i, and b_i = E_i / (E_0 + E_1 + E_2) is the
+// perspective-correct barycentric weight (homogeneous rasterization, Olano and Greer 1997). For corners in
+// front of the camera E_i is the planar edge function (Pineda 1988) of the projected edge times z_j z_k.
+// Swapping the ends of an edge negates its function exactly, whichever triangle it belongs to; with the
+// top-left rule for samples on an edge, a sample on a shared edge therefore belongs to exactly one of the two
+// triangles.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <limits>
 
+#include "check.h"
 #include "simd.h"
 #include "types.h"
 
 namespace ms {
 
-// A projected vertex: samples from the top left corner, and 1 / depth (0 marks one nearer than the near plane).
+// A projected vertex: position in samples from the top left corner of the image, and w = 1 / depth; all 0 for
+// a vertex nearer than the near plane.
 struct Projected {
     double x, y, w;
 };
@@ -25,14 +30,24 @@ struct Vec3 {
     double x, y, z;
 };
 
-// World to camera and camera to sample coordinates.
+// det(v_0, v_1, v_2) = v_0 . (v_1 x v_2).
+inline double determinant(const Vec3 v[3]) {
+    return v[0].x * (v[1].y * v[2].z - v[2].y * v[1].z) - v[0].y * (v[1].x * v[2].z - v[2].x * v[1].z) +
+           v[0].z * (v[1].x * v[2].y - v[2].x * v[1].y);
+}
+
+// From world space to camera space and on to sample coordinates.
 struct Projection {
-    double m[12];
+    double m[12];  // world to camera, 3 x 4 row-major
     double fx, fy, cx, cy, near;
 
     Projection(const MsCamera &camera, int samples)
-        : fx(camera.fx * samples), fy(camera.fy * samples), cx(camera.cx * samples), cy(camera.cy * samples),
+        : fx(camera.fx * samples),
+          fy(camera.fy * samples),
+          cx(camera.cx * samples),
+          cy(camera.cy * samples),
           near(camera.near) {
+        MS_ASSERT(near > 0);
         for (int i = 0; i < 12; ++i) m[i] = camera.world_to_camera[i];
     }
     Vec3 to_camera(const float *p) const {
@@ -47,42 +62,46 @@ struct Projection {
     }
 };
 
-// A function a x + b y + c of the sample position.
+// The linear function a x + b y + c of a sample position.
 struct Linear {
     double a, b, c;
 };
 
-// A few triangles made ready for a tile, side by side; positions count from the tile's corner.
-// Everything a sample needs is linear in its position: the edge functions E_i, 1 / depth and RGBA / depth.
+// Triangle set-up of N triangles in SIMD lanes. Sample positions are relative to an origin that the caller
+// chooses, such as the corner of a tile. All functions that a sample needs are linear in its position: the
+// edge functions E_i, 1 / depth and b_i / depth.
 template <int COUNT>
-struct Triangles {
+struct TriangleSetup {
     static constexpr int N = COUNT;
 
-    // In: corners of projected triangles, relative to the tile.
+    // In: corners of projected triangles.
     alignas(64) double x[3][N], y[3][N], w[3][N];
     const float *rgba[3][N];
     int32_t face[N];
 
-    // Out.
-    alignas(64) float ea[3][N], eb[3][N], ec[3][N];  // edge functions, positive inside
-    alignas(64) float threshold[3][N];   // 0 where samples on the edge belong to the triangle, else the least normal float
-    alignas(64) float qa[N], qb[N], qc[N];     // 1 / depth
-    alignas(64) float q_min[N], q_max[N];      // its range over the corners
-    alignas(64) float sa[3][N], sb[3][N], sc[3][N];  // b_i / depth
-    alignas(64) float area[N];           // 0: no area on the picture, nothing to draw
+    // Out: coefficients a, b, c of linear functions.
+    alignas(64) float ea[3][N], eb[3][N], ec[3][N];  // E_i, positive inside
+    // A sample is inside where every E_i >= threshold: 0 for top and left edges, which own their samples,
+    // else the smallest normal float.
+    alignas(64) float threshold[3][N];
+    alignas(64) float qa[N], qb[N], qc[N];           // q = 1 / depth
+    alignas(64) float q_min[N], q_max[N];            // range of q over the corners
+    alignas(64) float sa[3][N], sb[3][N], sc[3][N];  // s_i = b_i / depth
+    alignas(64) float valid[N];                      // 1, or 0 for a triangle without area in the image
 
-    // For triangles wholly in front of the near plane; all N slots are computed, whatever they hold.
-    void set_up_in_front() {
+    // Sets up all N lanes for triangles entirely beyond the near plane. Results of unused lanes and of other
+    // triangles have no meaning.
+    void set_up_visible() {
         alignas(64) double scale[N], flip[N];
         for (int t = 0; t < N; ++t) {
             double d = (x[1][t] - x[0][t]) * (y[2][t] - y[0][t]) - (x[2][t] - x[0][t]) * (y[1][t] - y[0][t]);
             double size = std::fabs(d);
-            area[t] = size < 1e300 && size > 1e-300 ? 1.0f : 0.0f;
+            valid[t] = is_valid(size) ? 1.0f : 0.0f;
             flip[t] = d < 0 ? -1.0 : 1.0;
             scale[t] = 1 / size;
         }
-        alignas(64) double qs[3][N];
-        for (int t = 0; t < N; ++t) qs[0][t] = qs[1][t] = qs[2][t] = 0;
+        alignas(64) double q[3][N];
+        for (int t = 0; t < N; ++t) q[0][t] = q[1][t] = q[2][t] = 0;
         for (int i = 0; i < 3; ++i) {
             int j = (i + 1) % 3, k = (i + 2) % 3;
             for (int t = 0; t < N; ++t) {
@@ -95,15 +114,15 @@ struct Triangles {
                 sa[i][t] = (float)(a * s);
                 sb[i][t] = (float)(b * s);
                 sc[i][t] = (float)(c * s);
-                qs[0][t] += a * s;
-                qs[1][t] += b * s;
-                qs[2][t] += c * s;
+                q[0][t] += a * s;
+                q[1][t] += b * s;
+                q[2][t] += c * s;
             }
         }
         for (int t = 0; t < N; ++t) {
-            qa[t] = (float)qs[0][t];
-            qb[t] = (float)qs[1][t];
-            qc[t] = (float)qs[2][t];
+            qa[t] = (float)q[0][t];
+            qb[t] = (float)q[1][t];
+            qc[t] = (float)q[2][t];
         }
         for (int i = 0; i < 3; ++i)
             for (int t = 0; t < N; ++t) threshold[i][t] = edge_threshold(ea[i][t], eb[i][t]);
@@ -115,18 +134,23 @@ struct Triangles {
         }
     }
 
-    // For a triangle in slot t with one or two corners nearer than the near plane (their w is 0). `v` are all corners
-    // in camera space with x and y scaled to samples, (fx X + (cx - x0) Z, fy Y + (cy - y0) Z, Z).
-    void set_up_crossing(int t, const Vec3 v[3], double near) {
-        double det = v[0].x * (v[1].y * v[2].z - v[2].y * v[1].z) - v[0].y * (v[1].x * v[2].z - v[2].x * v[1].z) +
-                     v[0].z * (v[1].x * v[2].y - v[2].x * v[1].y);
+    // Whether the triangle in lane t has a corner nearer than the near plane: it needs set_up_clipped.
+    bool is_clipped(int t) const { return !(w[0][t] > 0) | !(w[1][t] > 0) | !(w[2][t] > 0); }
+
+    // Near-plane clipping: sets up lane t for a triangle with one or two corners nearer than the near plane,
+    // whose w is 0. `v` are its corners in camera space with x and y scaled to samples relative to the origin
+    // (x0, y0): (fx X + (cx - x0) Z, fy Y + (cy - y0) Z, Z). The caller discards samples with q > q_max.
+    void set_up_clipped(int t, const Vec3 v[3], double near) {
+        MS_ASSERT(t >= 0 && t < N);
+        double det = determinant(v);
         double size = std::fabs(det), flip = det < 0 ? -1 : 1, scale = 1 / size, q[3] = {0, 0, 0};
-        area[t] = size < 1e300 && size > 1e-300 ? 1.0f : 0.0f;
+        valid[t] = is_valid(size) ? 1.0f : 0.0f;
         for (int i = 0; i < 3; ++i) {
             int j = (i + 1) % 3, k = (i + 2) % 3;
             double a, b, c, s = scale;
             if (w[j][t] > 0 && w[k][t] > 0) {
-                // An edge in front: the very function that a neighbour in front computes for it.
+                // The edge is visible. A neighbour may be entirely visible: use the function that it
+                // computes.
                 a = y[j][t] - y[k][t];
                 b = x[k][t] - x[j][t];
                 c = x[j][t] * y[k][t] - x[k][t] * y[j][t];
@@ -153,12 +177,17 @@ struct Triangles {
         qa[t] = (float)q[0];
         qb[t] = (float)q[1];
         qc[t] = (float)q[2];
-        // What is in front reaches from the near plane to the farthest corner.
+        // The visible part reaches from the near plane to the farthest corner.
         q_min[t] = (float)(1 / std::max({v[0].z, v[1].z, v[2].z}));
         q_max[t] = (float)(1 / near);
     }
 
   private:
+    // Whether 1 / size is finite and not 0.
+    static bool is_valid(double size) { return size < 1e300 && size > 1e-300; }
+
+    // Top-left rule (OpenGL, Direct3D), bit-exact: of two triangles at an edge, one sees (a, b) and the other
+    // (-a, -b).
     static float edge_threshold(float a, float b) {
         return (a > 0) | ((a == 0) & (b > 0)) ? 0.0f : std::numeric_limits<float>::min();
     }

@@ -1,4 +1,4 @@
-// The plain C structures of the interface. Mirrored in rendering/core.py.
+// Structures of the C interface, mirrored in rendering/core.py.
 #pragma once
 
 #include <cstdint>
@@ -6,68 +6,68 @@
 extern "C" {
 
 struct MsCamera {
-    double world_to_camera[12];  // three rows of four
+    double world_to_camera[12];  // 3 x 4, row-major
     double fx, fy, cx, cy;       // pixels
-    double near;                 // smallest depth drawn
-    int32_t width, height;
+    double near;                 // depth of the near plane, > 0
+    int32_t width, height;       // pixels
 };
 
 struct MsOptions {
-    int32_t samples;          // an s x s grid of samples in each pixel
-    int32_t max_layers;       // 0: all
+    int32_t samples;     // a grid of samples x samples in each pixel, 1 to 16
+    int32_t max_layers;  // blend at most the nearest max_layers fragments of a sample; 0: no limit
     int32_t threads;
-    float min_transmittance;  // a sample stops once less light than this comes through
-    const float *background;  // RGB, one for all or one a pixel
+    float min_transmittance;  // early termination: a sample stops below this transmittance
+    const float *background;  // RGB: 3 values, or (height, width, 3)
     int32_t background_per_pixel;
 };
 
 struct MsMesh {
     int64_t vertex_count, face_count;
-    const float *vertices;       // xyz
-    const float *colors;         // straight RGBA
-    const int32_t *faces;        // three vertex numbers
-    const int32_t *face_splat;   // or null
-    const int32_t *depth_group;  // or null; numbers below face_count, -1 for none
-    const float *normals;        // or null: the faces' own
-    const float *attributes;     // attribute_count numbers a vertex, or null
+    const float *vertices;       // (vertex_count, 3) world space
+    const float *colors;         // (vertex_count, 4) straight RGBA
+    const int32_t *faces;        // (face_count, 3) vertex indices
+    const int32_t *face_splat;   // (face_count,) splat of each face, or null
+    const int32_t *depth_group;  // (face_count,) below face_count, -1: no group; or null
+    const float *normals;        // (vertex_count, 3), or null: the faces' own normals
+    const float *attributes;     // (vertex_count, attribute_count), or null
     int32_t attribute_count;
-    double filter_px2;           // variance of the low-pass filter of its fans; needs face_splat where it is not 0
+    double filter_px2;  // variance of the fans' low-pass filter in square pixels; > 0 needs face_splat
 };
 
 struct MsSplats {
     int64_t count;
-    const float *means;        // xyz
-    const float *quaternions;  // wxyz
-    const float *scales;
-    const float *opacities;
-    const float *sh;           // (sh_stored, 3) a splat
-    int32_t sh_stored;         // coefficients a channel in the file
-    int32_t sh_used;           // coefficients a channel to be used
+    const float *means;        // (count, 3) world space
+    const float *quaternions;  // (count, 4) unit, wxyz
+    const float *scales;       // (count, 3) standard deviations
+    const float *opacities;    // (count,)
+    const float *sh;           // (count, sh_stored, 3) spherical harmonics
+    int32_t sh_stored;         // stored coefficients per channel
+    int32_t sh_used;           // coefficients to evaluate: 1, 4, 9 or 16, at most sh_stored
     int32_t kernel;            // 0: 3dgs, 1: antialiased, 2: 2dgs
-    float dilation;            // px^2; 2dgs: variance of the low pass
+    float dilation;            // low-pass variance in square pixels
 };
 
-struct MsPicture {
-    float *color;       // (h, w, 3) over the background
-    float *alpha;       // (h, w)
-    float *depth;       // (h, w) or null
-    float *normals;     // (h, w, 3) or null
-    float *attributes;  // (h, w, attribute_count) or null
-    int64_t fragments;  // blended
+struct MsImage {
+    float *color;       // (height, width, 3) over the background
+    float *alpha;       // (height, width)
+    float *depth;       // (height, width), or null
+    float *normals;     // (height, width, 3), or null
+    float *attributes;  // (height, width, attribute_count), or null
+    int64_t fragments;  // out: number of blended fragments
 };
 
-// Gradients of a number with respect to a picture ...
-struct MsPictureGradient {
-    const float *color;
-    const float *alpha;       // or null
-    const float *attributes;  // or null
+// Gradients of a loss with respect to an image.
+struct MsImageGradients {
+    const float *color;       // (height, width, 3)
+    const float *alpha;       // (height, width), or null
+    const float *attributes;  // (height, width, attribute_count), or null
 };
 
-// ... and to the vertices: added to what is there.
+// Gradients of a loss with respect to the vertices. The core adds to the arrays.
 struct MsVertexGradients {
-    float *vertices;    // xyz
-    float *colors;      // RGBA
-    float *attributes;  // or null
+    float *vertices;    // (vertex_count, 3)
+    float *colors;      // (vertex_count, 4)
+    float *attributes;  // (vertex_count, attribute_count), or null
 };
 
 }  // extern "C"

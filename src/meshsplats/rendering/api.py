@@ -125,7 +125,7 @@ def render(
     depths = np.empty((h, w), np.float32) if depth else None
     directions = np.empty((h, w, 3), np.float32) if normals else None
     sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
-    picture = library.PictureStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
+    picture = library.ImageStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
     library.call("ms_render_mesh", subject, camera_struct(camera), options, picture)
 
     named = {}
@@ -194,7 +194,7 @@ def render_splats(
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
-    picture = library.PictureStruct(keep(color), keep(alpha), None, None, None, 0)
+    picture = library.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
     library.call("ms_render_splats", subject, camera_struct(camera), options, picture)
     return Rendering(color, alpha, fragments=int(picture.fragments))
 

@@ -66,7 +66,7 @@ class TapedRendering:
         self.color = np.empty((h, w, 3), np.float32)
         self.alpha = np.empty((h, w), np.float32)
         self.attributes = np.empty((h, w, width), np.float32)
-        picture = library.PictureStruct(
+        picture = library.ImageStruct(
             keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
         )
         self._log = ctypes.c_void_p()
@@ -90,7 +90,7 @@ class TapedRendering:
 
     def __del__(self) -> None:
         if getattr(self, "_log", None):
-            library.load_core().ms_forget(self._log)
+            library.load_core().ms_free_tape(self._log)
             self._log = ctypes.c_void_p()
 
     def back(
@@ -114,7 +114,7 @@ class TapedRendering:
             raise ValueError("the picture was drawn without a log: there is no way back")
         if attributes is not None and not self._mesh.attribute_count:
             attributes = None
-        given = library.PictureGradientStruct(
+        given = library.ImageGradientsStruct(
             library.pointer(color), library.pointer(alpha), library.pointer(attributes)
         )
         out = library.VertexGradientsStruct(
@@ -122,7 +122,7 @@ class TapedRendering:
             library.pointer(colors),
             None if attributes is None else library.pointer(vertex_attributes),
         )
-        library.call("ms_rasterize_back", self._mesh, self._camera, self._options, self._log, given, out)
+        library.call("ms_rasterize_backward", self._mesh, self._camera, self._options, self._log, given, out)
 
     def spread(self, values: np.ndarray) -> np.ndarray:
         """(v, k) float32: for each vertex the sum of ``values`` (h, w, k) by the weights with which it is
