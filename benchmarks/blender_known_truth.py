@@ -5,7 +5,7 @@
 Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the
 data folder), clean and noisy, and drawn on the ground under sun and sky: as ``meshsplats blender --lit``
 draws them and, for comparison, with a plain diffuse material. Prints a Markdown table, below what Blender
-says, and writes a strip of the pictures (-o). Shadow overlap is intersection over union of those pixels of
+says, and writes a strip of the images (-o). Shadow overlap is intersection over union of those pixels of
 the ground that are darker than 0.8 of the bare ground.
 """
 
@@ -95,16 +95,16 @@ def add_truth(obj, texture: Path, like) -> None:
     data.shade_smooth()
     material = bpy.data.materials.new("Truth")
     tree = versions.node_tree(material)
-    picture, surface, out = (
+    image, surface, out = (
         tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexImage", "BsdfDiffuse", "OutputMaterial")
     )
-    picture.image = bpy.data.images.load(str(texture))
-    tree.links.new(picture.outputs["Color"], surface.inputs["Color"])
+    image.image = bpy.data.images.load(str(texture))
+    tree.links.new(image.outputs["Color"], surface.inputs["Color"])
     tree.links.new(surface.outputs[0], out.inputs["Surface"])
     data.materials.append(material)
-    thing = bpy.data.objects.new("Truth", data)
-    thing.matrix_world = like.matrix_world
-    bpy.context.scene.collection.objects.link(thing)
+    obj = bpy.data.objects.new("Truth", data)
+    obj.matrix_world = like.matrix_world
+    bpy.context.scene.collection.objects.link(obj)
 
 
 def main() -> None:
@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with meshes/spot_textured/spot")
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--samples", type=int, default=48)
-    parser.add_argument("-o", "--output", type=Path, help="picture of all: a .png")
+    parser.add_argument("-o", "--output", type=Path, help="image of all: a .png")
     asked = parser.parse_args()
     folder = asked.data / "meshes" / "spot_textured" / "spot"
     obj = read_obj(folder / "spot_triangulated.obj")
@@ -124,14 +124,14 @@ def main() -> None:
 
     def shot(made) -> np.ndarray:
         with tempfile.TemporaryDirectory() as place:
-            pictures.render_to(made.scene, Path(place) / "picture.exr")
-            return pictures.read_pixels(Path(place) / "picture.exr")[..., :3]
+            pictures.render_to(made.scene, Path(place) / "image.exr")
+            return pictures.read_pixels(Path(place) / "image.exr")[..., :3]
 
-    def display(picture: np.ndarray) -> np.ndarray:
-        return linear_to_srgb(np.clip(picture, 0, 1))
+    def display(image: np.ndarray) -> np.ndarray:
+        return linear_to_srgb(np.clip(image, 0, 1))
 
     rows = [
-        "| splats | material | PSNR, picture | PSNR, cow alone | shadow overlap | light, of the mesh's |",
+        "| splats | material | PSNR, image | PSNR, cow alone | shadow overlap | light, of the mesh's |",
         "|---|---|---|---|---|---|",
     ]
     truth = ground = None
@@ -145,9 +145,9 @@ def main() -> None:
         arrays, facts = subject.prepare(mesh, [view], options, layers)
         if truth is None:
             made = scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
-            made.thing.hide_render = True
+            made.obj.hide_render = True
             ground = shot(made)
-            add_truth(obj, folder / "spot_texture.png", made.thing)
+            add_truth(obj, folder / "spot_texture.png", made.obj)
             truth = shot(made)
             shown.append(display(truth))
             captions.append("textured mesh")

@@ -1,10 +1,10 @@
-"""How long a person waits for a lit picture, what it is worth, and what the command says beforehand.
+"""How long a person waits for a lit image, what it is worth, and what the command says beforehand.
 
     blender-env/bin/python benchmarks/blender_waiting.py [--width 240]
 
 The demo scene, as it is, of a tenth as many splats, and of faint large ones, is drawn by Cycles under the
 default light, flat ellipses as ``meshsplats blender --lit`` has them. Prints two Markdown tables: processor
-time a picture and what the command announces; and, of the first scene, PSNR (8 bits) of fewer samples, with
+time an image and what the command announces; and, of the first scene, PSNR (8 bits) of fewer samples, with
 and without denoising, against many.
 """
 
@@ -37,29 +37,29 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.png"
 
-        def picture(mesh, options):
+        def image(mesh, options):
             ahead: list[dict] = []
             camera = orbit(mesh, 1, **lens)
-            told = draw(mesh, camera, pictures=[path], options=options, announce=ahead.append)
-            return load_png(path) / 255, told["picture_processor_seconds"][0], ahead[0]
+            told = draw(mesh, camera, images=[path], options=options, announce=ahead.append)
+            return load_png(path) / 255, told["image_processor_seconds"][0], ahead[0]
 
         print("| scene | light | layers, mean | samples | processor time | estimate |")
         print("|---|---|---|---|---|---|")
         for name, mesh in meshes.items():
             for light in (None, LightOptions()):
                 options = SceneOptions(light=light, samples=2 if light is None else 4, threads=1)
-                _, seconds, ahead = picture(mesh, options)
+                _, seconds, ahead = image(mesh, options)
                 guess = estimated_seconds(ahead, options)
                 kind = "unlit" if light is None else "lit"
                 row = f"{ahead['mean_layers']:.1f} | {ahead['samples']} | {seconds:.1f} s | {guess:.1f} s"
                 print(f"| {name} | {kind} | {row} |", flush=True)
         mesh, light = meshes["still life"], LightOptions()
-        many, _, _ = picture(mesh, SceneOptions(light=light, samples=given.reference))
+        many, _, _ = image(mesh, SceneOptions(light=light, samples=given.reference))
         print("\n| samples | denoised | PSNR | processor time |\n|---|---|---|---|")
         for samples in (8, 16, 64):
             for denoise in (False, True):
                 options = SceneOptions(light=light, samples=samples, denoise=denoise)
-                shown, seconds, _ = picture(mesh, options)
+                shown, seconds, _ = image(mesh, options)
                 told = f"{psnr(shown, many):.1f} dB | {seconds:.1f} s"
                 print(f"| {samples} | {'yes' if denoise else 'no'} | {told} |", flush=True)
 

@@ -1,4 +1,4 @@
-"""A mesh drawn with a filter, at five sizes: dB against the splats' own pictures, and what the filter costs.
+"""A mesh drawn with a filter, at five sizes: dB against the splats' own images, and what the filter costs.
 
     python benchmarks/fan_filter.py FILE.ply ...
 
@@ -7,7 +7,7 @@ sides (elevation 20 degrees), and at 800 pixels from half as far (twice the foca
 with one sample a pixel, too: converted by default, without a footprint, with `footprint="filter"` in the
 modes crossed (the default) and flat, and the crossed one baked for the views of 800 pixels.
 
-Costs are processor milliseconds of one thread, medians, of a picture and of one with its way back, without a
+Costs are processor milliseconds of one thread, medians, of an image and of one with its way back, without a
 filter and with one of 1e-9 px^2: it does all its work, but triangles cover what they covered before.
 """
 
@@ -65,7 +65,7 @@ def cost(work: Callable[[], object], repeat: int) -> float:
 
 
 def back_and_forth(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
-    picture = TapedRendering(
+    image = TapedRendering(
         mesh.vertices,
         mesh.faces,
         mesh.colors,
@@ -76,7 +76,7 @@ def back_and_forth(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
         threads=1,
     )
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-    picture.back(np.ones_like(picture.color), None, None, vertices=points, colors=colors)
+    image.back(np.ones_like(image.color), None, None, vertices=points, colors=colors)
 
 
 def main() -> None:
@@ -87,7 +87,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=9)
     asked = parser.parse_args()
     clouds = {path.stem: load_gaussians(path) for path in asked.files}
-    print("| | triangles | pixels | picture | with a filter | and back | with a filter |")
+    print("| | triangles | pixels | image | with a filter | and back | with a filter |")
     print("|---|---|---|---|---|---|---|")
     for name, cloud in clouds.items():
         mesh = convert(cloud, footprint="none")

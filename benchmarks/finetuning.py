@@ -7,7 +7,7 @@ Splat files are judged at the cameras `DATA/cameras/*_mid.json` on white at degr
 learned (`--look area`: means over pixels' areas, against the mesh at as many samples as it needs; `splats`:
 the image of a viewer, against one sample); drawing the targets counts towards the time, judging does not.
 Photographs are judged on their held-out views: mean (median), then the same after a gain and an offset a
-channel are fitted to each picture. `--exposure` fits such to the training pictures, too.
+channel are fitted to each image. `--exposure` fits such to the training images, too.
 `--clock processor` counts the processor time of all threads, divided by --processors, instead of the clock on
 the wall: for machines that do other work at the same time.
 """

@@ -3,7 +3,7 @@
     python benchmarks/losses.py                     both tables
     python benchmarks/losses.py --size 800 --rows 1000000 --repeat 9
 
-The loss is 0.6 L1 + 0.4 (1 - SSIM) of pictures (size, size, 3), with its gradient. The step is Adam on
+The loss is 0.6 L1 + 0.4 (1 - SSIM) of images (size, size, 3), with its gradient. The step is Adam on
 positions (v, 3) and colours (v, 4), where a view reached a share of the splats of nine vertices each. Rows
 take turns and medians are printed, so that other work on the machine disturbs all of them alike; processor
 time is that of all threads together. Needs torch.
@@ -49,10 +49,10 @@ def gaussian() -> torch.Tensor:
     return line / line.sum()
 
 
-def torch_loss(picture: torch.Tensor, truth: torch.Tensor, separable: bool) -> torch.Tensor:
+def torch_loss(image: torch.Tensor, truth: torch.Tensor, separable: bool) -> torch.Tensor:
     """The same loss in torch alone: five means under the window, each with one or with two convolutions."""
     line = gaussian()
-    x, y = (p.permute(2, 0, 1)[None] for p in (picture, truth))
+    x, y = (p.permute(2, 0, 1)[None] for p in (image, truth))
 
     def mean(z: torch.Tensor) -> torch.Tensor:
         if separable:
@@ -69,11 +69,11 @@ def torch_loss(picture: torch.Tensor, truth: torch.Tensor, separable: bool) -> t
 def losses(size: int, repeat: int) -> None:
     generator = torch.Generator().manual_seed(0)
     truth = torch.rand(size, size, 3, generator=generator)
-    picture = (truth + 0.05 * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
+    image = (truth + 0.05 * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
 
     def step(loss: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[], torch.Tensor]:
         def work() -> torch.Tensor:
-            x = picture.clone().requires_grad_()
+            x = image.clone().requires_grad_()
             loss(x).backward()
             assert x.grad is not None
             return x.grad

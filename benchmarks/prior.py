@@ -3,7 +3,7 @@
     python benchmarks/prior.py --data ../shared/data --steps 200
     python benchmarks/prior.py --data ../shared/data --steps 500 --only layers=6
 
-The base is a visual hull (`meshes/lego_visual_hull_40k_vertexcolor.ply`), the pictures `photos/lego`, with
+The base is a visual hull (`meshes/lego_visual_hull_40k_vertexcolor.ply`), the images `photos/lego`, with
 its own 40 test views. Rows: the base opaque with the vertex colours it came with; the same with its vertex
 colours optimised by the same losses, rates and number of steps (positions and opacity fixed); priors of
 several forms; and the fans of splats that were trained on the same photographs, fine-tuned. Seconds are

@@ -3,8 +3,8 @@
     python benchmarks/rendering.py [--repeat 5] [--threads 1 2] [--scenes 160k 1M 4M]
     python benchmarks/rendering.py --growth --threads 1
 
-Prints a Markdown table. render: a picture, exact at every pixel. log: the same, with a log to go back by.
-back: gradients of positions and colours from that of the picture. Medians of the clock in milliseconds;
+Prints a Markdown table. render: an image, exact at every pixel. log: the same, with a log to go back by.
+back: gradients of positions and colours from that of the image. Medians of the clock in milliseconds;
 fragments blended a pixel, and a second by render; nanoseconds of log and back together for each fragment; the
 peak of the process's memory beyond what it held before, of render, and of log and back without the gradients
 (Linux). Each row runs in a process of its own. --growth: one scene, then four times as many triangles of a
@@ -35,7 +35,7 @@ SCENES = {
     "1M": (125_000, 0.0145, 0.05, 800),
     "4M": (500_000, 0.006, 0.06, 800),
 }
-"""Fans, their radius at depth 1, opacity, side of the picture in pixels."""
+"""Fans, their radius at depth 1, opacity, side of the image in pixels."""
 
 GROWTH = {
     "one": (31_250, 0.029, 0.05, 400),
@@ -46,7 +46,7 @@ GROWTH = {
 
 
 def random_fans(fans: int, radius: float, opacity: float, side: int) -> tuple[SplatMesh, Camera]:
-    """Fans of random orientation between the depths 2.5 and 5, in front of the whole picture."""
+    """Fans of random orientation between the depths 2.5 and 5, in front of the whole image."""
     rng = np.random.default_rng(0)
     centers = np.stack([rng.uniform(-1, 1, fans), rng.uniform(-1, 1, fans), rng.uniform(2.5, 5, fans)], 1)
     centers[:, :2] *= centers[:, 2:] / 2
@@ -103,13 +103,13 @@ def run(name: str, threads: int, repeat: int) -> None:
     fragments = render(mesh, camera, threads=threads).fragments
     drawing = memory("VmHWM") - before
     before = memory("VmRSS", reset=True)
-    picture = recorded()
-    picture.back(towards, None, None, vertices=points, colors=colors)
+    image = recorded()
+    image.back(towards, None, None, vertices=points, colors=colors)
     both = memory("VmHWM") - before
 
     draw = clocked(lambda: render(mesh, camera, threads=threads), repeat)
     log = clocked(recorded, repeat)
-    back = clocked(lambda: picture.back(towards, None, None, vertices=points, colors=colors), repeat)
+    back = clocked(lambda: image.back(towards, None, None, vertices=points, colors=colors), repeat)
     pixels = camera.width * camera.height
     cells = (
         f"{len(mesh.faces):,}",
@@ -139,7 +139,7 @@ def main() -> None:
         run(args.row[0], int(args.row[1]), args.repeat)
         return
     print(f"Core: {available_variants()[0]}.\n")
-    heads = ["triangles", "picture", "threads", "fragments a pixel", "render", "log", "back", "log + back"]
+    heads = ["triangles", "image", "threads", "fragments a pixel", "render", "log", "back", "log + back"]
     heads += ["M fragments a second", "ns a fragment", "MB, render", "MB, log + back"]
     print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
     for name in GROWTH if args.growth else args.scenes:

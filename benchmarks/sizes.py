@@ -2,13 +2,13 @@
 
     python benchmarks/sizes.py SPLATS ... --minutes 2 --look area
     python benchmarks/sizes.py SPLATS --mesh tuned.npz
-    python benchmarks/sizes.py demo --minutes 2 --picture docs/images/sizes.png
+    python benchmarks/sizes.py demo --minutes 2 --image docs/images/sizes.png
 
 Views of ``orbit(cloud, 4, elevation=20)`` on white at degree 0, 200, 400, 800 and 1600 pixels wide and 800
 pixels from half as far. Look 'area': the mean of an image four times as large, the mesh at 2 x 2 samples.
 Look 'splats': the image of a 3DGS viewer at that size, the mesh at one sample. Rows: converted by default,
 converted for the look 'splats' (at the cameras of a framing) and with the filter, and tuned, or the mesh
-given. ``demo`` is this project's own scene. ``--picture`` shows the middle of one view at four sizes:
+given. ``demo`` is this project's own scene. ``--image`` shows the middle of one view at four sizes:
 splats, converted with a footprint and tuned on viewers' images of 400 pixels, as a mesh without a filter of
 its own has to be, and tuned on means over areas.
 """
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--max-triangles", type=int)
     parser.add_argument("--save", type=Path, help="folder for the tuned meshes")
-    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--image", type=Path)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
     print("| scene | mesh | triangles | look | " + " | ".join(SIZES) + " |")
@@ -52,8 +52,8 @@ def main() -> None:
     for name in options.splats:
         cloud = make_scene() if name == "demo" else ms.load_gaussians(name)
         cloud = replace(cloud, sh=cloud.sh[:, :1])
-        if options.picture:
-            picture(cloud, options)
+        if options.image:
+            image(cloud, options)
             continue
         for label, mesh in meshes(cloud, name, options):
             for look in options.looks:
@@ -125,7 +125,7 @@ def scores(cloud: ms.GaussianCloud, mesh: ms.SplatMesh, look: str, options: argp
     return found
 
 
-def picture(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
+def image(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
     from PIL import Image
 
     from meshsplats.images.writing import save_png, strip, to_bytes
@@ -148,7 +148,7 @@ def picture(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
             enlarged = Image.fromarray(part).resize((300, 300), Image.Resampling.NEAREST)
             parts.append(np.asarray(enlarged, np.float32) / 255)
         rows.append(strip(parts, [f"{side} px: {captions[0]}", *captions[1:]]))
-    save_png(options.picture, np.concatenate(rows, axis=0))
+    save_png(options.image, np.concatenate(rows, axis=0))
 
 
 if __name__ == "__main__":

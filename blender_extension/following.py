@@ -9,7 +9,7 @@ BASE = "meshsplats_base"
 
 
 def _anything_to_do(scene):
-    return any(BASE in thing for thing in scene.objects)
+    return any(BASE in obj for obj in scene.objects)
 
 
 @persistent

@@ -59,19 +59,19 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
         from meshsplats.blender.inside import objects
         from meshsplats.formats.gaussians import subject_name
 
-        things = []
+        objs = []
         for path, prepared in work.results:
             name = subject_name(Path(path))
-            thing = objects.add(prepared, name, context.collection)
+            obj = objects.add(prepared, name, context.collection)
             if self.at_origin:
-                thing.location = (0, 0, 0)
-            thing.meshsplats.path = path
-            copy_choices(thing.meshsplats, self)
-            things.append(thing)
+                obj.location = (0, 0, 0)
+            obj.meshsplats.path = path
+            copy_choices(obj.meshsplats, self)
+            objs.append(obj)
         for other in context.selected_objects:
             other.select_set(False)
-        for thing in things:
-            thing.select_set(True)
+        for obj in objs:
+            obj.select_set(True)
         if self.set_up_scene:
             # All that the scene holds, as rays pass through several of them.
             every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
@@ -79,8 +79,8 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
             clash = objects.clash(every, self.shading == "lit")
             if clash:
                 self.report({"WARNING"}, f"MeshSplats: {clash}")
-        count = sum(len(thing.data.polygons) for thing in things)
-        self.report({"INFO"}, f"MeshSplats: {len(things)} imported, {count:,} triangles")
+        count = sum(len(obj.data.polygons) for obj in objs)
+        self.report({"INFO"}, f"MeshSplats: {len(objs)} imported, {count:,} triangles")
 
 
 class MeshSplatsFileHandler(bpy.types.FileHandler):

@@ -20,8 +20,8 @@ class ConvertAgain(Modal, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        thing = context.object
-        return thing is not None and bool(thing.meshsplats.path) and not thing.meshsplats.busy
+        obj = context.object
+        return obj is not None and bool(obj.meshsplats.path) and not obj.meshsplats.busy
 
     def execute(self, context):
         source = context.object.meshsplats
@@ -31,20 +31,20 @@ class ConvertAgain(Modal, bpy.types.Operator):
         return self.begin(context, Work([path], {name: getattr(source, name) for name in CHOICES}))
 
     def given_up(self):
-        thing = bpy.data.objects.get(self._name)
-        if thing is not None:
-            thing.meshsplats.busy = False
+        obj = bpy.data.objects.get(self._name)
+        if obj is not None:
+            obj.meshsplats.busy = False
 
     def done(self, context, work):
         from meshsplats.blender.inside import objects
 
         self.given_up()
-        thing = bpy.data.objects.get(self._name)
-        if thing is None:
+        obj = bpy.data.objects.get(self._name)
+        if obj is None:
             self.report({"WARNING"}, "MeshSplats: the object is gone")
             return
-        objects.replace_mesh(thing, work.results[0][1])
-        self.report({"INFO"}, f"MeshSplats: {len(thing.data.polygons):,} triangles")
+        objects.replace_mesh(obj, work.results[0][1])
+        self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
 
 
 class SetShading(bpy.types.Operator):
@@ -63,14 +63,14 @@ class SetShading(bpy.types.Operator):
     def execute(self, context):
         from meshsplats.blender.inside import objects
 
-        thing = context.object
+        obj = context.object
         lit = self.shading == "lit"
         try:
-            if objects.LIT in thing.data:
-                objects.replace_mesh(thing, objects.prepare(objects.as_splat_mesh(thing), lit))
-                thing.meshsplats.shading = self.shading
+            if objects.LIT in obj.data:
+                objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), lit))
+                obj.meshsplats.shading = self.shading
             else:
-                objects.dress(thing, lit)
+                objects.dress(obj, lit)
                 # One click: the colours of imports are shown right with these settings only.
                 every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
                 objects.render_settings(context.scene, every, lit)
@@ -98,7 +98,7 @@ class SetUpRender(bpy.types.Operator):
         clash = objects.clash(every, lit)
         if clash:
             self.report({"WARNING"}, f"MeshSplats: {clash}")
-        layers = sum(int(thing.data[objects.LAYERS]) for thing in every)
+        layers = sum(int(obj.data[objects.LAYERS]) for obj in every)
         if layers > limit:
             self.report(
                 {"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black"
@@ -135,10 +135,10 @@ class SetUpStage(bpy.types.Operator):
 
         every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
         try:
-            for thing in every if self.make_lit else []:
-                if not thing.data[objects.LIT]:
-                    objects.replace_mesh(thing, objects.prepare(objects.as_splat_mesh(thing), True))
-                    thing.meshsplats.shading = "lit"
+            for obj in every if self.make_lit else []:
+                if not obj.data[objects.LIT]:
+                    objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), True))
+                    obj.meshsplats.shading = "lit"
             setting.set_up(context.scene, every, self.lights, camera=self.camera)
         except ValueError as error:
             self.report({"ERROR"}, str(error))

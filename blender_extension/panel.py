@@ -18,9 +18,9 @@ class MeshSplatsPanel(bpy.types.Panel):
     def draw(self, context):
         layout = self.layout
         layout.operator(ImportMeshSplats.bl_idname, icon="IMPORT")
-        thing = context.object
-        if thing is not None and thing.type == "MESH":
-            self._object(layout, thing)
+        obj = context.object
+        if obj is not None and obj.type == "MESH":
+            self._object(layout, obj)
         layout.separator()
         layout.label(text="Light, ground and camera")
         row = layout.row(align=True)
@@ -31,20 +31,20 @@ class MeshSplatsPanel(bpy.types.Panel):
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
         row.operator(SetUpRender.bl_idname, text="Lit").shading = "lit"
 
-    def _object(self, layout, thing):
-        if thing.meshsplats.path:
+    def _object(self, layout, obj):
+        if obj.meshsplats.path:
             box = layout.box()
             box.use_property_split = True
-            box.prop(thing.meshsplats, "path")
-            draw_choices(thing.meshsplats, box)
-            box.label(text=f"{len(thing.data.polygons):,} triangles")
+            box.prop(obj.meshsplats, "path")
+            draw_choices(obj.meshsplats, box)
+            box.label(text=f"{len(obj.data.polygons):,} triangles")
             box.operator(ConvertAgain.bl_idname, icon="FILE_REFRESH")
-        base = thing.get("meshsplats_base")
+        base = obj.get("meshsplats_base")
         if base is not None:
             box = layout.box()
             box.label(text=f"Follows {base.name}", icon="MOD_MESHDEFORM")
-            if thing.get("meshsplats_problem"):
-                box.label(text=thing["meshsplats_problem"], icon="ERROR")
+            if obj.get("meshsplats_problem"):
+                box.label(text=obj["meshsplats_problem"], icon="ERROR")
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
         layout.label(text="Material of this object")
         row = layout.row(align=True)

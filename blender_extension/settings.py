@@ -46,7 +46,7 @@ class Choices:
         name="Shading",
         description="How the mesh reacts to light",
         items=[
-            ("unlit", "Unlit", "Colours as they are: the exact picture of the splats"),
+            ("unlit", "Unlit", "Colours as they are: the exact image of the splats"),
             ("lit", "Lit", "Light and shadow act on the splats, by smoothed normals"),
         ],
         default="unlit",

@@ -37,12 +37,12 @@ lifted = replace(lifted, attributes={"height": -vertices[:, 1]})
 camera = ms.orbit(mesh, 1, elevation=20, width=320, height=320)[0]
 drawn = ms.render(lifted, camera, depth=True, attributes=["height"], samples=2)
 
-pictures = [
+images = [
     ms.render(without_ball, camera, samples=2).color,
     drawn.color,
     np.repeat(1 - drawn.attributes["height"][:, :, None] / 2, 3, axis=2),
 ]
-strip = np.concatenate(pictures, axis=1).clip(0, 1)
+strip = np.concatenate(images, axis=1).clip(0, 1)
 Image.fromarray(np.rint(255 * strip).astype(np.uint8)).save(out / "edit.png")
 print(f"{out / 'edit.png'}: without the ball | lifted and dyed | height")
 seen = drawn.alpha > 0.5

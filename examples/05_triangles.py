@@ -1,4 +1,4 @@
-"""What the mesh is made of: splats, mesh, and the mesh with its triangles drawn opaque. The README's picture.
+"""What the mesh is made of: splats, mesh, and the mesh with its triangles drawn opaque. The README's image.
 
 python examples/05_triangles.py [scene.ply]      Without a file: the demo scene. Writes into example-output/.
 """
@@ -35,11 +35,11 @@ triangles = replace(
     face_splat=None,
 )
 
-pictures = [
+images = [
     ms.render_splats(cloud, camera).color,
     ms.render(mesh, camera, samples=3).color,
     ms.render(triangles, camera, samples=3).color,
 ]
-strip = np.concatenate(pictures, axis=1).clip(0, 1)
+strip = np.concatenate(images, axis=1).clip(0, 1)
 Image.fromarray(np.rint(255 * strip).astype(np.uint8)).save(out / "triangles.png", optimize=True)
 print(f"{out / 'triangles.png'}: {len(cloud):,} splats | {len(mesh.faces):,} triangles | the same, opaque")

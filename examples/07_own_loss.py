@@ -19,7 +19,7 @@ out = Path("example-output")
 out.mkdir(exist_ok=True)
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 48
 
-# Pictures of splats with their cameras, and the mesh to begin with.
+# Images of splats with their cameras, and the mesh to begin with.
 cloud = make_scene()
 data = ms.splat_dataset(cloud, train=12, test=4, width=96, sh_degree=0)
 mesh = ms.convert(cloud, mode="flat", cameras=[view.camera for view in data.train])
@@ -57,7 +57,7 @@ def leaves(of: ms.SplatMesh) -> list[torch.Tensor]:
 
 
 def pixels_shown(vertices: torch.Tensor, colors: torch.Tensor) -> np.ndarray:
-    """(v,) pixels of all views in which each vertex shows: the gradient of a further attribute's pictures."""
+    """(v,) pixels of all views in which each vertex shows: the gradient of a further attribute's images."""
     attribute = torch.zeros(len(vertices), 1, requires_grad=True)
     with torch.no_grad():
         now = poses().float()

@@ -61,12 +61,12 @@ home = bpy.data.collections.new("Bodies")
 scene.collection.children.link(home)
 
 
-def make_body(thing, kind, shape, **settings):
-    bpy.context.view_layer.objects.active = thing
+def make_body(obj, kind, shape, **settings):
+    bpy.context.view_layer.objects.active = obj
     bpy.ops.rigidbody.object_add(type=kind)
-    thing.rigid_body.collision_shape = shape
+    obj.rigid_body.collision_shape = shape
     for name, value in {"friction": 0.6, "restitution": 0.2, "collision_margin": 0.0, **settings}.items():
-        setattr(thing.rigid_body, name, value)
+        setattr(obj.rigid_body, name, value)
 
 
 def hull(points, name):
@@ -74,11 +74,11 @@ def hull(points, name):
     middle = points.mean(axis=0)
     data = bpy.data.meshes.new(name)
     data.from_pydata((points - middle).tolist(), [], [])
-    thing = bpy.data.objects.new(name, data)
-    thing.location = middle
-    thing.hide_render = True
-    home.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, data)
+    obj.location = middle
+    obj.hide_render = True
+    home.objects.link(obj)
+    return obj
 
 
 bodies = {}
@@ -108,8 +108,8 @@ for frame, held in [(1, True), (7, False)]:
     ball.rigid_body.kinematic = held
     ball.rigid_body.keyframe_insert("kinematic", frame=frame)
 
-things = [thing for thing in scene.objects if thing.type == "MESH" and not thing.hide_render]
-objects.render_settings(scene, [thing for thing in things if objects.LAYERS in thing.data], lit=True)
+objs = [obj for obj in scene.objects if obj.type == "MESH" and not obj.hide_render]
+objects.render_settings(scene, [obj for obj in objs if objects.LAYERS in obj.data], lit=True)
 scene.cycles.samples, scene.cycles.use_denoising = given.samples, True
 moments = [1, 12, 24, 50]
 strip = []

@@ -1,6 +1,6 @@
 """Any ray tracer draws a splat mesh: here Mitsuba 3, with sun, sky and ground.
 
-python examples/mitsuba/render.py [splats.ply | mesh.npz] [-o picture.exr] [--width 320] [--samples 64]
+python examples/mitsuba/render.py [splats.ply | mesh.npz] [-o image.exr] [--width 320] [--samples 64]
 
 Without a file: the demo scene. Writes example-output/mitsuba.exr (linear light) and a .png. Needs mitsuba
 (pip install mitsuba). The variant scalar_rgb runs everywhere; llvm_ad_rgb is several times quicker where a
@@ -139,10 +139,10 @@ def main() -> None:
         mesh = ms.convert(ms.load_gaussians(given.input), mode="flat")
     height = given.width * 3 // 4
     camera = ms.orbit(mesh, 1, elevation=20, width=given.width, height=height, distance=1.3)[0]
-    picture = mi.render(make_scene_of(mesh, camera, given.samples))
-    mi.util.write_bitmap(str(given.output), picture)
+    image = mi.render(make_scene_of(mesh, camera, given.samples))
+    mi.util.write_bitmap(str(given.output), image)
     shown = given.output.with_suffix(".png")
-    mi.util.write_bitmap(str(shown), picture)
+    mi.util.write_bitmap(str(shown), image)
     print(f"{given.output}, {shown}: {len(mesh.faces):,} triangles by Mitsuba {mi.__version__}")
 
 

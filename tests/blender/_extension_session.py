@@ -37,26 +37,26 @@ told["imported"] = sorted(bpy.ops.import_scene.meshsplats(filepath=str(folder / 
 import meshsplats  # noqa: E402
 
 told["package"] = meshsplats.__file__
-thing = bpy.context.object
-told["origin"] = list(thing.location)
-thing.location = (1, 2, 2)  # of the foot of the ball
-told["triangles"] = {"default": len(thing.data.polygons)}
+obj = bpy.context.object
+told["origin"] = list(obj.location)
+obj.location = (1, 2, 2)  # of the foot of the ball
+told["triangles"] = {"default": len(obj.data.polygons)}
 told["bounces"] = bpy.context.scene.cycles.transparent_max_bounces
-told["materials"] = [thing.data.materials[0].name]
+told["materials"] = [obj.data.materials[0].name]
 
-thing.meshsplats.max_triangles = 400
-thing.meshsplats.shading = "unlit"
+obj.meshsplats.max_triangles = 400
+obj.meshsplats.shading = "unlit"
 bpy.ops.object.meshsplats_convert_again()
-told["triangles"]["fewer"] = len(thing.data.polygons)
-told["materials"].append(thing.data.materials[0].name)
-told["moved"] = list(thing.location)
+told["triangles"]["fewer"] = len(obj.data.polygons)
+told["materials"].append(obj.data.materials[0].name)
+told["moved"] = list(obj.location)
 bpy.ops.object.meshsplats_shading(shading="lit")
 bpy.ops.object.meshsplats_shading(shading="unlit")
-assert thing.data.materials[0].name.startswith("Splats, unlit")
+assert obj.data.materials[0].name.startswith("Splats, unlit")
 bpy.ops.scene.meshsplats_set_up(shading="unlit")
 
 told["sog"] = None
-if len(sys.argv) > 3:  # its pictures are decoded by the other wheel, Pillow
+if len(sys.argv) > 3:  # its images are decoded by the other wheel, Pillow
     bpy.ops.import_scene.meshsplats(filepath=sys.argv[3], max_triangles=800)
     told["sog"] = len(bpy.context.object.data.polygons)
     bpy.data.objects.remove(bpy.context.object)
@@ -78,7 +78,7 @@ told["dropped"] = {
 
 # Alone in the scene, a mesh for linear blending is shown encoded; beside others, that is told.
 told["linear"] = []
-hidden = [thing for thing in bpy.context.scene.objects if thing.type == "MESH"]
+hidden = [obj for obj in bpy.context.scene.objects if obj.type == "MESH"]
 for other in hidden:
     bpy.context.scene.collection.objects.unlink(other)
 bpy.ops.import_scene.meshsplats(filepath=str(folder / "linear.npz"))
@@ -88,7 +88,7 @@ for other in hidden:
 bpy.ops.scene.meshsplats_set_up(shading="unlit")
 told["linear"].append(bpy.context.scene.view_settings.view_transform)
 bpy.data.objects.remove(bpy.data.objects["linear"])
-bpy.context.view_layer.objects.active = thing
+bpy.context.view_layer.objects.active = obj
 
 try:
     bpy.ops.import_scene.meshsplats(filepath=str(folder / "broken.ply"))
@@ -112,11 +112,11 @@ told["follow"] = sorted(bpy.ops.object.meshsplats_follow())
 bpy.data.objects.remove(splats)
 bpy.data.objects.remove(base)
 
-# All splats again, for a picture of the ball: it stands at (1, 2, 3) and has radius 1.
-bpy.context.view_layer.objects.active = thing
-thing.meshsplats.max_triangles = 0
+# All splats again, for an image of the ball: it stands at (1, 2, 3) and has radius 1.
+bpy.context.view_layer.objects.active = obj
+obj.meshsplats.max_triangles = 0
 bpy.ops.object.meshsplats_convert_again()
-told["triangles"]["again"] = len(thing.data.polygons)
+told["triangles"]["again"] = len(obj.data.polygons)
 from meshsplats.blender.inside import stage  # noqa: E402
 
 scene = bpy.context.scene
@@ -128,10 +128,10 @@ camera.rotation_euler = (1.5708, 0, 0)
 scene.camera = camera
 stage.even_world((1, 1, 1))
 scene.render.resolution_x = scene.render.resolution_y = 32
-scene.render.filepath = str(folder / "picture.png")
+scene.render.filepath = str(folder / "image.png")
 bpy.ops.render.render(write_still=True)
-picture = bpy.data.images.load(scene.render.filepath)
-values = picture.pixels[:]
+image = bpy.data.images.load(scene.render.filepath)
+values = image.pixels[:]
 row = [values[4 * (16 * 32 + column)] for column in range(32)]
 told["edge"], told["middle"] = row[1], row[16]
 
@@ -202,7 +202,7 @@ def event(kind):
     return SimpleNamespace(type=kind, value="PRESS")
 
 
-choices = {name: getattr(thing.meshsplats, name) for name in sys.modules[addon + ".settings"].CHOICES}
+choices = {name: getattr(obj.meshsplats, name) for name in sys.modules[addon + ".settings"].CHOICES}
 window, operator = Window(), Operator()
 answers = [operator.begin(window, work.Work([str(folder / "ball.ply")], choices))]
 answers.append(operator.modal(window, event("MOUSEMOVE")))

@@ -1,6 +1,6 @@
 # ruff: noqa: E402
 """The extension as Blender sees it: its manifest, its installation from the .zip, import, another
-conversion, the picture, and its removal."""
+conversion, the image, and its removal."""
 
 from __future__ import annotations
 

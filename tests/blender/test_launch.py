@@ -46,7 +46,7 @@ def test_missing_bpy_names_the_extra_and_the_environment(monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bpy" else real(name))
     with pytest.raises(MissingDependencyError, match=r"pip install '\.\[blender\]'.*--executable"):
-        draw(random_mesh(3), cameras()[:1], pictures=["a.png"])
+        draw(random_mesh(3), cameras()[:1], images=["a.png"])
 
 
 def test_executable_that_is_not_blender(program, tmp_path):
@@ -69,10 +69,10 @@ def test_what_blender_said_last_is_in_the_error(program, tmp_path):
     crashing = program("Blender 5.0.1", "echo 'no memory for the render'; exit 3")
     target = tmp_path / "a.png"
     with pytest.raises(BlenderError, match=r"exit code 3.*no memory for the render"):
-        draw(random_mesh(3), cameras()[:1], pictures=[target], executable=crashing)
+        draw(random_mesh(3), cameras()[:1], images=[target], executable=crashing)
     killed = program("Blender 5.0.1", "kill -9 $$")
     with pytest.raises(BlenderError, match=r"SIGKILL.*fewer triangles"):
-        draw(random_mesh(3), cameras()[:1], pictures=[target], executable=killed)
+        draw(random_mesh(3), cameras()[:1], images=[target], executable=killed)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blender"]
 
 
@@ -80,7 +80,7 @@ def test_folders_that_cannot_be_written_in_are_told_first(program, tmp_path):
     blender = program("Blender 5.0.1", f"touch {tmp_path}/started")
     places = [tmp_path / "nowhere"] + [Path("/proc")] * Path("/proc/self").exists()
     for folder in places:
-        for outputs in ({"pictures": [folder / "a.png"]}, {"blend": folder / "a.blend"}):
+        for outputs in ({"images": [folder / "a.png"]}, {"blend": folder / "a.blend"}):
             with pytest.raises(OSError, match="cannot write in the folder") as told:
                 draw(random_mesh(3), cameras()[:1], executable=blender, **outputs)
             assert told.value.filename == str(folder)
@@ -206,7 +206,7 @@ def test_leftovers_of_crashes_are_removed(program, tmp_path, monkeypatch):
             draw(
                 random_mesh(3),
                 cameras()[:1],
-                pictures=[tmp_path / "a.png"],
+                images=[tmp_path / "a.png"],
                 executable=program("Blender 5.0.1", "exit 3"),
             )
         assert sorted(path.name for path in tmp_path.iterdir()) == [
@@ -220,14 +220,14 @@ def test_a_full_disk_inside_blender_is_a_full_disk(program, tmp_path):
     told = launch.worker.MARK + json.dumps({"error": [errno.ENOSPC, "no space left", "/disk/a.png"]})
     blender = program("Blender 5.0.1", f"echo '{told}'; exit 1")
     with pytest.raises(OSError, match="no space left") as caught:
-        draw(random_mesh(3), cameras()[:1], pictures=[tmp_path / "a.png"], executable=blender)
+        draw(random_mesh(3), cameras()[:1], images=[tmp_path / "a.png"], executable=blender)
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, "/disk/a.png")
 
 
 def test_what_blender_says_is_passed_on(program, tmp_path):
     stages = [
         {"stage": "Sample 4/16", "share": 0.25, "left": "00:10.1"},
-        {"picture": "a", "seconds": 1, "processor": 1},
+        {"image": "a", "seconds": 1, "processor": 1},
     ]
     lines = "\n".join(f"echo '{launch.worker.MARK}{json.dumps(stage)}'" for stage in stages)
     ahead, seen = [], []
@@ -235,7 +235,7 @@ def test_what_blender_says_is_passed_on(program, tmp_path):
         draw(
             random_mesh(3),
             cameras()[:1],
-            pictures=[tmp_path / "a.png"],
+            images=[tmp_path / "a.png"],
             executable=program("Blender 5.0.1", lines + "\nexit 1"),
             announce=ahead.append,
             progress=seen.append,
@@ -289,7 +289,7 @@ def test_missing_system_libraries_are_named(monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(MissingDependencyError, match=r"libSM\.so\.6: cannot open.*apt install .*libsm6"):
-        draw(random_mesh(3), cameras()[:1], pictures=[tmp_path / "a.png"])
+        draw(random_mesh(3), cameras()[:1], images=[tmp_path / "a.png"])
     assert not (tmp_path / "a.png").exists()
 
 

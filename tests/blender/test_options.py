@@ -43,7 +43,7 @@ def test_defaults_are_good():
     assert {f.name for f in fields(LightOptions)} >= {"sun", "hdri", "ground", "mirror", "glass"}
 
 
-def test_environment_pictures_are_known_by_content(tmp_path):
+def test_environment_images_are_known_by_content(tmp_path):
     good, bad = tmp_path / "sky.hdr", tmp_path / "sky.exr"
     good.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n")
     bad.write_bytes(b"\x89PNG\r\n")

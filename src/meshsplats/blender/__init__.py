@@ -1,4 +1,4 @@
-"""Pictures and scenes of splat meshes by Blender: exact ones, and lit ones with shadows, mirrors and glass.
+"""Images and scenes of splat meshes by Blender: exact ones, and lit ones with shadows, mirrors and glass.
 
 Blender runs as a process of its own, as the module bpy of this environment or as an installed program.
 """
@@ -37,7 +37,7 @@ def draw(
     mesh: SplatMesh,
     cameras: Sequence[Camera],
     *,
-    pictures: Sequence[str | os.PathLike[str]] = (),
+    images: Sequence[str | os.PathLike[str]] = (),
     blend: str | os.PathLike[str] | None = None,
     options: SceneOptions | None = None,
     executable: str | os.PathLike[str] | None = None,
@@ -54,22 +54,22 @@ def draw(
 
     Args:
         mesh: what to draw.
-        cameras: at least one for pictures; in a .blend, each is a camera and a frame of the timeline.
-        pictures: .png (8 bits) or .exr (32 bits) to write, one a camera.
+        cameras: at least one for images; in a .blend, each is a camera and a frame of the timeline.
+        images: .png (8 bits) or .exr (32 bits) to write, one a camera.
         blend: Blender file to write: mesh, material, cameras, light, world, in named collections.
         options: how; unlit in Cycles by default.
         executable: an installed Blender, 4.2 or newer; the module bpy of this environment by default.
         announce: called once before Blender starts, with what is ahead: ``{"triangles", "layers",
-            "bounce_limit", "samples" a pixel, "pixels" of all pictures, "mean_layers" of a pixel}``.
+            "bounce_limit", "samples" a pixel, "pixels" of all images, "mean_layers" of a pixel}``.
         progress: called whenever Blender tells how far it is.
 
     Returns:
-        ``{"blender": its version, "build_seconds": float, "picture_seconds": [float, ...], "layers": most
+        ``{"blender": its version, "build_seconds": float, "image_seconds": [float, ...], "layers": most
         layers behind each other, "bounce_limit": int}``, and as ``build_processor_seconds`` and
-        ``picture_processor_seconds`` the processor time of all threads.
+        ``image_processor_seconds`` the processor time of all threads.
 
     Raises:
-        ValueError: options out of range, another suffix, pictures that do not match the cameras, an empty
+        ValueError: options out of range, another suffix, images that do not match the cameras, an empty
         mesh.
         MissingDependencyError: neither bpy nor an executable, or no OpenGL libraries for EEVEE.
         OSError: a folder that cannot be written in, told before the work.
@@ -81,14 +81,14 @@ def draw(
 
     options = options or SceneOptions()
     options.check()
-    targets = [Path(path) for path in pictures]
+    targets = [Path(path) for path in images]
     for path in targets:
         if path.suffix.lower() not in (".png", ".exr"):
-            raise ValueError(f"{path.name!r}: Blender's pictures end in .png or .exr")
+            raise ValueError(f"{path.name!r}: Blender's images end in .png or .exr")
     if blend is not None and Path(blend).suffix.lower() != ".blend":
         raise ValueError(f"{Path(blend).name!r}: a Blender file ends in .blend")
     if targets and len(targets) != len(cameras):
-        raise ValueError(f"{len(targets)} pictures for {len(cameras)} cameras: there must be one a camera")
+        raise ValueError(f"{len(targets)} images for {len(cameras)} cameras: there must be one a camera")
     if len(mesh.faces) == 0:
         raise ValueError("the mesh has no triangles: there is nothing to draw")
     launch.command(None if executable is None else Path(executable))  # told before the work
@@ -119,7 +119,7 @@ def draw(
         cameras,
         options,
         limit=limit,
-        pictures=targets,
+        images=targets,
         blend=None if blend is None else Path(blend),
         executable=None if executable is None else Path(executable),
         progress=progress,

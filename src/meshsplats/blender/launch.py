@@ -44,15 +44,15 @@ class Progress:
     """How far Blender is."""
 
     done: int
-    """Pictures that are finished."""
-    pictures: int
+    """Images that are finished."""
+    images: int
     """Those wanted."""
     share: float
-    """Of the picture at hand, 0 to 1: the samples taken."""
+    """Of the image at hand, 0 to 1: the samples taken."""
     stage: str
     """What Blender is doing, in its words."""
     left: str | None
-    """Time that Blender thinks the picture at hand still takes, where it knows."""
+    """Time that Blender thinks the image at hand still takes, where it knows."""
 
 
 class BlenderError(ChildProcessError):
@@ -93,16 +93,16 @@ def run_job(
     options: SceneOptions,
     *,
     limit: int,
-    pictures: Sequence[Path] = (),
+    images: Sequence[Path] = (),
     blend: Path | None = None,
     executable: Path | None = None,
     progress: Callable[[Progress], object] | None = None,
 ) -> dict[str, Any]:
-    """Has Blender build the scene, save ``blend`` and render ``pictures``, one a camera.
+    """Has Blender build the scene, save ``blend`` and render ``images``, one a camera.
 
     ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called as Blender
     tells how far it is. Returns ``{"blender": version, "build_seconds": s, "build_processor_seconds": s,
-    "picture_seconds": [s, ...], "picture_processor_seconds": [s, ...]}``.
+    "image_seconds": [s, ...], "image_processor_seconds": [s, ...]}``.
 
     Raises BlenderError with Blender's own words if it fails, MissingDependencyError if the system lacks
     libraries that it needs, besides what ``command`` raises, and OSError for an output that cannot be written
@@ -124,9 +124,9 @@ def run_job(
             "options": _plain_options(options),
             "limit": limit,
             "blend": None if blend is None else os.path.abspath(blend),
-            "pictures": [os.path.abspath(path) for path in pictures],
+            "images": [os.path.abspath(path) for path in images],
         }
-        outputs = [path for path in (*pictures, blend) if path is not None]
+        outputs = [path for path in (*images, blend) if path is not None]
         temporary = {os.path.abspath(path): str(temporary_beside(path)) for path in outputs}
         job["temporary"] = temporary
         job["new"] = [os.path.abspath(path) for path in outputs if is_promised(path)]
@@ -134,7 +134,7 @@ def run_job(
         try:
             for name, content in (("job.json", job), ("plan.json", plan)):
                 (folder / name).write_text(json.dumps(content), encoding="utf-8")
-            return _watch(plan, folder, lock, options, len(pictures), progress)
+            return _watch(plan, folder, lock, options, len(images), progress)
         finally:
             for path in temporary.values():  # of a Blender that crashed
                 Path(path).unlink(missing_ok=True)
@@ -170,7 +170,7 @@ def _watch(
     folder: Path,
     lock: int,
     options: SceneOptions,
-    pictures: int,
+    images: int,
     progress: Callable[[Progress], object] | None,
 ) -> dict[str, Any]:
     arguments = plan["command"]
@@ -181,7 +181,7 @@ def _watch(
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
     # Blender's own temporary files go with ours.
     environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
-    result: dict[str, Any] = {"picture_seconds": [], "picture_processor_seconds": []}
+    result: dict[str, Any] = {"image_seconds": [], "image_processor_seconds": []}
     said: deque[str] = deque(maxlen=40)
     finished, failure, unloadable, status = False, None, None, None
     process = subprocess.Popen(
@@ -195,7 +195,7 @@ def _watch(
         start_new_session=True,  # what ends our group must leave the guard to tidy up
         pass_fds=() if sys.platform == "win32" else (lock,),
     )
-    at = Progress(0, pictures, 0.0, "starting", None)
+    at = Progress(0, images, 0.0, "starting", None)
     try:
         assert process.stdin is not None and process.stdout is not None  # noqa: PT018
         for line in process.stdout:
@@ -206,14 +206,14 @@ def _watch(
             if "built" in message:
                 result |= {"blender": message["blender"], "build_seconds": message["built"]}
                 result["build_processor_seconds"] = message["processor"]
-            elif "picture" in message:
-                result["picture_seconds"].append(message["seconds"])
-                result["picture_processor_seconds"].append(message["processor"])
-                at = Progress(at.done + 1, pictures, 0.0, "", None)
+            elif "image" in message:
+                result["image_seconds"].append(message["seconds"])
+                result["image_processor_seconds"].append(message["processor"])
+                at = Progress(at.done + 1, images, 0.0, "", None)
             elif "stage" in message:
                 at = replace(at, share=message["share"], stage=message["stage"], left=message["left"])
             status = message.get("ended", status)
-            if progress is not None and ("picture" in message or "stage" in message):
+            if progress is not None and ("image" in message or "stage" in message):
                 progress(at)
             finished |= "done" in message
             failure = message.get("error", failure)

@@ -15,8 +15,8 @@ from meshsplats.rendering import render
 
 _PROBE = 2.0**-12
 PROBE_SIDE = 192
-"""Longer side in pixels of the pictures in which layers are counted: the count changes slowly over a
-picture."""
+"""Longer side in pixels of the images in which layers are counted: the count changes slowly over a
+image."""
 
 
 def count_layers(mesh: SplatMesh, camera: Camera, *, threads: int | None = None) -> np.ndarray:

@@ -25,7 +25,7 @@ CELL = 2.5
 clean and noisy, where 2 to 3 give the least error (see docs/blender.md)."""
 VIEWS = 24
 _SIDE = 160
-"""Pixels of the square pictures that decide what is seen."""
+"""Pixels of the square images that decide what is seen."""
 _SOLID = 0.3
 """Opacity from which a pixel counts as covered."""
 _CHUNK = 1 << 16
@@ -175,10 +175,10 @@ def _seen_from(
     views += a_few(cameras or (), 16, _SIDE)
     seen = np.zeros_like(centers)
     for camera in views:
-        picture = render(mesh, camera, depth=True, threads=threads)
-        assert picture.depth is not None
-        solid = picture.alpha > _SOLID
-        surface = np.where(solid, picture.depth / np.where(solid, picture.alpha, 1), np.inf)
+        image = render(mesh, camera, depth=True, threads=threads)
+        assert image.depth is not None
+        solid = image.alpha > _SOLID
+        surface = np.where(solid, image.depth / np.where(solid, image.alpha, 1), np.inf)
         x, y, z = camera.world_to_camera[:3, :3] @ centers.T + camera.world_to_camera[:3, 3:]
         front = z > camera.near
         z = np.where(front, z, 1)

@@ -17,7 +17,7 @@ MAX_LAYERS = 1024
 
 @dataclass(frozen=True)
 class LightOptions:
-    """Light and surroundings of lit pictures. Lengths follow the subject's size."""
+    """Light and surroundings of lit images. Lengths follow the subject's size."""
 
     sun: tuple[float, float] = (-50.0, 45.0)
     """Where the sun stands: azimuth (0 behind the viewer of the front, 90 on that viewer's right) and
@@ -35,16 +35,16 @@ class LightOptions:
     sky_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
     """Colour of that sky: linear R G B, 0 to 1; --sky is multiplied by it."""
     hdri: Path | None = None
-    """Environment picture (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
+    """Environment image (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
     hdri_strength: float = 1.0
-    """Factor on the environment picture."""
+    """Factor on the environment image."""
     hdri_rotation: float = 0.0
     """Degrees that the environment is turned round the up direction."""
     ground: Ground = "plane"
     """What the subject stands on: a grey plane that fades into the background; a catcher, seen only where
     shadows fall (Cycles); or nothing."""
     exposure: float = 0.35
-    """How much brighter pictures are shown than they are lit, in stops, -20 to 20: with 0.35, a white plate
+    """How much brighter images are shown than they are lit, in stops, -20 to 20: with 0.35, a white plate
     that faces the viewer looks white. Neither the values of an .exr change nor the background."""
     mirror: bool = False
     """A mirror behind the subject."""
@@ -64,7 +64,7 @@ class LightOptions:
         return (-self.sun[0], 20.0)
 
     def check(self) -> None:
-        """Raises ValueError for a value out of range, FileNotFoundError for a missing environment picture."""
+        """Raises ValueError for a value out of range, FileNotFoundError for a missing environment image."""
         azimuth, elevation = self.sun
         if not (np.isfinite(azimuth) and -90 <= elevation <= 90):
             raise ValueError(f"sun must be an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
@@ -114,13 +114,13 @@ class SceneOptions:
     """How Blender draws the mesh."""
 
     light: LightOptions | None = None
-    """None: colours as they are, the picture that ``meshsplats.render`` draws. Else lit by these."""
+    """None: colours as they are, the image that ``meshsplats.render`` draws. Else lit by these."""
     engine: Engine = "cycles"
     """cycles: exact order and ray-traced light. eevee: quick; triangles are sorted for each camera."""
     samples: int = 1
     """Unlit: side of the grid of samples in each pixel, as in ``render``. Lit: samples a pixel."""
     background: Annotated[tuple[float, float, float] | None, "RGB"] = (1.0, 1.0, 1.0)
-    """Display RGB behind everything; None: transparent. With an environment picture, that is seen instead."""
+    """Display RGB behind everything; None: transparent. With an environment image, that is seen instead."""
     denoise: bool = False
     """Cycles, lit: remove noise with OpenImageDenoise."""
     threads: int | None = None
@@ -139,7 +139,7 @@ class SceneOptions:
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         if self.denoise and (self.light is None or self.engine != "cycles"):
-            raise ValueError("denoise is for lit pictures in Cycles: others have no noise, or another kind")
+            raise ValueError("denoise is for lit images in Cycles: others have no noise, or another kind")
         if self.light is not None:
             self.light.check()
             if self.engine == "eevee" and self.light.ground == "catcher":
@@ -153,5 +153,5 @@ def check_environment(path: Path) -> None:
         start = file.read(10)
     if not (start.startswith((b"#?RADIANCE", b"#?RGBE")) or start[:4] == b"\x76\x2f\x31\x01"):
         raise ValueError(
-            f"{path}: an environment picture is a Radiance .hdr or an OpenEXR file; this is neither"
+            f"{path}: an environment image is a Radiance .hdr or an OpenEXR file; this is neither"
         )

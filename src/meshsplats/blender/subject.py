@@ -37,12 +37,12 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
         if options.light.fill > 0:
             directions.append(_world_direction(axes, *options.light.fill_direction))
     layers = most_layers(mesh, cameras, directions, threads=options.threads)
-    # An unlit picture is exact or it is not: a high limit costs nothing where there are no layers.
+    # An unlit image is exact or it is not: a high limit costs nothing where there are no layers.
     return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
 
 
 def mean_layers(mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None = None) -> float:
-    """How many triangles lie behind each other in a pixel, on average over the pictures."""
+    """How many triangles lie behind each other in a pixel, on average over the images."""
     some = a_few(cameras, 4, PROBE_SIDE)
     return float(np.mean([count_layers(mesh, camera, threads=threads).mean() for camera in some] or [0.0]))
 

@@ -152,7 +152,7 @@ class Blender:
             result = draw(
                 mesh,
                 cameras,
-                pictures=pictures,
+                images=pictures,
                 blend=blend,
                 options=options,
                 executable=self.executable,
@@ -322,6 +322,6 @@ class _Lines:
 
 
 def _words(at: Progress) -> str:
-    which = f"picture {min(at.done + 1, at.pictures)} of {at.pictures}" if at.pictures > 1 else ""
+    which = f"picture {min(at.done + 1, at.images)} of {at.images}" if at.images > 1 else ""
     left = f"{at.left} left" if at.left else ""
     return ", ".join(filter(None, [which, at.stage, left]))

@@ -31,7 +31,7 @@ LAYERS = "meshsplats_layers"
 
 def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
     """All that takes time and does not touch Blender: may run in another thread. Coplanar layers of a mesh
-    prior are set apart, as exports are; a filter is made part of the triangles, for pictures of the whole
+    prior are set apart, as exports are; a filter is made part of the triangles, for images of the whole
     subject."""
     if mesh.binding is not None and mesh.normals is not None:
         prior = MeshPrior(mesh)
@@ -58,18 +58,18 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
     """A new object in ``collection``, upright in Blender's frame, with its material; that of a mesh prior
     hangs on an object of its base, which it follows. The object's origin lies under the subject."""
     rotation = frame.to_blender(prepared["mesh"].up)
-    thing = meshes.make_object(_data(prepared, name), name, rotation, collection)
-    thing.location = (rotation @ prepared["origin"]).tolist()  # where the file has it
+    obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
+    obj.location = (rotation @ prepared["origin"]).tolist()  # where the file has it
     if prepared["mesh"].binding is not None:
-        priors.give_base(thing, prepared["mesh"].binding, collection)
-    bpy.context.view_layer.objects.active = thing
-    return thing
+        priors.give_base(obj, prepared["mesh"].binding, collection)
+    bpy.context.view_layer.objects.active = obj
+    return obj
 
 
-def replace_mesh(thing: Any, prepared: dict[str, Any]) -> None:
-    """Gives ``thing`` another mesh and material; its place, parent, modifiers and name stay."""
-    old = thing.data
-    thing.data = _data(prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}, old.name)
+def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
+    """Gives ``obj`` another mesh and material; its place, parent, modifiers and name stay."""
+    old = obj.data
+    obj.data = _data(prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}, old.name)
     if old.users == 0:
         bpy.data.meshes.remove(old)
 
@@ -98,13 +98,13 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
     return data
 
 
-def as_splat_mesh(thing: Any) -> SplatMesh:
-    """The unlit mesh that ``thing`` was made from, frame and colours as in its file.
+def as_splat_mesh(obj: Any) -> SplatMesh:
+    """The unlit mesh that ``obj`` was made from, frame and colours as in its file.
 
     Raises ValueError for an object that is not a mesh of triangles with the colours of this project.
     """
-    data: Any = getattr(thing, "data", None)
-    if thing is None or thing.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
+    data: Any = getattr(obj, "data", None)
+    if obj is None or obj.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
         raise ValueError("the object was not made by MeshSplats")
     vertices = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", vertices)
@@ -136,22 +136,22 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
         up=up,
         blending=blending,
     )
-    if priors.base_of(thing) is None:
+    if priors.base_of(obj) is None:
         return found
-    binding = priors.binding_of(thing)
+    binding = priors.binding_of(obj)
     return replace(found, vertices=binding.positions(), normals=binding.normals(), binding=binding)
 
 
-def render_settings(scene: Any, things: list[Any], lit: bool, light: LightOptions | None = None) -> int:
-    """Sets the scene up for ``things``: engine settings, colour management and the limit on transparent
+def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions | None = None) -> int:
+    """Sets the scene up for ``objs``: engine settings, colour management and the limit on transparent
     bounces, which is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor
     EEVEE). One scene cannot be right for both unlit meshes of display and of linear blending: where there are
-    both, it is for the former. Lit pictures are denoised, and shown as ``light`` exposes them."""
+    both, it is for the former. Lit images are denoised, and shown as ``light`` exposes them."""
     light = light or LightOptions(exposure=0.0)
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
-    layers = sum(int(thing.data.get(LAYERS, 256)) for thing in things)
-    linear = bool(things) and all(thing.data.get(LINEAR) for thing in things)
+    layers = sum(int(obj.data.get(LAYERS, 256)) for obj in objs)
+    linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs)
     limit = bounce_limit(layers)
     if lit:
         pictures.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)
@@ -161,18 +161,18 @@ def render_settings(scene: Any, things: list[Any], lit: bool, light: LightOption
     return limit
 
 
-def clash(things: list[Any], lit: bool) -> str:
-    """What cannot be right in one unlit scene of ``things``, or ''."""
-    kinds = {bool(thing.data.get(LINEAR)) for thing in things}
+def clash(objs: list[Any], lit: bool) -> str:
+    """What cannot be right in one unlit scene of ``objs``, or ''."""
+    kinds = {bool(obj.data.get(LINEAR)) for obj in objs}
     if lit or len(kinds) < 2:
         return ""
     return "some meshes blend display values and others linear light: unlit, the latter look too dark here"
 
 
-def dress(thing: Any, lit: bool) -> None:
+def dress(obj: Any, lit: bool) -> None:
     """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) what a mesh of our own has: display
-    colours for the exact picture, or linear ones, smoothed normals and a lit material.
+    colours for the exact image, or linear ones, smoothed normals and a lit material.
 
     Raises ValueError if the object has no colours or other faces than triangles.
     """
-    replace_mesh(thing, prepare(foreign.splat_mesh(thing), lit))
+    replace_mesh(obj, prepare(foreign.splat_mesh(obj), lit))

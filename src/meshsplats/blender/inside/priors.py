@@ -38,41 +38,41 @@ def store(data: Any, binding: Binding) -> None:
     data[LIFT] = binding.lift
 
 
-def give_base(thing: Any, binding: Binding, collection: Any) -> Any:
-    """Makes the base of ``thing``, the object of its splats, as an object in ``collection``: drawn as wire,
-    left out of pictures, at the splats' place, which hang on it from now on. Returns it."""
-    data = meshes.make_plain(f"{thing.name} base", binding.base_vertices, binding.base_faces)
+def give_base(obj: Any, binding: Binding, collection: Any) -> Any:
+    """Makes the base of ``obj``, the object of its splats, as an object in ``collection``: drawn as wire,
+    left out of images, at the splats' place, which hang on it from now on. Returns it."""
+    data = meshes.make_plain(f"{obj.name} base", binding.base_vertices, binding.base_faces)
     data.update(calc_edges=True)
-    base = bpy.data.objects.new(f"{thing.name} base", data)
+    base = bpy.data.objects.new(f"{obj.name} base", data)
     base.display_type = "WIRE"
     base.hide_render = True
-    base.matrix_world = thing.matrix_world.copy()
+    base.matrix_world = obj.matrix_world.copy()
     collection.objects.link(base)
-    thing.parent = base
-    thing.matrix_parent_inverse.identity()
-    thing.matrix_basis.identity()
-    thing[BASE] = base
-    thing[PROBLEM] = ""
+    obj.parent = base
+    obj.matrix_parent_inverse.identity()
+    obj.matrix_basis.identity()
+    obj[BASE] = base
+    obj[PROBLEM] = ""
     return base
 
 
-def base_of(thing: Any) -> Any:
-    """The object of the base that ``thing`` follows; None if it follows none, or that has been deleted."""
-    base = thing.get(BASE) if thing is not None and thing.type == "MESH" else None
-    if base is None or base.type != "MESH" or FACE not in thing.data.attributes:
+def base_of(obj: Any) -> Any:
+    """The object of the base that ``obj`` follows; None if it follows none, or that has been deleted."""
+    base = obj.get(BASE) if obj is not None and obj.type == "MESH" else None
+    if base is None or base.type != "MESH" or FACE not in obj.data.attributes:
         return None
     return base
 
 
-def binding_of(thing: Any) -> Binding:
-    """The binding of ``thing`` to its base as that stands without modifiers.
+def binding_of(obj: Any) -> Binding:
+    """The binding of ``obj`` to its base as that stands without modifiers.
 
     Raises ValueError if the base has other vertices or faces than the splats were bound to.
     """
-    base = base_of(thing)
+    base = base_of(obj)
     if base is None:
         raise ValueError("the object is bound to no base")
-    data = thing.data
+    data = obj.data
     count = len(data.vertices)
     face, layers = np.empty(count, np.int32), np.empty(count, np.int32)
     weights = np.empty(3 * count, np.float32)
@@ -88,29 +88,29 @@ def binding_of(thing: Any) -> Binding:
     )
 
 
-def follow(things: Iterable[Any], depsgraph: Any) -> int:
-    """Moves the splats ``things`` to where their bases are in ``depsgraph``, modifiers and simulations done;
+def follow(objs: Iterable[Any], depsgraph: Any) -> int:
+    """Moves the splats ``objs`` to where their bases are in ``depsgraph``, modifiers and simulations done;
     returns how many. What went wrong stands in the object's property ``PROBLEM``."""
     moved = 0
-    for thing in things:
+    for obj in objs:
         problem = ""
         try:
-            _move(thing, depsgraph)
+            _move(obj, depsgraph)
             moved += 1
         except ValueError as error:
             problem = str(error)
-        if thing.get(PROBLEM) != problem:
-            thing[PROBLEM] = problem
+        if obj.get(PROBLEM) != problem:
+            obj[PROBLEM] = problem
     return moved
 
 
 def followers(scene: Any) -> list[Any]:
     """The objects of ``scene`` that follow a base."""
-    return [thing for thing in scene.objects if base_of(thing) is not None]
+    return [obj for obj in scene.objects if base_of(obj) is not None]
 
 
-def _move(thing: Any, depsgraph: Any) -> None:
-    binding, base = binding_of(thing), base_of(thing)
+def _move(obj: Any, depsgraph: Any) -> None:
+    binding, base = binding_of(obj), base_of(obj)
     places = _evaluated(base, depsgraph)
     if len(places) != len(binding.base_vertices):
         raise ValueError(
@@ -120,7 +120,7 @@ def _move(thing: Any, depsgraph: Any) -> None:
     if not np.isfinite(places).all():
         raise ValueError("the base has vertices at no finite place")
     moved = binding.moved(places, binding.lift)
-    data = thing.data
+    data = obj.data
     versions.set_positions(data, moved.positions())
     if meshes.NORMAL in data.attributes:
         normals = moved.normals()

@@ -57,7 +57,7 @@ class Built:
     """What was made."""
 
     scene: Any
-    thing: Any
+    obj: Any
     """The object of the splats."""
     cameras: list[Any]
     rotation: np.ndarray
@@ -86,7 +86,7 @@ def build(
         face_splat=subject.face_splat,
         edges=edges,
     )
-    thing = meshes.make_object(mesh, subject.name, rotation, splats)
+    obj = meshes.make_object(mesh, subject.name, rotation, splats)
     center = rotation @ subject.center
     home = stage.collection("Cameras")
     made = []
@@ -117,9 +117,9 @@ def build(
             caster.materials.append(materials.plain("Shadow", stage.GREY))
             stand_in = meshes.make_object(caster, caster.name, rotation, splats)
             stand_in.visible_camera = False
-            stand_in.parent = thing
-            stand_in.matrix_parent_inverse = thing.matrix_world.inverted()
-            thing.visible_shadow = False
+            stand_in.parent = obj
+            stand_in.matrix_parent_inverse = obj.matrix_world.inverted()
+            obj.visible_shadow = False
         viewer = np.array(made[0].matrix_world.translation) if made else None
         floor = np.array([center[0], center[1], subject.floor])
         surround(floor, subject.radius, light, viewer, options.background)
@@ -141,8 +141,8 @@ def build(
     _timeline(scene, made)
     if made:
         stage.aim(scene, cameras[0], made[0])
-    bpy.context.view_layer.objects.active = thing
-    return Built(scene, thing, made, rotation)
+    bpy.context.view_layer.objects.active = obj
+    return Built(scene, obj, made, rotation)
 
 
 def surround(
@@ -167,7 +167,7 @@ def surround(
     else:
         seen = None
         if background is not None:
-            # The background is shown as it was asked for, however pictures are exposed.
+            # The background is shown as it was asked for, however images are exposed.
             seen = (srgb_to_linear(np.array(background)) / 2**light.exposure).tolist()
         stage.even_world([light.sky * part for part in light.sky_color], seen)
     home = stage.collection("Surroundings")

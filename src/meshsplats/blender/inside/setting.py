@@ -19,11 +19,11 @@ _FLOOR = 0.002
 UP = (0.0, 0.0, 1.0)
 
 
-def set_up(view: Any, things: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
-    """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``things`` and, with ``camera``, a
+def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
+    """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
     camera that sees all of them at the scene's resolution; in place of what an earlier call made. Returns the
-    light. ValueError if ``things`` have no vertices that can be seen."""
-    points = np.concatenate([world_points(thing) for thing in things] or [np.zeros((0, 3))])
+    light. ValueError if ``objs`` have no vertices that can be seen."""
+    points = np.concatenate([world_points(obj) for obj in objs] or [np.zeros((0, 3))])
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
     light, bounds = LIGHTS[lights], scene_bounds(points)
@@ -40,13 +40,13 @@ def set_up(view: Any, things: list[Any], lights: str = "sun", *, camera: bool = 
         viewer = seen.center
     floor = np.array([bounds.center[0], bounds.center[1], low])
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
-    objects.render_settings(view, things, True, light)
+    objects.render_settings(view, objs, True, light)
     return light
 
 
-def world_points(thing: Any) -> np.ndarray:
-    """(k, 3) float64 some of the vertices of ``thing`` that can be seen, in Blender's world."""
-    data = thing.data
+def world_points(obj: Any) -> np.ndarray:
+    """(k, 3) float64 some of the vertices of ``obj`` that can be seen, in Blender's world."""
+    data = obj.data
     vertices = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", vertices)
     points = vertices.reshape(-1, 3).astype(np.float64)
@@ -55,5 +55,5 @@ def world_points(thing: Any) -> np.ndarray:
         data.attributes[meshes.COLOR].data.foreach_get("color", colors)
         points = points[colors[3::4] > _SEEN]
     points = points[:: -(-max(len(points), 1) // SAMPLE)]
-    world = np.array(thing.matrix_world)
+    world = np.array(obj.matrix_world)
     return points @ world[:3, :3].T + world[:3, 3]

@@ -43,7 +43,7 @@ def end_with_parent() -> None:
 
 
 def tell_stage(text: str, *_: object) -> None:
-    """Passes on what Blender says of the picture at hand."""
+    """Passes on what Blender says of the image at hand."""
     sample = re.search(r"Sample (\d+)/(\d+)", text)
     left = re.search(r"Remaining: ?([\d:.]+)", text)
     share = int(sample[1]) / max(int(sample[2]), 1) if sample else 0.0
@@ -83,14 +83,14 @@ def main(job_path: str) -> None:
     options = SceneOptions(light=light, **job["options"])
     if (
         light is not None
-        and job["pictures"]
-        and all(path.lower().endswith(".exr") for path in job["pictures"])
+        and job["images"]
+        and all(path.lower().endswith(".exr") for path in job["images"])
     ):
         # Values of light: nothing is shown, and the background is one of them.
         options = replace(options, light=replace(light, exposure=0.0))
     cameras = [Camera(np.array(c.pop("world_to_camera")), **c) for c in job["cameras"]]
     temporary, new = job["temporary"], job["new"]
-    blend, targets = job["blend"], [Path(target) for target in job["pictures"]]
+    blend, targets = job["blend"], [Path(target) for target in job["images"]]
 
     start, processor = time.perf_counter(), time.process_time()
     sort = options.engine == "eevee"
@@ -110,18 +110,18 @@ def main(job_path: str) -> None:
     factor = options.samples if light is None else 1
     bpy.app.handlers.render_stats.append(tell_stage)
     for i, target in enumerate(targets):
-        camera, thing = cameras[i], built.cameras[i]
+        camera, obj = cameras[i], built.cameras[i]
         if sort and i > 0:
             order = meshes.far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
-            meshes.set_faces(built.thing.data, subject.faces[order])
+            meshes.set_faces(built.obj.data, subject.faces[order])
         built.scene.frame_set(i)  # where the timeline puts camera i before the lens
-        stage.aim(built.scene, camera, thing, factor)
+        stage.aim(built.scene, camera, obj, factor)
         start, processor = time.perf_counter(), time.process_time()
         name = str(target)
         with atomic_path(target, temporary=Path(temporary[name]), new=name in new) as place:
             pictures.render_to(built.scene, place, factor, scratch=Path(job_path).parent)
         tell(
-            picture=str(target),
+            image=str(target),
             seconds=round(time.perf_counter() - start, 3),
             processor=round(time.process_time() - processor, 3),
         )
