@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats of mesh priors go where their base goes: after every change of its shape, and on every frame."""
+"""Handlers by which the splats of mesh priors follow their base, after every change and on every frame."""
 
 import bpy
 from bpy.app.handlers import persistent

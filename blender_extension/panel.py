@@ -4,8 +4,19 @@
 import bpy
 
 from .import_operator import ImportMeshSplats
-from .object_operators import ConvertAgain, FollowBase, SetShading, SetUpRender, SetUpStage
+from .object_operators import (
+    ConvertAgain,
+    FitLevel,
+    FollowBase,
+    SetShading,
+    SetUpRender,
+    SetUpStage,
+    ShowLevel,
+)
 from .settings import draw_choices
+
+CHAIN, LEVEL = "meshsplats_levels", "meshsplats_level"
+"""Properties of the collections of levels of detail; ``meshsplats.blender.inside.levels`` sets them."""
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -21,6 +32,9 @@ class MeshSplatsPanel(bpy.types.Panel):
         obj = context.object
         if obj is not None and obj.type == "MESH":
             self._object(layout, obj)
+        for collection in context.scene.collection.children_recursive:
+            if CHAIN in collection:
+                self._chain(layout, collection)
         layout.separator()
         layout.label(text="Light, ground and camera")
         row = layout.row(align=True)
@@ -30,6 +44,16 @@ class MeshSplatsPanel(bpy.types.Panel):
         row = layout.row(align=True)
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
         row.operator(SetUpRender.bl_idname, text="Lit").shading = "lit"
+
+    def _chain(self, layout, chain):
+        box = layout.box()
+        box.label(text=chain.name, icon="OUTLINER_COLLECTION")
+        row = box.row(align=True)
+        row.label(text="Show level")
+        for child in sorted((c for c in chain.children if LEVEL in c), key=lambda c: c[LEVEL]):
+            button = row.operator(ShowLevel.bl_idname, text=str(child[LEVEL]), depress=not child.hide_render)
+            button.chain, button.level = chain.name, child[LEVEL]
+        box.operator(FitLevel.bl_idname, icon="CAMERA_DATA").chain = chain.name
 
     def _object(self, layout, obj):
         if obj.meshsplats.path:

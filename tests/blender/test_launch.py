@@ -279,7 +279,7 @@ def test_missing_graphics_libraries_are_named(program, monkeypatch, tmp_path):
 
     monkeypatch.setattr(ctypes, "CDLL", absent)
     with pytest.raises(MissingDependencyError, match=r"libEGL\.so\.1.*apt install libegl1.*--engine cycles"):
-        launch.run_job({}, {}, [], SceneOptions(engine="eevee"), limit=1, executable=program("Blender 5.0.1"))
+        launch.run_job([], [], SceneOptions(engine="eevee"), limit=1, executable=program("Blender 5.0.1"))
 
 
 @linux

@@ -87,8 +87,7 @@ def command(executable: Path | None) -> list[str]:
 
 
 def run_job(
-    arrays: dict[str, np.ndarray],
-    subject: dict[str, Any],
+    subjects: Sequence[tuple[dict[str, np.ndarray], dict[str, Any]]],
     cameras: Sequence[Camera],
     options: SceneOptions,
     *,
@@ -98,28 +97,38 @@ def run_job(
     executable: Path | None = None,
     progress: Callable[[Progress], object] | None = None,
 ) -> dict[str, Any]:
-    """Has Blender build the scene, save ``blend`` and render ``images``, one a camera.
+    """Has Blender build the scene, save ``blend`` and render ``images``, one per camera.
 
-    ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called as Blender
-    tells how far it is. Returns ``{"blender": version, "build_seconds": s, "build_processor_seconds": s,
-    "image_seconds": [s, ...], "image_processor_seconds": [s, ...]}``.
+    Blender ends with this process, however that ends, and leaves nothing behind (``guard``).
 
-    Raises BlenderError with Blender's own words if it fails, MissingDependencyError if the system lacks
-    libraries that it needs, besides what ``command`` raises, and OSError for an output that cannot be written
-    (a full disk; a name that another process has taken meanwhile). Blender ends with this process, however it
-    ends, and leaves nothing (``guard``).
+    Args:
+        subjects: arrays and facts, the fields of ``inside.scene.Subject``; of a chain, those of each level,
+            the finest first.
+        cameras: at least one per image.
+        limit: on transparent bounces.
+        progress: called whenever Blender reports progress.
+
+    Returns:
+        ``{"blender": version, "build_seconds": s, "build_processor_seconds": s, "image_seconds": [s, ...],
+        "image_processor_seconds": [s, ...]}``.
+
+    Raises:
+        BlenderError: Blender failed; the message quotes it.
+        MissingDependencyError: system libraries are missing; see also ``command``.
+        OSError: an output cannot be written (a full disk, a name that another process has taken meanwhile).
     """
     start = command(executable)
     if options.engine == "eevee":
         _check_graphics()
     with _scratch() as (folder, lock):
-        files = {}
-        for name, array in arrays.items():
-            files[name] = os.path.join(folder, f"{name}.npy")
-            np.save(files[name], array, allow_pickle=False)
+        stored = []
+        for level, (arrays, facts) in enumerate(subjects):
+            files = {name: os.path.join(folder, f"{name}_{level}.npy") for name in arrays}
+            for name, array in arrays.items():
+                np.save(files[name], array, allow_pickle=False)
+            stored.append((files, facts))
         job = {
-            "arrays": files,
-            "subject": subject,
+            "subjects": stored,
             "cameras": [_plain_camera(camera) for camera in cameras],
             "options": _plain_options(options),
             "limit": limit,

@@ -8,6 +8,7 @@ import numpy as np
 
 from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
+from meshsplats.cameras.framing import SAMPLE
 
 COLOR = "Color"
 """Attribute with RGBA: display values where the image is unlit, linear light where it is lit."""
@@ -15,6 +16,8 @@ NORMAL = "splat_normal"
 """Attribute with the shading normal, in the object's own frame."""
 SPLAT = "splat"
 """Face attribute: index of the splat that each was made from."""
+_VISIBLE = 0.1
+"""Opacity from which a vertex counts as visible."""
 
 
 def make_mesh(
@@ -87,3 +90,18 @@ def far_to_near(vertices: np.ndarray, faces: np.ndarray, world_to_camera: np.nda
     ``vertices`` (v, 3) in the world frame of ``world_to_camera`` (4, 4)."""
     depth = vertices @ world_to_camera[2, :3].astype(np.float32)
     return np.argsort(-depth[faces].sum(axis=1), kind="stable")
+
+
+def world_points(obj: Any) -> np.ndarray:
+    """(k, 3) float64 sample of the visible vertices of ``obj``, in Blender's world."""
+    data = obj.data
+    vertices = np.empty(3 * len(data.vertices), np.float32)
+    data.vertices.foreach_get("co", vertices)
+    points = vertices.reshape(-1, 3).astype(np.float64)
+    if COLOR in data.attributes and len(points):
+        colors = np.empty(4 * len(points), np.float32)
+        data.attributes[COLOR].data.foreach_get("color", colors)
+        points = points[colors[3::4] > _VISIBLE]
+    points = points[:: -(-max(len(points), 1) // SAMPLE)]
+    world = np.array(obj.matrix_world)
+    return points @ world[:3, :3].T + world[:3, 3]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import foreign, frame, materials, meshes, pictures, priors, versions
+from meshsplats.blender.inside import foreign, frame, levels, materials, meshes, pictures, priors, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
@@ -66,6 +67,34 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
     return obj
 
 
+def add_chain(
+    prepared: Sequence[dict[str, Any]], name: str, screen_sizes: Sequence[int], collection: Any
+) -> list[Any]:
+    """New objects for the levels of a chain, the finest first, each in a collection of its own inside a new
+    one called ``name``. All stand where the finest does, and only that is visible (``levels.show``)."""
+    homes = levels.add_collections(name, screen_sizes, collection)
+    origin = prepared[0]["origin"]
+    objs = [add(p | {"origin": origin}, home.name, home) for p, home in zip(prepared, homes, strict=True)]
+    levels.tie(objs)
+    bpy.context.view_layer.objects.active = objs[0]
+    return objs
+
+
+def splat_objects(scene: Any) -> list[Any]:
+    """The splat meshes of ``scene``, hidden ones too."""
+    return [obj for obj in scene.objects if obj.type == "MESH" and LAYERS in obj.data]
+
+
+def count_layers(objs: Iterable[Any]) -> int:
+    """Most layers behind each other of ``objs``; of the levels of a chain, one is shown at a time."""
+    most: dict[tuple[bool, str], int] = {}
+    for obj in objs:
+        chain = levels.chain_of(obj)
+        key = (True, chain.name) if chain is not None else (False, obj.name)
+        most[key] = max(most.get(key, 0), int(obj.data.get(LAYERS, 256)))
+    return sum(most.values())
+
+
 def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
     """Gives ``obj`` another mesh and material; its place, parent, modifiers and name stay."""
     old = obj.data
@@ -90,12 +119,27 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
         data.materials.append(materials.lit(self_shadow=prepared["self_shadow"]))
     else:
         data.materials.append(materials.unlit())
-    data[UP] = mesh.up.tolist()
-    data[ORIGIN] = prepared["origin"].tolist()
-    data[LIT] = prepared["lit"]
-    data[LINEAR] = mesh.blending == "linear"
-    data[LAYERS] = prepared["layers"]
+    mark(
+        data,
+        up=mesh.up,
+        origin=prepared["origin"],
+        lit=prepared["lit"],
+        linear=mesh.blending == "linear",
+        layers=prepared["layers"],
+    )
     return data
+
+
+def mark(
+    data: Any, *, up: np.ndarray, origin: np.ndarray, lit: bool, linear: bool, layers: int
+) -> None:
+    """Stores with the mesh ``data`` the facts that ``as_splat_mesh`` and ``render_settings`` need; ``up`` (3,)
+    and ``origin`` (3,) in the frame of the splats."""
+    data[UP] = np.asarray(up, np.float64).tolist()
+    data[ORIGIN] = np.asarray(origin, np.float64).tolist()
+    data[LIT] = lit
+    data[LINEAR] = linear
+    data[LAYERS] = layers
 
 
 def as_splat_mesh(obj: Any) -> SplatMesh:
@@ -150,7 +194,7 @@ def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions 
     light = light or LightOptions(exposure=0.0)
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
-    layers = sum(int(obj.data.get(LAYERS, 256)) for obj in objs)
+    layers = count_layers(objs)
     linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs)
     limit = bounce_limit(layers)
     if lit:

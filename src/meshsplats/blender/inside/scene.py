@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import frame, materials, meshes, pictures, stage, versions
+from meshsplats.blender.inside import frame, levels, materials, meshes, objects, pictures, stage, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.camera import Camera
@@ -49,6 +49,8 @@ class Subject:
     """(w, 3) float32 stand-in that casts the shadow in EEVEE."""
     caster_faces: np.ndarray | None = None
     """(g, 3) int32."""
+    screen_size: int = 0
+    """Of a level of detail: side in pixels of the images for which it was made."""
     name: str = "Splats"
 
 
@@ -65,28 +67,37 @@ class Built:
 
 
 def build(
-    subject: Subject, cameras: Sequence[Camera], options: SceneOptions, limit: int, *, edges: bool
+    subject: Subject,
+    cameras: Sequence[Camera],
+    options: SceneOptions,
+    limit: int,
+    *,
+    edges: bool,
+    coarser: Sequence[Subject] = (),
 ) -> Built:
-    """An empty file with the subject, its cameras and surroundings, ready to render.
+    """A new file with the subject, its cameras and surroundings, ready to render.
 
-    ``limit`` is that of transparent bounces; ``edges`` as in ``meshes.make_mesh``.
+    Args:
+        limit: that of transparent bounces.
+        edges: as in ``meshes.make_mesh``.
+        coarser: further levels of detail of the subject, hidden at first (``levels.show``).
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     versions.enable_cycles()
     scene = bpy.context.scene
     scene.name = "MeshSplats"
     rotation = frame.to_blender(subject.up)
-    splats = stage.collection("Splats")
-    mesh = meshes.make_mesh(
-        subject.name,
-        subject.vertices,
-        subject.faces,
-        subject.colors,
-        normals=subject.normals,
-        face_splat=subject.face_splat,
-        edges=edges,
-    )
-    obj = meshes.make_object(mesh, subject.name, rotation, splats)
+    if coarser:
+        chain = [subject, *coarser]
+        homes = levels.add_collections(subject.name, [level.screen_size for level in chain], scene.collection)
+        objs = [
+            _add_splats(replace(level, name=home.name), options, rotation, edges, home)
+            for level, home in zip(chain, homes, strict=True)
+        ]
+        levels.tie(objs)
+        obj = objs[0]
+    else:
+        obj = _add_splats(subject, options, rotation, edges, stage.collection("Splats", lasting=True))
     center = rotation @ subject.center
     home = stage.collection("Cameras")
     made = []
@@ -96,30 +107,10 @@ def build(
         made.append(stage.add_camera(camera, camera.name or f"view_{i:04d}", rotation, reach, home))
     light = options.light
     if light is None:
-        mesh.materials.append(materials.unlit())
         behind = np.array(options.background or (0, 0, 0))
         stage.even_world((srgb_to_linear(behind) if subject.linear else behind).tolist())
         pictures.exact_settings(scene, options.engine, linear=subject.linear)
     else:
-        material = materials.lit(
-            self_shadow=subject.self_shadow,
-            roughness=light.roughness,
-            specular=light.specular,
-            smooth=subject.normals is not None,
-        )
-        mesh.materials.append(material)
-        if subject.caster_vertices is not None and subject.caster_faces is not None:
-            caster = meshes.make_plain(
-                f"{subject.name} shadow", subject.caster_vertices, subject.caster_faces
-            )
-            if edges:
-                caster.update(calc_edges=True)
-            caster.materials.append(materials.plain("Shadow", stage.GREY))
-            stand_in = meshes.make_object(caster, caster.name, rotation, splats)
-            stand_in.visible_camera = False
-            stand_in.parent = obj
-            stand_in.matrix_parent_inverse = obj.matrix_world.inverted()
-            obj.visible_shadow = False
         viewer = np.array(made[0].matrix_world.translation) if made else None
         floor = np.array([center[0], center[1], subject.floor])
         surround(floor, subject.radius, light, viewer, options.background)
@@ -143,6 +134,53 @@ def build(
         stage.aim(scene, cameras[0], made[0])
     bpy.context.view_layer.objects.active = obj
     return Built(scene, obj, made, rotation)
+
+
+def _add_splats(
+    subject: Subject, options: SceneOptions, rotation: np.ndarray, edges: bool, home: Any
+) -> Any:
+    """The object of ``subject`` in the collection ``home``, with its material and, for EEVEE's shadows, its
+    stand-in."""
+    mesh = meshes.make_mesh(
+        subject.name,
+        subject.vertices,
+        subject.faces,
+        subject.colors,
+        normals=subject.normals,
+        face_splat=subject.face_splat,
+        edges=edges,
+    )
+    obj = meshes.make_object(mesh, subject.name, rotation, home)
+    light = options.light
+    objects.mark(
+        mesh,
+        up=subject.up,
+        origin=np.zeros(3),
+        lit=light is not None,
+        linear=subject.linear,
+        layers=subject.layers,
+    )
+    if light is None:
+        mesh.materials.append(materials.unlit())
+        return obj
+    material = materials.lit(
+        self_shadow=subject.self_shadow,
+        roughness=light.roughness,
+        specular=light.specular,
+        smooth=subject.normals is not None,
+    )
+    mesh.materials.append(material)
+    if subject.caster_vertices is not None and subject.caster_faces is not None:
+        caster = meshes.make_plain(f"{subject.name} shadow", subject.caster_vertices, subject.caster_faces)
+        if edges:
+            caster.update(calc_edges=True)
+        caster.materials.append(materials.plain("Shadow", stage.GREY))
+        stand_in = meshes.make_object(caster, caster.name, rotation, home)
+        stand_in.visible_camera = False
+        stand_in.parent = obj
+        stand_in.matrix_parent_inverse = obj.matrix_world.inverted()
+        obj.visible_shadow = False
+    return obj
 
 
 def surround(

@@ -9,11 +9,9 @@ import numpy as np
 
 from meshsplats.blender.inside import meshes, objects, scene, stage
 from meshsplats.blender.options import LIGHTS, LightOptions
-from meshsplats.cameras.framing import SAMPLE, scene_bounds, weighted_quantile
+from meshsplats.cameras.framing import scene_bounds, weighted_quantile
 from meshsplats.cameras.trajectories import orbit
 
-_SEEN = 0.1
-"""Opacity from which a vertex counts."""
 _FLOOR = 0.002
 """Share of the vertices that may lie below the ground."""
 UP = (0.0, 0.0, 1.0)
@@ -23,7 +21,7 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
     camera that sees all of them at the scene's resolution; in place of what an earlier call made. Returns the
     light. ValueError if ``objs`` have no vertices that can be seen."""
-    points = np.concatenate([world_points(obj) for obj in objs] or [np.zeros((0, 3))])
+    points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
     light, bounds = LIGHTS[lights], scene_bounds(points)
@@ -42,18 +40,3 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
     objects.render_settings(view, objs, True, light)
     return light
-
-
-def world_points(obj: Any) -> np.ndarray:
-    """(k, 3) float64 some of the vertices of ``obj`` that can be seen, in Blender's world."""
-    data = obj.data
-    vertices = np.empty(3 * len(data.vertices), np.float32)
-    data.vertices.foreach_get("co", vertices)
-    points = vertices.reshape(-1, 3).astype(np.float64)
-    if meshes.COLOR in data.attributes and len(points):
-        colors = np.empty(4 * len(points), np.float32)
-        data.attributes[meshes.COLOR].data.foreach_get("color", colors)
-        points = points[colors[3::4] > _SEEN]
-    points = points[:: -(-max(len(points), 1) // SAMPLE)]
-    world = np.array(obj.matrix_world)
-    return points @ world[:3, :3].T + world[:3, 3]

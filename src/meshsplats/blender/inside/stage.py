@@ -20,10 +20,11 @@ FADES = (1.5, 10.0)
 """From where to where the ground fades, in radii of the subject."""
 
 
-def collection(name: str) -> Any:
-    """A new collection in the scene, marked as made here (``clear``)."""
+def collection(name: str, *, lasting: bool = False) -> Any:
+    """A new collection in the scene; unless ``lasting``, ``clear`` removes it."""
     made = bpy.data.collections.new(name)
-    made[MADE] = True
+    if not lasting:
+        made[MADE] = True
     bpy.context.scene.collection.children.link(made)
     return made
 

@@ -74,8 +74,10 @@ def main(job_path: str) -> None:
     if bpy.app.version < versions.OLDEST:
         raise ValueError(f"Blender 4.2 or newer is needed, this is {bpy.app.version_string}")
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
-    arrays = {name: np.load(file, allow_pickle=False) for name, file in job["arrays"].items()}
-    subject = Subject(**arrays, **job["subject"])
+    subject, *coarser = (
+        Subject(**{name: np.load(file, allow_pickle=False) for name, file in arrays.items()}, **facts)
+        for arrays, facts in job["subjects"]
+    )
     light = job["options"].pop("light")
     if light is not None:
         light["hdri"] = Path(light["hdri"]) if light["hdri"] else None
@@ -95,8 +97,8 @@ def main(job_path: str) -> None:
     start, processor = time.perf_counter(), time.process_time()
     sort = options.engine == "eevee"
     if sort and cameras:
-        subject = _for_painter(subject, cameras[0])
-    built = build(subject, cameras, options, job["limit"], edges=bool(blend))
+        subject, *coarser = (_for_painter(level, cameras[0]) for level in (subject, *coarser))
+    built = build(subject, cameras, options, job["limit"], edges=bool(blend), coarser=coarser)
     tell(
         built=round(time.perf_counter() - start, 3),
         processor=round(time.process_time() - processor, 3),
