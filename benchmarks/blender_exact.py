@@ -110,8 +110,7 @@ def main() -> None:
             warnings.simplefilter("ignore", DataWarning)  # the guitar has more layers than 1024 in places
             files = [[Path(folder) / f"{k}.{kind}" for k in range(len(views))] for kind in ("exr", "png")]
             told = [
-                draw(mesh, views, images=some, options=SceneOptions(threads=asked.threads))
-                for some in files
+                draw(mesh, views, images=some, options=SceneOptions(threads=asked.threads)) for some in files
             ]
             white = np.ones(3)
             for view, exr, png in zip(views, *files, strict=True):

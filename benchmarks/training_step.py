@@ -68,9 +68,7 @@ class Step:
         image = self.draw()
         times.append(time.perf_counter())
         rates = dict(l1_rate=0.6 / self.truth.size, ssim_rate=-0.4 / self.truth.size)
-        compared = compare_images(
-            image.color[None], self.truth, gradient=True, threads=self.threads, **rates
-        )
+        compared = compare_images(image.color[None], self.truth, gradient=True, threads=self.threads, **rates)
         assert compared.gradient is not None
         times.append(time.perf_counter())
         gradients = [np.zeros_like(values) for values in (self.vertices, self.colors)]

@@ -89,8 +89,7 @@ def main() -> None:
                 for i in range(len(cameras))
             ]
             figures = [
-                np.mean([psnr(a, b) for a, b in zip(images, truth, strict=True)])
-                for truth in (exact, splats)
+                np.mean([psnr(a, b) for a, b in zip(images, truth, strict=True)]) for truth in (exact, splats)
             ]
             print(f"| {titles[job['viewer']]} | {job['name']} | {figures[0]:.1f} | {figures[1]:.1f} |")
         best = np.mean([psnr(a, b) for a, b in zip(exact, splats, strict=True)])

@@ -262,7 +262,7 @@ def test_what_blender_says_is_passed_on(program, tmp_path):
 )
 def test_blenders_words_are_understood(text, share, left, capsys):
     """As versions 4.2 and 5.0 print them."""
-    launch.worker.tell_stage(text)
+    launch.worker.report_stage(text)
     said = capsys.readouterr().out
     if share is None:
         assert said == ""

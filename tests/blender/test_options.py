@@ -16,7 +16,7 @@ from meshsplats.blender.options import LIGHTS, check_environment
         (SceneOptions(engine="povray"), "engine must be one of cycles, eevee"),
         (SceneOptions(samples=0), "samples is the side of the sample grid, 1 to 16, got 0"),
         (SceneOptions(samples=17), "1 to 16"),
-        (SceneOptions(light=LightOptions(), samples=70000), "samples a pixel, 1 to 65536"),
+        (SceneOptions(light=LightOptions(), samples=70000), "samples per pixel, 1 to 65536"),
         (SceneOptions(background=(0, 0, 2)), "background must be RGB in"),
         (SceneOptions(threads=0), "threads"),
         (SceneOptions(denoise=True), "denoise is for lit"),

@@ -1,4 +1,4 @@
-"""Blender as a process of its own: a crash, its chatter and its memory stay out of ours."""
+"""Runs Blender as a process of its own, apart from our memory and output, and safe from its crashes."""
 
 from __future__ import annotations
 
@@ -41,29 +41,31 @@ _LIBRARIES = (
 
 @dataclass(frozen=True)
 class Progress:
-    """How far Blender is."""
+    """Progress of a Blender job."""
 
     done: int
-    """Images that are finished."""
+    """Images finished."""
     images: int
-    """Those wanted."""
+    """Images in all."""
     share: float
-    """Of the image at hand, 0 to 1: the samples taken."""
+    """Share of the samples of the current image, 0 to 1."""
     stage: str
-    """What Blender is doing, in its words."""
+    """Current step, in Blender's words."""
     left: str | None
-    """Time that Blender thinks the image at hand still takes, where it knows."""
+    """Blender's estimate of the time left for the current image, if any."""
 
 
 class BlenderError(ChildProcessError):
-    """Blender could not do its job; the message holds what it said."""
+    """Blender failed; the message quotes it."""
 
 
 def command(executable: Path | None) -> list[str]:
     """The command line that runs the worker, without its argument.
 
-    Raises MissingDependencyError if there is no bpy (and no executable was named), FileNotFoundError or
-    ValueError for an executable that is missing, no Blender, or too old.
+    Raises:
+        MissingDependencyError: no bpy, and no executable given.
+        FileNotFoundError: the executable is missing.
+        ValueError: the executable is not Blender, or too old.
     """
     if executable is None:
         if importlib.util.find_spec("bpy") is None:
@@ -76,10 +78,10 @@ def command(executable: Path | None) -> list[str]:
         answer = subprocess.run([found, "--version"], capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ValueError(f"{found}: cannot be run as Blender ({error})") from None
-    told = answer.stdout or answer.stderr  # the latter where libraries are missing
-    version = re.search(r"Blender (\d+)\.(\d+)", told)
+    text = answer.stdout or answer.stderr  # the latter where libraries are missing
+    version = re.search(r"Blender (\d+)\.(\d+)", text)
     if version is None:
-        raise ValueError(f"{found}: not Blender; asked for its version, it says {told.strip()[:200]!r}")
+        raise ValueError(f"{found}: not Blender; asked for its version, it says {text.strip()[:200]!r}")
     if (int(version[1]), int(version[2])) < OLDEST:
         raise ValueError(f"{found}: Blender {version[1]}.{version[2]} is too old; 4.2 or newer is needed")
     flags = ["--background", "--factory-startup", "--python-exit-code", "1", "--python"]
@@ -151,8 +153,8 @@ def run_job(
 
 @contextmanager
 def _scratch() -> Iterator[tuple[Path, int]]:
-    """A temporary folder and a descriptor of its lock, by which others know that it is in use. Those that
-    nobody uses any more, left by processes that were killed together with their guards, are removed."""
+    """A temporary folder and the descriptor of its lock, which marks it as in use. Removes folders out of use,
+    left by processes that were killed together with their guards."""
     prefix = "meshsplats-blender-"
     for old in Path(tempfile.gettempdir()).glob(f"{prefix}*/lock"):
         with suppress(OSError):
@@ -163,7 +165,7 @@ def _scratch() -> Iterator[tuple[Path, int]]:
     while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix))
         descriptor = None
-        with suppress(FileNotFoundError):  # someone has just tidied up
+        with suppress(FileNotFoundError):  # another process has just removed it
             descriptor = try_lock(folder / "lock")
         if descriptor is not None:
             break
@@ -185,10 +187,10 @@ def _watch(
     arguments = plan["command"]
     environment = dict(os.environ)
     if arguments[1] == "-m":
-        # The worker must be this very package, wherever this process found it.
-        places = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
-    # Blender's own temporary files go with ours.
+        # The worker must import this very package, wherever this process found it.
+        paths = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+    # Blender's own temporary files go into our folder.
     environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
     result: dict[str, Any] = {"image_seconds": [], "image_processor_seconds": []}
     said: deque[str] = deque(maxlen=40)
@@ -201,7 +203,7 @@ def _watch(
         env=environment,
         text=True,
         errors="replace",
-        start_new_session=True,  # what ends our group must leave the guard to tidy up
+        start_new_session=True,  # the guard must survive our process group to clean up
         pass_fds=() if sys.platform == "win32" else (lock,),
     )
     at = Progress(0, images, 0.0, "starting", None)
@@ -268,7 +270,7 @@ def _post_mortem(status: int, said: Sequence[str], options: SceneOptions) -> str
 
 
 def _check_graphics() -> None:
-    """Raises MissingDependencyError where EEVEE cannot start for want of libraries (Linux)."""
+    """Raises MissingDependencyError where libraries that EEVEE needs are missing (Linux)."""
     if not sys.platform.startswith("linux"):
         return
     import ctypes

@@ -154,7 +154,9 @@ class Blender:
             self.output.mkdir(exist_ok=True)
         with _shown(len(pictures)) as show:
             result = draw(
-                LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels]) if chain else mesh,
+                LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
+                if chain
+                else mesh,
                 cameras,
                 images=pictures,
                 blend=blend,

@@ -1,4 +1,4 @@
-"""Splat meshes as objects of an open Blender file: what the extension does."""
+"""Splat meshes as objects of an open Blender file, for the extension."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ LIT = "meshsplats_lit"
 LINEAR = "meshsplats_linear"
 """Property of the mesh data: whether the mesh was made for blending in linear light."""
 UP = "meshsplats_up"
-"""Property of the mesh data: what points up in its own frame."""
+"""Property of the mesh data: its up direction, in its own frame."""
 ORIGIN = "meshsplats_origin"
-"""Property of the mesh data: where the object's origin lies in the mesh's own frame: under the subject."""
+"""Property of the mesh data: the object's origin, under the subject, in the mesh's own frame."""
 LAYERS = "meshsplats_layers"
 """Property of the mesh data: most layers behind each other."""
 
 
 def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
-    """All that takes time and does not touch Blender: may run in another thread. Coplanar layers of a mesh
-    prior are set apart, as exports are; a filter is made part of the triangles, for images of the whole
-    subject."""
+    """Everything that takes time and does not touch Blender, so that it may run in another thread. Coplanar
+    layers of a mesh prior are separated, as in exports; a filter is baked for images of the whole subject."""
     if mesh.binding is not None and mesh.normals is not None:
         prior = MeshPrior(mesh)
         mesh = prior.pose(lift=prior.export_lift)
@@ -43,24 +42,24 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
     if lit:
         made, arrays["self_shadow"] = lit_arrays(mesh)
         arrays |= made
-    # What hangs on a base keeps the base's frame.
+    # Splats on a base keep the base's frame.
     origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
     return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh), "origin": origin}
 
 
 def foot(mesh: SplatMesh) -> np.ndarray:
-    """(3,) float64 the point under the middle of the subject of ``mesh``, at the height of its lowest part;
-    frame of the mesh."""
+    """(3,) float64 point under the centre of the subject of ``mesh``, at the height of its lowest part; frame
+    of the mesh."""
     bounds, up = scene_bounds(mesh), mesh.up.astype(np.float64)
     return bounds.center + (lowest(bounds, up) - bounds.center @ up) * up
 
 
 def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
-    """A new object in ``collection``, upright in Blender's frame, with its material; that of a mesh prior
-    hangs on an object of its base, which it follows. The object's origin lies under the subject."""
+    """A new object in ``collection``, upright in Blender's frame, with its material. Its origin lies under the
+    subject. The splats of a mesh prior are a child of a new object of their base, which they follow."""
     rotation = frame.to_blender(prepared["mesh"].up)
     obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
-    obj.location = (rotation @ prepared["origin"]).tolist()  # where the file has it
+    obj.location = (rotation @ prepared["origin"]).tolist()
     if prepared["mesh"].binding is not None:
         priors.give_base(obj, prepared["mesh"].binding, collection)
     bpy.context.view_layer.objects.active = obj
@@ -96,7 +95,7 @@ def count_layers(objs: Iterable[Any]) -> int:
 
 
 def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
-    """Gives ``obj`` another mesh and material; its place, parent, modifiers and name stay."""
+    """Gives ``obj`` another mesh and material; its transform, parent, modifiers and name stay."""
     old = obj.data
     obj.data = _data(prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}, old.name)
     if old.users == 0:
@@ -130,9 +129,7 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
     return data
 
 
-def mark(
-    data: Any, *, up: np.ndarray, origin: np.ndarray, lit: bool, linear: bool, layers: int
-) -> None:
+def mark(data: Any, *, up: np.ndarray, origin: np.ndarray, lit: bool, linear: bool, layers: int) -> None:
     """Stores with the mesh ``data`` the facts that ``as_splat_mesh`` and ``render_settings`` need; ``up`` (3,)
     and ``origin`` (3,) in the frame of the splats."""
     data[UP] = np.asarray(up, np.float64).tolist()
@@ -143,9 +140,10 @@ def mark(
 
 
 def as_splat_mesh(obj: Any) -> SplatMesh:
-    """The unlit mesh that ``obj`` was made from, frame and colours as in its file.
+    """The unlit mesh that ``obj`` was made from, in the frame and colours of its file.
 
-    Raises ValueError for an object that is not a mesh of triangles with the colours of this project.
+    Raises:
+        ValueError: not a mesh of triangles that MeshSplats made.
     """
     data: Any = getattr(obj, "data", None)
     if obj is None or obj.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
@@ -187,10 +185,15 @@ def as_splat_mesh(obj: Any) -> SplatMesh:
 
 
 def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions | None = None) -> int:
-    """Sets the scene up for ``objs``: engine settings, colour management and the limit on transparent
-    bounces, which is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor
-    EEVEE). One scene cannot be right for both unlit meshes of display and of linear blending: where there are
-    both, it is for the former. Lit images are denoised, and shown as ``light`` exposes them."""
+    """Sets up engine, colour management and bounce limits of the scene for ``objs``.
+
+    Keeps the engine, or chooses Cycles where it is neither Cycles nor EEVEE. A scene cannot be right for
+    unlit meshes of both display and linear blending: display wins. Lit images are denoised, with the exposure
+    of ``light``.
+
+    Returns:
+        The limit on transparent bounces.
+    """
     light = light or LightOptions(exposure=0.0)
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
@@ -206,7 +209,7 @@ def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions 
 
 
 def clash(objs: list[Any], lit: bool) -> str:
-    """What cannot be right in one unlit scene of ``objs``, or ''."""
+    """Message if ``objs`` cannot all be right in one unlit scene, else ''."""
     kinds = {bool(obj.data.get(LINEAR)) for obj in objs}
     if lit or len(kinds) < 2:
         return ""
@@ -214,9 +217,10 @@ def clash(objs: list[Any], lit: bool) -> str:
 
 
 def dress(obj: Any, lit: bool) -> None:
-    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) what a mesh of our own has: display
+    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) our colours and material: display
     colours for the exact image, or linear ones, smoothed normals and a lit material.
 
-    Raises ValueError if the object has no colours or other faces than triangles.
+    Raises:
+        ValueError: the object has no colours, or faces that are not triangles.
     """
     replace_mesh(obj, prepare(foreign.splat_mesh(obj), lit))

@@ -1,8 +1,8 @@
 """Mesh priors in an open Blender file: the base as an object of its own, and splats that follow it.
 
-The splats are a child of the base, so they go where it goes; when its vertices move against each other (edit
-mode, shape keys, an armature, cloth, soft bodies), ``follow`` computes theirs from them, as does
-``MeshPrior.pose``. The extension calls it after every change and on every frame.
+The splats are a child of the base, so they move with it. When the base deforms (edit mode, shape keys, an
+armature, cloth, soft bodies), ``follow`` computes their vertices from its own, as ``MeshPrior.pose`` does. The
+extension calls it after every change and on every frame.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from meshsplats.blender.inside import meshes, versions
 from meshsplats.blender.inside.host import bpy
 
 BASE = "meshsplats_base"
-"""Property of the splats' object: the object of their base."""
+"""Property of the splats' object: the object of its base."""
 PROBLEM = "meshsplats_problem"
-"""Property of the splats' object: why it could not follow its base; empty if it did."""
+"""Property of the splats' object: why it could not follow its base; empty if it could."""
 LIFT = "meshsplats_lift"
 """Property of the mesh data: distance between layers."""
 FACE, WEIGHTS, LAYER = "splat_base_face", "splat_base_weights", "splat_layer"
@@ -27,7 +27,7 @@ FACE, WEIGHTS, LAYER = "splat_base_face", "splat_base_weights", "splat_layer"
 
 
 def store(data: Any, binding: Binding) -> None:
-    """Keeps ``binding`` with the bpy mesh ``data`` of its splats, but for the base, which is an object."""
+    """Stores ``binding`` with the bpy mesh ``data`` of its splats, except the base, which is an object."""
     for name, kind, key, values in [
         (FACE, "INT", "value", binding.vertex_face),
         (WEIGHTS, "FLOAT_VECTOR", "vector", binding.weights),
@@ -39,8 +39,8 @@ def store(data: Any, binding: Binding) -> None:
 
 
 def give_base(obj: Any, binding: Binding, collection: Any) -> Any:
-    """Makes the base of ``obj``, the object of its splats, as an object in ``collection``: drawn as wire,
-    left out of images, at the splats' place, which hang on it from now on. Returns it."""
+    """Makes the base of ``obj``, the object of the splats, as an object in ``collection``: drawn as wire, not
+    rendered, with the transform of the splats, which become its child. Returns it."""
     data = meshes.make_plain(f"{obj.name} base", binding.base_vertices, binding.base_faces)
     data.update(calc_edges=True)
     base = bpy.data.objects.new(f"{obj.name} base", data)
@@ -57,7 +57,7 @@ def give_base(obj: Any, binding: Binding, collection: Any) -> Any:
 
 
 def base_of(obj: Any) -> Any:
-    """The object of the base that ``obj`` follows; None if it follows none, or that has been deleted."""
+    """The object of the base that ``obj`` follows; None if there is none, or it was deleted."""
     base = obj.get(BASE) if obj is not None and obj.type == "MESH" else None
     if base is None or base.type != "MESH" or FACE not in obj.data.attributes:
         return None
@@ -65,9 +65,10 @@ def base_of(obj: Any) -> Any:
 
 
 def binding_of(obj: Any) -> Binding:
-    """The binding of ``obj`` to its base as that stands without modifiers.
+    """The binding of ``obj`` to its base without modifiers.
 
-    Raises ValueError if the base has other vertices or faces than the splats were bound to.
+    Raises:
+        ValueError: the base does not have the vertices or faces that the splats were bound to.
     """
     base = base_of(obj)
     if base is None:
@@ -89,8 +90,8 @@ def binding_of(obj: Any) -> Binding:
 
 
 def follow(objs: Iterable[Any], depsgraph: Any) -> int:
-    """Moves the splats ``objs`` to where their bases are in ``depsgraph``, modifiers and simulations done;
-    returns how many. What went wrong stands in the object's property ``PROBLEM``."""
+    """Moves the splats ``objs`` with their bases as evaluated in ``depsgraph``, with modifiers and
+    simulations. Returns how many moved; the property ``PROBLEM`` of the others says why not."""
     moved = 0
     for obj in objs:
         problem = ""
@@ -111,15 +112,15 @@ def followers(scene: Any) -> list[Any]:
 
 def _move(obj: Any, depsgraph: Any) -> None:
     binding, base = binding_of(obj), base_of(obj)
-    places = _evaluated(base, depsgraph)
-    if len(places) != len(binding.base_vertices):
+    vertices = _evaluated(base, depsgraph)
+    if len(vertices) != len(binding.base_vertices):
         raise ValueError(
-            f"the base has {len(binding.base_vertices):,} vertices, with its modifiers {len(places):,}:"
+            f"the base has {len(binding.base_vertices):,} vertices, with its modifiers {len(vertices):,}:"
             " splats follow modifiers that move vertices, not those that add some"
         )
-    if not np.isfinite(places).all():
-        raise ValueError("the base has vertices at no finite place")
-    moved = binding.moved(places, binding.lift)
+    if not np.isfinite(vertices).all():
+        raise ValueError("the base has vertices that are not finite")
+    moved = binding.moved(vertices, binding.lift)
     data = obj.data
     versions.set_positions(data, moved.positions())
     if meshes.NORMAL in data.attributes:
@@ -130,8 +131,8 @@ def _move(obj: Any, depsgraph: Any) -> None:
 
 
 def _evaluated(base: Any, depsgraph: Any) -> np.ndarray:
-    """(n, 3) float32 vertices of the object ``base`` in its own frame, as it is drawn."""
-    if base.mode == "EDIT":  # what is being edited has no evaluated mesh yet
+    """(n, 3) float32 vertices of the object ``base`` as displayed, in its own frame."""
+    if base.mode == "EDIT":  # no evaluated mesh while it is edited
         import bmesh
 
         edited = bmesh.from_edit_mesh(base.data)
@@ -145,18 +146,18 @@ def _evaluated(base: Any, depsgraph: Any) -> np.ndarray:
 
 
 def _coordinates(mesh: Any) -> np.ndarray:
-    places = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", places)
-    return places.reshape(-1, 3)
+    coordinates = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", coordinates)
+    return coordinates.reshape(-1, 3)
 
 
 def after_update(scene: Any, depsgraph: Any) -> None:
-    """Follows the bases whose shape has changed, a handler of ``depsgraph_update_post``. Splats that are
-    moved change too, but are no bases."""
-    waiting = followers(scene)
-    if waiting:
+    """Follows the bases whose shape has changed, a handler of ``depsgraph_update_post``. Moved splats change
+    too, but are no bases."""
+    following = followers(scene)
+    if following:
         changed = {update.id.original for update in depsgraph.updates if update.is_updated_geometry}
-        follow([t for t in waiting if base_of(t) in changed or base_of(t).data in changed], depsgraph)
+        follow([t for t in following if base_of(t) in changed or base_of(t).data in changed], depsgraph)
 
 
 def after_frame(scene: Any, depsgraph: Any) -> None:

@@ -1,4 +1,4 @@
-"""A whole Blender scene of a mesh: what the command line renders and saves."""
+"""A whole Blender scene of a mesh, as the command line renders and saves it."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from meshsplats.colors import srgb_to_linear
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The mesh as Blender gets it, and what was found out about it."""
+    """The mesh as Blender gets it, and its bounds."""
 
     vertices: np.ndarray
     """(v, 3) float32, world frame of the splats."""
     faces: np.ndarray
     """(f, 3) int32."""
     colors: np.ndarray
-    """(v, 4) float32: linear light where lit, else as composited."""
+    """(v, 4) float32: linear light if lit, else as composited."""
     up: np.ndarray
-    """(3,) direction that points up in the world frame."""
+    """(3,) up direction in the world frame."""
     center: np.ndarray
-    """(3,) middle of the subject, world frame."""
+    """(3,) centre of the subject, world frame."""
     radius: float
-    """Distance from there within which most of it lies, scene units."""
+    """Distance from ``center`` within which most of it lies, scene units."""
     floor: float
     """Height of its lowest part along ``up``, scene units."""
     reach: float
@@ -40,9 +40,9 @@ class Subject:
     self_shadow: float
     """Distance within which layers do not shade each other, scene units."""
     linear: bool = False
-    """Whether the mesh was made for blending in linear light: unlit colours are linear light then, too."""
+    """Whether the mesh was made for blending in linear light: then unlit colours are linear light, too."""
     normals: np.ndarray | None = None
-    """(v, 3) float32 unit shading normals, where lit."""
+    """(v, 3) float32 unit shading normals, if lit."""
     face_splat: np.ndarray | None = None
     """(f,) int32."""
     caster_vertices: np.ndarray | None = None
@@ -56,7 +56,7 @@ class Subject:
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """What was made."""
+    """A scene that was built."""
 
     scene: Any
     obj: Any
@@ -107,8 +107,8 @@ def build(
         made.append(stage.add_camera(camera, camera.name or f"view_{i:04d}", rotation, reach, home))
     light = options.light
     if light is None:
-        behind = np.array(options.background or (0, 0, 0))
-        stage.even_world((srgb_to_linear(behind) if subject.linear else behind).tolist())
+        background = np.array(options.background or (0, 0, 0))
+        stage.even_world((srgb_to_linear(background) if subject.linear else background).tolist())
         pictures.exact_settings(scene, options.engine, linear=subject.linear)
     else:
         viewer = np.array(made[0].matrix_world.translation) if made else None
@@ -136,9 +136,7 @@ def build(
     return Built(scene, obj, made, rotation)
 
 
-def _add_splats(
-    subject: Subject, options: SceneOptions, rotation: np.ndarray, edges: bool, home: Any
-) -> Any:
+def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, edges: bool, home: Any) -> Any:
     """The object of ``subject`` in the collection ``home``, with its material and, for EEVEE's shadows, its
     stand-in."""
     mesh = meshes.make_mesh(
@@ -190,8 +188,8 @@ def surround(
     viewer: np.ndarray | None,
     background: Sequence[float] | None,
 ) -> None:
-    """Sun, world, ground, mirror and glass round a subject of this ``radius`` that stands at ``floor`` (3,),
-    placed for someone at ``viewer`` (3,); Blender's frame. ``background``: display RGB that cameras see."""
+    """Adds sun, world, ground, mirror and glass around a subject of ``radius`` that stands at ``floor`` (3,),
+    placed for a viewer at ``viewer`` (3,); Blender's frame. ``background``: display RGB that cameras see."""
     if light.sun_strength > 0:
         direction = frame.sun_direction(*light.sun)
         home = stage.collection("Lights")
@@ -205,7 +203,7 @@ def surround(
     else:
         seen = None
         if background is not None:
-            # The background is shown as it was asked for, however images are exposed.
+            # The displayed background does not depend on the exposure.
             seen = (srgb_to_linear(np.array(background)) / 2**light.exposure).tolist()
         stage.even_world([light.sky * part for part in light.sky_color], seen)
     home = stage.collection("Surroundings")
@@ -218,18 +216,18 @@ def surround(
             towards = level / np.linalg.norm(level)
     right = np.array([-towards[1], towards[0], 0.0])
     if light.mirror:
-        # A little to the left and turned to the viewer, so that the back of the subject shows in it.
-        place = floor - 1.5 * radius * towards - 0.7 * radius * right
+        # A little to the left and turned to the viewer, so that it shows the back of the subject.
+        position = floor - 1.5 * radius * towards - 0.7 * radius * right
         facing = towards + 0.45 * right
-        stage.add_mirror(place, facing / np.linalg.norm(facing), 2.6 * radius, 2.2 * radius, home)
+        stage.add_mirror(position, facing / np.linalg.norm(facing), 2.6 * radius, 2.2 * radius, home)
     if light.glass:
         size = 0.35 * radius
-        place = floor + 0.9 * radius * towards + 0.95 * radius * right + [0, 0, 1.001 * size]
-        stage.add_glass_ball(place, size, home)
+        position = floor + 0.9 * radius * towards + 0.95 * radius * right + [0, 0, 1.001 * size]
+        stage.add_glass_ball(position, size, home)
 
 
 def _timeline(scene: Any, cameras: Sequence[Any]) -> None:
-    """One frame a camera, so that the timeline steps through the views."""
+    """One frame per camera, so that the timeline steps through the views."""
     scene.frame_start, scene.frame_end = 0, max(len(cameras) - 1, 0)
     if len(cameras) > 1:
         for i, camera in enumerate(cameras):

@@ -1,4 +1,4 @@
-"""Sun, sky, ground and a camera round splat meshes in an open Blender file, as the command line sets them
+"""Sun, sky, ground and a camera around splat meshes in an open Blender file, as the command line sets them
 up."""
 
 from __future__ import annotations
@@ -19,8 +19,14 @@ UP = (0.0, 0.0, 1.0)
 
 def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
     """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
-    camera that sees all of them at the scene's resolution; in place of what an earlier call made. Returns the
-    light. ValueError if ``objs`` have no vertices that can be seen."""
+    camera that sees all of them at the scene's resolution. Replaces those of an earlier call.
+
+    Returns:
+        The light.
+
+    Raises:
+        ValueError: ``objs`` have no visible vertices.
+    """
     points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")

@@ -1,5 +1,5 @@
-"""What surrounds the mesh in Blender: cameras, sun, sky, ground, mirror, glass ball, each in a named
-collection."""
+"""The surroundings of the mesh in Blender: cameras, sun, sky, ground, mirror and glass ball, in named
+collections."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GREY = (0.6, 0.6, 0.6)
 MADE = "meshsplats_stage"
 """Property of the collections that were made here."""
 FADES = (1.5, 10.0)
-"""From where to where the ground fades, in radii of the subject."""
+"""Distances between which the ground fades, in radii of the subject."""
 
 
 def collection(name: str, *, lasting: bool = False) -> Any:
@@ -30,7 +30,7 @@ def collection(name: str, *, lasting: bool = False) -> Any:
 
 
 def clear() -> None:
-    """Removes the collections that were made here from the scene, with all that is in them."""
+    """Removes the collections made here from the scene, with everything in them."""
     for old in [c for c in bpy.context.scene.collection.children_recursive if c.get(MADE)]:
         for obj in list(old.objects):
             bpy.data.objects.remove(obj)
@@ -38,8 +38,8 @@ def clear() -> None:
 
 
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
-    """A Blender camera like ``camera``; what is farther than ``reach`` is cut off. Its pixel aspect is the
-    scene's: see ``aim``."""
+    """A Blender camera like ``camera`` that clips beyond ``reach``. The pixel aspect belongs to the scene: see
+    ``aim``."""
     from mathutils import Matrix
 
     data = bpy.data.cameras.new(name)
@@ -57,7 +57,7 @@ def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, ho
 
 
 def aim(scene: Any, camera: Camera, obj: Any, factor: int = 1) -> None:
-    """Renders are taken by ``obj``, the Blender camera of ``camera``, at ``factor`` times its pixels."""
+    """Makes ``obj``, the Blender camera of ``camera``, the active one, at ``factor`` times its resolution."""
     settings = frame.lens(camera)
     scene.camera = obj
     scene.render.resolution_x = camera.width * factor
@@ -144,9 +144,8 @@ def environment_world(path: str, strength: float, rotation: float) -> Any:
 
 
 def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> Any:
-    """A level square at ``center`` (3,) under a subject of this ``radius``, a hundred times as large. It
-    fades into what is behind it, so that no horizon is seen; a ``catcher`` is seen only where shadows
-    fall."""
+    """A level square at ``center`` (3,) under a subject of ``radius``, a hundred times as large. It fades into
+    the background, so that there is no horizon; a ``catcher`` is visible only where shadows fall."""
     reach = 100 * radius
     corners = [(-reach, -reach, 0), (reach, -reach, 0), (reach, reach, 0), (-reach, reach, 0)]
     obj = _faces("Ground", corners, [(0, 1, 2, 3)], home)
@@ -162,8 +161,8 @@ def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> A
 
 
 def add_mirror(center: np.ndarray, facing: np.ndarray, width: float, height: float, home: Any) -> Any:
-    """An upright mirror, its lower edge's middle at ``center`` (3,), that faces the level direction
-    ``facing``."""
+    """An upright mirror that faces the horizontal direction ``facing`` (3,); ``center`` (3,) is the middle of
+    its lower edge."""
     corners = [(-width / 2, 0, 0), (width / 2, 0, 0), (width / 2, 0, height), (-width / 2, 0, height)]
     obj = _faces("Mirror", corners, [(0, 1, 2, 3)], home)
     obj.location = center.tolist()

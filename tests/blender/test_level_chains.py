@@ -42,7 +42,10 @@ def test_the_folder_that_the_command_writes_is_a_chain(tmp_path):
         ('{"levels": []}', "expected a table of levels"),
         ('{"levels": [3]}', "level 0: expected the name of a file beside it, got None"),
         ('{"levels": [{"file": "../a.npz", "screen_size": 8}]}', "beside it, got '../a.npz'"),
-        ('{"levels": [{"file": "a.npz", "screen_size": 0}]}', "screen_size must be a number of pixels, got 0"),
+        (
+            '{"levels": [{"file": "a.npz", "screen_size": 0}]}',
+            "screen_size must be a number of pixels, got 0",
+        ),
         ('{"levels": [{"file": "a.npz"}]}', "screen_size must be a number of pixels, got None"),
     ],
 )
