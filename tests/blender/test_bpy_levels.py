@@ -1,5 +1,5 @@
 # ruff: noqa: E402
-"""Levels of detail in Blender: a collection for each, one visible at a time, chosen by hand or by the camera."""
+"""Levels of detail in Blender: a collection for each, one visible, chosen by hand or by the camera."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_selection_passes_to_the_level_that_is_shown(chain, scene):
 
 
 def test_layers_of_levels_do_not_add_up(chain, scene):
-    found, objs = imported(chain, scene)
+    _, objs = imported(chain, scene)
     most = max(obj.data[objects.LAYERS] for obj in objs)
     assert objects.count_layers(objects.splat_objects(scene)) == most
     other = objects.add(objects.prepare(chain.meshes[2], False), "other", scene.collection)

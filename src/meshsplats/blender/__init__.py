@@ -101,7 +101,7 @@ def draw(
         raise ValueError(f"{len(targets)} images for {len(cameras)} cameras: expected one per camera")
     chain = mesh if isinstance(mesh, LevelMeshes) else LevelMeshes("Splats", (mesh,), (0,))
     if targets and len(chain.meshes) > 1:
-        raise ValueError("a chain of levels of detail makes a .blend; for images, give one of its meshes")
+        raise ValueError("a chain of levels of detail makes a .blend; for images, give one mesh of it")
     if any(len(level.faces) == 0 for level in chain.meshes):
         raise ValueError("the mesh has no triangles: there is nothing to draw")
     launch.command(None if executable is None else Path(executable))  # fail before the work

@@ -153,8 +153,8 @@ def run_job(
 
 @contextmanager
 def _scratch() -> Iterator[tuple[Path, int]]:
-    """A temporary folder and the descriptor of its lock, which marks it as in use. Removes folders out of use,
-    left by processes that were killed together with their guards."""
+    """A temporary folder and the descriptor of its lock, which marks it as in use. Removes folders out of
+    use, left by processes that were killed together with their guards."""
     prefix = "meshsplats-blender-"
     for old in Path(tempfile.gettempdir()).glob(f"{prefix}*/lock"):
         with suppress(OSError):

@@ -175,7 +175,7 @@ class Blender:
             return None
         if suffix != ".blend":
             raise UsageError(
-                f"{self.input}: a chain of levels of detail makes a .blend; for images, give one of its meshes"
+                f"{self.input}: a chain of levels of detail makes a .blend; for images, give one mesh of it"
             )
         return read_chain(self.input)
 

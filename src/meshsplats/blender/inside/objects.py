@@ -55,8 +55,8 @@ def foot(mesh: SplatMesh) -> np.ndarray:
 
 
 def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
-    """A new object in ``collection``, upright in Blender's frame, with its material. Its origin lies under the
-    subject. The splats of a mesh prior are a child of a new object of their base, which they follow."""
+    """A new object in ``collection``, upright in Blender's frame, with its material. Its origin lies under
+    the subject. The splats of a mesh prior are a child of a new object of their base, which they follow."""
     rotation = frame.to_blender(prepared["mesh"].up)
     obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
     obj.location = (rotation @ prepared["origin"]).tolist()
@@ -130,8 +130,8 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
 
 
 def mark(data: Any, *, up: np.ndarray, origin: np.ndarray, lit: bool, linear: bool, layers: int) -> None:
-    """Stores with the mesh ``data`` the facts that ``as_splat_mesh`` and ``render_settings`` need; ``up`` (3,)
-    and ``origin`` (3,) in the frame of the splats."""
+    """Stores with the mesh ``data`` the facts that ``as_splat_mesh`` and ``render_settings`` need; ``up``
+    (3,) and ``origin`` (3,) in the frame of the splats."""
     data[UP] = np.asarray(up, np.float64).tolist()
     data[ORIGIN] = np.asarray(origin, np.float64).tolist()
     data[LIT] = lit

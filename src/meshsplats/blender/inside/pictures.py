@@ -16,8 +16,8 @@ from meshsplats.blender.inside.host import bpy
 
 
 def exact_settings(scene: Any, engine: str, *, linear: bool = False) -> None:
-    """Settings that render colours unchanged: no dither, one sample at each pixel's centre, no view transform.
-    Colours that are ``linear`` light are encoded for display (sRGB)."""
+    """Settings that render colours unchanged: no dither, one sample at each pixel's centre, no view
+    transform. Colours that are ``linear`` light are encoded for display (sRGB)."""
     _common(scene, engine, "Standard" if linear else "Raw")
     cycles = scene.cycles
     cycles.samples = 1

@@ -1,8 +1,8 @@
 """Mesh priors in an open Blender file: the base as an object of its own, and splats that follow it.
 
 The splats are a child of the base, so they move with it. When the base deforms (edit mode, shape keys, an
-armature, cloth, soft bodies), ``follow`` computes their vertices from its own, as ``MeshPrior.pose`` does. The
-extension calls it after every change and on every frame.
+armature, cloth, soft bodies), ``follow`` computes their vertices from its own, as ``MeshPrior.pose`` does.
+The extension calls it after every change and on every frame.
 """
 
 from __future__ import annotations

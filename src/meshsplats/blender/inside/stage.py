@@ -38,8 +38,8 @@ def clear() -> None:
 
 
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
-    """A Blender camera like ``camera`` that clips beyond ``reach``. The pixel aspect belongs to the scene: see
-    ``aim``."""
+    """A Blender camera like ``camera`` that clips beyond ``reach``. The pixel aspect belongs to the scene:
+    see ``aim``."""
     from mathutils import Matrix
 
     data = bpy.data.cameras.new(name)
@@ -144,8 +144,8 @@ def environment_world(path: str, strength: float, rotation: float) -> Any:
 
 
 def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> Any:
-    """A level square at ``center`` (3,) under a subject of ``radius``, a hundred times as large. It fades into
-    the background, so that there is no horizon; a ``catcher`` is visible only where shadows fall."""
+    """A level square at ``center`` (3,) under a subject of ``radius``, a hundred times as large. It fades
+    into the background, so that there is no horizon; a ``catcher`` is visible only where shadows fall."""
     reach = 100 * radius
     corners = [(-reach, -reach, 0), (reach, -reach, 0), (reach, reach, 0), (-reach, reach, 0)]
     obj = _faces("Ground", corners, [(0, 1, 2, 3)], home)
