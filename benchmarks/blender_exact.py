@@ -4,10 +4,9 @@
 
 Each scene of the data folder is converted with default settings and drawn by two of its standard cameras and
 by a lens with the principal point off the centre and fx different from fy; --mesh draws finished meshes
-instead. Prints a Markdown table: PSNR of the .exr images, of both rounded to 8 bits, and of the .png
-images, encoded for display. --times prints what one more image of a scene takes, in
-seconds by the clock: Cycles' share of a run with more views than another, and ``render`` with 1 sample a
-pixel and all threads.
+instead. Prints a Markdown table: PSNR of the .exr images, of both rounded to 8 bits, and of the .png images,
+encoded for display. --times prints the wall time of one more image of a scene, in seconds: by Cycles, from
+runs with more and with fewer views, and by ``render`` with 1 sample per pixel and all threads.
 """
 
 from __future__ import annotations
@@ -60,9 +59,9 @@ def times(data: Path, scale: float, more: int = 3) -> None:
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)
             files = [Path(folder) / f"{k}.exr" for k in range(len(views))]
-            for number in (1, 1 + more):  # the first also loads what Blender loads once
-                taken = seconds(partial(draw, mesh, views[:number], images=files[:number]))
-                if number == 1:
+            for count in (1, 1 + more):  # the first also pays for what Blender loads once
+                taken = seconds(partial(draw, mesh, views[:count], images=files[:count]))
+                if count == 1:
                     one = seconds(partial(draw, mesh, views[:1], images=files[:1]))
         cycles = (taken - one) / more
         ours = statistics.mean(
@@ -109,7 +108,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # the guitar has more layers than 1024 in places
             files = [[Path(folder) / f"{k}.{kind}" for k in range(len(views))] for kind in ("exr", "png")]
-            told = [
+            results = [
                 draw(mesh, views, images=some, options=SceneOptions(threads=asked.threads)) for some in files
             ]
             white = np.ones(3)
@@ -117,7 +116,7 @@ def main() -> None:
                 expected = render(mesh, view, background=white, threads=asked.threads).color
                 drawn, shown = read_pixels(exr)[..., :3], load_png(png) / 255
                 print(
-                    f"| {name} | {len(mesh.faces):,} | {told[0]['layers']} | {view.name} |"
+                    f"| {name} | {len(mesh.faces):,} | {results[0]['layers']} | {view.name} |"
                     f" {psnr(drawn, expected):.1f} dB | {psnr(rounded(drawn), rounded(expected)):.1f} dB |"
                     f" {psnr(shown, rounded(encoded(expected))):.1f} dB |",
                     flush=True,

@@ -1,9 +1,9 @@
-"""How evenly splats take light as one, two or three ellipses a splat: the conversion's modes.
+"""How evenly splats are lit with one, two or three ellipses per splat: the conversion's modes.
 
     blender-env/bin/python benchmarks/blender_modes.py [--size 96] [--samples 32]
 
 A grey ball of 3000 splats, twice as long as wide and half as thick, tilted and moved at random, is lit by sun
-and sky. Prints a Markdown table: the light of the ball's middle, and how far it deviates from a smooth
+and sky. Prints a Markdown table: the radiance of the ball's centre, and how far it deviates from a smooth
 image (a polynomial of degree 4), which is what looks mottled or speckled.
 """
 

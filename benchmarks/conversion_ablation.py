@@ -1,11 +1,11 @@
-"""What each choice of the conversion is worth: PSNR of the mesh's image against that of the splats.
+"""Ablation of the conversion's choices: PSNR of the mesh's image against that of the splats.
 
     python benchmarks/conversion_ablation.py                              on a scene of our own
     python benchmarks/conversion_ablation.py --data FOLDER                on guitar, truck and playbot
     python benchmarks/conversion_ablation.py --scene SPLATS CAMERAS...    on other splats, with camera files
 
 FOLDER holds ``splats`` and ``cameras``. Every mesh is converted once, for the first set of cameras (close),
-and drawn from all of them with 2 x 2 samples a pixel on white; the splats are drawn the 3DGS way. Both have
+and drawn from all of them with 2 x 2 samples per pixel on white; the splats are drawn the 3DGS way. Both have
 the splats' display colour of degree 0, in [0, 1]. Prints Markdown tables.
 """
 

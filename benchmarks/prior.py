@@ -1,4 +1,4 @@
-"""What a mesh prior gains: PSNR on held-out views, against the same base drawn opaque and against fan mode.
+"""The gain of a mesh prior: PSNR on held-out views, against the same base opaque and against fan mode.
 
     python benchmarks/prior.py --data ../shared/data --steps 200
     python benchmarks/prior.py --data ../shared/data --steps 500 --only layers=6
@@ -94,7 +94,7 @@ def main() -> None:
 def trained(
     mesh: ms.SplatMesh, data: ms.Dataset, config: FinetuneConfig, threads: int
 ) -> tuple[ms.SplatMesh, int, float]:
-    """``mesh`` after all steps, their number, and their processor time."""
+    """``mesh`` after all steps, their count, and their processor time."""
     state = State.begin(mesh, len(data.train), config, threads)
     steps, interval = config.total_steps(len(data.train)) or 0, config.prune_interval(len(data.train))
     start = time.process_time()

@@ -8,10 +8,10 @@
 CAMERAS is a JSON list. splats: dB of the reduced splats against all of them, drawn alike, and seconds of
 processor time; --other: files that another program reduced, beside them. meshes: the same number of splats
 merged and dropped, then converted for fine-tuning, and fine-tuned. triangles: the same number of triangles
-shared out in different ways; budgets are triangles for each splat of the file. speed: merging COUNT splats of
-our own scene to a quarter, and the memory that it took.
+distributed in different ways; budgets are triangles for each splat of the file. speed: merging COUNT splats
+of our own scene to a quarter, and the memory that it took.
 
-Images on white, degree 0: (i) one sample a pixel against the splats drawn at that size, (ii) 2 x 2 samples
+Images on white, degree 0: (i) one sample per pixel against the splats drawn at that size, (ii) 2 x 2 samples
 against the mean of splats drawn four times as large.
 """
 

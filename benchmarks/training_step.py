@@ -1,14 +1,14 @@
-"""What one step of fine-tuning costs, how it grows, and what others take for the same.
+"""Cost of one step of fine-tuning, its growth, and the cost of others' steps.
 
     python benchmarks/training_step.py                        steps at 160k, 1 M and 4 M triangles
     python benchmarks/training_step.py --growth               with triangles, pixels and layers, one at a time
     python benchmarks/training_step.py --beside               beside torch and, where installed, Mitsuba 3
 
 A step draws an image, takes 0.6 L1 + 0.4 (1 - SSIM) and its gradient back to positions and colours, and
-moves all vertices by Adam; scenes are those of benchmarks/rendering.py. Medians by the clock in milliseconds;
+moves all vertices by Adam; scenes are those of benchmarks/rendering.py. Medians of wall time in milliseconds;
 parts are timed within the same steps. --beside takes an image and the gradients of its colours of one small
 scene: by this program, by the float64 reference in torch, and by Mitsuba's path integrator with automatic
-differentiation (llvm_ad_rgb, which needs an LLVM library), one sample a pixel. Mitsuba draws the same
+differentiation (llvm_ad_rgb, which needs an LLVM library), one sample per pixel. Mitsuba draws the same
 triangles as diffuse surfaces with an opacity under a white sky, not the same image: it has no unlit
 blending. --beside needs torch.
 """
@@ -48,7 +48,7 @@ class Step:
         self.mesh, self.camera, self.threads = mesh, camera, threads
         self.vertices, self.colors = mesh.vertices.copy(), mesh.colors.copy()
         size = (1, camera.height, camera.width, 3)
-        self.truth = np.random.default_rng(0).random(size, np.float32)
+        self.target = np.random.default_rng(0).random(size, np.float32)
         # Rates so small that every step draws the same scene.
         self.optimizers = [RowAdam(self.vertices, lr=1e-9), RowAdam(self.colors, lr=1e-9, bounds=(0, 1))]
 
@@ -67,8 +67,10 @@ class Step:
         times = [time.perf_counter()]
         image = self.draw()
         times.append(time.perf_counter())
-        rates = dict(l1_rate=0.6 / self.truth.size, ssim_rate=-0.4 / self.truth.size)
-        compared = compare_images(image.color[None], self.truth, gradient=True, threads=self.threads, **rates)
+        rates = dict(l1_rate=0.6 / self.target.size, ssim_rate=-0.4 / self.target.size)
+        compared = compare_images(
+            image.color[None], self.target, gradient=True, threads=self.threads, **rates
+        )
         assert compared.gradient is not None
         times.append(time.perf_counter())
         gradients = [np.zeros_like(values) for values in (self.vertices, self.colors)]
@@ -97,16 +99,18 @@ def steps(scenes: list[str], threads: list[int], repeat: int) -> None:
 
 def growth(repeat: int) -> None:
     """From a scene of 160k triangles, each of triangles, pixels and layers grows by itself."""
-    table(["what grows", "triangles", "image", "fragments a pixel", "draw", "back", "ns a fragment"])
+    table(
+        ["what grows", "triangles", "image", "fragments per pixel", "forward", "backward", "ns per fragment"]
+    )
     fans, radius, opacity, side = SCENES["160k"]
     cases = []
     for by in (0.25, 1, 4):
-        # As many fragments in all, of smaller triangles.
+        # The same number of fragments, of smaller triangles.
         cases.append(("triangles", int(fans * by), radius / by**0.5, opacity, side))
     for by in (0.5, 1, 2):
         cases.append(("pixels", fans, radius, opacity, int(side * by)))
     for by in (0.25, 1, 4):
-        # Fainter where there are more, so that the same share of light is spent.
+        # Fainter where there are more, so that the transmittance stays the same.
         cases.append(("layers", int(fans * by), radius, opacity / by, side))
     for what, *scene in cases:
         mesh, camera = random_fans(*scene)

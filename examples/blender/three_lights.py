@@ -64,8 +64,8 @@ images = []
 for name, light in LIGHTS.items():
     path = out / f"{name.replace(' ', '_')}.png"
     options = SceneOptions(light=light, samples=asked.samples, denoise=True, background=(0.75, 0.8, 0.88))
-    told = draw(mesh, [camera], images=[path], options=options)
+    result = draw(mesh, [camera], images=[path], options=options)
     images.append(load_png(path) / 255)
-    print(f"{path}: {told['image_seconds'][0]:.0f} s, up to {told['layers']} layers")
+    print(f"{path}: {result['image_seconds'][0]:.0f} s, up to {result['layers']} layers")
 save_png(out / "three_lights.png", strip(images, list(LIGHTS)))
 print(f"{out / 'three_lights.png'}: all three; lit by {out / 'studio.hdr'}, too")

@@ -1,4 +1,4 @@
-"""The Blender examples run, smaller than they are, and show what they say."""
+"""The Blender examples run at a smaller size and show what they claim."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def test_three_lights_give_three_images(tmp_path):
 
 
 def test_the_vase_falls(tmp_path):
-    told, out = run("falling.py", tmp_path, "--width", 40, "--samples", 1, "--splats", 800)
-    tilt = re.search(r"the vase lies at (\d+) degrees", told)
+    printed, out = run("falling.py", tmp_path, "--width", 40, "--samples", 1, "--splats", 800)
+    tilt = re.search(r"the vase lies at (\d+) degrees", printed)
     assert tilt
     assert 60 < int(tilt[1]) <= 180
     assert (out / "falling.blend").stat().st_size > 10_000

@@ -146,7 +146,7 @@ def test_up_and_owners_survive(tmp_path):
     assert taken.face_splat.tolist() == mesh.face_splat.tolist()
 
 
-def test_what_is_no_splat_mesh_is_told():
+def test_an_object_that_is_no_splat_mesh_is_refused():
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with pytest.raises(ValueError, match="no vertex colours"):
         objects.dress(bpy.data.objects.new("empty", None), True)

@@ -166,7 +166,7 @@ def test_edit_mode_is_followed(placed):
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_what_cannot_be_followed_is_told(placed):
+def test_a_base_that_cannot_be_followed_is_reported(placed):
     obj, base, prior = placed
     before = places(obj)
     base.modifiers.new("more", "SUBSURF").levels = 1

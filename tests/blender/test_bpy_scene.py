@@ -121,10 +121,10 @@ def test_command_line_draws_meshes_and_splats(tmp_path, suffix, capsys):
         "--json",
     ]
     assert main(arguments) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert len(told["pictures"]) == len(told["image_seconds"]) == 2
-    assert told["blender"] == bpy.app.version_string
-    assert load_png(told["pictures"][1]).shape == (40, 72, 3)
+    result = json.loads(capsys.readouterr().out)
+    assert len(result["pictures"]) == len(result["image_seconds"]) == 2
+    assert result["blender"] == bpy.app.version_string
+    assert load_png(result["pictures"][1]).shape == (40, 72, 3)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "cameras.json",
         "config.json",

@@ -1,5 +1,5 @@
 # ruff: noqa: E402
-"""Light, ground and camera round objects of an open file, and where imported objects have their origin."""
+"""Light, ground and camera around objects of an open file, and the origin of imported objects."""
 
 from __future__ import annotations
 
@@ -136,8 +136,8 @@ def test_values_of_light_do_not_change_with_exposure(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["png", "exr"])
-def test_a_image_that_is_not_whole_is_told(tmp_path, monkeypatch, suffix):
-    """Blender says nothing of a full disk; what it leaves is cut off."""
+def test_a_truncated_image_is_an_error(tmp_path, monkeypatch, suffix):
+    """Blender does not report a full disk, and leaves a truncated file."""
     mesh, camera = plate(0.5)
     path = tmp_path / f"a.{suffix}"
     draw(mesh, [camera], images=[path])

@@ -1,4 +1,4 @@
-"""What is missing, too old, broken or in the way is said in words, and nothing is left behind."""
+"""Anything missing, too old, broken or in the way is a clear error, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ def test_folders_that_cannot_be_written_in_are_told_first(program, tmp_path):
     places = [tmp_path / "nowhere"] + [Path("/proc")] * Path("/proc/self").exists()
     for folder in places:
         for outputs in ({"images": [folder / "a.png"]}, {"blend": folder / "a.blend"}):
-            with pytest.raises(OSError, match="cannot write in the folder") as told:
+            with pytest.raises(OSError, match="cannot write in the folder") as caught:
                 draw(random_mesh(3), cameras()[:1], executable=blender, **outputs)
-            assert told.value.filename == str(folder)
+            assert caught.value.filename == str(folder)
     assert not (tmp_path / "started").exists()
 
 
@@ -217,8 +217,8 @@ def test_leftovers_of_crashes_are_removed(program, tmp_path, monkeypatch):
 
 
 def test_a_full_disk_inside_blender_is_a_full_disk(program, tmp_path):
-    told = launch.worker.MARK + json.dumps({"error": [errno.ENOSPC, "no space left", "/disk/a.png"]})
-    blender = program("Blender 5.0.1", f"echo '{told}'; exit 1")
+    line = launch.worker.MARK + json.dumps({"error": [errno.ENOSPC, "no space left", "/disk/a.png"]})
+    blender = program("Blender 5.0.1", f"echo '{line}'; exit 1")
     with pytest.raises(OSError, match="no space left") as caught:
         draw(random_mesh(3), cameras()[:1], images=[tmp_path / "a.png"], executable=blender)
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, "/disk/a.png")
@@ -267,9 +267,9 @@ def test_blenders_words_are_understood(text, share, left, capsys):
     if share is None:
         assert said == ""
         return
-    told = json.loads(said.removeprefix(launch.worker.MARK))
-    assert (told["share"], told["left"]) == (share, left)
-    assert told["stage"] in text
+    message = json.loads(said.removeprefix(launch.worker.MARK))
+    assert (message["share"], message["left"]) == (share, left)
+    assert message["stage"] in text
 
 
 @linux

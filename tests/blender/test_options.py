@@ -1,4 +1,4 @@
-"""Options that contradict each other or lie out of range are told before any work."""
+"""Options that contradict each other or are out of range are refused before any work."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from meshsplats.blender.options import LIGHTS, check_environment
         (SceneOptions(light=LightOptions(ground="catcher"), engine="eevee"), "Cycles only"),
     ],
 )
-def test_what_cannot_be_is_told(options, words):
+def test_impossible_options_are_refused(options, words):
     with pytest.raises(ValueError, match=words):
         options.check()
 
