@@ -13,8 +13,9 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats
 
 from meshsplats import convert, save_mesh
-from meshsplats.blender import LevelMeshes, LightOptions, SceneOptions, draw
+from meshsplats.blender import LevelMeshes, LightOptions, SceneOptions, draw, subject
 from meshsplats.blender.inside import levels, meshes, objects, pictures, stage, versions
+from meshsplats.blender.inside import scene as build_scene
 from meshsplats.cameras.trajectories import dome, orbit
 from meshsplats.cli import main
 from meshsplats.images.writing import load_png
@@ -136,6 +137,30 @@ def test_imported_levels_stand_in_one_place(chain, scene, lit):
     again, _ = imported(chain, scene)
     assert [child.name for child in again.children] == [f"ball.001 level {i}" for i in range(3)]
     assert len(levels.chains(scene)) == 2
+
+
+def test_shadow_casters_of_eevee_hide_with_their_level(chain):
+    options = SceneOptions(light=LightOptions(), engine="eevee")
+    subjects = []
+    for mesh, size in zip(chain.meshes, SIZES, strict=True):
+        arrays, facts = subject.prepare(mesh, [], options, 10)
+        subjects.append(build_scene.Subject(**arrays, **facts, name="ball", screen_size=size))
+    built = build_scene.build(subjects[0], [], options, 64, edges=True, coarser=subjects[1:])
+    (found,) = levels.chains(built.scene)
+    for i in (0, 1, 2):
+        levels.show(found, i)
+        bpy.context.view_layer.update()
+        shown = {obj.name for obj in built.scene.objects if obj.name.startswith("ball") and obj.visible_get()}
+        assert shown == {f"ball level {i}", f"ball level {i} shadow"}
+
+
+def test_a_chain_of_one_level_is_a_chain(tmp_path, chain):
+    one = LevelMeshes("one", chain.meshes[:1], SIZES[:1])
+    draw(one, orbit(chain.meshes[0], 1, width=20, height=20), blend=tmp_path / "one.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "one.blend"))
+    (found,) = levels.chains(bpy.context.scene)
+    assert [child.name for child in found.children] == ["one level 0"]
+    assert levels.fitting_level(found, bpy.context.scene) == 0
 
 
 def test_a_level_moved_by_hand_takes_the_others_along(chain, scene):

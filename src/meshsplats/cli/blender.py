@@ -149,14 +149,15 @@ class Blender:
             [*pictures, *([blend] if blend else []), *records], self.force, None if suffix else self.output
         )
         mesh = _converted(scene, self.lit)
-        levels = [mesh, *(_converted(level, self.lit) for level in coarser)]
+        subject: SplatMesh | LevelMeshes = mesh
+        if chain:
+            levels = [mesh, *(_converted(level, self.lit) for level in coarser)]
+            subject = LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
         if not suffix:
             self.output.mkdir(exist_ok=True)
         with _shown(len(pictures)) as show:
             result = draw(
-                LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
-                if chain
-                else mesh,
+                subject,
                 cameras,
                 images=pictures,
                 blend=blend,

@@ -50,7 +50,7 @@ class Subject:
     caster_faces: np.ndarray | None = None
     """(g, 3) int32."""
     screen_size: int = 0
-    """Of a level of detail: side in pixels of the images for which it was made."""
+    """Of a level of detail: side in pixels of the images for which it was made; else 0."""
     name: str = "Splats"
 
 
@@ -80,14 +80,14 @@ def build(
     Args:
         limit: that of transparent bounces.
         edges: as in ``meshes.make_mesh``.
-        coarser: further levels of detail of the subject, hidden at first (``levels.show``).
+        coarser: further levels of detail, if the subject is one; hidden at first (``levels.show``).
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     versions.enable_cycles()
     scene = bpy.context.scene
     scene.name = "MeshSplats"
     rotation = frame.to_blender(subject.up)
-    if coarser:
+    if subject.screen_size:
         chain = [subject, *coarser]
         homes = levels.add_collections(subject.name, [level.screen_size for level in chain], scene.collection)
         objs = [
