@@ -232,8 +232,8 @@ class FitLevel(bpy.types.Operator):
     def _level(self, context, chain):
         from meshsplats.blender.inside import levels
 
-        level = levels.fitting_level(chain, context.scene)
         size = levels.screen_size(chain, context.scene)
+        level = levels.fitting_level(chain, size)
         self.report({"INFO"}, f"MeshSplats: level {level} for {size:.0f} pixels")
         return level
 

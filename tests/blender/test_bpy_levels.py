@@ -59,6 +59,10 @@ def world(obj):
     return places @ matrix[:3, :3].T + matrix[:3, 3]
 
 
+def fitting(found, scene):
+    return levels.fitting_level(found, levels.screen_size(found, scene))
+
+
 def watch(scene, camera):
     """Makes ``camera``, in Blender's frame, the active one."""
     obj = stage.add_camera(camera, "camera", np.eye(3), 1000, scene.collection)
@@ -116,7 +120,7 @@ def test_the_command_line_saves_a_chain(tmp_path, chain, capsys):
         assert [len(obj.data.polygons) for obj in levels.objects_of(found)] == [
             len(mesh.faces) for mesh in chain.meshes
         ]
-        assert levels.fitting_level(found, scene) == 0, "the default camera is for 800 pixels"
+        assert fitting(found, scene) == 0, "the default camera is for 800 pixels"
         # As in a file that the extension made, colours and materials can be changed.
         for obj, mesh in zip(levels.objects_of(found), chain.meshes, strict=True):
             assert obj.data.materials[0].name.startswith("Splats, lit" if i else "Splats, unlit")
@@ -160,7 +164,7 @@ def test_a_chain_of_one_level_is_a_chain(tmp_path, chain):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "one.blend"))
     (found,) = levels.chains(bpy.context.scene)
     assert [child.name for child in found.children] == ["one level 0"]
-    assert levels.fitting_level(found, bpy.context.scene) == 0
+    assert fitting(found, bpy.context.scene) == 0
 
 
 def test_a_level_moved_by_hand_takes_the_others_along(chain, scene):
@@ -209,7 +213,7 @@ def test_a_level_fits_the_camera_for_whose_size_it_was_made(chain, scene):
             camera = dome(meshes.world_points(objs[0]), 3, up=(0, 0, 1), width=width, height=width)[1]
             watch(scene, camera)
             assert levels.screen_size(found, scene) == pytest.approx(width, rel=0.03)
-            assert levels.fitting_level(found, scene) == level
+            assert fitting(found, scene) == level
 
 
 def test_the_size_follows_distance_lens_and_resolution(chain, scene):
@@ -243,24 +247,24 @@ def test_the_size_follows_distance_lens_and_resolution(chain, scene):
     # A ball of radius 1, 1.08 of which images leave room for, on an orthographic image 10 units wide.
     scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 10
     assert levels.screen_size(found, scene) == pytest.approx(200 * 2.16 / 10, rel=0.15)
-    levels.show(found, levels.fitting_level(found, scene))
+    levels.show(found, fitting(found, scene))
     assert levels.visible_level(found) == 1
 
 
 def test_without_a_camera_nothing_fits(chain, scene):
     found, objs = imported(chain, scene)
     with pytest.raises(ValueError, match="no active camera"):
-        levels.fitting_level(found, scene)
+        fitting(found, scene)
     bpy.context.view_layer.update()
     watch(scene, orbit(meshes.world_points(objs[0]), 1, up=(0, 0, 1))[0]).data.type = "PANO"
     with pytest.raises(ValueError, match="camera is panoramic"):
-        levels.fitting_level(found, scene)
+        fitting(found, scene)
     bpy.data.objects.remove(objs[0])
     scene.camera.data.type = "PERSP"
     for obj in objs[1:]:
         bpy.data.objects.remove(obj)
     with pytest.raises(ValueError, match="no visible vertices"):
-        levels.fitting_level(found, scene)
+        fitting(found, scene)
 
 
 def test_light_and_camera_leave_saved_splats_in_place(tmp_path, chain):

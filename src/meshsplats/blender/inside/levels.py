@@ -95,19 +95,21 @@ def show(chain: Any, level: int) -> None:
     Raises:
         ValueError: the chain has no such level.
     """
-    held = collections(chain)
-    if level not in [child[LEVEL] for child in held]:
-        raise ValueError(f"{chain.name} has the levels 0 to {len(held) - 1}, got {level}")
+    children = collections(chain)
+    if level not in [child[LEVEL] for child in children]:
+        raise ValueError(f"{chain.name} has the levels 0 to {len(children) - 1}, got {level}")
     objs = {obj[LEVEL]: obj for obj in objects_of(chain)}
-    before = objs.get(visible_level(chain))
-    finest, after = objs.get(0), objs.get(level)
-    if before is not None and before is not finest and before.parent is finest and finest is not None:
+    before: Any = objs.get(visible_level(chain))
+    finest: Any = objs.get(0)
+    after: Any = objs.get(level)
+    tied = before is not None and finest is not None and before.parent == finest
+    if tied and not before.matrix_basis.is_identity:
         bpy.context.view_layer.update()
         finest.matrix_world = before.matrix_world.copy()
         before.matrix_basis.identity()
     layer = bpy.context.view_layer
     selected = before is not None and before.name in layer.objects and before.select_get()
-    _set_visible(held, level)
+    _set_visible(children, level)
     layer.update()
     if after is None or after.name not in layer.objects:
         return
@@ -117,8 +119,8 @@ def show(chain: Any, level: int) -> None:
         after.select_set(True)
 
 
-def _set_visible(held: Iterable[Any], level: int) -> None:
-    for child in held:
+def _set_visible(children: Iterable[Any], level: int) -> None:
+    for child in children:
         child.hide_viewport = child.hide_render = child[LEVEL] != level
 
 
@@ -155,15 +157,13 @@ def screen_size(chain: Any, scene: Any) -> float:
     return float(side * focal / max(distance, 1e-9 * away))
 
 
-def fitting_level(chain: Any, scene: Any) -> int:
-    """Index of the level of ``chain`` made for the size nearest, as a ratio, to ``screen_size``. Raises
-    ValueError as that does."""
-    size = screen_size(chain, scene)
+def fitting_level(chain: Any, size: float) -> int:
+    """Index of the level of ``chain`` made for the screen size nearest to ``size``, as a ratio; pixels."""
     return min(collections(chain), key=lambda child: abs(np.log(size / child[SCREEN_SIZE])))[LEVEL]
 
 
 def _framing(chain: Any) -> tuple[np.ndarray, float]:
-    """(3,) what cameras look at, and the distance from which their images just hold the subject."""
+    """(3,) the centre of the subject, and the distance from which images just hold it; Blender's world."""
     objs = objects_of(chain)
     points = world_points(objs[0]) if objs else np.zeros((0, 3))
     if not len(points):
