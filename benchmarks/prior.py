@@ -22,7 +22,7 @@ import torch
 
 import meshsplats as ms
 from meshsplats.finetuning import make_config, starting_mesh
-from meshsplats.finetuning.config import FinetuneConfig, rates
+from meshsplats.finetuning.config import FinetuneConfig, learning_rates
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, loss_of, make_step, target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
@@ -122,7 +122,7 @@ def opaque_colors(
         drawn = rasterize(
             vertices, mesh.faces, rgba, view.camera, background=target.background, threads=threads
         )
-        adam.param_groups[0]["lr"] = rates(config, step, step / steps)[0]
+        adam.param_groups[0]["lr"] = learning_rates(config, step, step / steps)[0]
         adam.zero_grad()
         loss_of(drawn.color, target, config, threads).backward()
         adam.step()

@@ -27,7 +27,7 @@ from meshsplats.finetuning.checkpoint import OtherRunError, load_checkpoint
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
-    LEAST_LIGHT,
+    MIN_TRANSMITTANCE,
     encoding_slope,
     importance,
     kept_faces,
@@ -144,7 +144,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]
     exposure = torch.tensor([*gain, *offset], requires_grad=True)
     behind = srgb_to_linear(np.float32(background)) if blending == "linear" else np.float32(background)
-    options = dict(face_splat=mesh.face_splat, min_transmittance=LEAST_LIGHT[blending], samples=2)
+    options = dict(face_splat=mesh.face_splat, min_transmittance=MIN_TRANSMITTANCE[blending], samples=2)
     picture = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
     if blending == "linear":
         curve = 1.055 * picture.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
@@ -260,7 +260,7 @@ def test_resuming_with_other_inputs_is_refused(scene, tmp_path):
     again = replace(run, resume=True)
     with pytest.raises(OtherRunError, match="seed was 0 and is 3"):
         finetune(mesh, dataset, make_config(steps=2, seed=3), run=again)
-    with pytest.raises(OtherRunError, match="has made 2 steps already, 1 are asked for"):
+    with pytest.raises(OtherRunError, match="has taken 2 steps already, 1 were requested"):
         finetune(mesh, dataset, make_config(steps=1), run=again)
     with pytest.raises(OtherRunError, match="another mesh"):
         finetune(mesh.prune(0.5), dataset, make_config(steps=2), run=again)

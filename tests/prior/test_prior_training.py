@@ -15,7 +15,7 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import RunOptions, make_config
-from meshsplats.finetuning.bound import BoundPositions, nearest_convex, weight_units
+from meshsplats.finetuning.bound import BoundPositions, project_to_simplex, weight_units
 from meshsplats.finetuning.checkpoint import load_checkpoint, mesh_arrays, stored_mesh
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
@@ -52,7 +52,7 @@ def check_constraint(binding) -> None:
 @given(st.lists(triples, min_size=1, max_size=20))
 def test_projection_is_the_nearest_point_of_the_simplex(rows):
     given_weights = np.array(rows, np.float32)
-    found = nearest_convex(given_weights)
+    found = project_to_simplex(given_weights)
     assert found.min() >= 0
     assert np.abs(found.sum(axis=1, dtype=np.float64) - 1).max() <= 6e-8
     # Nearest: from it, no corner of the simplex lies in the direction of the given point.
@@ -63,10 +63,12 @@ def test_projection_is_the_nearest_point_of_the_simplex(rows):
 
 def test_projection_leaves_corners_edges_and_the_inside_alone():
     kept = np.array([[1, 0, 0], [0, 0, 1], [0.25, 0, 0.75], [0.25, 0.25, 0.5]], np.float32)
-    np.testing.assert_array_equal(nearest_convex(kept), kept)
-    rounded = nearest_convex(np.random.default_rng(0).dirichlet((1, 1, 1), 10_000).astype(np.float32) * 1.1)
+    np.testing.assert_array_equal(project_to_simplex(kept), kept)
+    rounded = project_to_simplex(
+        np.random.default_rng(0).dirichlet((1, 1, 1), 10_000).astype(np.float32) * 1.1
+    )
     assert np.abs(rounded.sum(axis=1, dtype=np.float64) - 1).max() <= 6e-8
-    moved = nearest_convex(np.array([[2, 0, 0], [0.6, 0.6, -1], [0, 0, 0]], np.float32))
+    moved = project_to_simplex(np.array([[2, 0, 0], [0.6, 0.6, -1], [0, 0, 0]], np.float32))
     np.testing.assert_allclose(moved, [[1, 0, 0], [0.5, 0.5, 0], [1 / 3, 1 / 3, 1 / 3]], atol=1e-7)
 
 
@@ -105,7 +107,7 @@ def test_what_is_on_an_edge_slides_along_it():
     before = bound.weights.copy()
     bound.weights += rng.normal(size=before.shape).astype(np.float32) * 0.3
     positions = mesh.vertices.copy()
-    bound.settle(before, rows, positions)
+    bound.project(before, rows, positions)
     after = bound.binding()
     check_constraint(after)
     assert (after.weights[zero] == 0).all()
