@@ -18,7 +18,7 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
 from meshsplats.prior.bind import LAYERS, SHELLS_DEPTH
-from meshsplats.prior.pattern import MOST, counts_by_area, face_pattern
+from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 
 
 def base_picture(base, camera, **options):
@@ -29,7 +29,7 @@ def base_picture(base, camera, **options):
 # ---- Dividing a face
 
 
-@pytest.mark.parametrize("count", [*range(1, 26), 100, MOST])
+@pytest.mark.parametrize("count", [*range(1, 26), 100, MAX_PER_FACE])
 def test_a_pattern_covers_the_face_once(count):
     pattern = face_pattern(count).astype(np.float64)
     assert pattern.shape == (count, 3, 3)
@@ -64,7 +64,7 @@ def test_counts_follow_areas(seed, mean):
     counts = counts_by_area(areas, mean)
     assert (np.sqrt(counts) % 1 == 0).all()
     assert counts.min() >= 1
-    assert counts.max() <= MOST
+    assert counts.max() <= MAX_PER_FACE
     order = np.argsort(areas)
     assert (np.diff(counts[order]) >= 0).all()
     assert counts.mean() == pytest.approx(mean, rel=0.15)
@@ -236,7 +236,7 @@ def test_colours_that_are_not_there_are_an_error():
     ("options", "message"),
     [
         ({"triangles": 0}, "triangles must be"),
-        ({"triangles": MOST + 1}, "triangles must be"),
+        ({"triangles": MAX_PER_FACE + 1}, "triangles must be"),
         ({"layers": 0}, "layers must be"),
         ({"layers": 17}, "layers must be"),
     ],
