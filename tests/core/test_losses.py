@@ -306,10 +306,10 @@ def test_not_a_number_is_not_hidden():
 def test_bad_arguments_are_refused(loss):
     good = torch.zeros(12, 12, 3)
     with pytest.raises(
-        TypeError, match=r"picture must be a torch tensor, got ndarray; use torch\.from_numpy"
+        TypeError, match=r"image must be a torch tensor, got ndarray; use torch\.from_numpy"
     ):
         loss(good.numpy(), good)
-    with pytest.raises(TypeError, match=r"truth must be float32 .* got torch\.float64"):
+    with pytest.raises(TypeError, match=r"target must be float32 .* got torch\.float64"):
         loss(good, good.double())
     with pytest.raises(ValueError, match=r"same shape, got \(12, 12, 3\) and \(12, 12, 1\)"):
         loss(good, good[..., :1])

@@ -120,7 +120,7 @@ def test_pictures_of_something_else_are_told(cloud):
     noise = np.random.default_rng(0)
     other = [View(v.camera, ViewImage(noise.random((32, 32, 3), np.float32))) for v in data.train]
     found = find_background(Dataset(tuple(other)), {"splats": cloud})
-    with pytest.warns(DataWarning, match=r"splats shows next to nothing of the photographs \(\d+\.\d dB\)"):
+    with pytest.warns(DataWarning, match=r"splats shows almost nothing of the photographs \(\d+\.\d dB\)"):
         warn_of_other_worlds(found)
 
 

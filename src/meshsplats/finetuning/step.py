@@ -27,8 +27,8 @@ tenth to a sixth of the time and changes images by 0.0002 (rms). The limit is lo
 encoding for display amplifies dark values."""
 
 MIXED_INTERVAL = 4
-"""With background 'mixed', every step of this interval has a random background. On the background that images
-are evaluated on, one in four is 0.1 dB better than one in two."""
+"""With background 'mixed', one step of this many has a random background. One in four is 0.1 dB better than
+one in two, on the background that images are evaluated on."""
 
 AREA_SAMPLES = 2
 """Samples along each side of a pixel when the target is the mean over each pixel's area."""
