@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -318,8 +317,7 @@ def test_a_benchmark_scores_each_scene_that_is_there(tmp_path):
     assert "# Two scenes: 1 scene of 2" in result.table()
     assert "| reported | paper | 28.00 |" in result.table()
     with (
+        pytest.warns(DataWarning),
         pytest.raises(FileNotFoundError, match="none of the scenes of Two scenes"),
-        warnings.catch_warnings(),
     ):
-        warnings.simplefilter("ignore")
         run_benchmark(benchmark, tmp_path, tmp_path / "data", load=lambda path: cloud)
