@@ -124,7 +124,8 @@ def opaque_colors(
         )
         adam.param_groups[0]["lr"] = learning_rates(config, step, step / steps)[0]
         adam.zero_grad()
-        loss_of(drawn.color, target, config, threads).backward()
+        gradient = loss_of(drawn.color.detach().numpy(), target, config, threads)[1]
+        drawn.color.backward(torch.from_numpy(gradient))
         adam.step()
         with torch.no_grad():
             colors.clamp_(0, 1)

@@ -256,7 +256,7 @@ def test_broken_and_hostile_files(folder, tmp_path):
             load_lpips(file, network="alex")
 
 
-def test_bad_pictures_are_refused(folder):
+def test_bad_images_are_refused(folder):
     for network, smallest in (("vgg", 16), ("alex", 31)):
         distance = load_lpips(folder, network=network)
         a, b = pictures(smallest, smallest)

@@ -74,7 +74,7 @@ def test_counts_follow_areas(seed, mean):
 
 
 @pytest.mark.parametrize("triangles", [1, 4, 6, 9])
-def test_identity_the_picture_is_the_base(triangles):
+def test_identity_the_image_is_the_base(triangles):
     base = bumpy()
     mesh = bind(base, triangles=triangles, layers=1).mesh
     assert len(mesh.faces) == triangles * len(base.faces)
@@ -190,7 +190,7 @@ def test_colors_come_from_the_views_that_see_a_place():
 
 
 def test_shells_take_the_colours_that_views_show_behind_the_base():
-    """A base that floats above the sheet in the pictures, with a shell where the sheet is."""
+    """A base that floats above the sheet in the images, with a shell where the sheet is."""
     n, height = 24, 0.3
     sheet = bumpy(n)
     flat = sheet.vertices * np.float32([1, 1, 0])
@@ -360,7 +360,7 @@ def test_a_rigid_motion_is_that_of_the_camera(seed):
 
 
 def test_layers_do_not_flicker():
-    """Fifty tiny moves of the camera: coplanar layers change no more from picture to picture than one opaque
+    """Fifty tiny moves of the camera: coplanar layers change no more from image to image than one opaque
     layer does."""
     base = cube()
     opaque = bind(base, layers=1).mesh

@@ -25,7 +25,7 @@ triples = st.tuples(*[st.floats(-10, 10, width=32)] * 3)
 
 
 def views_of(mesh, count=6, side=40) -> tuple[View, ...]:
-    """What cameras round ``mesh`` see of it, with alpha."""
+    """What cameras around ``mesh`` see of it, with alpha."""
     views = []
     for camera in orbit(mesh, count, width=side, height=side, elevation=35):
         drawn = render(mesh, camera, background=(0, 0, 0))
@@ -35,7 +35,7 @@ def views_of(mesh, count=6, side=40) -> tuple[View, ...]:
 
 @pytest.fixture(scope="module")
 def task():
-    """A base whose colours are wrong, and pictures of it with the right ones."""
+    """A base whose colours are wrong, and images of it with the right ones."""
     base = bumpy(6)
     right = np.random.default_rng(7).random((len(base.vertices), 3)).astype(np.float32)
     truth = SplatMesh(base.vertices, base.faces, np.column_stack([right, base.colors[:, 3]]), up=base.up)
@@ -166,7 +166,7 @@ def test_the_constraint_holds_after_every_step(task, layers, spacing):
     ).any()
 
 
-def test_training_brings_the_pictures_closer_and_moves_with_the_base(task, tmp_path):
+def test_training_brings_the_images_closer_and_moves_with_the_base(task, tmp_path):
     base, data = task
     prior = bind(base, triangles=4, layers=2, spacing=0)
     config = make_config(steps=60, position_rate=0.005, color_rate=0.05, prune_epochs=0)
