@@ -30,5 +30,4 @@ class NoTextureWarning(DataWarning):
 
 
 class DivergenceError(ValueError):
-    """Values that are not finite turned up in an optimisation; the message names the view that brought
-    them."""
+    """An optimisation diverged: its loss or gradients are not finite. The message names the step and view."""

@@ -11,6 +11,7 @@ import pytest
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.comparison import Comparison, ViewScore, compare, compare_views
+from meshsplats.evaluation.metrics import ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
@@ -47,7 +48,7 @@ def test_scores_are_those_of_the_images(look):
         np.testing.assert_array_equal(view.mesh, b)
         error = np.mean((a.astype(float) - b) ** 2)
         assert view.score.psnr == pytest.approx(-10 * np.log10(error), abs=1e-6)
-        assert -1 <= view.score.ssim < 1
+        assert view.score.ssim == pytest.approx(ssim(a, b), abs=1e-6)
     result = compare(cloud, mesh, cameras, sh_degree=0, **options)
     assert result.views == tuple(view.score for view in views)
     assert result.psnr == pytest.approx(np.mean([view.score.psnr for view in views]))

@@ -120,7 +120,7 @@ def test_what_cannot_be_done():
         ({"resolution": 600}, "resolution must be"),
         ({"faces": 3}, "faces must be"),
         ({"cameras": 2}, "cameras must be"),
-        ({"cameras": []}, "no cameras"),
+        ({"cameras": []}, "at least one camera"),
     ]:
         with pytest.raises(ValueError, match=message):
             base_surface(mesh, **options)
