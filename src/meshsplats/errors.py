@@ -30,4 +30,5 @@ class NoTextureWarning(DataWarning):
 
 
 class DivergenceError(ValueError):
-    """An optimisation diverged: its loss or gradients are not finite. The message names the step and view."""
+    """Values that are not finite turned up in an optimisation; the message names the view that brought
+    them."""
