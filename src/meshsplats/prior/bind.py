@@ -93,21 +93,8 @@ def bind(
     if not 1 <= triangles <= MAX_PER_FACE:
         raise ValueError(f"triangles must be a number from 1 to {MAX_PER_FACE}, got {triangles}")
     source = _color_source(base, colors, views)
-    corners = base.vertices[base.faces].astype(np.float64)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    solid = np.flatnonzero(areas > 0)
-    if not len(solid):
-        raise ValueError(f"none of the base's {len(base.faces):,} faces has an area: nothing to bind to")
-    if len(solid) < len(base.faces):
-        warnings.warn(
-            f"{len(base.faces) - len(solid):,} of {len(base.faces):,} faces of the base have no area and"
-            " carry no splats",
-            DataWarning,
-            stacklevel=2,
-        )
-    counts = np.full(len(solid), triangles)
-    if by_area:
-        counts = counts_by_area(areas[solid], triangles)
+    solid, areas = _faces_with_area(base)
+    counts = counts_by_area(areas, triangles) if by_area else np.full(len(solid), triangles)
     total = int(counts.sum()) * layers
     if total > MAX_TRIANGLES:
         raise ValueError(
@@ -120,11 +107,11 @@ def bind(
         depth_views = render_depth_views(
             base.vertices, faces, [view.camera for view in views], threads=threads
         )
-    if depth_views is None:
-        spacing = spacing or 0.0
-    elif spacing is None:
-        depth = SHELLS_DEPTH * float(np.linalg.norm(np.ptp(corners[solid].reshape(-1, 3), axis=0)))
-        spacing = (-depth if depth_views.facing else depth) / (layers - 1)
+        if spacing is None:
+            corners = base.vertices[faces].astype(np.float64)
+            depth = SHELLS_DEPTH * float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
+            spacing = (-depth if depth_views.facing else depth) / (layers - 1)
+    spacing = spacing or 0.0
     layout = _lay_out(solid, counts, layers)
     face = layout.vertex_face[layout.triangles[:, 0]]
     binding = Binding(base.vertices, base.faces, layout.vertex_face, layout.weights, layout.layers, spacing)
@@ -148,6 +135,23 @@ def bind(
         binding=binding,
     )
     return MeshPrior(mesh)
+
+
+def _faces_with_area(base: BaseMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (m,) of the faces of ``base`` that have an area, and their areas (m,); warns of the others."""
+    corners = base.vertices[base.faces].astype(np.float64)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    solid = np.flatnonzero(areas > 0)
+    if not len(solid):
+        raise ValueError(f"none of the base's {len(base.faces):,} faces has an area: nothing to bind to")
+    if len(solid) < len(base.faces):
+        warnings.warn(
+            f"{len(base.faces) - len(solid):,} of {len(base.faces):,} faces of the base have no area and"
+            " carry no splats",
+            DataWarning,
+            stacklevel=3,
+        )
+    return solid, areas[solid]
 
 
 def _protruding(binding: Binding, depth_views: DepthViews) -> np.ndarray:
