@@ -113,15 +113,15 @@ def finetune(
     ``mesh`` would not fit it.
 
     Args:
-        config: what is done; the preset 'default' by default.
-        run: where it is written down, and whether it goes on from a checkpoint.
+        config: the configuration; the preset 'default' by default.
+        run: output folder, resumption from a checkpoint, logging and resources.
         on_progress: called after every step.
 
     Raises:
         ValueError: no training view, an empty mesh. OtherRunError: the checkpoint is of another run.
-        MemoryError: it would not fit; nothing was written.
-        DivergenceError: a view gave values that are not finite; names it.
-        Interrupted: after SIGINT or SIGTERM, with a checkpoint, if there is a folder.
+        MemoryError: the estimated memory is not available; nothing was written.
+        DivergenceError: the loss or a gradient is not finite; the message names the view.
+        Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
     """
     config, run = config or FinetuneConfig(), run or RunOptions()
     if not dataset.train:
