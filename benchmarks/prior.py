@@ -22,7 +22,7 @@ import torch
 
 import meshsplats as ms
 from meshsplats.finetuning import make_config, starting_mesh
-from meshsplats.finetuning.config import FinetuneConfig, rates
+from meshsplats.finetuning.config import FinetuneConfig, learning_rates
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, loss_of, make_step, target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
@@ -122,9 +122,10 @@ def opaque_colors(
         drawn = rasterize(
             vertices, mesh.faces, rgba, view.camera, background=target.background, threads=threads
         )
-        adam.param_groups[0]["lr"] = rates(config, step, step / steps)[0]
+        adam.param_groups[0]["lr"] = learning_rates(config, step, step / steps)[0]
         adam.zero_grad()
-        loss_of(drawn.color, target, config, threads).backward()
+        gradient = loss_of(drawn.color.detach().numpy(), target, config, threads)[1]
+        drawn.color.backward(torch.from_numpy(gradient))
         adam.step()
         with torch.no_grad():
             colors.clamp_(0, 1)
