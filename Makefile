@@ -24,7 +24,18 @@ LOWEST_PYTHON ?= $(shell for name in python3.10 $(wildcard $(HOME)/.pyenv/versio
 	python; do $$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))' \
 	2>/dev/null && echo $$name && break; done)
 
-.PHONY: help demo test test-lowest test-blender lint format clean
+# The sanitizers' run-time libraries are found by the names that GCC gives them.
+SANITIZED := build/sanitizers
+SANITIZER_CXX ?= g++
+SANITIZER_FLAGS := -std=gnu++17 -O1 -g -fno-omit-frame-pointer -fno-sanitize-recover=all -fPIC -shared -pthread \
+	-ffp-contract=off -fno-math-errno -fno-trapping-math -fvisibility=hidden -Wno-psabi -Wno-uninitialized \
+	-Wno-maybe-uninitialized $(if $(filter x86_64,$(shell uname -m)),-march=x86-64-v3) -DMS_CHECKS -D_GLIBCXX_ASSERTIONS
+CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_rasterize test_fan_filter test_losses \
+	test_adam test_merging
+# Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
+CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
+
+.PHONY: help demo test test-lowest test-blender test-sanitizers lint format clean
 .DEFAULT_GOAL := help
 
 help:
@@ -32,6 +43,7 @@ help:
 	@echo 'make test    the tests'
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
+	@echo 'make test-sanitizers   those of the compiled core, with GCC'"'"'s sanitizers and with assertions'
 	@echo 'make lint    ruff, mypy and clang-format (make format tidies the source)'
 	@echo 'make clean   removes everything that these made'
 
@@ -102,6 +114,26 @@ test-blender: $(BPY:%=$(BLENDER_VENV)/%/installed)
 	  MESHSPLATS_WHEEL=$$(echo build/wheel/*.whl) $(BLENDER_VENV)/$$version/bin/python -m pytest \
 	    tests/blender tests/conversion/test_conversion.py tests/test_demo_mesh.py || exit 1; \
 	done
+
+$(SANITIZED)/address.so: SANITIZERS := address,undefined,float-cast-overflow
+$(SANITIZED)/thread.so: SANITIZERS := thread
+$(SANITIZED)/%.so: $(CORE_SOURCES) Makefile
+	@echo 'Compiling the core with -fsanitize=$(SANITIZERS)'
+	@mkdir -p $(@D)
+	@$(SANITIZER_CXX) $(SANITIZER_FLAGS) -fsanitize=$(SANITIZERS) -DMS_VARIANT='"sanitizers"' \
+	  src/meshsplats/csrc/api.cpp -o $@
+
+# Python itself is built without sanitizers: their library has to be loaded before it, its leaks and races are its own.
+# OpenBLAS and OpenMP run without threads, which the thread sanitizer cannot follow.
+sanitized = LD_PRELOAD="$$($(SANITIZER_CXX) -print-file-name=$(1)) $$($(SANITIZER_CXX) -print-file-name=libstdc++.so.6)" \
+	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	TSAN_OPTIONS='halt_on_error=1 ignore_noninstrumented_modules=1' OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
+	MESHSPLATS_LIBRARY=$(CURDIR)/$(SANITIZED)/$(2).so $(BIN)/python -m pytest -k 'not ($(CORE_TESTS_LEFT_OUT))' \
+	$(foreach name,$(CORE_TESTS),$(shell find tests -name $(name).py))
+
+test-sanitizers: $(VENV)/installed-dev $(SANITIZED)/address.so $(SANITIZED)/thread.so
+	$(call sanitized,libasan.so,address)
+	$(call sanitized,libtsan.so,thread) -k 'threads'
 
 lint: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check .

@@ -1,13 +1,12 @@
-"""Unlit pictures by Cycles against ``render``, on real splats.
+"""Unlit images by Cycles against ``render``, on real splats.
 
     blender-env/bin/python benchmarks/blender_exact.py --data ../shared/data [--scale 0.6]
 
 Each scene of the data folder is converted with default settings and drawn by two of its standard cameras and
 by a lens with the principal point off the centre and fx different from fy; --mesh draws finished meshes
-instead. Prints a Markdown table: PSNR of the .exr pictures, of both rounded to 8 bits, and of the .png
-pictures, encoded for display. --times prints what one more picture of a scene takes, in
-seconds by the clock: Cycles' share of a run with more views than another, and ``render`` with 1 sample a
-pixel and all threads.
+instead. Prints a Markdown table: PSNR of the .exr images, of both rounded to 8 bits, and of the .png images,
+encoded for display. --times prints the wall time of one more image of a scene, in seconds: by Cycles, from
+runs with more and with fewer views, and by ``render`` with 1 sample per pixel and all threads.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ SCENES = {
 }
 
 
-def rounded(picture: np.ndarray) -> np.ndarray:
-    return np.rint(255 * np.clip(picture, 0, 1)) / 255
+def rounded(image: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(image, 0, 1)) / 255
 
 
 def seconds(work: Callable[[], object]) -> float:
@@ -50,7 +49,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def times(data: Path, scale: float, more: int = 3) -> None:
-    print("| scene | triangles | picture | Cycles, s a picture | render, s a picture | ratio |")
+    print("| scene | triangles | image | Cycles, s an image | render, s an image | ratio |")
     print("|---|---|---|---|---|---|")
     for name, file in SCENES.items():
         mesh = convert(load_gaussians(data / "splats" / file))
@@ -60,10 +59,10 @@ def times(data: Path, scale: float, more: int = 3) -> None:
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)
             files = [Path(folder) / f"{k}.exr" for k in range(len(views))]
-            for number in (1, 1 + more):  # the first also loads what Blender loads once
-                taken = seconds(partial(draw, mesh, views[:number], pictures=files[:number]))
-                if number == 1:
-                    one = seconds(partial(draw, mesh, views[:1], pictures=files[:1]))
+            for count in (1, 1 + more):  # the first also pays for what Blender loads once
+                taken = seconds(partial(draw, mesh, views[:count], images=files[:count]))
+                if count == 1:
+                    one = seconds(partial(draw, mesh, views[:1], images=files[:1]))
         cycles = (taken - one) / more
         ours = statistics.mean(
             statistics.median(seconds(partial(render, mesh, view)) for _ in range(5)) for view in views[1:]
@@ -76,7 +75,7 @@ def times(data: Path, scale: float, more: int = 3) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Unlit pictures by Cycles against render.")
+    parser = argparse.ArgumentParser(description="Unlit images by Cycles against render.")
     parser.add_argument("--data", type=Path, required=True, help="folder with splats/ and cameras/")
     parser.add_argument("--scale", type=float, default=0.6, help="of the standard cameras' 400 x 400")
     parser.add_argument("--mesh", type=Path, nargs="+", help="meshes to draw instead, fine-tuned ones say")
@@ -109,16 +108,15 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # the guitar has more layers than 1024 in places
             files = [[Path(folder) / f"{k}.{kind}" for k in range(len(views))] for kind in ("exr", "png")]
-            told = [
-                draw(mesh, views, pictures=some, options=SceneOptions(threads=asked.threads))
-                for some in files
+            results = [
+                draw(mesh, views, images=some, options=SceneOptions(threads=asked.threads)) for some in files
             ]
             white = np.ones(3)
             for view, exr, png in zip(views, *files, strict=True):
                 expected = render(mesh, view, background=white, threads=asked.threads).color
                 drawn, shown = read_pixels(exr)[..., :3], load_png(png) / 255
                 print(
-                    f"| {name} | {len(mesh.faces):,} | {told[0]['layers']} | {view.name} |"
+                    f"| {name} | {len(mesh.faces):,} | {results[0]['layers']} | {view.name} |"
                     f" {psnr(drawn, expected):.1f} dB | {psnr(rounded(drawn), rounded(expected)):.1f} dB |"
                     f" {psnr(shown, rounded(encoded(expected))):.1f} dB |",
                     flush=True,

@@ -2,11 +2,11 @@
 
     blender-env/bin/python benchmarks/blender_known_truth.py --data ../shared/data
 
-Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the
-data folder), clean and noisy, and drawn on the ground under sun and sky: as ``meshsplats blender --lit``
-draws them and, for comparison, with a plain diffuse material. Prints a Markdown table, below what Blender
-says, and writes a strip of the pictures (-o). Shadow overlap is intersection over union of those pixels of
-the ground that are darker than 0.8 of the bare ground.
+Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the data
+folder), clean and noisy, and drawn on the ground under sun and sky: as ``meshsplats blender --lit`` draws
+them and, for comparison, with a plain diffuse material. Prints a Markdown table, below Blender's own output,
+and writes a strip of the images (-o). Shadow overlap is intersection over union of those pixels of the ground
+that are darker than 0.8 of the bare ground.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ SPLATS = 20_000
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (v, 3), texture coordinates (t, 2), and the numbers of both at the corners (f, 3) of the
+    """Vertices (v, 3), texture coordinates (t, 2), and the indices of both at the corners (f, 3) of the
     triangles."""
-    points, places, corners = [], [], []
+    points, coordinates, corners = [], [], []
     for line in path.read_text().splitlines():
         kind, *values = line.split() or [""]
         if kind == "v":
             points.append([float(x) for x in values])
         elif kind == "vt":
-            places.append([float(x) for x in values])
+            coordinates.append([float(x) for x in values])
         elif kind == "f":
             corners.append([[int(x) - 1 for x in corner.split("/")[:2]] for corner in values])
-    numbers = np.array(corners)
-    return np.array(points), np.array(places), numbers[:, :, 0], numbers[:, :, 1]
+    indices = np.array(corners)
+    return np.array(points), np.array(coordinates), indices[:, :, 0], indices[:, :, 1]
 
 
 def sample(obj, texture: np.ndarray, noisy: bool) -> GaussianCloud:
     """Flat splats in the surface; ``noisy``: tilted by 20 degrees at random, moved by a third of their
     spacing, and of all opacities from 0.3 on."""
-    points, places, faces, texture_faces = obj
+    points, coordinates, faces, texture_faces = obj
     rng = np.random.default_rng(0)
     a, b, c = (points[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
@@ -67,7 +67,7 @@ def sample(obj, texture: np.ndarray, noisy: bool) -> GaussianCloud:
     normals = (vertex_normals[faces[face]] * shares).sum(axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     means = (points[faces[face]] * shares).sum(axis=1)
-    u, v = (places[texture_faces[face]] * shares).sum(axis=1).T
+    u, v = (coordinates[texture_faces[face]] * shares).sum(axis=1).T
     height, width = texture.shape[:2]
     colors = texture[((1 - v) * height).astype(int) % height, (u * width).astype(int) % width] / 255
     spacing = np.sqrt(area.sum() / SPLATS)
@@ -87,24 +87,24 @@ def sample(obj, texture: np.ndarray, noisy: bool) -> GaussianCloud:
 
 def add_truth(obj, texture: Path, like) -> None:
     """The textured mesh, smooth, where the splat object ``like`` is."""
-    points, places, faces, texture_faces = obj
+    points, coordinates, faces, texture_faces = obj
     data = meshes.make_plain("Truth", points, faces)
     data.update(calc_edges=True)
     layer = data.uv_layers.new(name="UVMap")
-    layer.data.foreach_set("uv", places[texture_faces].astype(np.float32).ravel())
+    layer.data.foreach_set("uv", coordinates[texture_faces].astype(np.float32).ravel())
     data.shade_smooth()
     material = bpy.data.materials.new("Truth")
     tree = versions.node_tree(material)
-    picture, surface, out = (
+    texture_node, surface, out = (
         tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexImage", "BsdfDiffuse", "OutputMaterial")
     )
-    picture.image = bpy.data.images.load(str(texture))
-    tree.links.new(picture.outputs["Color"], surface.inputs["Color"])
+    texture_node.image = bpy.data.images.load(str(texture))
+    tree.links.new(texture_node.outputs["Color"], surface.inputs["Color"])
     tree.links.new(surface.outputs[0], out.inputs["Surface"])
     data.materials.append(material)
-    thing = bpy.data.objects.new("Truth", data)
-    thing.matrix_world = like.matrix_world
-    bpy.context.scene.collection.objects.link(thing)
+    target = bpy.data.objects.new("Ground truth", data)
+    target.matrix_world = like.matrix_world
+    bpy.context.scene.collection.objects.link(target)
 
 
 def main() -> None:
@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with meshes/spot_textured/spot")
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--samples", type=int, default=48)
-    parser.add_argument("-o", "--output", type=Path, help="picture of all: a .png")
+    parser.add_argument("-o", "--output", type=Path, help="image of all: a .png")
     asked = parser.parse_args()
     folder = asked.data / "meshes" / "spot_textured" / "spot"
     obj = read_obj(folder / "spot_triangulated.obj")
@@ -123,18 +123,18 @@ def main() -> None:
     shown, captions = [], []
 
     def shot(made) -> np.ndarray:
-        with tempfile.TemporaryDirectory() as place:
-            pictures.render_to(made.scene, Path(place) / "picture.exr")
-            return pictures.read_pixels(Path(place) / "picture.exr")[..., :3]
+        with tempfile.TemporaryDirectory() as scratch:
+            pictures.render_to(made.scene, Path(scratch) / "image.exr")
+            return pictures.read_pixels(Path(scratch) / "image.exr")[..., :3]
 
-    def display(picture: np.ndarray) -> np.ndarray:
-        return linear_to_srgb(np.clip(picture, 0, 1))
+    def display(image: np.ndarray) -> np.ndarray:
+        return linear_to_srgb(np.clip(image, 0, 1))
 
     rows = [
-        "| splats | material | PSNR, picture | PSNR, cow alone | shadow overlap | light, of the mesh's |",
+        "| splats | material | PSNR, image | PSNR, cow alone | shadow overlap | light, of the mesh's |",
         "|---|---|---|---|---|---|",
     ]
-    truth = ground = None
+    target = ground = None
     for kind, noisy in [("clean", False), ("noisy", True)]:
         mesh = replace(convert(sample(obj, texture, noisy), mode="flat"), up=UP)
         if view is None:
@@ -143,17 +143,17 @@ def main() -> None:
             ]
         layers, limit = subject.count(mesh, [view], options)
         arrays, facts = subject.prepare(mesh, [view], options, layers)
-        if truth is None:
+        if target is None:
             made = scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
-            made.thing.hide_render = True
+            made.obj.hide_render = True
             ground = shot(made)
-            add_truth(obj, folder / "spot_texture.png", made.thing)
-            truth = shot(made)
-            shown.append(display(truth))
+            add_truth(obj, folder / "spot_texture.png", made.obj)
+            target = shot(made)
+            shown.append(display(target))
             captions.append("textured mesh")
         covered = render(mesh, view).alpha
         floor = (covered < 0.02) & (ground.mean(axis=2) > 0.05)
-        shade = (truth.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
+        shade = (target.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
         for material in ("plain diffuse", "--lit"):
             taken = scene.Subject(**arrays, **facts)
             if material == "plain diffuse":
@@ -162,10 +162,10 @@ def main() -> None:
             dark = (drawn.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
             cow = covered > 0.98
             rows.append(
-                f"| {kind} | {material} | {psnr(display(drawn), display(truth)):.1f} dB |"
-                f" {psnr(display(drawn)[cow][None], display(truth)[cow][None]):.1f} dB |"
+                f"| {kind} | {material} | {psnr(display(drawn), display(target)):.1f} dB |"
+                f" {psnr(display(drawn)[cow][None], display(target)[cow][None]):.1f} dB |"
                 f" {(dark & shade).sum() / max((dark | shade).sum(), 1):.2f} |"
-                f" {drawn[cow].mean() / truth[cow].mean():.2f} |"
+                f" {drawn[cow].mean() / target[cow].mean():.2f} |"
             )
             shown.append(display(drawn))
             captions.append(f"{kind}, {material}")

@@ -1,10 +1,10 @@
-"""How evenly splats take light as one, two or three ellipses a splat: the conversion's modes.
+"""How evenly splats are lit with one, two or three ellipses per splat: the conversion's modes.
 
     blender-env/bin/python benchmarks/blender_modes.py [--size 96] [--samples 32]
 
 A grey ball of 3000 splats, twice as long as wide and half as thick, tilted and moved at random, is lit by sun
-and sky. Prints a Markdown table: the light of the ball's middle, and how far it deviates from a smooth
-picture (a polynomial of degree 4), which is what looks mottled or speckled.
+and sky. Prints a Markdown table: the radiance of the ball's centre, and how far it deviates from a smooth
+image (a polynomial of degree 4), which is what looks mottled or speckled.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def main() -> None:
     for mode in ("flat", "crossed", "3d"):
         mesh = convert(ball(), mode=mode)
         with tempfile.TemporaryDirectory() as folder:
-            draw(mesh, [view], pictures=[Path(folder) / "ball.exr"], options=options)
+            draw(mesh, [view], images=[Path(folder) / "ball.exr"], options=options)
             light = read_pixels(Path(folder) / "ball.exr")[..., 1][middle]
         rest = light - smooth @ np.linalg.lstsq(smooth, light, rcond=None)[0]
         share = rest.std() / light.mean()

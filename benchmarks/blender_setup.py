@@ -38,15 +38,15 @@ def measure(millions: float) -> dict:
     mesh = convert(cloud, preset="paper")
     view = orbit(mesh, 1, width=64, height=64)[0]
     with tempfile.TemporaryDirectory() as folder:
-        told = draw(mesh, [view], pictures=[Path(folder) / "picture.png"])
+        result = draw(mesh, [view], images=[Path(folder) / "image.png"])
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
-        "blender": told["blender"],
+        "blender": result["blender"],
         "triangles": len(mesh.faces),
-        "build": told["build_seconds"],
-        "build_processor": told["build_processor_seconds"],
-        "render": told["picture_seconds"][0],
-        "render_processor": told["picture_processor_seconds"][0],
+        "build": result["build_seconds"],
+        "build_processor": result["build_processor_seconds"],
+        "render": result["image_seconds"][0],
+        "render_processor": result["image_processor_seconds"][0],
         "processor": used.ru_utime + used.ru_stime,
         "memory": used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3),
     }

@@ -1,10 +1,10 @@
-"""How long a person waits for a lit picture, what it is worth, and what the command says beforehand.
+"""Time and quality of lit images, and the command's estimate of the time.
 
     blender-env/bin/python benchmarks/blender_waiting.py [--width 240]
 
 The demo scene, as it is, of a tenth as many splats, and of faint large ones, is drawn by Cycles under the
 default light, flat ellipses as ``meshsplats blender --lit`` has them. Prints two Markdown tables: processor
-time a picture and what the command announces; and, of the first scene, PSNR (8 bits) of fewer samples, with
+time per image and the command's estimate; and, of the first scene, PSNR (8 bits) of fewer samples, with
 and without denoising, against many.
 """
 
@@ -26,42 +26,42 @@ from meshsplats.images.writing import load_png
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--width", type=int, default=240)
-    parser.add_argument("--reference", type=int, default=400, help="samples that count as many")
-    given = parser.parse_args()
+    parser.add_argument("--reference", type=int, default=400, help="samples of the reference image")
+    asked = parser.parse_args()
     whole, faint = make_scene(20_000), make_scene(20_000)
     faint = replace(faint, opacities=0.15 * faint.opacities, scales=2 * faint.scales)
     scenes = {"still life": whole, "2,000 splats": make_scene(2000), "faint, large splats": faint}
     meshes = {name: convert(cloud, mode="flat") for name, cloud in scenes.items()}
     lens: dict[str, Any] = {"elevation": 15, "azimuth": 20}
-    lens |= {"width": given.width, "height": given.width * 9 // 16}
+    lens |= {"width": asked.width, "height": asked.width * 9 // 16}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.png"
 
-        def picture(mesh, options):
+        def image(mesh, options):
             ahead: list[dict] = []
             camera = orbit(mesh, 1, **lens)
-            told = draw(mesh, camera, pictures=[path], options=options, announce=ahead.append)
-            return load_png(path) / 255, told["picture_processor_seconds"][0], ahead[0]
+            result = draw(mesh, camera, images=[path], options=options, announce=ahead.append)
+            return load_png(path) / 255, result["image_processor_seconds"][0], ahead[0]
 
         print("| scene | light | layers, mean | samples | processor time | estimate |")
         print("|---|---|---|---|---|---|")
         for name, mesh in meshes.items():
             for light in (None, LightOptions()):
                 options = SceneOptions(light=light, samples=2 if light is None else 4, threads=1)
-                _, seconds, ahead = picture(mesh, options)
+                _, seconds, ahead = image(mesh, options)
                 guess = estimated_seconds(ahead, options)
                 kind = "unlit" if light is None else "lit"
                 row = f"{ahead['mean_layers']:.1f} | {ahead['samples']} | {seconds:.1f} s | {guess:.1f} s"
                 print(f"| {name} | {kind} | {row} |", flush=True)
         mesh, light = meshes["still life"], LightOptions()
-        many, _, _ = picture(mesh, SceneOptions(light=light, samples=given.reference))
+        many, _, _ = image(mesh, SceneOptions(light=light, samples=asked.reference))
         print("\n| samples | denoised | PSNR | processor time |\n|---|---|---|---|")
         for samples in (8, 16, 64):
             for denoise in (False, True):
                 options = SceneOptions(light=light, samples=samples, denoise=denoise)
-                shown, seconds, _ = picture(mesh, options)
-                told = f"{psnr(shown, many):.1f} dB | {seconds:.1f} s"
-                print(f"| {samples} | {'yes' if denoise else 'no'} | {told} |", flush=True)
+                shown, seconds, _ = image(mesh, options)
+                cells = f"{psnr(shown, many):.1f} dB | {seconds:.1f} s"
+                print(f"| {samples} | {'yes' if denoise else 'no'} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""What each choice of the conversion is worth: PSNR of the mesh's picture against that of the splats.
+"""Ablation of the conversion's choices: PSNR of the mesh's image against that of the splats.
 
     python benchmarks/conversion_ablation.py                              on a scene of our own
     python benchmarks/conversion_ablation.py --data FOLDER                on guitar, truck and playbot
     python benchmarks/conversion_ablation.py --scene SPLATS CAMERAS...    on other splats, with camera files
 
 FOLDER holds ``splats`` and ``cameras``. Every mesh is converted once, for the first set of cameras (close),
-and drawn from all of them with 2 x 2 samples a pixel on white; the splats are drawn the 3DGS way. Both have
+and drawn from all of them with 2 x 2 samples per pixel on white; the splats are drawn the 3DGS way. Both have
 the splats' display colour of degree 0, in [0, 1]. Prints Markdown tables.
 """
 
@@ -83,15 +83,15 @@ class Scene:
     cloud: GaussianCloud
     cameras: dict[str, list[Camera]]
     """By distance; the first is the one that meshes are converted for."""
-    pictures: dict[str, list[np.ndarray]]
+    images: dict[str, list[np.ndarray]]
 
 
 def make(name: str, cloud: GaussianCloud, cameras: dict[str, list[Camera]], views: int) -> Scene:
     # What a mesh can hold: one colour a splat, in [0, 1].
     cloud = replace(cloud, sh=((cloud.colors - 0.5) / np.float32(SH_C0))[:, None])
     shown = {where: some[:: max(1, len(some) // views)][:views] for where, some in cameras.items()}
-    pictures = {where: [render_splats(cloud, c).color for c in some] for where, some in shown.items()}
-    return Scene(name, cloud, cameras, pictures)
+    images = {where: [render_splats(cloud, c).color for c in some] for where, some in shown.items()}
+    return Scene(name, cloud, cameras, images)
 
 
 def load_scenes(args: argparse.Namespace) -> list[Scene]:
@@ -143,9 +143,9 @@ def measure(scene: Scene, options: dict) -> Measured:
         seconds = min(seconds, time.perf_counter() - start)
     quality = []
     for where in distances:
-        pictures = scene.pictures[where]
-        shown = scene.cameras[where][:: max(1, len(scene.cameras[where]) // len(pictures))]
-        pairs = zip(shown, pictures, strict=False)
+        images = scene.images[where]
+        shown = scene.cameras[where][:: max(1, len(scene.cameras[where]) // len(images))]
+        pairs = zip(shown, images, strict=False)
         quality.append(float(np.mean([psnr(render(mesh, c, samples=2).color, p) for c, p in pairs])))
     arrays = (mesh.vertices, mesh.faces, mesh.colors, mesh.face_splat)
     size = sum(array.nbytes for array in arrays if array is not None)
@@ -194,7 +194,7 @@ def main() -> None:
     if args.quick:
         return
     print_table("Flat, crossed, 3d", scenes, MODES)
-    print_table("The default with one thing changed", scenes, VARIATIONS)
+    print_table("The default with one obj changed", scenes, VARIATIONS)
     grid = []
     for radius, sides, rim, footprint in product(*GRID.values()):
         options = dict(preset="paper", rim_radius=radius, sides=sides, rim_opacity=rim, footprint=footprint)

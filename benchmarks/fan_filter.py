@@ -1,14 +1,14 @@
-"""A mesh drawn with a filter, at five sizes: dB against the splats' own pictures, and what the filter costs.
+"""A mesh drawn with a filter, at five sizes: dB against the splats' own images, and the cost of the filter.
 
     python benchmarks/fan_filter.py FILE.ply ...
 
-Truth: `render_splats`, degree 0, over white, one sample a pixel, at 200, 400, 800 and 1600 pixels from four
-sides (elevation 20 degrees), and at 800 pixels from half as far (twice the focal length). Meshes are drawn
-with one sample a pixel, too: converted by default, without a footprint, with `footprint="filter"` in the
-modes crossed (the default) and flat, and the crossed one baked for the views of 800 pixels.
+Target: `render_splats`, degree 0, over white, one sample per pixel, at 200, 400, 800 and 1600 pixels from
+four sides (elevation 20 degrees), and at 800 pixels from half as far (twice the focal length). Meshes are
+drawn with one sample per pixel, too: converted by default, without a footprint, with `footprint="filter"` in
+the modes crossed (the default) and flat, and the crossed one baked for the views of 800 pixels.
 
-Costs are processor milliseconds of one thread, medians, of a picture and of one with its way back, without a
-filter and with one of 1e-9 px^2: it does all its work, but triangles cover what they covered before.
+Costs are processor milliseconds of one thread, medians, of an image and of one with its backward pass,
+without a filter and with one of 1e-9 px^2, which does all its work and leaves the triangles as they are.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def views(cloud: GaussianCloud) -> dict[str, list[Camera]]:
     return found | {"near": [replace(camera, fx=2 * camera.fx, fy=2 * camera.fy) for camera in cameras]}
 
 
-def score(mesh: SplatMesh, cameras: list[Camera], truth: list[np.ndarray]) -> float:
+def score(mesh: SplatMesh, cameras: list[Camera], targets: list[np.ndarray]) -> float:
     drawn = [np.clip(render(mesh, camera).color, 0, 1) for camera in cameras]
-    return float(np.mean([psnr(a, b) for a, b in zip(drawn, truth, strict=True)]))
+    return float(np.mean([psnr(a, b) for a, b in zip(drawn, targets, strict=True)]))
 
 
 def cost(work: Callable[[], object], repeat: int) -> float:
@@ -64,8 +64,8 @@ def cost(work: Callable[[], object], repeat: int) -> float:
     return 1000 * statistics.median(seconds)
 
 
-def back_and_forth(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
-    picture = TapedRendering(
+def forward_and_backward(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
+    taped = TapedRendering(
         mesh.vertices,
         mesh.faces,
         mesh.colors,
@@ -76,7 +76,7 @@ def back_and_forth(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
         threads=1,
     )
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-    picture.back(np.ones_like(picture.color), None, None, vertices=points, colors=colors)
+    taped.back(np.ones_like(taped.color), None, None, vertices=points, colors=colors)
 
 
 def main() -> None:
@@ -87,25 +87,25 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=9)
     asked = parser.parse_args()
     clouds = {path.stem: load_gaussians(path) for path in asked.files}
-    print("| | triangles | pixels | picture | with a filter | and back | with a filter |")
+    print("| | triangles | pixels | image | with a filter | and backward | with a filter |")
     print("|---|---|---|---|---|---|---|")
     for name, cloud in clouds.items():
         mesh = convert(cloud, footprint="none")
         for side in (400, 800):
             camera = views(cloud)[str(side)][0]
-            numbers = [
-                cost(partial(way, mesh, camera, filter_px2=px2), asked.repeat)
-                for way in (partial(render, threads=1), back_and_forth)
+            costs = [
+                cost(partial(function, mesh, camera, filter_px2=px2), asked.repeat)
+                for function in (partial(render, threads=1), forward_and_backward)
                 for px2 in (0, TINY)
             ]
-            cells = " | ".join(f"{number:.0f}" for number in numbers)
+            cells = " | ".join(f"{milliseconds:.0f}" for milliseconds in costs)
             print(f"| {name} | {len(mesh.faces):,} | {side} | {cells} |", flush=True)
     print(f"\n| | | {' | '.join(map(str, SIZES))} | near |\n|---|---|---|---|---|---|---|")
     for name, cloud in clouds.items():
-        places = views(cloud)
-        truth = {
+        views_of = views(cloud)
+        targets = {
             size: [np.clip(render_splats(cloud, camera, sh_degree=0).color, 0, 1) for camera in cameras]
-            for size, cameras in places.items()
+            for size, cameras in views_of.items()
         }
         filtered = convert(cloud, footprint="filter")
         for kind, mesh in {
@@ -113,9 +113,9 @@ def main() -> None:
             "footprint none": convert(cloud, footprint="none"),
             "filter": filtered,
             "filter, flat": convert(cloud, footprint="filter", mode="flat"),
-            "filter, baked for 800": bake_filter(filtered, places["800"]),
+            "filter, baked for 800": bake_filter(filtered, views_of["800"]),
         }.items():
-            scores = [score(mesh, cameras, truth[size]) for size, cameras in places.items()]
+            scores = [score(mesh, cameras, targets[size]) for size, cameras in views_of.items()]
             print(f"| {name} | {kind} | {' | '.join(f'{s:.1f}' for s in scores)} |", flush=True)
 
 

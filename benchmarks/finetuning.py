@@ -1,13 +1,13 @@
-"""What fine-tuning gains: PSNR on views that were not trained on, before and after, preset by preset.
+"""The gain of fine-tuning: PSNR on held-out views, before and after, preset by preset.
 
     python benchmarks/finetuning.py --data ../shared/data --minutes 2
     python benchmarks/finetuning.py --data ../shared/data --scenes lego --presets default --minutes 5
 
-Splat files are judged at the cameras `DATA/cameras/*_mid.json` on white at degree 0, in the look that is
+Splat files are scored at the cameras `DATA/cameras/*_mid.json` on white at degree 0, in the look that is
 learned (`--look area`: means over pixels' areas, against the mesh at as many samples as it needs; `splats`:
-the image of a viewer, against one sample); drawing the targets counts towards the time, judging does not.
-Photographs are judged on their held-out views: mean (median), then the same after a gain and an offset a
-channel are fitted to each picture. `--exposure` fits such to the training pictures, too.
+the image of a viewer, against one sample); rendering the targets counts towards the time, scoring does not.
+Photographs are scored on their held-out views: mean (median), then the same after a gain and an offset per
+channel are fitted to each image. `--exposure` fits them to the training images, too.
 `--clock processor` counts the processor time of all threads, divided by --processors, instead of the clock on
 the wall: for machines that do other work at the same time.
 """
@@ -62,14 +62,14 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--presets", nargs="+", default=["default", "paper", "published"])
     parser.add_argument("--minutes", type=float, default=2.0)
-    parser.add_argument("--steps", type=int, help="so many steps instead of a time")
+    parser.add_argument("--steps", type=int, help="steps, instead of a time")
     parser.add_argument("--clock", choices=["wall", "processor"], default="wall")
     parser.add_argument("--processors", type=int, default=2, help="that processor time is divided by")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--sh-degree", type=int, default=0, help="of targets drawn from splats")
     parser.add_argument("--look", choices=["area", "splats"], default="area")
     parser.add_argument("--exposure", action="store_true", help="fit gains and offsets of the photographs")
-    parser.add_argument("--test-views", type=int, default=40, help="at most so many views to judge by")
+    parser.add_argument("--test-views", type=int, default=40, help="most views to score")
     options = parser.parse_args()
     print("| scene | preset | triangles | steps | seconds | splats | converted | tuned |")
     print("|---|---|---|---|---|---|---|---|")
@@ -104,11 +104,11 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
         judged = ms.Dataset((), views, look=options.look)
     cameras = [view.camera for view in data.train]
     mesh = starting_mesh(cloud, cameras, preset=preset, look=data.look)
-    told = []
+    reports = []
     run = RunOptions(threads=options.threads, report_every=0, spent=seconds())
     if options.clock == "wall" or options.steps:
-        tuned = finetune(mesh, ms.Dataset(data.train), config, run=run, on_progress=told.append)
-        steps = told[-1].step
+        tuned = finetune(mesh, ms.Dataset(data.train), config, run=run, on_progress=reports.append)
+        steps = reports[-1].step
     else:
         tuned, steps = by_processor_time(mesh, data, config, options, seconds)
     used = seconds()

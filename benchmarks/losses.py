@@ -1,9 +1,9 @@
-"""What the loss and the optimiser's step cost, beside what torch offers.
+"""Cost of the loss and of the optimiser's step, beside torch's.
 
     python benchmarks/losses.py                     both tables
     python benchmarks/losses.py --size 800 --rows 1000000 --repeat 9
 
-The loss is 0.6 L1 + 0.4 (1 - SSIM) of pictures (size, size, 3), with its gradient. The step is Adam on
+The loss is 0.6 L1 + 0.4 (1 - SSIM) of images (size, size, 3), with its gradient. The step is Adam on
 positions (v, 3) and colours (v, 4), where a view reached a share of the splats of nine vertices each. Rows
 take turns and medians are printed, so that other work on the machine disturbs all of them alike; processor
 time is that of all threads together. Needs torch.
@@ -49,10 +49,10 @@ def gaussian() -> torch.Tensor:
     return line / line.sum()
 
 
-def torch_loss(picture: torch.Tensor, truth: torch.Tensor, separable: bool) -> torch.Tensor:
+def torch_loss(image: torch.Tensor, target: torch.Tensor, separable: bool) -> torch.Tensor:
     """The same loss in torch alone: five means under the window, each with one or with two convolutions."""
     line = gaussian()
-    x, y = (p.permute(2, 0, 1)[None] for p in (picture, truth))
+    x, y = (p.permute(2, 0, 1)[None] for p in (image, target))
 
     def mean(z: torch.Tensor) -> torch.Tensor:
         if separable:
@@ -68,12 +68,12 @@ def torch_loss(picture: torch.Tensor, truth: torch.Tensor, separable: bool) -> t
 
 def losses(size: int, repeat: int) -> None:
     generator = torch.Generator().manual_seed(0)
-    truth = torch.rand(size, size, 3, generator=generator)
-    picture = (truth + 0.05 * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
+    target = torch.rand(size, size, 3, generator=generator)
+    image = (target + 0.05 * torch.randn(target.shape, generator=generator)).clamp(0, 1)
 
     def step(loss: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[], torch.Tensor]:
         def work() -> torch.Tensor:
-            x = picture.clone().requires_grad_()
+            x = image.clone().requires_grad_()
             loss(x).backward()
             assert x.grad is not None
             return x.grad
@@ -81,10 +81,10 @@ def losses(size: int, repeat: int) -> None:
         return work
 
     rows = {
-        "meshsplats, 1 thread": step(lambda x: photometric_loss(x, truth, threads=1)),
-        "meshsplats": step(lambda x: photometric_loss(x, truth)),
-        "torch, separable": step(lambda x: torch_loss(x, truth, separable=True)),
-        "torch, 11 x 11 windows": step(lambda x: torch_loss(x, truth, separable=False)),
+        "meshsplats, 1 thread": step(lambda x: photometric_loss(x, target, threads=1)),
+        "meshsplats": step(lambda x: photometric_loss(x, target)),
+        "torch, separable": step(lambda x: torch_loss(x, target, separable=True)),
+        "torch, 11 x 11 windows": step(lambda x: torch_loss(x, target, separable=False)),
     }
     expected = rows["torch, separable"]()
     found = rows["meshsplats"]()
@@ -115,7 +115,7 @@ def steps(rows: int, repeat: int) -> None:
             gradient = torch.from_numpy(generator.normal(size=(rows, columns)).astype(np.float32))
             gradient *= torch.from_numpy(mask)[:, None]
             ours = RowAdam(start.clone(), lr=1e-3)
-            for name, reached in {"by mask": mask, "by number": chosen}.items():
+            for name, reached in {"by mask": mask, "by index": chosen}.items():
                 step = partial(ours.step, gradient, reached)
                 work.setdefault(f"meshsplats, rows {name}", []).append(step)
             for name, make in {

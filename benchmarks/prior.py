@@ -1,9 +1,9 @@
-"""What a mesh prior gains: PSNR on held-out views, against the same base drawn opaque and against fan mode.
+"""The gain of a mesh prior: PSNR on held-out views, against the same base opaque and against fan mode.
 
     python benchmarks/prior.py --data ../shared/data --steps 200
     python benchmarks/prior.py --data ../shared/data --steps 500 --only layers=6
 
-The base is a visual hull (`meshes/lego_visual_hull_40k_vertexcolor.ply`), the pictures `photos/lego`, with
+The base is a visual hull (`meshes/lego_visual_hull_40k_vertexcolor.ply`), the images `photos/lego`, with
 its own 40 test views. Rows: the base opaque with the vertex colours it came with; the same with its vertex
 colours optimised by the same losses, rates and number of steps (positions and opacity fixed); priors of
 several forms; and the fans of splats that were trained on the same photographs, fine-tuned. Seconds are
@@ -22,7 +22,7 @@ import torch
 
 import meshsplats as ms
 from meshsplats.finetuning import make_config, starting_mesh
-from meshsplats.finetuning.config import FinetuneConfig, rates
+from meshsplats.finetuning.config import FinetuneConfig, learning_rates
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, loss_of, make_step, target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
@@ -94,7 +94,7 @@ def main() -> None:
 def trained(
     mesh: ms.SplatMesh, data: ms.Dataset, config: FinetuneConfig, threads: int
 ) -> tuple[ms.SplatMesh, int, float]:
-    """``mesh`` after all steps, their number, and their processor time."""
+    """``mesh`` after all steps, their count, and their processor time."""
     state = State.begin(mesh, len(data.train), config, threads)
     steps, interval = config.total_steps(len(data.train)) or 0, config.prune_interval(len(data.train))
     start = time.process_time()
@@ -122,9 +122,10 @@ def opaque_colors(
         drawn = rasterize(
             vertices, mesh.faces, rgba, view.camera, background=target.background, threads=threads
         )
-        adam.param_groups[0]["lr"] = rates(config, step, step / steps)[0]
+        adam.param_groups[0]["lr"] = learning_rates(config, step, step / steps)[0]
         adam.zero_grad()
-        loss_of(drawn.color, target, config, threads).backward()
+        gradient = loss_of(drawn.color.detach().numpy(), target, config, threads)[1]
+        drawn.color.backward(torch.from_numpy(gradient))
         adam.step()
         with torch.no_grad():
             colors.clamp_(0, 1)

@@ -1,15 +1,14 @@
-"""Speed and memory of the renderer, and of its way back, on random fans of 8 triangles.
+"""Speed and memory of the renderer and of its backward pass, on random fans of 8 triangles.
 
     python benchmarks/rendering.py [--repeat 5] [--threads 1 2] [--scenes 160k 1M 4M]
     python benchmarks/rendering.py --growth --threads 1
 
-Prints a Markdown table. render: a picture, exact at every pixel. log: the same, with a log to go back by.
-back: gradients of positions and colours from that of the picture. Medians of the clock in milliseconds;
-fragments blended a pixel, and a second by render; nanoseconds of log and back together for each fragment; the
-peak of the process's memory beyond what it held before, of render, and of log and back without the gradients
-(Linux). Each row runs in a process of its own. --growth: one scene, then four times as many triangles of a
-quarter of the size, four times as many pixels, and four times as many layers (triangles of a quarter of the
-opacity).
+Prints a Markdown table. render: an image, exact at every pixel. tape: the same, recording a tape. backward:
+gradients of positions and colours from that of the image. Medians of wall time in milliseconds; fragments
+blended per pixel, and per second by render; nanoseconds of tape and backward together per fragment; the peak
+of the process's memory above its start, of render, and of tape and backward without the gradients (Linux).
+Each row runs in a process of its own. --growth: one scene, then four times as many triangles of a quarter of
+the size, four times as many pixels, and four times as many layers (triangles of a quarter of the opacity).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ SCENES = {
     "1M": (125_000, 0.0145, 0.05, 800),
     "4M": (500_000, 0.006, 0.06, 800),
 }
-"""Fans, their radius at depth 1, opacity, side of the picture in pixels."""
+"""Fans, their radius at depth 1, opacity, side of the image in pixels."""
 
 GROWTH = {
     "one": (31_250, 0.029, 0.05, 400),
@@ -46,7 +45,7 @@ GROWTH = {
 
 
 def random_fans(fans: int, radius: float, opacity: float, side: int) -> tuple[SplatMesh, Camera]:
-    """Fans of random orientation between the depths 2.5 and 5, in front of the whole picture."""
+    """Fans of random orientation between the depths 2.5 and 5, in front of the whole image."""
     rng = np.random.default_rng(0)
     centers = np.stack([rng.uniform(-1, 1, fans), rng.uniform(-1, 1, fans), rng.uniform(2.5, 5, fans)], 1)
     centers[:, :2] *= centers[:, 2:] / 2
@@ -94,7 +93,7 @@ def run(name: str, threads: int, repeat: int) -> None:
     towards = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
 
-    def recorded() -> TapedRendering:
+    def taped() -> TapedRendering:
         return TapedRendering(
             mesh.vertices, mesh.faces, mesh.colors, None, camera, face_splat=mesh.face_splat, threads=threads
         )
@@ -103,22 +102,22 @@ def run(name: str, threads: int, repeat: int) -> None:
     fragments = render(mesh, camera, threads=threads).fragments
     drawing = memory("VmHWM") - before
     before = memory("VmRSS", reset=True)
-    picture = recorded()
-    picture.back(towards, None, None, vertices=points, colors=colors)
+    rendering = taped()
+    rendering.back(towards, None, None, vertices=points, colors=colors)
     both = memory("VmHWM") - before
 
     draw = clocked(lambda: render(mesh, camera, threads=threads), repeat)
-    log = clocked(recorded, repeat)
-    back = clocked(lambda: picture.back(towards, None, None, vertices=points, colors=colors), repeat)
+    tape = clocked(taped, repeat)
+    backward = clocked(lambda: rendering.back(towards, None, None, vertices=points, colors=colors), repeat)
     pixels = camera.width * camera.height
     cells = (
         f"{len(mesh.faces):,}",
         f"{camera.width} x {camera.height}",
         f"{threads}",
         f"{fragments / pixels:.1f}",
-        *(f"{1000 * seconds:.0f}" for seconds in (draw, log, back, log + back)),
+        *(f"{1000 * seconds:.0f}" for seconds in (draw, tape, backward, tape + backward)),
         f"{fragments / draw / 1e6:.1f}",
-        f"{1e9 * (log + back) / fragments:.1f}",
+        f"{1e9 * (tape + backward) / fragments:.1f}",
         f"{drawing / 1e6:.0f}",
         f"{both / 1e6:.0f}",
     )
@@ -139,8 +138,17 @@ def main() -> None:
         run(args.row[0], int(args.row[1]), args.repeat)
         return
     print(f"Core: {available_variants()[0]}.\n")
-    heads = ["triangles", "picture", "threads", "fragments a pixel", "render", "log", "back", "log + back"]
-    heads += ["M fragments a second", "ns a fragment", "MB, render", "MB, log + back"]
+    heads = [
+        "triangles",
+        "image",
+        "threads",
+        "fragments per pixel",
+        "render",
+        "tape",
+        "backward",
+        "tape + backward",
+    ]
+    heads += ["M fragments per second", "ns per fragment", "MB, render", "MB, tape + backward"]
     print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
     for name in GROWTH if args.growth else args.scenes:
         for threads in args.threads:

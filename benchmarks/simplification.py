@@ -8,10 +8,10 @@
 CAMERAS is a JSON list. splats: dB of the reduced splats against all of them, drawn alike, and seconds of
 processor time; --other: files that another program reduced, beside them. meshes: the same number of splats
 merged and dropped, then converted for fine-tuning, and fine-tuned. triangles: the same number of triangles
-shared out in different ways; budgets are triangles for each splat of the file. speed: merging COUNT splats of
-our own scene to a quarter, and the memory that it took.
+distributed in different ways; budgets are triangles for each splat of the file. speed: merging COUNT splats
+of our own scene to a quarter, and the memory that it took.
 
-Pictures on white, degree 0: (i) one sample a pixel against the splats drawn at that size, (ii) 2 x 2 samples
+Images on white, degree 0: (i) one sample per pixel against the splats drawn at that size, (ii) 2 x 2 samples
 against the mean of splats drawn four times as large.
 """
 
@@ -58,14 +58,14 @@ class Truth:
         return means
 
     def of_splats(self, cloud):
-        pictures = [render_splats(cloud, c).color.clip(0, 1) for c in self.cameras]
-        return np.mean([psnr(a, b) for a, b in zip(pictures, self.same, strict=True)])
+        images = [render_splats(cloud, c).color.clip(0, 1) for c in self.cameras]
+        return np.mean([psnr(a, b) for a, b in zip(images, self.same, strict=True)])
 
     def of_mesh(self, mesh):
         scores = []
         for samples, truth in ((1, self.same), (2, self.mean)):
-            pictures = [render(mesh, c, samples=samples).color.clip(0, 1) for c in self.cameras]
-            scores.append(np.mean([psnr(a, b) for a, b in zip(pictures, truth, strict=True)]))
+            images = [render(mesh, c, samples=samples).color.clip(0, 1) for c in self.cameras]
+            scores.append(np.mean([psnr(a, b) for a, b in zip(images, truth, strict=True)]))
         return "{:.2f} / {:.2f}".format(*scores)
 
 

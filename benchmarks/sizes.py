@@ -1,14 +1,14 @@
-"""How right a mesh is at every size: PSNR against its splats at five sizes, under both looks.
+"""Quality of a mesh at every size: PSNR against its splats at five sizes, under both looks.
 
     python benchmarks/sizes.py SPLATS ... --minutes 2 --look area
     python benchmarks/sizes.py SPLATS --mesh tuned.npz
-    python benchmarks/sizes.py demo --minutes 2 --picture docs/images/sizes.png
+    python benchmarks/sizes.py demo --minutes 2 --image docs/images/sizes.png
 
 Views of ``orbit(cloud, 4, elevation=20)`` on white at degree 0, 200, 400, 800 and 1600 pixels wide and 800
 pixels from half as far. Look 'area': the mean of an image four times as large, the mesh at 2 x 2 samples.
 Look 'splats': the image of a 3DGS viewer at that size, the mesh at one sample. Rows: converted by default,
 converted for the look 'splats' (at the cameras of a framing) and with the filter, and tuned, or the mesh
-given. ``demo`` is this project's own scene. ``--picture`` shows the middle of one view at four sizes:
+given. ``demo`` is this project's own scene. ``--image`` shows the middle of one view at four sizes:
 splats, converted with a footprint and tuned on viewers' images of 400 pixels, as a mesh without a filter of
 its own has to be, and tuned on means over areas.
 """
@@ -36,15 +36,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("splats", nargs="+")
-    parser.add_argument("--mesh", type=Path, help="a mesh to score in place of what is made")
-    parser.add_argument("--minutes", type=float, default=2.0, help="0: nothing is tuned")
-    parser.add_argument("--steps", type=int, help="so many steps instead of a time")
+    parser.add_argument("--mesh", type=Path, help="a mesh to score instead of those made here")
+    parser.add_argument("--minutes", type=float, default=2.0, help="0: convert only")
+    parser.add_argument("--steps", type=int, help="steps, instead of a time")
     parser.add_argument("--look", choices=["area", "splats"], default="area", help="of the tuning")
     parser.add_argument("--looks", nargs="+", choices=["area", "splats"], default=["area", "splats"])
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--max-triangles", type=int)
     parser.add_argument("--save", type=Path, help="folder for the tuned meshes")
-    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--image", type=Path)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
     print("| scene | mesh | triangles | look | " + " | ".join(SIZES) + " |")
@@ -52,8 +52,8 @@ def main() -> None:
     for name in options.splats:
         cloud = make_scene() if name == "demo" else ms.load_gaussians(name)
         cloud = replace(cloud, sh=cloud.sh[:, :1])
-        if options.picture:
-            picture(cloud, options)
+        if options.image:
+            image(cloud, options)
             continue
         for label, mesh in meshes(cloud, name, options):
             for look in options.looks:
@@ -78,11 +78,11 @@ def meshes(cloud: ms.GaussianCloud, name: str, options: argparse.Namespace):
     if cloud.kernel == "3dgs":
         yield "converted, filter", ms.convert(cloud, footprint="filter", **limit)
     if options.minutes or options.steps:
-        tuned, told = tune(cloud, options, look=options.look, **limit)
+        tuned, description = tune(cloud, options, look=options.look, **limit)
         if options.save:
             options.save.mkdir(exist_ok=True)
             ms.save_mesh(tuned, options.save / f"{Path(name).stem}_{options.look}.npz")
-        yield f"tuned, look {options.look}, {told}", tuned
+        yield f"tuned, look {options.look}, {description}", tuned
 
 
 def tune(
@@ -118,14 +118,14 @@ def scores(cloud: ms.GaussianCloud, mesh: ms.SplatMesh, look: str, options: argp
     for side, zoom in SIZES.values():
         decibels = []
         for camera in cameras(cloud, options.views, side, zoom):
-            truth = ms.draw_splats(cloud, camera, look, threads=options.threads).color
+            target_image = ms.draw_splats(cloud, camera, look, threads=options.threads).color
             drawn = ms.render(mesh, camera, samples=SAMPLES[look], threads=options.threads).color
-            decibels.append(ms.psnr(np.clip(drawn, 0, 1), np.clip(truth, 0, 1)))
+            decibels.append(ms.psnr(np.clip(drawn, 0, 1), np.clip(target_image, 0, 1)))
         found.append(f"{np.mean(decibels):.2f}")
     return found
 
 
-def picture(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
+def image(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
     from PIL import Image
 
     from meshsplats.images.writing import save_png, strip, to_bytes
@@ -135,11 +135,11 @@ def picture(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
     rows = []
     for side in (200, 400, 800, 1600):
         (camera,) = cameras(cloud, 1, side, 1)
-        truth = ms.draw_splats(cloud, camera).color
-        images = [truth] + [ms.render(mesh, camera, samples=2).color for mesh in (viewers, areas)]
+        target_image = ms.draw_splats(cloud, camera).color
+        images = [target_image] + [ms.render(mesh, camera, samples=2).color for mesh in (viewers, areas)]
         captions = ["splats"]
         for label, image in zip(("tuned at 400 pixels", "tuned on areas"), images[1:], strict=True):
-            captions.append(f"{label}: {ms.psnr(np.clip(image, 0, 1), np.clip(truth, 0, 1)):.1f} dB")
+            captions.append(f"{label}: {ms.psnr(np.clip(image, 0, 1), np.clip(target_image, 0, 1)):.1f} dB")
         # The same part of the subject, as large in each row.
         half, (x, y) = side // 8, (round(0.5 * side), round(0.55 * side))
         parts = []
@@ -148,7 +148,7 @@ def picture(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
             enlarged = Image.fromarray(part).resize((300, 300), Image.Resampling.NEAREST)
             parts.append(np.asarray(enlarged, np.float32) / 255)
         rows.append(strip(parts, [f"{side} px: {captions[0]}", *captions[1:]]))
-    save_png(options.picture, np.concatenate(rows, axis=0))
+    save_png(options.image, np.concatenate(rows, axis=0))
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
-"""What one step of fine-tuning costs, how it grows, and what others take for the same.
+"""Cost of one step of fine-tuning, its growth, and the cost of others' steps.
 
     python benchmarks/training_step.py                        steps at 160k, 1 M and 4 M triangles
     python benchmarks/training_step.py --growth               with triangles, pixels and layers, one at a time
     python benchmarks/training_step.py --beside               beside torch and, where installed, Mitsuba 3
 
-A step draws a picture, takes 0.6 L1 + 0.4 (1 - SSIM) and its gradient back to positions and colours, and
-moves all vertices by Adam; scenes are those of benchmarks/rendering.py. Medians by the clock in milliseconds;
-parts are timed within the same steps. --beside takes a picture and the gradients of its colours of one small
+A step draws an image, takes 0.6 L1 + 0.4 (1 - SSIM) and its gradient back to positions and colours, and
+moves all vertices by Adam; scenes are those of benchmarks/rendering.py. Medians of wall time in milliseconds;
+parts are timed within the same steps. --beside takes an image and the gradients of its colours of one small
 scene: by this program, by the float64 reference in torch, and by Mitsuba's path integrator with automatic
-differentiation (llvm_ad_rgb, which needs an LLVM library), one sample a pixel. Mitsuba draws the same
-triangles as diffuse surfaces with an opacity under a white sky, not the same picture: it has no unlit
+differentiation (llvm_ad_rgb, which needs an LLVM library), one sample per pixel. Mitsuba draws the same
+triangles as diffuse surfaces with an opacity under a white sky, not the same image: it has no unlit
 blending. --beside needs torch.
 """
 
@@ -48,7 +48,7 @@ class Step:
         self.mesh, self.camera, self.threads = mesh, camera, threads
         self.vertices, self.colors = mesh.vertices.copy(), mesh.colors.copy()
         size = (1, camera.height, camera.width, 3)
-        self.truth = np.random.default_rng(0).random(size, np.float32)
+        self.target = np.random.default_rng(0).random(size, np.float32)
         # Rates so small that every step draws the same scene.
         self.optimizers = [RowAdam(self.vertices, lr=1e-9), RowAdam(self.colors, lr=1e-9, bounds=(0, 1))]
 
@@ -65,16 +65,16 @@ class Step:
 
     def __call__(self) -> list[float]:
         times = [time.perf_counter()]
-        picture = self.draw()
+        image = self.draw()
         times.append(time.perf_counter())
-        rates = dict(l1_rate=0.6 / self.truth.size, ssim_rate=-0.4 / self.truth.size)
+        rates = dict(l1_rate=0.6 / self.target.size, ssim_rate=-0.4 / self.target.size)
         compared = compare_images(
-            picture.color[None], self.truth, gradient=True, threads=self.threads, **rates
+            image.color[None], self.target, gradient=True, threads=self.threads, **rates
         )
         assert compared.gradient is not None
         times.append(time.perf_counter())
         gradients = [np.zeros_like(values) for values in (self.vertices, self.colors)]
-        picture.back(compared.gradient[0], None, None, vertices=gradients[0], colors=gradients[1])
+        image.back(compared.gradient[0], None, None, vertices=gradients[0], colors=gradients[1])
         times.append(time.perf_counter())
         for optimizer, gradient in zip(self.optimizers, gradients, strict=True):
             optimizer.step(gradient)
@@ -88,7 +88,7 @@ def timed(step: Step, repeat: int) -> list[float]:
 
 
 def steps(scenes: list[str], threads: list[int], repeat: int) -> None:
-    table(["triangles", "picture", "threads", *Step.parts, "step"])
+    table(["triangles", "image", "threads", *Step.parts, "step"])
     for name in scenes:
         mesh, camera = random_fans(*SCENES[name])
         for count in threads:
@@ -99,16 +99,18 @@ def steps(scenes: list[str], threads: list[int], repeat: int) -> None:
 
 def growth(repeat: int) -> None:
     """From a scene of 160k triangles, each of triangles, pixels and layers grows by itself."""
-    table(["what grows", "triangles", "picture", "fragments a pixel", "draw", "back", "ns a fragment"])
+    table(
+        ["what grows", "triangles", "image", "fragments per pixel", "forward", "backward", "ns per fragment"]
+    )
     fans, radius, opacity, side = SCENES["160k"]
     cases = []
     for by in (0.25, 1, 4):
-        # As many fragments in all, of smaller triangles.
+        # The same number of fragments, of smaller triangles.
         cases.append(("triangles", int(fans * by), radius / by**0.5, opacity, side))
     for by in (0.5, 1, 2):
         cases.append(("pixels", fans, radius, opacity, int(side * by)))
     for by in (0.25, 1, 4):
-        # Fainter where there are more, so that the same share of light is spent.
+        # Fainter where there are more, so that the transmittance stays the same.
         cases.append(("layers", int(fans * by), radius, opacity / by, side))
     for what, *scene in cases:
         mesh, camera = random_fans(*scene)
@@ -126,7 +128,7 @@ def growth(repeat: int) -> None:
         )
 
 
-def mitsuba_picture(mesh: SplatMesh, camera: Camera) -> tuple[str, Callable[[], object]] | None:
+def mitsuba_image(mesh: SplatMesh, camera: Camera) -> tuple[str, Callable[[], object]] | None:
     """Drawing with gradients of the colours by Mitsuba 3, and its variant; None where it is missing."""
     try:
         import mitsuba as mi
@@ -177,8 +179,8 @@ def mitsuba_picture(mesh: SplatMesh, camera: Camera) -> tuple[str, Callable[[], 
     def work() -> object:
         dr.enable_grad(params[key])
         params.update()
-        picture = mi.render(scene, params, spp=1)
-        dr.backward(dr.mean(picture))
+        image = mi.render(scene, params, spp=1)
+        dr.backward(dr.mean(image))
         return np.array(dr.grad(params[key]))
 
     return mi.variant(), work
@@ -206,10 +208,10 @@ def beside(fans: int, repeat: int) -> None:
     reference = reference_autograd.rasterize(vertices, mesh.faces, colors, camera).color.mean()
     order = clocked(lambda: reference_autograd.rasterize(vertices, mesh.faces, colors, camera), 1)
     found["torch, float64 reference"] = clocked(lambda: reference.backward(retain_graph=True), 1) + order
-    other = mitsuba_picture(mesh, camera)
+    other = mitsuba_image(mesh, camera)
     if other:
         found[f"Mitsuba 3, {other[0]}"] = clocked(other[1], repeat)
-    table(["picture and gradients of colours", "ms", "of ours"])
+    table(["image and gradients of colours", "ms", "of ours"])
     for name, taken in found.items():
         row(name, f"{1e3 * taken:.1f}", f"{taken / ours:.1f}")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Splats of mesh priors go where their base goes: after every change of its shape, and on every frame."""
+"""Handlers by which the splats of mesh priors follow their base, after every change and on every frame."""
 
 import bpy
 from bpy.app.handlers import persistent
@@ -9,7 +9,7 @@ BASE = "meshsplats_base"
 
 
 def _anything_to_do(scene):
-    return any(BASE in thing for thing in scene.objects)
+    return any(BASE in obj for obj in scene.objects)
 
 
 @persistent

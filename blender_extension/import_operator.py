@@ -11,10 +11,12 @@ from .settings import CHOICES, Choices, copy_choices, draw_choices
 from .work import Modal, Work
 
 SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".npz", ".glb", ".gltf")
+CHAIN = "levels.json"
+"""Table of a chain of levels of detail, as ``meshsplats levels`` writes it."""
 
 
 class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
-    """Import Gaussian splats as a mesh, or a mesh made by MeshSplats"""
+    """Import Gaussian splats as a mesh, or a mesh or levels of detail made by MeshSplats"""
 
     bl_idname = "import_scene.meshsplats"
     bl_label = "Import Gaussian Splats"
@@ -22,17 +24,17 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
 
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
-    filter_glob: StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join([*(f"*{s}" for s in SUFFIXES), CHAIN]), options={"HIDDEN"})
     set_up_scene: BoolProperty(
         name="Set up Render",
-        description="Bounce limits and colour management as these meshes need them",
+        description="Set bounce limits and colour management for these meshes",
         default=True,
     )
 
     at_origin: BoolProperty(
         name="Move to World Origin",
-        description="Stand it on the middle of the grid. Without, it lies where its file has it, with others"
-        " of the same capture",
+        description="Stand it on the centre of the grid. Otherwise it keeps the place that its file gives it,"
+        " with others of the same capture",
         default=False,
     )
 
@@ -50,44 +52,47 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
 
     def execute(self, context):
         names = [file.name for file in self.files if file.name]
-        paths = [os.path.join(self.directory, name) for name in names] or [self.filepath]
+        # Without a file: the folder, of a model or of levels of detail.
+        paths = [os.path.join(self.directory, name) for name in names] or [self.filepath or self.directory]
         return self.begin(context, Work(paths, {name: getattr(self, name) for name in CHOICES}))
 
     def done(self, context, work):
-        from pathlib import Path
-
         from meshsplats.blender.inside import objects
-        from meshsplats.formats.gaussians import subject_name
 
-        things = []
-        for path, prepared in work.results:
-            name = subject_name(Path(path))
-            thing = objects.add(prepared, name, context.collection)
+        objs = []
+        for result in work.results:
+            if result.screen_sizes:
+                made = objects.add_chain(
+                    result.prepared, result.name, result.screen_sizes, context.collection
+                )
+            else:
+                made = [objects.add(result.prepared[0], result.name, context.collection)]
             if self.at_origin:
-                thing.location = (0, 0, 0)
-            thing.meshsplats.path = path
-            copy_choices(thing.meshsplats, self)
-            things.append(thing)
+                made[0].location = (0, 0, 0)
+            for obj, path in zip(made, result.level_paths or (result.path,), strict=True):
+                obj.meshsplats.path = path
+                copy_choices(obj.meshsplats, self)
+            objs.append(made[0])
         for other in context.selected_objects:
             other.select_set(False)
-        for thing in things:
-            thing.select_set(True)
+        for obj in objs:
+            obj.select_set(True)
         if self.set_up_scene:
-            # All that the scene holds, as rays pass through several of them.
-            every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
+            # All splat meshes of the scene, as rays may pass through several.
+            every = objects.splat_objects(context.scene)
             objects.render_settings(context.scene, every, self.shading == "lit")
             clash = objects.clash(every, self.shading == "lit")
             if clash:
                 self.report({"WARNING"}, f"MeshSplats: {clash}")
-        count = sum(len(thing.data.polygons) for thing in things)
-        self.report({"INFO"}, f"MeshSplats: {len(things)} imported, {count:,} triangles")
+        count = sum(len(obj.data.polygons) for obj in objs)
+        self.report({"INFO"}, f"MeshSplats: {len(objs)} imported, {count:,} triangles")
 
 
 class MeshSplatsFileHandler(bpy.types.FileHandler):
     bl_idname = "IMPORT_FH_meshsplats"
     bl_label = "Gaussian Splats"
     bl_import_operator = ImportMeshSplats.bl_idname
-    bl_file_extensions = ";".join(SUFFIXES)
+    bl_file_extensions = ";".join([*SUFFIXES, ".json"])
 
     @classmethod
     def poll_drop(cls, context):

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What can be done to objects: convert again, another shading, a material for other imports, render
-settings."""
+"""Operators on objects and scenes: conversion, shading, render settings, stage, mesh priors, levels of
+detail."""
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty
+from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from .settings import CHOICES
+from .settings import CHOICES, copy_choices
 from .work import Modal, Work
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
@@ -20,35 +20,45 @@ class ConvertAgain(Modal, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        thing = context.object
-        return thing is not None and bool(thing.meshsplats.path) and not thing.meshsplats.busy
+        obj = context.object
+        return obj is not None and bool(obj.meshsplats.path) and not obj.meshsplats.busy
 
     def execute(self, context):
-        source = context.object.meshsplats
-        self._name = context.object.name
-        source.busy = not bpy.app.background
-        path = bpy.path.abspath(source.path)
-        return self.begin(context, Work([path], {name: getattr(source, name) for name in CHOICES}))
+        from meshsplats.blender.inside import levels
 
-    def given_up(self):
-        thing = bpy.data.objects.get(self._name)
-        if thing is not None:
-            thing.meshsplats.busy = False
+        source = context.object.meshsplats
+        self._active = context.object.name
+        self._names = {}  # of the object and the other levels of its chain, by file
+        for obj in levels.with_levels(context.object):
+            if obj.meshsplats.path:
+                copy_choices(obj.meshsplats, source)
+                obj.meshsplats.busy = not bpy.app.background
+                self._names[bpy.path.abspath(obj.meshsplats.path)] = obj.name
+        return self.begin(context, Work(self._names, {name: getattr(source, name) for name in CHOICES}))
+
+    def cancelled(self):
+        for name in self._names.values():
+            obj = bpy.data.objects.get(name)
+            if obj is not None:
+                obj.meshsplats.busy = False
 
     def done(self, context, work):
         from meshsplats.blender.inside import objects
 
-        self.given_up()
-        thing = bpy.data.objects.get(self._name)
-        if thing is None:
+        self.cancelled()
+        for result in work.results:
+            obj = bpy.data.objects.get(self._names[result.path])
+            if obj is not None:
+                objects.replace_mesh(obj, result.prepared[0])
+        obj = bpy.data.objects.get(self._active)
+        if obj is None:
             self.report({"WARNING"}, "MeshSplats: the object is gone")
-            return
-        objects.replace_mesh(thing, work.results[0][1])
-        self.report({"INFO"}, f"MeshSplats: {len(thing.data.polygons):,} triangles")
+        else:
+            self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
 
 
 class SetShading(bpy.types.Operator):
-    """Change between unlit and lit, with what was edited since the import kept"""
+    """Change between unlit and lit; edits since the import are kept"""
 
     bl_idname = "object.meshsplats_shading"
     bl_label = "Change Shading"
@@ -61,19 +71,18 @@ class SetShading(bpy.types.Operator):
         return context.object is not None and context.object.type == "MESH"
 
     def execute(self, context):
-        from meshsplats.blender.inside import objects
+        from meshsplats.blender.inside import levels, objects
 
-        thing = context.object
         lit = self.shading == "lit"
         try:
-            if objects.LIT in thing.data:
-                objects.replace_mesh(thing, objects.prepare(objects.as_splat_mesh(thing), lit))
-                thing.meshsplats.shading = self.shading
-            else:
-                objects.dress(thing, lit)
-                # One click: the colours of imports are shown right with these settings only.
-                every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
-                objects.render_settings(context.scene, every, lit)
+            for obj in levels.with_levels(context.object):
+                if objects.LIT in obj.data:
+                    objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), lit))
+                    obj.meshsplats.shading = self.shading
+                else:
+                    objects.dress(obj, lit)
+                    # One click: only these settings show the colours of imports correctly.
+                    objects.render_settings(context.scene, objects.splat_objects(context.scene), lit)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -92,13 +101,13 @@ class SetUpRender(bpy.types.Operator):
     def execute(self, context):
         from meshsplats.blender.inside import objects
 
-        every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
+        every = objects.splat_objects(context.scene)
         lit = self.shading == "lit"
         limit = objects.render_settings(context.scene, every, lit)
         clash = objects.clash(every, lit)
         if clash:
             self.report({"WARNING"}, f"MeshSplats: {clash}")
-        layers = sum(int(thing.data[objects.LAYERS]) for thing in every)
+        layers = objects.count_layers(every)
         if layers > limit:
             self.report(
                 {"WARNING"}, f"Up to {layers} layers, and Cycles follows {limit}: beyond, pixels turn black"
@@ -107,7 +116,7 @@ class SetUpRender(bpy.types.Operator):
 
 
 class SetUpStage(bpy.types.Operator):
-    """Sun, sky, ground and a camera round the splat meshes; what an earlier click made is replaced"""
+    """Set up sun, sky, ground and a camera around the splat meshes, in place of an earlier set-up"""
 
     bl_idname = "scene.meshsplats_stage"
     bl_label = "Set up Light and Camera"
@@ -123,7 +132,7 @@ class SetUpStage(bpy.types.Operator):
         ],
         default="sun",
     )
-    camera: BoolProperty(name="Camera", description="A camera that sees all of it", default=True)
+    camera: BoolProperty(name="Camera", description="Add a camera that sees all of them", default=True)
     make_lit: BoolProperty(
         name="Make Lit",
         description="Give unlit splat meshes the lit material, which light acts on",
@@ -133,12 +142,12 @@ class SetUpStage(bpy.types.Operator):
     def execute(self, context):
         from meshsplats.blender.inside import objects, setting
 
-        every = [o for o in context.scene.objects if o.type == "MESH" and objects.LAYERS in o.data]
+        every = objects.splat_objects(context.scene)
         try:
-            for thing in every if self.make_lit else []:
-                if not thing.data[objects.LIT]:
-                    objects.replace_mesh(thing, objects.prepare(objects.as_splat_mesh(thing), True))
-                    thing.meshsplats.shading = "lit"
+            for obj in every if self.make_lit else []:
+                if not obj.data[objects.LIT]:
+                    objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), True))
+                    obj.meshsplats.shading = "lit"
             setting.set_up(context.scene, every, self.lights, camera=self.camera)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
@@ -147,7 +156,7 @@ class SetUpStage(bpy.types.Operator):
 
 
 class FollowBase(bpy.types.Operator):
-    """Move the splats to where their base is now; after edits and on each frame this happens by itself"""
+    """Move the splats to their base now; after edits and on each frame this happens by itself"""
 
     bl_idname = "object.meshsplats_follow"
     bl_label = "Follow Base Now"
@@ -166,7 +175,70 @@ class FollowBase(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (ConvertAgain, SetShading, SetUpRender, SetUpStage, FollowBase)
+def find_chain(context, name):
+    """The collection of the chain called ``name``; without a name, that of the active object or the only one.
+    None if there is none."""
+    from meshsplats.blender.inside import levels
+
+    chains = levels.chains(context.scene)
+    if name:
+        return next((chain for chain in chains if chain.name == name), None)
+    active = levels.chain_of(context.object)
+    return active if active is not None else chains[0] if len(chains) == 1 else None
+
+
+class ShowLevel(bpy.types.Operator):
+    """Show one level of detail, in the viewport and in renders, and hide the others"""
+
+    bl_idname = "scene.meshsplats_level"
+    bl_label = "Show Level"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    chain: StringProperty(
+        name="Chain", description="Collection of the levels; that of the active object if left out"
+    )
+    level: IntProperty(name="Level", description="0 is the finest", default=0, min=0)
+
+    def execute(self, context):
+        from meshsplats.blender.inside import levels
+
+        chain = find_chain(context, self.chain)
+        try:
+            if chain is None:
+                raise ValueError(f"no chain of levels of detail {self.chain}".rstrip())
+            levels.show(chain, self._level(context, chain))
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def _level(self, context, chain):
+        return self.level
+
+
+class FitLevel(bpy.types.Operator):
+    """Show the level of detail made for the size that the active camera sees at the render resolution"""
+
+    bl_idname = "scene.meshsplats_fit_level"
+    bl_label = "Fit Level to Camera"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    chain: StringProperty(
+        name="Chain", description="Collection of the levels; that of the active object if left out"
+    )
+
+    execute = ShowLevel.execute
+
+    def _level(self, context, chain):
+        from meshsplats.blender.inside import levels
+
+        size = levels.screen_size(chain, context.scene)
+        level = levels.fitting_level(chain, size)
+        self.report({"INFO"}, f"MeshSplats: level {level} for {size:.0f} pixels")
+        return level
+
+
+CLASSES = (ConvertAgain, SetShading, SetUpRender, SetUpStage, FollowBase, ShowLevel, FitLevel)
 
 
 def register():

@@ -4,8 +4,19 @@
 import bpy
 
 from .import_operator import ImportMeshSplats
-from .object_operators import ConvertAgain, FollowBase, SetShading, SetUpRender, SetUpStage
+from .object_operators import (
+    ConvertAgain,
+    FitLevel,
+    FollowBase,
+    SetShading,
+    SetUpRender,
+    SetUpStage,
+    ShowLevel,
+)
 from .settings import draw_choices
+
+CHAIN, LEVEL = "meshsplats_levels", "meshsplats_level"
+"""Properties of the collections of levels of detail; ``meshsplats.blender.inside.levels`` sets them."""
 
 
 class MeshSplatsPanel(bpy.types.Panel):
@@ -18,9 +29,12 @@ class MeshSplatsPanel(bpy.types.Panel):
     def draw(self, context):
         layout = self.layout
         layout.operator(ImportMeshSplats.bl_idname, icon="IMPORT")
-        thing = context.object
-        if thing is not None and thing.type == "MESH":
-            self._object(layout, thing)
+        obj = context.object
+        if obj is not None and obj.type == "MESH":
+            self._object(layout, obj)
+        for collection in context.scene.collection.children_recursive:
+            if CHAIN in collection:
+                self._chain(layout, collection)
         layout.separator()
         layout.label(text="Light, ground and camera")
         row = layout.row(align=True)
@@ -31,20 +45,30 @@ class MeshSplatsPanel(bpy.types.Panel):
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"
         row.operator(SetUpRender.bl_idname, text="Lit").shading = "lit"
 
-    def _object(self, layout, thing):
-        if thing.meshsplats.path:
+    def _chain(self, layout, chain):
+        box = layout.box()
+        box.label(text=chain.name, icon="OUTLINER_COLLECTION")
+        row = box.row(align=True)
+        row.label(text="Show level")
+        for child in sorted((c for c in chain.children if LEVEL in c), key=lambda c: c[LEVEL]):
+            button = row.operator(ShowLevel.bl_idname, text=str(child[LEVEL]), depress=not child.hide_render)
+            button.chain, button.level = chain.name, child[LEVEL]
+        box.operator(FitLevel.bl_idname, icon="CAMERA_DATA").chain = chain.name
+
+    def _object(self, layout, obj):
+        if obj.meshsplats.path:
             box = layout.box()
             box.use_property_split = True
-            box.prop(thing.meshsplats, "path")
-            draw_choices(thing.meshsplats, box)
-            box.label(text=f"{len(thing.data.polygons):,} triangles")
+            box.prop(obj.meshsplats, "path")
+            draw_choices(obj.meshsplats, box)
+            box.label(text=f"{len(obj.data.polygons):,} triangles")
             box.operator(ConvertAgain.bl_idname, icon="FILE_REFRESH")
-        base = thing.get("meshsplats_base")
+        base = obj.get("meshsplats_base")
         if base is not None:
             box = layout.box()
             box.label(text=f"Follows {base.name}", icon="MOD_MESHDEFORM")
-            if thing.get("meshsplats_problem"):
-                box.label(text=thing["meshsplats_problem"], icon="ERROR")
+            if obj.get("meshsplats_problem"):
+                box.label(text=obj["meshsplats_problem"], icon="ERROR")
             box.operator(FollowBase.bl_idname, icon="FILE_REFRESH")
         layout.label(text="Material of this object")
         row = layout.row(align=True)

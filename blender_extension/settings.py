@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The choices of a conversion, as properties: of the import, and kept with each imported object."""
+"""Conversion settings, as properties of the import operator and of each imported object."""
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
@@ -19,7 +19,7 @@ class Choices:
     )
     max_triangles: IntProperty(
         name="Max. Triangles",
-        description="Merge splats that are alike until the mesh has at most so many triangles; 0: all",
+        description="Merge splats that are alike until the mesh has at most this many triangles; 0: all",
         default=0,
         min=0,
         soft_max=10_000_000,
@@ -46,7 +46,7 @@ class Choices:
         name="Shading",
         description="How the mesh reacts to light",
         items=[
-            ("unlit", "Unlit", "Colours as they are: the exact picture of the splats"),
+            ("unlit", "Unlit", "Colours unchanged: the exact image of the splats"),
             ("lit", "Lit", "Light and shadow act on the splats, by smoothed normals"),
         ],
         default="unlit",
@@ -69,7 +69,7 @@ def copy_choices(owner, other):
 
 
 class MeshSplatsSource(Choices, bpy.types.PropertyGroup):
-    """Where an object came from and how it was converted."""
+    """The source of an object and how it was converted."""
 
     path: StringProperty(name="File", description="The file this object was made from", subtype="FILE_PATH")
     busy: BoolProperty(options={"SKIP_SAVE", "HIDDEN"})

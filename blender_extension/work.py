@@ -1,19 +1,33 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Reading and converting in a thread of its own, so that Blender's window stays alive and the work can be
-given up."""
+"""Reading and converting in a thread, so that Blender's window stays responsive and the user can cancel."""
 
 import threading
 import traceback
 import warnings
+from dataclasses import dataclass
 
 
 class Stopped(Exception):
-    """The user has pressed Escape."""
+    """The user pressed Escape."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """A file that was read: a mesh, or the levels of a chain."""
+
+    path: str
+    name: str
+    prepared: tuple
+    """What ``objects.add`` takes; of a chain, for each level, the finest first."""
+    level_paths: tuple = ()
+    """Of a chain: the file of each level."""
+    screen_sizes: tuple = ()
+    """Of a chain: of each level, the size for which it was made, in pixels."""
 
 
 class Work:
-    """Reads files and prepares their meshes. ``progress`` runs from 0 to 1, ``stage`` says what is being
-    done."""
+    """Reads files and prepares their meshes. ``progress`` runs from 0 to 1, ``stage`` names the current
+    step."""
 
     def __init__(self, paths, choices):
         self.paths = list(paths)
@@ -21,9 +35,9 @@ class Work:
         self.progress = 0.0
         self.stage = ""
         self.results = []
-        """Of each file that could be read: its path and what ``objects.add`` takes."""
+        """A ``Result`` for each file that could be read."""
         self.problems = []
-        """Messages of the files that could not."""
+        """Messages for the files that could not."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run_all, name="meshsplats", daemon=True)
 
@@ -31,7 +45,7 @@ class Work:
         self._thread.start()
 
     def cancel(self):
-        """Asks the thread to stop at the next stage; what it still makes is thrown away."""
+        """Asks the thread to stop at the next stage; its results are discarded."""
         self._stop.set()
 
     @property
@@ -43,16 +57,16 @@ class Work:
         return not self._thread.is_alive()
 
     def run(self):
-        """The same in this thread, for Blender without a window."""
+        """Runs in this thread, for Blender without a window."""
         self._run_all()
 
     def _run_all(self):
-        for number, path in enumerate(self.paths):
+        for index, path in enumerate(self.paths):
             try:
-                with warnings.catch_warnings(record=True) as told:
+                with warnings.catch_warnings(record=True) as caught:
                     warnings.simplefilter("always")
-                    self.results.append((path, self._one(path, number)))
-                self.problems += [f"{path}: {warning.message}" for warning in told]
+                    self.results.append(self._one(path, index))
+                self.problems += [f"{path}: {warning.message}" for warning in caught]
             except Stopped:
                 return
             except Exception as error:
@@ -60,19 +74,34 @@ class Work:
                     traceback.print_exc()
                 self.problems.append(str(error) or type(error).__name__)
 
-    def _at(self, number, share, stage):
+    def _at(self, progress, stage):
         if self._stop.is_set():
             raise Stopped
-        self.progress = (number + share) / len(self.paths)
+        self.progress = progress / len(self.paths)
         self.stage = stage
 
-    def _one(self, path, number):
+    def _one(self, path, index):
+        from pathlib import Path
+
+        from meshsplats.blender.levels import is_chain, read_chain
+        from meshsplats.formats.gaussians import subject_name
+
+        if not is_chain(Path(path)):
+            return Result(path, subject_name(Path(path)), (self._prepared(path, index, 1.0),))
+        chain = read_chain(Path(path))
+        files = tuple(str(level.path) for level in chain.levels)
+        share = 1 / len(files)
+        prepared = tuple(self._prepared(file, index + i * share, share) for i, file in enumerate(files))
+        return Result(path, chain.name, prepared, files, tuple(level.screen_size for level in chain.levels))
+
+    def _prepared(self, path, begin, share):
+        """What ``objects.add`` takes. Progress, in files, goes from ``begin`` on by ``share``."""
         from pathlib import Path
 
         from meshsplats.blender.inside import objects
         from meshsplats.formats.sniff import identify
 
-        self._at(number, 0.0, "reading")
+        self._at(begin, "reading")
         if identify(Path(path)) == "mesh":
             from meshsplats.formats.meshes import load_mesh
 
@@ -82,23 +111,23 @@ class Work:
             from meshsplats.formats.gaussians import load_gaussians
 
             cloud = load_gaussians(path, axes=self.choices["axes"])
-            self._at(number, 0.3, "converting")
+            self._at(begin + 0.3 * share, "converting")
             options = {"max_triangles": self.choices["max_triangles"] or None}
             if self.choices["min_opacity"] > 0:
                 options["min_opacity"] = self.choices["min_opacity"]
             if self.choices["shading"] == "lit":
-                options["mode"] = (
-                    "flat"  # crossed ellipses stand upright on the surface and catch too little light
-                )
+                # Crossed ellipses stand upright on the surface and catch too little light.
+                options["mode"] = "flat"
             mesh = convert(cloud, preset=self.choices["preset"], **options)
-        self._at(number, 0.6, "shading normals" if self.choices["shading"] == "lit" else "counting layers")
-        prepared = objects.prepare(mesh, self.choices["shading"] == "lit")
-        self._at(number, 1.0, "building")
+        lit = self.choices["shading"] == "lit"
+        self._at(begin + 0.6 * share, "shading normals" if lit else "counting layers")
+        prepared = objects.prepare(mesh, lit)
+        self._at(begin + share, "building")
         return prepared
 
 
 class Modal:
-    """An operator that waits for ``Work`` while Blender goes on; Escape gives up. Mixed into operators."""
+    """Mix-in for operators that wait for ``Work`` while Blender stays responsive; Escape cancels."""
 
     def begin(self, context, work):
         """What ``execute`` returns."""
@@ -118,13 +147,13 @@ class Modal:
         if event.type == "ESC" and event.value == "PRESS":
             work.cancel()
             self._clean(context)
-            self.report({"INFO"}, "MeshSplats: given up")
-            self.given_up()
+            self.report({"INFO"}, "MeshSplats: cancelled")
+            self.cancelled()
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         context.window_manager.progress_update(100 * work.progress)
-        context.workspace.status_text_set(f"MeshSplats: {work.stage} {work.progress:.0%} (Esc gives up)")
+        context.workspace.status_text_set(f"MeshSplats: {work.stage} {work.progress:.0%} (Esc cancels)")
         if not work.finished:
             return {"RUNNING_MODAL"}
         self._clean(context)
@@ -140,12 +169,12 @@ class Modal:
         for problem in self._work.problems:
             self.report({"WARNING"} if self._work.results else {"ERROR"}, problem)
         if not self._work.results:
-            self.given_up()
+            self.cancelled()
             return {"CANCELLED"}
         self.done(context, self._work)
         return {"FINISHED"}
 
-    def given_up(self):
+    def cancelled(self):
         """Called when there is no result."""
 
 

@@ -19,10 +19,10 @@ meshes = {
     "filter": ms.convert(cloud, footprint="filter"),
 }
 
-# area: the mean over each pixel's area, as programs show it that take several samples a pixel.
-# splats: what a splat viewer shows.
+# area: the mean over each pixel's area, as programs show it that take several samples per pixel.
+# splats: the image of a splat viewer.
 for look, samples in (("area", 2), ("splats", 1)):
-    # Degree 0 compares like with like: a mesh has one colour a vertex, whatever the view.
+    # Degree 0 compares like with like: a mesh has one colour per vertex, whatever the view.
     splats = [ms.draw_splats(cloud, camera, look, sh_degree=0).color.clip(0, 1) for camera in cameras]
     for name, mesh in meshes.items():
         images = [ms.render(mesh, camera, samples=samples).color.clip(0, 1) for camera in cameras]

@@ -1,4 +1,4 @@
-"""A splat mesh is ordinary triangles: cut it, move it, colour it, and draw depth and any number a vertex has.
+"""A splat mesh is ordinary triangles: cut it, move it, colour it, and render depth and vertex attributes.
 
 python examples/04_edit.py        Writes into example-output/.
 """
@@ -18,7 +18,7 @@ out.mkdir(exist_ok=True)
 cloud = make_scene()
 mesh = ms.convert(cloud)
 
-# The splats of the ball, hence their triangles: face_splat tells which splat a triangle was made from.
+# The splats of the ball, hence their triangles: face_splat is the index of each triangle's splat.
 center, radius = BALL
 in_ball = np.abs(np.linalg.norm(cloud.means - center, axis=1) - radius) < 1e-4
 ball_faces = in_ball[mesh.face_splat]
@@ -32,17 +32,17 @@ vertices[ball_vertices] -= [0, 0.7, 0]  # y points down
 colors[ball_vertices, :3] = colors[ball_vertices, :3][:, [2, 1, 0]]
 lifted = replace(mesh, vertices=vertices, colors=colors)
 
-# Height above the table as a vertex attribute, drawn with the same weights as colour.
+# Height above the table as a vertex attribute, interpolated and blended as colour is.
 lifted = replace(lifted, attributes={"height": -vertices[:, 1]})
 camera = ms.orbit(mesh, 1, elevation=20, width=320, height=320)[0]
 drawn = ms.render(lifted, camera, depth=True, attributes=["height"], samples=2)
 
-pictures = [
+images = [
     ms.render(without_ball, camera, samples=2).color,
     drawn.color,
     np.repeat(1 - drawn.attributes["height"][:, :, None] / 2, 3, axis=2),
 ]
-strip = np.concatenate(pictures, axis=1).clip(0, 1)
+strip = np.concatenate(images, axis=1).clip(0, 1)
 Image.fromarray(np.rint(255 * strip).astype(np.uint8)).save(out / "edit.png")
 print(f"{out / 'edit.png'}: without the ball | lifted and dyed | height")
 seen = drawn.alpha > 0.5

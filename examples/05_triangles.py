@@ -1,4 +1,4 @@
-"""What the mesh is made of: splats, mesh, and the mesh with its triangles drawn opaque. The README's picture.
+"""The triangles of a mesh: splats, mesh, and the mesh with its triangles opaque. The README's image.
 
 python examples/05_triangles.py [scene.ply]      Without a file: the demo scene. Writes into example-output/.
 """
@@ -20,7 +20,7 @@ cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()
 camera = ms.orbit(cloud, 1, elevation=22, azimuth=-10, width=340, height=380)[0]
 mesh = ms.convert(cloud, cameras=[camera])
 
-# One vertex a corner, so that each triangle has a shade of its own; fans made smaller, so that they show.
+# One vertex per corner, so that each triangle has its own shade; smaller fans, so that gaps show.
 corners = mesh.vertices[mesh.faces]
 centers = cloud.means[mesh.face_splat][:, None]
 shade = np.random.default_rng(0).uniform(0.55, 1.1, (len(mesh.faces), 1, 1))
@@ -35,11 +35,11 @@ triangles = replace(
     face_splat=None,
 )
 
-pictures = [
+images = [
     ms.render_splats(cloud, camera).color,
     ms.render(mesh, camera, samples=3).color,
     ms.render(triangles, camera, samples=3).color,
 ]
-strip = np.concatenate(pictures, axis=1).clip(0, 1)
+strip = np.concatenate(images, axis=1).clip(0, 1)
 Image.fromarray(np.rint(255 * strip).astype(np.uint8)).save(out / "triangles.png", optimize=True)
 print(f"{out / 'triangles.png'}: {len(cloud):,} splats | {len(mesh.faces):,} triangles | the same, opaque")

@@ -1,4 +1,4 @@
-"""A mesh prior: splats on a base mesh, trained, bent and lit anew. The picture of docs/mesh-prior.md.
+"""A mesh prior: splats on a base mesh, trained, bent and lit anew. The image of docs/mesh-prior.md.
 
 python examples/06_mesh_prior.py [steps]      Needs the extra base. Writes into example-output/.
 """
@@ -18,7 +18,7 @@ out = Path("example-output")
 out.mkdir(exist_ok=True)
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 20
 
-# Train: a base of the surface, splats on it and on shells inside, and the splats' own pictures to learn from.
+# Train: a base of the surface, splats on it and on shells inside, and images of the splats as targets.
 cloud = make_scene()
 base = base_surface(cloud, resolution=64, faces=10_000, cameras=32)
 data = ms.splat_dataset(cloud, train=30, test=4, width=160, sh_degree=0)
@@ -30,17 +30,17 @@ print(f"{out / 'prior.npz'}: {len(base.faces):,} faces, {len(prior.mesh.faces):,
 print(f"held out: {before:.1f} -> {after:.1f} dB after {steps} steps")
 
 # Bend: the base is twisted about the up direction and leans over; the splats follow.
-places = prior.base_vertices
-height = places @ base.up
+vertices = prior.base_vertices
+height = vertices @ base.up
 angle = 0.9 * (height - height.min())
 axis = np.array(base.up, np.float64)
-across = places - height[:, None] * axis
+across = vertices - height[:, None] * axis
 turned = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
 sideways = np.cross(axis, [0, 0, 1])
 lean = 0.15 * (height - height.min())[:, None] ** 2 * sideways
 bent = prior.pose(turned + height[:, None] * axis + lean)
 
-# Relight: the base's normals tell how much of a lamp's light each vertex gets.
+# Relight: the base's normals give the light of a lamp at each vertex.
 camera = ms.orbit(cloud, 1, elevation=22, azimuth=-10, width=300, height=340)[0]
 right, _, forward = camera.world_to_camera[:3, :3]
 lamp = 1.2 * right + 0.8 * axis - 0.6 * forward
@@ -49,12 +49,12 @@ shade = 0.25 + 0.95 * np.clip(facing * bent.normals @ (lamp / np.linalg.norm(lam
 warm = bent.colors.copy()
 warm[:, :3] = np.clip(warm[:, :3] * shade[:, None] * [1.1, 1.0, 0.8], 0, 1)
 
-pictures = [
+images = [
     ms.render_splats(cloud, camera, sh_degree=0).color,
     ms.render(prior.mesh, camera, samples=2).color,
     ms.render(bent, camera, samples=2).color,
     ms.render(replace(bent, colors=warm), camera, samples=2).color,
 ]
 captions = ("splats", "mesh prior", "its base bent", "lit by a lamp")
-save_png(out / "mesh_prior.png", strip(np.clip(pictures, 0, 1), captions))
+save_png(out / "mesh_prior.png", strip(np.clip(images, 0, 1), captions))
 print(f"{out / 'mesh_prior.png'}: {' | '.join(captions)}")

@@ -1,4 +1,4 @@
-"""An optimisation of one's own: loss, camera poses and pruning, with the renderer as a torch operator.
+"""A custom optimisation: loss, camera poses and pruning, with the renderer as a torch operator.
 
 python examples/07_own_loss.py [steps]      Needs torch. Writes into example-output/.
 """
@@ -19,12 +19,12 @@ out = Path("example-output")
 out.mkdir(exist_ok=True)
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 48
 
-# Pictures of splats with their cameras, and the mesh to begin with.
+# Images of splats with their cameras, and the initial mesh.
 cloud = make_scene()
 data = ms.splat_dataset(cloud, train=12, test=4, width=96, sh_degree=0)
 mesh = ms.convert(cloud, mode="flat", cameras=[view.camera for view in data.train])
 
-# The cameras are only roughly known: each is turned and moved a little, by a twist of six numbers.
+# The camera poses are only roughly known: each is perturbed by a twist of six parameters.
 turns = torch.zeros(6, 4, 4, dtype=torch.float64)
 for k, (i, j) in enumerate([(2, 1), (0, 2), (1, 0)]):
     turns[k, i, j], turns[k, j, i] = 1, -1
@@ -46,7 +46,7 @@ def degrees_off() -> float:
 
 
 def loss_of(raster, view: ms.View) -> torch.Tensor:
-    """Charbonnier's distance of the colours, and that of the silhouettes."""
+    """Charbonnier loss of the colours, and L1 of the silhouettes."""
     color, alpha = torch.from_numpy(view.image), torch.from_numpy(view.alpha)
     near = torch.sqrt((raster.color - color).square() + 1e-4).mean()
     return near + 0.2 * (raster.alpha - alpha).abs().mean()
@@ -56,8 +56,8 @@ def leaves(of: ms.SplatMesh) -> list[torch.Tensor]:
     return [torch.from_numpy(array.copy()).requires_grad_() for array in (of.vertices, of.colors)]
 
 
-def pixels_shown(vertices: torch.Tensor, colors: torch.Tensor) -> np.ndarray:
-    """(v,) pixels of all views in which each vertex shows: the gradient of a further attribute's pictures."""
+def visible_pixels(vertices: torch.Tensor, colors: torch.Tensor) -> np.ndarray:
+    """(v,) visible pixels of each vertex over all views: the gradient of the images of another attribute."""
     attribute = torch.zeros(len(vertices), 1, requires_grad=True)
     with torch.no_grad():
         now = poses().float()
@@ -69,15 +69,15 @@ def pixels_shown(vertices: torch.Tensor, colors: torch.Tensor) -> np.ndarray:
 
 
 vertices, colors = leaves(mesh)
-# Adam on the rows that a view reaches, and torch's own for the cameras.
+# Adam on the rows with gradients in a view, and torch's own for the cameras.
 moving = RowAdam(vertices, lr=2e-4, betas=(0.5, 0.9), eps=1e-15)
 painting = RowAdam(colors, lr=0.02, betas=(0.5, 0.9), eps=1e-15, bounds=(0, 1))
 aiming = torch.optim.Adam([twists], lr=1e-3)
 before, first, triangles = ms.evaluate(mesh, data).methods[0].mean("psnr"), degrees_off(), len(mesh.faces)
 for step in range(steps):
-    number = step % len(data.train)
-    view = data.train[number]
-    pose = poses()[number].float()
+    index = step % len(data.train)
+    view = data.train[index]
+    pose = poses()[index].float()
     raster = rasterize(
         vertices, mesh.faces, colors, view.camera, world_to_camera=pose, face_splat=mesh.face_splat
     )
@@ -89,9 +89,9 @@ for step in range(steps):
     aiming.step()
     vertices.grad = colors.grad = twists.grad = None
     if step == steps // 2:
-        # Triangles of which next to nothing shows go, and the optimisers forget their vertices.
+        # Prune triangles that are hardly visible, and their vertices in the optimisers.
         mesh = replace(mesh, vertices=vertices.detach().numpy(), colors=colors.detach().numpy())
-        keep = pixels_shown(vertices, colors)[mesh.faces].sum(axis=1) > 0.2
+        keep = visible_pixels(vertices, colors)[mesh.faces].sum(axis=1) > 0.2
         rows = np.unique(mesh.faces[keep])
         mesh = mesh.keep_faces(keep)
         vertices, colors = leaves(mesh)

@@ -26,7 +26,7 @@ def test_plan():
 
 
 def test_likeness_is_that_of_the_means():
-    """A mesh that shows nothing, over white: by hand from the pictures of the splats."""
+    """A mesh that shows nothing, over white: by hand from the images of the splats."""
     from meshsplats import psnr, render_splats
 
     cloud = make_scene(300)
@@ -71,9 +71,9 @@ QUICK = ("--no-tune", "--width", 64, "--levels", 2)
 def test_a_chain(splats, tmp_path, capsys):
     out = tmp_path / "chain"
     assert run(splats, "-o", out, *QUICK, "--format", "npz", "--json") == 0
-    told = json.loads(capsys.readouterr().out)
+    message = json.loads(capsys.readouterr().out)
     table = json.loads((out / "levels.json").read_text())
-    assert told == table | {"folder": str(out)}
+    assert message == table | {"folder": str(out)}
     assert [row["screen_size"] for row in table["levels"]] == [64, 32]
     assert sorted(p.name for p in out.iterdir()) == [
         "config.json",
@@ -127,7 +127,7 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (["--levels", "0"], "--levels must be at least 1, got 0"),
         (["--no-tune", "--minutes", "1"], "no effect with --no-tune"),
@@ -136,9 +136,9 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
         (["--max-splats", "0"], "--max-splats must be at least 1, got 0"),
     ],
 )
-def test_wrong_options(splats, tmp_path, capsys, options, told):
+def test_wrong_options(splats, tmp_path, capsys, options, message):
     assert run(splats, "-o", tmp_path / "chain", *options) == 2
-    assert told in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply"]
 
 

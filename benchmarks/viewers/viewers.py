@@ -1,4 +1,4 @@
-"""What web viewers make of our .glb files: PSNR against the exact picture of the same mesh.
+"""What web viewers make of our .glb files: PSNR against the exact image of the same mesh.
 
     npm install three babylonjs babylonjs-loaders puppeteer-core    (in some folder; Chromium installed)
     python benchmarks/viewers/viewers.py SPLATS CAMERAS --node-folder FOLDER [--views 4] [--keep DIR]
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("cameras", type=Path)
     parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
     parser.add_argument("--views", type=int, default=4, help="the first so many cameras")
-    parser.add_argument("--keep", type=Path, help="keep files and pictures here")
+    parser.add_argument("--keep", type=Path, help="keep files and images here")
     args = parser.parse_args()
 
     cloud = load_gaussians(args.splats)
@@ -84,13 +84,12 @@ def main() -> None:
         print(f"{args.splats.name}: {mesh.splat_count:,} splats, {len(mesh.faces):,} triangles")
         print("| viewer | alpha | against the exact mesh, dB | against the splats, dB |\n|---|---|---|---|")
         for job in jobs:
-            pictures = [
+            images = [
                 np.asarray(Image.open(Path(job["out"]) / f"{i}.png").convert("RGB"), np.float32) / 255
                 for i in range(len(cameras))
             ]
             figures = [
-                np.mean([psnr(a, b) for a, b in zip(pictures, truth, strict=True)])
-                for truth in (exact, splats)
+                np.mean([psnr(a, b) for a, b in zip(images, truth, strict=True)]) for truth in (exact, splats)
             ]
             print(f"| {titles[job['viewer']]} | {job['name']} | {figures[0]:.1f} | {figures[1]:.1f} |")
         best = np.mean([psnr(a, b) for a, b in zip(exact, splats, strict=True)])

@@ -21,14 +21,14 @@ arguments = argparse.ArgumentParser()
 arguments.add_argument("--width", type=int, default=320)
 arguments.add_argument("--samples", type=int, default=24)
 arguments.add_argument("--splats", type=int, default=20_000)
-given = arguments.parse_args()
+asked = arguments.parse_args()
 out = Path("example-output")
 out.mkdir(exist_ok=True)
 
-cloud = make_scene(given.splats)
+cloud = make_scene(asked.splats)
 mesh = ms.convert(cloud, mode="flat")
 
-# The parts of the still life follow each other: which splats are whose?
+# The splats of the still life are stored part by part.
 size = {name: int(share * len(cloud)) for name, share in SHARES.items()}
 order = [("vase", size["vase"]), ("ball", size["ball"])]
 order += [("orange", size["orange"]), ("orange.001", size["orange"])]
@@ -40,13 +40,13 @@ part_of_face = part_of_splat[mesh.face_splat]
 table = mesh.keep_faces(part_of_face == 5)
 
 # The table with ground, sun, sky and camera is a .blend of its own; the bodies are added to it.
-width, height = given.width, given.width * 5 // 6
+width, height = asked.width, asked.width * 5 // 6
 camera = ms.orbit(mesh, 1, elevation=16, azimuth=15, width=width, height=height, distance=1.15)[0]
 light = LightOptions(sun=(-60, 38), sun_strength=3.0)
-options = SceneOptions(light=light, samples=given.samples, denoise=True)
+options = SceneOptions(light=light, samples=asked.samples, denoise=True)
 draw(table, [camera], blend=out / "falling.blend", options=options)
 
-import bpy  # noqa: E402 - what follows is Blender's own Python
+import bpy  # noqa: E402 - from here on, Blender's own Python
 import mathutils  # noqa: E402
 
 from meshsplats.blender.inside import objects  # noqa: E402
@@ -61,12 +61,12 @@ home = bpy.data.collections.new("Bodies")
 scene.collection.children.link(home)
 
 
-def make_body(thing, kind, shape, **settings):
-    bpy.context.view_layer.objects.active = thing
+def make_body(obj, kind, shape, **settings):
+    bpy.context.view_layer.objects.active = obj
     bpy.ops.rigidbody.object_add(type=kind)
-    thing.rigid_body.collision_shape = shape
+    obj.rigid_body.collision_shape = shape
     for name, value in {"friction": 0.6, "restitution": 0.2, "collision_margin": 0.0, **settings}.items():
-        setattr(thing.rigid_body, name, value)
+        setattr(obj.rigid_body, name, value)
 
 
 def hull(points, name):
@@ -74,19 +74,19 @@ def hull(points, name):
     middle = points.mean(axis=0)
     data = bpy.data.meshes.new(name)
     data.from_pydata((points - middle).tolist(), [], [])
-    thing = bpy.data.objects.new(name, data)
-    thing.location = middle
-    thing.hide_render = True
-    home.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, data)
+    obj.location = middle
+    obj.hide_render = True
+    home.objects.link(obj)
+    return obj
 
 
 bodies = {}
-for number, (name, _) in enumerate(order[:4]):
-    part = mesh.keep_faces(part_of_face == number)
+for index, (name, _) in enumerate(order[:4]):
+    part = mesh.keep_faces(part_of_face == index)
     splats = objects.add(objects.prepare(part, lit=True), name, home)
-    # Leaves would make the vase as wide as they reach; at the vase's own splats, it collides.
-    solid = cloud.means[ends[number] - order[number][1] : ends[number]]
+    # The vase collides with its own splats only: leaves would make it as wide as they reach.
+    solid = cloud.means[ends[index] - order[index][1] : ends[index]]
     turn = np.array(splats.matrix_world.to_3x3())
     body = hull(solid[:: max(1, len(solid) // 400)] @ turn.T, f"{name} body")
     bpy.context.view_layer.update()
@@ -108,9 +108,9 @@ for frame, held in [(1, True), (7, False)]:
     ball.rigid_body.kinematic = held
     ball.rigid_body.keyframe_insert("kinematic", frame=frame)
 
-things = [thing for thing in scene.objects if thing.type == "MESH" and not thing.hide_render]
-objects.render_settings(scene, [thing for thing in things if objects.LAYERS in thing.data], lit=True)
-scene.cycles.samples, scene.cycles.use_denoising = given.samples, True
+objs = [obj for obj in scene.objects if obj.type == "MESH" and not obj.hide_render]
+objects.render_settings(scene, [obj for obj in objs if objects.LAYERS in obj.data], lit=True)
+scene.cycles.samples, scene.cycles.use_denoising = asked.samples, True
 moments = [1, 12, 24, 50]
 strip = []
 for frame in range(1, moments[-1] + 1):  # rigid bodies go from frame to frame

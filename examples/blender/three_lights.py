@@ -28,7 +28,7 @@ out.mkdir(exist_ok=True)
 
 
 def studio(path: Path) -> Path:
-    """An environment picture of a dark room with a warm window on one side and a cool one on the other."""
+    """An environment image of a dark room with a warm window on one side and a cool one on the other."""
     rows, columns = np.mgrid[0:128, 0:256] / np.array([128, 256])[:, None, None]
     light = np.full((128, 256, 3), 0.06) * (1.5 - rows)[..., None]
     for middle, color in [(0.42, (16, 9, 4)), (0.88, (3, 6, 13))]:
@@ -60,12 +60,12 @@ mesh = ms.convert(cloud, mode="flat")  # one flat ellipse a splat takes light be
 height = round(asked.width * 3 / 4)
 camera = ms.orbit(mesh, 1, elevation=14, azimuth=8, width=asked.width, height=height, distance=1.75)[0]
 
-pictures = []
+images = []
 for name, light in LIGHTS.items():
     path = out / f"{name.replace(' ', '_')}.png"
     options = SceneOptions(light=light, samples=asked.samples, denoise=True, background=(0.75, 0.8, 0.88))
-    told = draw(mesh, [camera], pictures=[path], options=options)
-    pictures.append(load_png(path) / 255)
-    print(f"{path}: {told['picture_seconds'][0]:.0f} s, up to {told['layers']} layers")
-save_png(out / "three_lights.png", strip(pictures, list(LIGHTS)))
+    result = draw(mesh, [camera], images=[path], options=options)
+    images.append(load_png(path) / 255)
+    print(f"{path}: {result['image_seconds'][0]:.0f} s, up to {result['layers']} layers")
+save_png(out / "three_lights.png", strip(images, list(LIGHTS)))
 print(f"{out / 'three_lights.png'}: all three; lit by {out / 'studio.hdr'}, too")

@@ -1,13 +1,13 @@
-"""Any ray tracer draws a splat mesh: here Mitsuba 3, with sun, sky and ground.
+"""Any ray tracer renders a splat mesh: here Mitsuba 3, with sun, sky and ground.
 
-python examples/mitsuba/render.py [splats.ply | mesh.npz] [-o picture.exr] [--width 320] [--samples 64]
+python examples/mitsuba/render.py [splats.ply | mesh.npz] [-o image.exr] [--width 320] [--samples 64]
 
 Without a file: the demo scene. Writes example-output/mitsuba.exr (linear light) and a .png. Needs mitsuba
 (pip install mitsuba). The variant scalar_rgb runs everywhere; llvm_ad_rgb is several times quicker where a
 recent LLVM library is installed.
 
-What a ray tracer needs to know: each vertex has a linear colour, taken as reflectance, and an opacity, which
-mixes the surface with nothing; light comes through the layers on its way from the lights, too.
+A ray tracer needs the linear colour of each vertex as reflectance, its opacity as a mask, and shadow rays
+that pass through translucent layers, too.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ def make_scene_of(
     to_sun = np.cos(elevation) * level + np.sin(elevation) * up
     bounds = scene_bounds(mesh)
     height = float((mesh.vertices @ up).min()) if floor is None else floor
-    place = bounds.center + (height - bounds.center @ up) * up
+    foot = bounds.center + (height - bounds.center @ up) * up
     # A rectangle in Mitsuba spans -1 to 1 in x and y and faces z.
     ground = np.eye(4)
     ground[:3, :3] = 100 * bounds.radius * np.stack([right, -forward, up], axis=1)
-    ground[:3, 3] = place
+    ground[:3, 3] = foot
     # The sun: a bright cone of the sky, of the same irradiance as a far disc.
     half = np.radians(SUN_SIZE / 2)
     far = 1000 * bounds.radius
@@ -102,7 +102,7 @@ def make_scene_of(
     return mi.load_dict(
         {
             "type": "scene",
-            # On its way to a light, volpath goes on through layers, which path would take for opaque.
+            # volpath traces shadow rays through layers, which path takes for opaque.
             "integrator": {"type": "volpath", "max_depth": 4, "rr_depth": 1000},
             "sensor": make_sensor(camera, samples),
             "splats": make_shape(mesh),
@@ -128,22 +128,22 @@ def main() -> None:
     arguments.add_argument("--width", type=int, default=320)
     arguments.add_argument("--samples", type=int, default=64)
     arguments.add_argument("--variant", default="scalar_rgb", help="a variant of Mitsuba")
-    given = arguments.parse_args()
-    mi.set_variant(given.variant)
-    given.output.parent.mkdir(exist_ok=True)
-    if given.input is None:
+    asked = arguments.parse_args()
+    mi.set_variant(asked.variant)
+    asked.output.parent.mkdir(exist_ok=True)
+    if asked.input is None:
         mesh = ms.convert(make_scene(), mode="flat")
-    elif Path(given.input).suffix in (".npz", ".glb"):
-        mesh = ms.load_mesh(given.input)
+    elif Path(asked.input).suffix in (".npz", ".glb"):
+        mesh = ms.load_mesh(asked.input)
     else:
-        mesh = ms.convert(ms.load_gaussians(given.input), mode="flat")
-    height = given.width * 3 // 4
-    camera = ms.orbit(mesh, 1, elevation=20, width=given.width, height=height, distance=1.3)[0]
-    picture = mi.render(make_scene_of(mesh, camera, given.samples))
-    mi.util.write_bitmap(str(given.output), picture)
-    shown = given.output.with_suffix(".png")
-    mi.util.write_bitmap(str(shown), picture)
-    print(f"{given.output}, {shown}: {len(mesh.faces):,} triangles by Mitsuba {mi.__version__}")
+        mesh = ms.convert(ms.load_gaussians(asked.input), mode="flat")
+    height = asked.width * 3 // 4
+    camera = ms.orbit(mesh, 1, elevation=20, width=asked.width, height=height, distance=1.3)[0]
+    image = mi.render(make_scene_of(mesh, camera, asked.samples))
+    mi.util.write_bitmap(str(asked.output), image)
+    shown = asked.output.with_suffix(".png")
+    mi.util.write_bitmap(str(shown), image)
+    print(f"{asked.output}, {shown}: {len(mesh.faces):,} triangles by Mitsuba {mi.__version__}")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,4 @@
-"""Levels of detail: a chain of meshes of one scene, each with a fraction of the triangles of the last, made
-for the size at which it is seen."""
+"""Levels of detail: meshes of one scene with ever fewer triangles, each made for one size on the screen."""
 
 from __future__ import annotations
 
@@ -27,29 +26,29 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 SMALLEST = 16
-"""Pixels across, below which no level is made."""
+"""Minimum image width of a level in pixels."""
 
 SAMPLES = 2
-"""Side of the grid of samples in each pixel, with which a level is measured."""
+"""Samples along each side of a pixel when a level is scored."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """What one mesh of a chain is made for."""
+    """Size of one level of detail."""
 
     splats: int
-    """How many it has at most."""
+    """Maximum number of splats."""
     width: int
-    """Side in pixels of the pictures, which just hold the subject, that it is made for."""
+    """Side in pixels of the square images, which the subject just fills, that the level is made for."""
 
 
 def plan_levels(splats: int, count: int, *, factor: int = 4, width: int = 800) -> list[Level]:
-    """``count`` levels, the first of all ``splats`` for pictures ``width`` pixels wide.
+    """Plans ``count`` levels, the first with all ``splats`` for images ``width`` pixels wide.
 
-    Each has a ``factor``-th of the splats of the last, and its pictures a ``factor``-th of the pixels: so a
-    splat covers as many pixels on every level.
+    Each following level has ``1 / factor`` of the splats, and images with ``1 / factor`` of the pixels, so
+    that a splat covers the same number of pixels on every level.
 
-    Raises ValueError if the last would have no splat or less than ``SMALLEST`` pixels.
+    Raises ValueError if the last level had no splat or less than ``SMALLEST`` pixels.
     """
     if count < 1 or factor < 2 or splats < 1:
         raise ValueError(f"there must be a splat, a level and a factor of 2, got {splats}, {count}, {factor}")
@@ -57,7 +56,7 @@ def plan_levels(splats: int, count: int, *, factor: int = 4, width: int = 800) -
     if levels[-1].splats < 1 or levels[-1].width < SMALLEST:
         fit = sum(level.splats >= 1 and level.width >= SMALLEST for level in levels)
         raise ValueError(
-            f"{count} levels are too many for {splats} splats and pictures of {width} pixels: the last would"
+            f"{count} levels are too many for {splats} splats and images of {width} pixels: the last would"
             f" have {levels[-1].splats} splats and {levels[-1].width} pixels; at most {fit} fit"
         )
     return levels
@@ -66,8 +65,11 @@ def plan_levels(splats: int, count: int, *, factor: int = 4, width: int = 800) -
 def level_targets(
     cloud: GaussianCloud, level: Level, config: FinetuneConfig | None = None, **options: Any
 ) -> Dataset:
-    """Pictures of ``cloud`` of the size of ``level``, to learn from and to measure with; as many as a run of
-    ``config`` is worth. ``options`` are those of ``splat_dataset``."""
+    """Training and held-out images of ``cloud`` in the size of ``level``.
+
+    Their number suits a run with ``config`` (``worthwhile_views``). ``options`` are those of
+    ``splat_dataset``.
+    """
     train = worthwhile_views(config) if config is not None else 1
     return splat_dataset(cloud, train=train, width=level.width, **options)
 
@@ -104,7 +106,7 @@ def likeness(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> float:
-    """PSNR in dB, the mean over ``cameras``: the mesh drawn with 2 x 2 samples a pixel against the splats in
-    the look 'area', on white."""
+    """Mean PSNR in dB over ``cameras``: the mesh at 2 x 2 samples per pixel against the splats in the look
+    'area', on white."""
     found = compare(cloud, mesh, cameras, samples=SAMPLES, sh_degree=sh_degree, threads=threads)
     return float(np.mean([min(view.psnr, 200.0) for view in found.views]))

@@ -1,4 +1,4 @@
-"""Run by test_bpy_extension: installs the extension, uses it, removes it, and writes down what happened."""
+"""Run by test_bpy_extension: installs the extension, uses it, removes it, and records what happened."""
 
 import json
 import sys
@@ -28,37 +28,37 @@ sys.meta_path.insert(0, OnlyFromTheWheel)
 
 import bpy  # noqa: E402
 
-told = {}
+report = {}
 bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.ops.extensions.package_install_files(filepath=package, repo="user_default", enable_on_install=True)
 (addon,) = [name for name in list(bpy.context.preferences.addons.keys()) if name.endswith("meshsplats")]
 
-told["imported"] = sorted(bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"), shading="lit"))
+report["imported"] = sorted(bpy.ops.import_scene.meshsplats(filepath=str(folder / "ball.ply"), shading="lit"))
 import meshsplats  # noqa: E402
 
-told["package"] = meshsplats.__file__
-thing = bpy.context.object
-told["origin"] = list(thing.location)
-thing.location = (1, 2, 2)  # of the foot of the ball
-told["triangles"] = {"default": len(thing.data.polygons)}
-told["bounces"] = bpy.context.scene.cycles.transparent_max_bounces
-told["materials"] = [thing.data.materials[0].name]
+report["package"] = meshsplats.__file__
+obj = bpy.context.object
+report["origin"] = list(obj.location)
+obj.location = (1, 2, 2)  # of the foot of the ball
+report["triangles"] = {"default": len(obj.data.polygons)}
+report["bounces"] = bpy.context.scene.cycles.transparent_max_bounces
+report["materials"] = [obj.data.materials[0].name]
 
-thing.meshsplats.max_triangles = 400
-thing.meshsplats.shading = "unlit"
+obj.meshsplats.max_triangles = 400
+obj.meshsplats.shading = "unlit"
 bpy.ops.object.meshsplats_convert_again()
-told["triangles"]["fewer"] = len(thing.data.polygons)
-told["materials"].append(thing.data.materials[0].name)
-told["moved"] = list(thing.location)
+report["triangles"]["fewer"] = len(obj.data.polygons)
+report["materials"].append(obj.data.materials[0].name)
+report["moved"] = list(obj.location)
 bpy.ops.object.meshsplats_shading(shading="lit")
 bpy.ops.object.meshsplats_shading(shading="unlit")
-assert thing.data.materials[0].name.startswith("Splats, unlit")
+assert obj.data.materials[0].name.startswith("Splats, unlit")
 bpy.ops.scene.meshsplats_set_up(shading="unlit")
 
-told["sog"] = None
-if len(sys.argv) > 3:  # its pictures are decoded by the other wheel, Pillow
+report["sog"] = None
+if len(sys.argv) > 3:  # its images are decoded by the other wheel, Pillow
     bpy.ops.import_scene.meshsplats(filepath=sys.argv[3], max_triangles=800)
-    told["sog"] = len(bpy.context.object.data.polygons)
+    report["sog"] = len(bpy.context.object.data.polygons)
     bpy.data.objects.remove(bpy.context.object)
 
 directory = str(folder) + "/"
@@ -66,7 +66,7 @@ bpy.ops.import_scene.meshsplats(directory=directory, files=[{"name": "mesh.npz"}
 assert {"mesh", "ball.001"} <= set(bpy.data.objects.keys())
 # Blender asks these of a file that is dropped on a window, and then calls the operator as above.
 handler = bpy.types.IMPORT_FH_meshsplats
-told["dropped"] = {
+report["dropped"] = {
     "operator": handler.bl_import_operator,
     "suffixes": handler.bl_file_extensions.split(";"),
     "places": [
@@ -76,25 +76,25 @@ told["dropped"] = {
     ],
 }
 
-# Alone in the scene, a mesh for linear blending is shown encoded; beside others, that is told.
-told["linear"] = []
-hidden = [thing for thing in bpy.context.scene.objects if thing.type == "MESH"]
+# Alone in the scene, a mesh for linear blending is shown encoded; beside others, a warning says so.
+report["linear"] = []
+hidden = [obj for obj in bpy.context.scene.objects if obj.type == "MESH"]
 for other in hidden:
     bpy.context.scene.collection.objects.unlink(other)
 bpy.ops.import_scene.meshsplats(filepath=str(folder / "linear.npz"))
-told["linear"].append(bpy.context.scene.view_settings.view_transform)
+report["linear"].append(bpy.context.scene.view_settings.view_transform)
 for other in hidden:
     bpy.context.scene.collection.objects.link(other)
 bpy.ops.scene.meshsplats_set_up(shading="unlit")
-told["linear"].append(bpy.context.scene.view_settings.view_transform)
+report["linear"].append(bpy.context.scene.view_settings.view_transform)
 bpy.data.objects.remove(bpy.data.objects["linear"])
-bpy.context.view_layer.objects.active = thing
+bpy.context.view_layer.objects.active = obj
 
 try:
     bpy.ops.import_scene.meshsplats(filepath=str(folder / "broken.ply"))
-    told["broken"] = "nothing was said"
+    report["broken"] = "nothing was said"
 except RuntimeError as error:
-    told["broken"] = str(error)
+    report["broken"] = str(error)
 
 # A mesh prior comes with its base, and its splats follow that.
 bpy.ops.import_scene.meshsplats(filepath=str(folder / "prior.npz"))
@@ -105,18 +105,18 @@ for vertex in base.data.vertices:
     vertex.co.z += 1
 base.data.update()
 bpy.context.view_layer.update()
-told["followed"] = [vertex.co.z - z for vertex, z in zip(splats.data.vertices, heights, strict=True)]
-told["base"] = base.name
+report["followed"] = [vertex.co.z - z for vertex, z in zip(splats.data.vertices, heights, strict=True)]
+report["base"] = base.name
 bpy.context.view_layer.objects.active = splats
-told["follow"] = sorted(bpy.ops.object.meshsplats_follow())
+report["follow"] = sorted(bpy.ops.object.meshsplats_follow())
 bpy.data.objects.remove(splats)
 bpy.data.objects.remove(base)
 
-# All splats again, for a picture of the ball: it stands at (1, 2, 3) and has radius 1.
-bpy.context.view_layer.objects.active = thing
-thing.meshsplats.max_triangles = 0
+# All splats again, for an image of the ball: it stands at (1, 2, 3) and has radius 1.
+bpy.context.view_layer.objects.active = obj
+obj.meshsplats.max_triangles = 0
 bpy.ops.object.meshsplats_convert_again()
-told["triangles"]["again"] = len(thing.data.polygons)
+report["triangles"]["again"] = len(obj.data.polygons)
 from meshsplats.blender.inside import stage  # noqa: E402
 
 scene = bpy.context.scene
@@ -128,12 +128,12 @@ camera.rotation_euler = (1.5708, 0, 0)
 scene.camera = camera
 stage.even_world((1, 1, 1))
 scene.render.resolution_x = scene.render.resolution_y = 32
-scene.render.filepath = str(folder / "picture.png")
+scene.render.filepath = str(folder / "image.png")
 bpy.ops.render.render(write_still=True)
-picture = bpy.data.images.load(scene.render.filepath)
-values = picture.pixels[:]
+image = bpy.data.images.load(scene.render.filepath)
+values = image.pixels[:]
 row = [values[4 * (16 * 32 + column)] for column in range(32)]
-told["edge"], told["middle"] = row[1], row[16]
+report["edge"], report["middle"] = row[1], row[16]
 
 # Named after its folder, and moved to the world's origin; then light, ground and camera in one click.
 model = folder / "chair" / "point_cloud" / "iteration_7"
@@ -141,13 +141,77 @@ model.mkdir(parents=True)
 (model / "point_cloud.ply").write_bytes((folder / "ball.ply").read_bytes())
 bpy.ops.import_scene.meshsplats(filepath=str(model / "point_cloud.ply"), at_origin=True)
 chair = bpy.context.object
-told["named"] = [chair.name, list(chair.location)]
-told["stage"] = sorted(bpy.ops.scene.meshsplats_stage(lights="studio"))
+report["named"] = [chair.name, list(chair.location)]
+report["stage"] = sorted(bpy.ops.scene.meshsplats_stage(lights="studio"))
 bpy.ops.scene.meshsplats_stage(lights="studio")
-told["staged"] = sorted(c.name for c in scene.collection.children)
-told["camera"] = scene.camera.name
-told["dressed"] = chair.data.materials[0].name.startswith("Splats, lit")
+report["staged"] = sorted(c.name for c in scene.collection.children)
+report["camera"] = scene.camera.name
+report["dressed"] = chair.data.materials[0].name.startswith("Splats, lit")
 bpy.data.objects.remove(chair)
+
+# Levels of detail, from the folder and from its table dropped on the window.
+chain = folder / "chain"
+bpy.ops.import_scene.meshsplats(filepath=str(chain) + "/")
+report["levels"] = [c.name for c in scene.collection.children if c.name.startswith("chain")]
+bpy.ops.import_scene.meshsplats(directory=str(chain) + "/", files=[{"name": "levels.json"}], shading="lit")
+(collection,) = [c for c in scene.collection.children if c.name == "chain.001"]
+report["levels"] += [(c.name, [o.name for o in c.objects], c.hide_render) for c in collection.children]
+report["level_triangles"] = [len(c.objects[0].data.polygons) for c in collection.children]
+report["shown"] = []
+
+
+def shown():
+    """Indices of the visible levels of the second chain, and the active object."""
+    bpy.context.view_layer.update()
+    seen = [i for i, c in enumerate(collection.children) if c.objects[0].visible_get() and not c.hide_render]
+    report["shown"].append([seen, bpy.context.object.name])
+
+
+shown()
+bpy.ops.scene.meshsplats_level(level=1)  # of the chain of the active object
+shown()
+bpy.ops.object.meshsplats_shading(shading="unlit")  # of all its levels
+report["level_materials"] = [c.objects[0].data.materials[0].name[:13] for c in collection.children]
+bpy.context.object.meshsplats.shading = "lit"
+bpy.ops.object.meshsplats_convert_again()
+report["level_materials"] += [c.objects[0].data.materials[0].name[:11] for c in collection.children]
+bpy.ops.scene.meshsplats_stage(lights="sun")  # with a camera that just sees the ball and all else
+scene.render.resolution_x = scene.render.resolution_y = 2000
+bpy.ops.scene.meshsplats_fit_level(chain="chain.001")
+shown()
+scene.render.resolution_x = scene.render.resolution_y = 20
+bpy.ops.scene.meshsplats_fit_level(chain="chain.001")
+shown()
+report["level_errors"] = []
+for operator, arguments in [
+    (bpy.ops.scene.meshsplats_level, {"chain": "chain.001", "level": 7}),
+    (bpy.ops.scene.meshsplats_level, {"chain": "nothing"}),
+    (bpy.ops.import_scene.meshsplats, {"filepath": str(folder / "cameras.json")}),
+]:
+    try:
+        report["level_errors"].append(str(operator(**arguments)))
+    except RuntimeError as error:
+        report["level_errors"].append(str(error))
+
+
+class Layout:
+    """What the panel asks of Blender's layout: remembers labels and buttons."""
+
+    def __init__(self, drawn):
+        self.drawn = drawn
+
+    def __getattr__(self, name):
+        def draw(*arguments, text=None, depress=None, **_):
+            if name in ("label", "operator"):
+                self.drawn.append([text or arguments[0], depress])
+            return Layout(self.drawn) if name in ("box", "row", "column") else SimpleNamespace()
+
+        return draw
+
+
+drawn = []
+sys.modules[addon + ".panel"].MeshSplatsPanel._chain(None, Layout(drawn), collection)
+report["panel"] = drawn
 
 # As in a window, where Blender calls the operator again and again while a thread does the work.
 work = sys.modules[addon + ".work"]
@@ -186,7 +250,7 @@ class Window:
 
 class Operator(work.Modal):
     def __init__(self):
-        self.said, self.results, self.left_alone = [], None, False
+        self.said, self.results, self.was_cancelled = [], None, False
 
     def report(self, kind, text):
         self.said.append(text)
@@ -194,22 +258,22 @@ class Operator(work.Modal):
     def done(self, context, work):
         self.results = len(work.results)
 
-    def given_up(self):
-        self.left_alone = True
+    def cancelled(self):
+        self.was_cancelled = True
 
 
 def event(kind):
     return SimpleNamespace(type=kind, value="PRESS")
 
 
-choices = {name: getattr(thing.meshsplats, name) for name in sys.modules[addon + ".settings"].CHOICES}
+choices = {name: getattr(obj.meshsplats, name) for name in sys.modules[addon + ".settings"].CHOICES}
 window, operator = Window(), Operator()
 answers = [operator.begin(window, work.Work([str(folder / "ball.ply")], choices))]
 answers.append(operator.modal(window, event("MOUSEMOVE")))
 while answers[-1] != {"FINISHED"} and len(answers) < 2000:
     time.sleep(0.02)
     answers.append(operator.modal(window, event("TIMER")))
-told["waited"] = {
+report["waited"] = {
     "answers": [sorted(answers[0]), sorted(answers[1]), sorted(answers[-1])],
     "progress": [value for value in window.shown if value != "end"],
     "results": operator.results,
@@ -220,29 +284,30 @@ told["waited"] = {
 window, operator = Window(), Operator()
 job = work.Work([str(folder / "ball.ply")] * 50, choices)
 operator.begin(window, job)
-told["escape"] = {"answer": sorted(operator.modal(window, event("ESC"))), "said": operator.said}
+report["escape"] = {"answer": sorted(operator.modal(window, event("ESC"))), "said": operator.said}
 job._thread.join(60)
-told["escape"] |= {
+report["escape"] |= {
     "alive": job._thread.is_alive(),
     "converted": len(job.results),
     "results": operator.results,
-    "left_alone": operator.left_alone,
+    "was_cancelled": operator.was_cancelled,
     "timers": window.timers,
 }
 
 bpy.ops.preferences.addon_disable(module=addon)
-told["left"] = [
+report["left"] = [
     name
     for group, name in [
         ("import_scene", "meshsplats"),
         ("object", "meshsplats_shading"),
         ("scene", "meshsplats_set_up"),
         ("scene", "meshsplats_stage"),
+        ("scene", "meshsplats_level"),
     ]
     if name in dir(getattr(bpy.ops, group))
 ]
-told["left"] += [name for name in dir(bpy.types) if "meshsplats" in name.lower()]
+report["left"] += [name for name in dir(bpy.types) if "meshsplats" in name.lower()]
 handlers = bpy.app.handlers.depsgraph_update_post[:] + bpy.app.handlers.frame_change_post[:]
-told["left"] += [h.__name__ for h in handlers if h.__module__.startswith(addon)]
-told["left"] += [name for name in dir(bpy.types.Object) if name == "meshsplats"]
-(folder / "told.json").write_text(json.dumps(told))
+report["left"] += [h.__name__ for h in handlers if h.__module__.startswith(addon)]
+report["left"] += [name for name in dir(bpy.types.Object) if name == "meshsplats"]
+(folder / "report.json").write_text(json.dumps(report))

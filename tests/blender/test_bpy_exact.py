@@ -1,5 +1,5 @@
 # ruff: noqa: E402
-"""Unlit pictures by Cycles are those of ``render``."""
+"""Unlit images by Cycles are those of ``render``."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from meshsplats.images.writing import load_png, to_bytes
 from meshsplats.mesh import SplatMesh
 
 
-def pictures(mesh, views, folder: Path, options: SceneOptions | None = None, suffix=".exr"):
+def images(mesh, views, folder: Path, options: SceneOptions | None = None, suffix=".exr"):
     paths = [folder / f"{i}{suffix}" for i in range(len(views))]
-    draw(mesh, views, pictures=paths, options=options)
+    draw(mesh, views, images=paths, options=options)
     assert sorted(folder.iterdir()) == sorted(paths), "nothing else is left behind"
     return [read_pixels(path) if suffix == ".exr" else load_png(path) for path in paths]
 
 
-def test_float_pictures_agree_for_every_lens(tmp_path):
+def test_float_images_agree_for_every_lens(tmp_path):
     mesh = random_mesh()
-    for camera, drawn in zip(cameras(), pictures(mesh, cameras(), tmp_path), strict=True):
+    for camera, drawn in zip(cameras(), images(mesh, cameras(), tmp_path), strict=True):
         expected = render(mesh, camera)
         assert drawn.shape == (camera.height, camera.width, 4)
         assert psnr(drawn[..., :3], expected.color) > 60, camera.name
@@ -43,25 +43,25 @@ def test_samples_and_background_and_up_and_threads(tmp_path):
     mesh = random_mesh(up=(0.2, 0.9, -0.3))
     view = cameras()[1]
     options = SceneOptions(samples=3, background=(0.1, 0.6, 0.3), threads=1)
-    drawn = pictures(mesh, [view], tmp_path, options)[0]
+    drawn = images(mesh, [view], tmp_path, options)[0]
     expected = render(mesh, view, samples=3, background=(0.1, 0.6, 0.3)).color
     assert psnr(drawn[..., :3], expected) > 60
 
 
-def test_transparent_pictures_composite_to_the_opaque_ones(tmp_path):
+def test_transparent_images_composite_to_the_opaque_ones(tmp_path):
     mesh = random_mesh()
     view = cameras()[0]
-    drawn = pictures(mesh, [view], tmp_path, SceneOptions(background=None))[0]
+    drawn = images(mesh, [view], tmp_path, SceneOptions(background=None))[0]
     expected = render(mesh, view, background=(0, 0, 0))
     assert psnr(drawn[..., :3], expected.color) > 60  # premultiplied, as .exr files are
     assert psnr(drawn[..., 3], expected.alpha) > 60
 
 
 @pytest.mark.parametrize("samples", [1, 2])
-def test_png_pictures_agree_to_a_step(tmp_path, samples):
+def test_png_images_agree_to_a_step(tmp_path, samples):
     mesh = random_mesh()
     view = cameras()[0]
-    drawn = pictures(mesh, [view], tmp_path, SceneOptions(samples=samples), ".png")[0]
+    drawn = images(mesh, [view], tmp_path, SceneOptions(samples=samples), ".png")[0]
     expected = to_bytes(render(mesh, view, samples=samples).color)
     difference = np.abs(drawn.astype(int) - expected)
     assert np.mean(difference > 1) < 2e-3
@@ -74,7 +74,7 @@ def test_linear_meshes_are_blended_in_linear_light_and_shown_encoded(tmp_path, s
     view = cameras()[1]
     options = SceneOptions(samples=samples, background=background)
     expected = render(mesh, view, samples=samples, background=srgb_to_linear(np.array(background))).color
-    draw(mesh, [view, view], pictures=[tmp_path / "a.exr", tmp_path / "a.png"], options=options)
+    draw(mesh, [view, view], images=[tmp_path / "a.exr", tmp_path / "a.png"], options=options)
     assert psnr(read_pixels(tmp_path / "a.exr")[..., :3], expected) > 60
     shown = to_bytes(linear_to_srgb(expected)) / 255
     assert psnr(load_png(tmp_path / "a.png") / 255, shown) > 60
@@ -83,7 +83,7 @@ def test_linear_meshes_are_blended_in_linear_light_and_shown_encoded(tmp_path, s
 def test_many_layers_are_not_cut_off(tmp_path):
     mesh = sheets(600, 0.004)
     view = look_at((0.2, 0.1, -3), (0, 0, 0), width=12, height=12, fov=20)
-    drawn = pictures(mesh, [view], tmp_path)[0]
+    drawn = images(mesh, [view], tmp_path)[0]
     assert psnr(drawn[..., :3], render(mesh, view, min_transmittance=0.0).color) > 60
 
 
@@ -92,7 +92,7 @@ def test_more_layers_than_blender_follows_are_told(tmp_path):
 
     view = look_at((0.2, 0.1, -30), (0, 0, 0), width=12, height=12, fov=2)
     with pytest.warns(DataWarning, match=r"up to 1[3-9]\d\d triangles.*1024.*100\.00%"):
-        draw(sheets(1400, 0.001), [view], pictures=[tmp_path / "a.png"])
+        draw(sheets(1400, 0.001), [view], images=[tmp_path / "a.png"])
 
 
 def test_points_land_within_a_fiftieth_of_a_pixel(tmp_path):
@@ -111,7 +111,7 @@ def test_points_land_within_a_fiftieth_of_a_pixel(tmp_path):
     world = (corners - view.world_to_camera[:3, 3]) @ rotation
     faces = (np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(pixels))[:, None, None]).reshape(-1, 3)
     mesh = SplatMesh(world.reshape(-1, 3), faces, np.ones((4 * len(pixels), 4)))
-    drawn = pictures(mesh, [view], tmp_path, SceneOptions(samples=16, background=(0, 0, 0)))[0][..., 0]
+    drawn = images(mesh, [view], tmp_path, SceneOptions(samples=16, background=(0, 0, 0)))[0][..., 0]
     rows, columns = np.mgrid[: view.height, : view.width] + 0.5
     for x, y in pixels:
         near = (np.abs(columns - x) < 3) & (np.abs(rows - y) < 3)
@@ -125,5 +125,5 @@ def test_real_splats(tmp_path, name):
     cloud = load_gaussians(shared_data(f"splats/{name}"))
     mesh = convert(cloud, max_splats=20_000)
     views = orbit(mesh, 3, width=120, height=90)[:2]
-    for view, drawn in zip(views, pictures(mesh, views, tmp_path), strict=True):
+    for view, drawn in zip(views, images(mesh, views, tmp_path), strict=True):
         assert psnr(np.clip(drawn[..., :3], 0, 1), render(mesh, view).color) > 60

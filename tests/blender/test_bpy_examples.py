@@ -1,4 +1,4 @@
-"""The Blender examples run, smaller than they are, and show what they say."""
+"""The Blender examples run at a smaller size and show what they claim."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ def run(name, folder, *arguments):
     return done.stdout, folder / "example-output"
 
 
-def test_three_lights_give_three_pictures(tmp_path):
+def test_three_lights_give_three_images(tmp_path):
     save_gaussians(demo_scene.make_scene(600), tmp_path / "scene.ply")
     _, out = run("three_lights.py", tmp_path, "scene.ply", "--width", 48, "--samples", 2)
-    pictures = [load_png(out / f"{name}.png") / 255 for name in ("low_sun", "overcast_sky", "studio")]
+    images = [load_png(out / f"{name}.png") / 255 for name in ("low_sun", "overcast_sky", "studio")]
     assert (out / "three_lights.png").exists()
-    red, _, blue = pictures[0].mean(axis=(0, 1))
+    red, _, blue = images[0].mean(axis=(0, 1))
     assert red > blue, "the low sun is warm"
     for k in range(3):
-        assert np.abs(pictures[k] - pictures[k - 1]).mean() > 0.05, "lights differ"
+        assert np.abs(images[k] - images[k - 1]).mean() > 0.05, "lights differ"
 
 
 def test_the_vase_falls(tmp_path):
-    told, out = run("falling.py", tmp_path, "--width", 40, "--samples", 1, "--splats", 800)
-    tilt = re.search(r"the vase lies at (\d+) degrees", told)
+    printed, out = run("falling.py", tmp_path, "--width", 40, "--samples", 1, "--splats", 800)
+    tilt = re.search(r"the vase lies at (\d+) degrees", printed)
     assert tilt
     assert 60 < int(tilt[1]) <= 180
     assert (out / "falling.blend").stat().st_size > 10_000

@@ -1,6 +1,6 @@
 # ruff: noqa: E402
 """The extension as Blender sees it: its manifest, its installation from the .zip, import, another
-conversion, the picture, and its removal."""
+conversion, the image, and its removal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats, random_mesh
 from conftest import SHARED
 
-from meshsplats import save_gaussians, save_mesh
+from meshsplats import convert, save_gaussians, save_mesh
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.prior import bind
 
@@ -83,6 +83,13 @@ def test_a_whole_session(packed, tmp_path):
     save_mesh(random_mesh(30, blending="linear"), tmp_path / "linear.npz")
     base = BaseMesh(np.eye(3), [[0, 1, 2]])
     save_mesh(bind(base, triangles=4, layers=2, spacing=0).mesh, tmp_path / "prior.npz")
+    (tmp_path / "chain").mkdir()
+    rows = []
+    for level, count in enumerate((400, 100)):
+        save_mesh(convert(ball_splats(count)[0], mode="flat"), tmp_path / "chain" / f"level_{level}.glb")
+        rows.append({"file": f"level_{level}.glb", "screen_size": 200 >> level})
+    (tmp_path / "chain" / "levels.json").write_text(json.dumps({"levels": rows}))
+    (tmp_path / "cameras.json").write_text("[]")
     (tmp_path / "broken.ply").write_bytes(b"ply\nnonsense")
     sog = [path for path in [SHARED / "splats" / "monkey_0001.sog"] if path.exists()]
     environment = {
@@ -98,41 +105,55 @@ def test_a_whole_session(packed, tmp_path):
         env=environment,
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    told = json.loads((tmp_path / "told.json").read_text())
-    assert str(tmp_path / "blender") in told["package"], "meshsplats comes from the wheel"
-    assert told["imported"] == ["FINISHED"]
-    assert told["sog"] is None or 0 < told["sog"] <= 800
-    assert told["triangles"]["default"] > told["triangles"]["fewer"] > 0
-    assert told["materials"] == ["Splats, lit", "Splats, unlit"]
-    assert told["origin"] == pytest.approx([0, 0, -1], abs=0.12), "under the ball"
-    assert told["moved"] == [1.0, 2.0, 2.0], "converting again leaves the object where it was"
-    assert 64 <= told["bounces"] <= 1024
-    assert told["broken"].startswith("Error: ")
-    assert "broken.ply" in told["broken"]
-    assert told["left"] == []
-    assert told["dropped"]["operator"] == "import_scene.meshsplats"
-    assert {".ply", ".splat", ".spz", ".sog", ".npz", ".glb"} <= set(told["dropped"]["suffixes"])
-    assert told["dropped"]["places"] == ["VIEW_3D", "OUTLINER"]
-    assert told["linear"] == ["Standard", "Raw"]
-    assert told["base"] == "prior base"
-    assert told["followed"] == pytest.approx([1.0] * 12, abs=1e-4)
-    assert told["follow"] == ["FINISHED"]
-    assert told["triangles"]["again"] > told["triangles"]["fewer"]
-    assert told["edge"] == pytest.approx(1, abs=0.01)
-    assert told["middle"] == pytest.approx(0.7, abs=0.1), "the grey ball is drawn"
-    assert told["named"] == ["chair", [0.0, 0.0, 0.0]]
-    assert told["stage"] == ["FINISHED"]
-    assert told["staged"] == ["Cameras", "Lights", "Surroundings"]
-    assert told["camera"] == "Camera"
-    assert told["dressed"]
-    waited = told["waited"]
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert str(tmp_path / "blender") in report["package"], "meshsplats comes from the wheel"
+    assert report["imported"] == ["FINISHED"]
+    assert report["sog"] is None or 0 < report["sog"] <= 800
+    assert report["triangles"]["default"] > report["triangles"]["fewer"] > 0
+    assert report["materials"] == ["Splats, lit", "Splats, unlit"]
+    assert report["origin"] == pytest.approx([0, 0, -1], abs=0.12), "under the ball"
+    assert report["moved"] == [1.0, 2.0, 2.0], "converting again leaves the object where it was"
+    assert 64 <= report["bounces"] <= 1024
+    assert report["broken"].startswith("Error: ")
+    assert "broken.ply" in report["broken"]
+    assert report["left"] == []
+    assert report["dropped"]["operator"] == "import_scene.meshsplats"
+    assert {".ply", ".splat", ".spz", ".sog", ".npz", ".glb", ".json"} <= set(report["dropped"]["suffixes"])
+    assert report["dropped"]["places"] == ["VIEW_3D", "OUTLINER"]
+    assert report["linear"] == ["Standard", "Raw"]
+    assert report["base"] == "prior base"
+    assert report["followed"] == pytest.approx([1.0] * 12, abs=1e-4)
+    assert report["follow"] == ["FINISHED"]
+    assert report["triangles"]["again"] > report["triangles"]["fewer"]
+    assert report["edge"] == pytest.approx(1, abs=0.01)
+    assert report["middle"] == pytest.approx(0.7, abs=0.1), "the grey ball is drawn"
+    assert report["named"] == ["chair", [0.0, 0.0, 0.0]]
+    assert report["stage"] == ["FINISHED"]
+    assert report["staged"] == ["Cameras", "Lights", "Surroundings"]
+    assert report["camera"] == "Camera"
+    assert report["dressed"]
+    assert report["levels"] == [
+        "chain",
+        ["chain.001 level 0", ["chain.001 level 0"], False],
+        ["chain.001 level 1", ["chain.001 level 1"], True],
+    ]
+    assert report["level_triangles"] == [3200, 800]
+    names = ["chain.001 level 0", "chain.001 level 1"]
+    assert report["shown"] == [[[0], names[0]], [[1], names[1]], [[0], names[0]], [[1], names[1]]]
+    assert report["level_materials"] == ["Splats, unlit"] * 2 + ["Splats, lit"] * 2
+    assert "has the levels 0 to 1, got 7" in report["level_errors"][0]
+    assert "no chain of levels of detail nothing" in report["level_errors"][1]
+    assert "cameras.json" in report["level_errors"][2]
+    assert report["panel"][:4] == [["chain.001", None], ["Show level", None], ["0", False], ["1", True]]
+    assert report["panel"][4][0] == "scene.meshsplats_fit_level"
+    waited = report["waited"]
     assert waited["answers"] == [["RUNNING_MODAL"], ["PASS_THROUGH"], ["FINISHED"]]
     assert (np.diff(waited["progress"]) >= 0).all()
     assert waited["results"] == 1
     assert (waited["timers"], waited["text"]) == (0, None)
-    escape = told["escape"]
+    escape = report["escape"]
     assert escape["answer"] == ["CANCELLED"]
-    assert escape["said"] == ["MeshSplats: given up"]
-    assert (escape["results"], escape["left_alone"], escape["timers"]) == (None, True, 0)
+    assert escape["said"] == ["MeshSplats: cancelled"]
+    assert (escape["results"], escape["was_cancelled"], escape["timers"]) == (None, True, 0)
     assert not escape["alive"], "the thread stops by itself"
     assert escape["converted"] < 50

@@ -67,7 +67,7 @@ def opened(mesh, suffix, folder):
         else:  # the file's own axes: y is down in it
             bpy.ops.wm.ply_import(filepath=str(path), up_axis="NEGATIVE_Y", forward_axis="Z")
     bpy.context.view_layer.update()
-    return next(thing for thing in bpy.data.objects if thing.type == "MESH")
+    return next(obj for obj in bpy.data.objects if obj.type == "MESH")
 
 
 def shot(view, path):
@@ -84,7 +84,7 @@ def shot(view, path):
 
 
 @pytest.mark.parametrize(("suffix", "least"), [(".glb", 50), (".ply", 60), (".usda", 60)])
-def test_one_click_gives_the_exact_picture(tmp_path, suffix, least):
+def test_one_click_gives_the_exact_image(tmp_path, suffix, least):
     """Upright, in its place, blended as ``render`` blends. (Blender keeps 8 bits of a .glb's colours.)"""
     mesh = random_mesh(150, up=UP)
     view = cameras()[1]
@@ -95,18 +95,18 @@ def test_one_click_gives_the_exact_picture(tmp_path, suffix, least):
 def test_a_glb_for_linear_blending_stays_so(tmp_path):
     mesh = random_mesh(150, up=UP, blending="linear")
     view = cameras()[1]
-    thing = opened(mesh, ".glb", tmp_path)
-    objects.dress(thing, lit=False)
-    assert objects.as_splat_mesh(thing).blending == "linear"
+    obj = opened(mesh, ".glb", tmp_path)
+    objects.dress(obj, lit=False)
+    assert objects.as_splat_mesh(obj).blending == "linear"
     assert psnr(shot(view, tmp_path / "p.exr"), render(mesh, view).color) > 50
     scene = bpy.context.scene
-    objects.render_settings(scene, [thing], lit=False)
+    objects.render_settings(scene, [obj], lit=False)
     assert scene.view_settings.view_transform == "Standard"
     other = bpy.data.objects.new("other", bpy.data.meshes.new("display"))
-    assert "too dark" in objects.clash([thing, other], lit=False)
-    objects.render_settings(scene, [thing, other], lit=False)
+    assert "too dark" in objects.clash([obj, other], lit=False)
+    objects.render_settings(scene, [obj, other], lit=False)
     assert scene.view_settings.view_transform == "Raw"
-    assert objects.clash([thing, other], lit=True) == objects.clash([thing], lit=False) == ""
+    assert objects.clash([obj, other], lit=True) == objects.clash([obj], lit=False) == ""
 
 
 def test_a_glb_needs_no_click(tmp_path):
@@ -121,9 +121,9 @@ def test_a_glb_needs_no_click(tmp_path):
 def test_lit_click_gives_linear_colours_and_smoothed_normals(tmp_path, suffix):
     cloud, _ = ball_splats(300)
     mesh = convert(cloud, mode="flat")
-    thing = opened(mesh, suffix, tmp_path)
-    objects.dress(thing, lit=True)
-    data = thing.data
+    obj = opened(mesh, suffix, tmp_path)
+    objects.dress(obj, lit=True)
+    data = obj.data
     assert data.materials[0].name.startswith("Splats, lit")
     assert 1 < data[objects.LAYERS] < 200
     normals = np.empty(3 * len(data.vertices), np.float32)
@@ -133,7 +133,7 @@ def test_lit_click_gives_linear_colours_and_smoothed_normals(tmp_path, suffix):
     outward, normals = outward.reshape(-1, 3), normals.reshape(-1, 3)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     assert np.median((outward * normals).sum(axis=1)) > 0.9, "nearly the ball's own, which turn across a disc"
-    again = objects.as_splat_mesh(thing)
+    again = objects.as_splat_mesh(obj)
     assert np.abs(np.sort(again.colors[:, 0]) - np.sort(mesh.colors[:, 0])).max() < 0.01
 
 
@@ -146,15 +146,15 @@ def test_up_and_owners_survive(tmp_path):
     assert taken.face_splat.tolist() == mesh.face_splat.tolist()
 
 
-def test_what_is_no_splat_mesh_is_told():
+def test_an_object_that_is_no_splat_mesh_is_refused():
     bpy.ops.wm.read_factory_settings(use_empty=True)
     with pytest.raises(ValueError, match="no vertex colours"):
         objects.dress(bpy.data.objects.new("empty", None), True)
     data = bpy.data.meshes.new("square")
     data.from_pydata([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [], [(0, 1, 2, 3)])
-    thing = bpy.data.objects.new("square", data)
+    obj = bpy.data.objects.new("square", data)
     with pytest.raises(ValueError, match="no vertex colours"):
-        objects.dress(thing, True)
+        objects.dress(obj, True)
     data.color_attributes.new("c", "FLOAT_COLOR", "POINT")
     with pytest.raises(ValueError, match="triangulate it first"):
-        objects.dress(thing, True)
+        objects.dress(obj, True)

@@ -1,5 +1,5 @@
 # ruff: noqa: E402
-"""Lit pictures against a known surface lit the same way."""
+"""Lit images against a known surface lit the same way."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def display(values):
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    """Linear pictures of splats on a ball, of the ball itself, and of the ground alone."""
+    """Linear images of splats on a ball, of the ball itself, and of the ground alone."""
     folder = tmp_path_factory.mktemp("ball")
     cloud, _ = ball_splats(3000)
     mesh = convert(cloud, mode="flat")
@@ -46,7 +46,7 @@ def ball(tmp_path_factory):
     options = SceneOptions(light=LightOptions(sun=(100, 40), bounces=1), samples=24)
     made = built(mesh, view, options)
     splats = shot(made, view, folder / "splats.exr")
-    made.thing.hide_render = True
+    made.obj.hide_render = True
     ground = shot(made, view, folder / "ground.exr")
     bpy.ops.mesh.primitive_uv_sphere_add(segments=128, ring_count=64, radius=1)
     true = bpy.context.object
@@ -76,8 +76,8 @@ def test_layers_do_not_speckle_or_mottle(ball):
         > 0.995
     )
 
-    def roughness(picture):
-        grey = display(picture).mean(axis=2)
+    def roughness(image):
+        grey = display(image).mean(axis=2)
         middle = grey[1:-1, 1:-1]
         around = (grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]) / 4
         return np.median(np.abs(middle - around)[inside])
@@ -88,7 +88,7 @@ def test_layers_do_not_speckle_or_mottle(ball):
 def test_shadow_falls_where_the_surface_throws_it(ball):
     splats, solid, ground, covered = ball
     floor = (covered < 0.02) & (ground.mean(axis=2) > 0.05)
-    dark = [picture.mean(axis=2)[floor] < 0.75 * ground.mean(axis=2)[floor] for picture in (splats, solid)]
+    dark = [image.mean(axis=2)[floor] < 0.75 * ground.mean(axis=2)[floor] for image in (splats, solid)]
     assert dark[1].sum() > 200
     assert (dark[0] & dark[1]).sum() / (dark[0] | dark[1]).sum() > 0.9
 
@@ -131,15 +131,15 @@ def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
     view = orbit(mesh, 1, elevation=35, azimuth=20, width=64, height=48, distance=2.2)[0]
     from meshsplats.blender import draw
 
-    draw(mesh, [view], pictures=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
+    draw(mesh, [view], images=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
     plain = pictures.read_pixels(tmp_path / "plain.exr")[..., :3]
     assert psnr(np.clip(plain, 0, 1), render(mesh, view).color) > 30
     light = LightOptions(sun=(100, 40), sky=0.2)
     options = SceneOptions(light=light, engine="eevee", samples=2)
-    draw(mesh, [view], pictures=[tmp_path / "lit.exr"], options=options)
+    draw(mesh, [view], images=[tmp_path / "lit.exr"], options=options)
     bare = replace(options, light=replace(light, sun_strength=0.0))
     lit = pictures.read_pixels(tmp_path / "lit.exr").mean(axis=2)
-    draw(mesh, [view], pictures=[tmp_path / "bare.exr"], options=bare)
+    draw(mesh, [view], images=[tmp_path / "bare.exr"], options=bare)
     dark = pictures.read_pixels(tmp_path / "bare.exr").mean(axis=2)
     floor = (render(mesh, view).alpha < 0.01) & (np.arange(48) > 30)[:, None]
     sun = (lit - dark)[floor]

@@ -31,14 +31,14 @@ mi.set_variant("scalar_rgb")
 example = runpy.run_path(sys.argv[1], run_name="example")
 mesh, camera = ms.load_mesh("mesh.npz"), ms.load_cameras("camera.json")[0]
 made = example["make_scene_of"](mesh, camera, int(sys.argv[3]), float(sys.argv[2]))
-np.save("picture.npy", np.array(mi.render(made)))
+np.save("image.npy", np.array(mi.render(made)))
 """
 
 
-def coarse(picture):
+def coarse(image):
     """Means of 4 x 4 pixels: noise and the pixel filters, which differ, go away."""
-    height, width = picture.shape[0] // 4, picture.shape[1] // 4
-    return picture[: 4 * height, : 4 * width].reshape(height, 4, width, 4, -1).mean(axis=(1, 3))
+    height, width = image.shape[0] // 4, image.shape[1] // 4
+    return image[: 4 * height, : 4 * width].reshape(height, 4, width, 4, -1).mean(axis=(1, 3))
 
 
 def test_mitsuba_and_cycles_agree(tmp_path):
@@ -53,7 +53,7 @@ def test_mitsuba_and_cycles_agree(tmp_path):
     built = scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
     stage.even_world((0.35, 0.35, 0.35))  # seen as it shines
     # Mitsuba's ground does not fade into the background.
-    (ground,) = (thing for thing in built.scene.objects if thing.name.startswith("Ground"))
+    (ground,) = (obj for obj in built.scene.objects if obj.name.startswith("Ground"))
     ground.data.materials[0] = materials.plain("Plain ground", stage.GREY)
     built.scene.cycles.pixel_filter_type = "BOX"
     built.scene.cycles.filter_width = 1.0
@@ -65,7 +65,7 @@ def test_mitsuba_and_cycles_agree(tmp_path):
     command = [sys.executable, "-c", SESSION, str(EXAMPLE), str(facts["floor"]), str(SAMPLES)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    mitsuba = coarse(np.load(tmp_path / "picture.npy"))
+    mitsuba = coarse(np.load(tmp_path / "image.npy"))
 
     assert mitsuba.mean() == pytest.approx(cycles.mean(), rel=0.02)
     covered = coarse(render(mesh, view).alpha[..., None])[..., 0]

@@ -37,13 +37,13 @@ def placed(request):
     """The splats' object, that of its base, and the prior they were made from."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh = prior_mesh()
-    thing = objects.add(objects.prepare(mesh, request.param), "prior", bpy.context.collection)
-    return thing, priors.base_of(thing), MeshPrior(mesh)
+    obj = objects.add(objects.prepare(mesh, request.param), "prior", bpy.context.collection)
+    return obj, priors.base_of(obj), MeshPrior(mesh)
 
 
-def places(thing) -> np.ndarray:
-    found = np.empty(3 * len(thing.data.vertices), np.float32)
-    thing.data.vertices.foreach_get("co", found)
+def places(obj) -> np.ndarray:
+    found = np.empty(3 * len(obj.data.vertices), np.float32)
+    obj.data.vertices.foreach_get("co", found)
     return found.reshape(-1, 3)
 
 
@@ -51,36 +51,36 @@ def wanted(prior: MeshPrior, vertices) -> np.ndarray:
     return prior.pose(vertices, lift=prior.export_lift).vertices
 
 
-def assert_follows(thing, prior, vertices) -> None:
-    np.testing.assert_allclose(places(thing), wanted(prior, vertices), atol=2e-6)
-    assert thing[priors.PROBLEM] == ""
+def assert_follows(obj, prior, vertices) -> None:
+    np.testing.assert_allclose(places(obj), wanted(prior, vertices), atol=2e-6)
+    assert obj[priors.PROBLEM] == ""
 
 
 def test_base_and_splats_stand_together(placed):
-    thing, base, prior = placed
-    assert thing.parent is base
+    obj, base, prior = placed
+    assert obj.parent is base
     assert (base.display_type, base.hide_render) == ("WIRE", True)
     bpy.context.view_layer.update()
-    np.testing.assert_allclose(np.array(thing.matrix_world), np.array(base.matrix_world), atol=1e-6)
+    np.testing.assert_allclose(np.array(obj.matrix_world), np.array(base.matrix_world), atol=1e-6)
     assert len(base.data.vertices) == len(prior.base_vertices)
-    assert_follows(thing, prior, prior.base_vertices)
-    found = priors.binding_of(thing)
+    assert_follows(obj, prior, prior.base_vertices)
+    found = priors.binding_of(obj)
     for name in ("base_vertices", "base_faces", "vertex_face", "weights", "layers"):
         np.testing.assert_array_equal(getattr(found, name), getattr(prior.mesh.binding, name))
 
 
 def test_an_edited_base(placed):
-    thing, base, prior = placed
+    obj, base, prior = placed
     moved = prior.base_vertices * np.float32(1.5) + np.float32([0.1, 0, 0.3])
     base.data.vertices.foreach_set("co", moved.ravel())
     base.data.update()
-    assert priors.follow([thing], bpy.context.evaluated_depsgraph_get()) == 1
+    assert priors.follow([obj], bpy.context.evaluated_depsgraph_get()) == 1
     lift = prior.export_lift
-    np.testing.assert_allclose(places(thing), prior.pose(moved, lift=lift).vertices, atol=2e-6)
+    np.testing.assert_allclose(places(obj), prior.pose(moved, lift=lift).vertices, atol=2e-6)
 
 
 def test_handlers_follow_shape_keys_and_armatures(placed):
-    thing, base, prior = placed
+    obj, base, prior = placed
     scene = bpy.context.scene
     handlers = (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post)
     functions = (priors.after_update, priors.after_frame)
@@ -93,17 +93,17 @@ def test_handlers_follow_shape_keys_and_armatures(placed):
         key.data.foreach_set("co", raised.ravel())
         key.value = 1.0
         bpy.context.view_layer.update()
-        assert_follows(thing, prior, raised)
+        assert_follows(obj, prior, raised)
         # From frame to frame, between the two.
         key.value = 0.0
         key.keyframe_insert("value", frame=1)
         key.value = 1.0
         key.keyframe_insert("value", frame=11)
         scene.frame_set(6)
-        heights = places(thing)[:, 2] - wanted(prior, prior.base_vertices)[:, 2]
+        heights = places(obj)[:, 2] - wanted(prior, prior.base_vertices)[:, 2]
         assert 0.1 < heights.mean() < 0.4
         scene.frame_set(1)
-        assert_follows(thing, prior, prior.base_vertices)
+        assert_follows(obj, prior, prior.base_vertices)
         # A hook, one of the modifiers that move vertices; an armature is another.
         bone = bpy.data.objects.new("rig", bpy.data.armatures.new("rig"))
         scene.collection.objects.link(bone)
@@ -116,10 +116,10 @@ def test_handlers_follow_shape_keys_and_armatures(placed):
         group.add(list(range(len(base.data.vertices))), 1.0, "REPLACE")
         modifier = base.modifiers.new("rig", "ARMATURE")
         modifier.object = bone
-        before = places(thing)
+        before = places(obj)
         bone.pose.bones["bone"].location = (0, 2, 0)
         bpy.context.view_layer.update()
-        shift = places(thing) - before
+        shift = places(obj) - before
         np.testing.assert_allclose(np.linalg.norm(shift, axis=1), 2, atol=1e-4)
     finally:
         for group, function in zip(handlers, functions, strict=True):
@@ -129,7 +129,7 @@ def test_handlers_follow_shape_keys_and_armatures(placed):
 @pytest.mark.parametrize("kind", ["CLOTH", "SOFT_BODY"])
 def test_a_simulated_base(placed, kind):
     """A cloth or soft body pinned nowhere falls, and takes its splats along."""
-    thing, base, prior = placed
+    obj, base, prior = placed
     modifier = base.modifiers.new("simulation", kind)
     if kind == "SOFT_BODY":
         modifier.settings.use_goal = False
@@ -139,18 +139,18 @@ def test_a_simulated_base(placed, kind):
         heights = []
         for frame in range(1, 9):
             scene.frame_set(frame)
-            world = np.array(thing.matrix_world)
-            heights.append(float((places(thing) @ world[:3, :3].T + world[:3, 3])[:, 2].mean()))
+            world = np.array(obj.matrix_world)
+            heights.append(float((places(obj) @ world[:3, :3].T + world[:3, 3])[:, 2].mean()))
         assert heights[-1] < heights[0] - 0.05
         evaluated = base.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
         fallen = np.array([vertex.co[:] for vertex in evaluated.vertices], np.float32)
-        np.testing.assert_allclose(places(thing), wanted(prior, fallen), atol=1e-5)
+        np.testing.assert_allclose(places(obj), wanted(prior, fallen), atol=1e-5)
     finally:
         bpy.app.handlers.frame_change_post.remove(priors.after_frame)
 
 
 def test_edit_mode_is_followed(placed):
-    thing, base, prior = placed
+    obj, base, prior = placed
     bpy.context.view_layer.objects.active = base
     bpy.ops.object.mode_set(mode="EDIT")
     try:
@@ -160,48 +160,48 @@ def test_edit_mode_is_followed(placed):
         for vertex in edited.verts:
             vertex.co.z += 1
         bmesh.update_edit_mesh(base.data)
-        priors.follow([thing], bpy.context.evaluated_depsgraph_get())
-        assert_follows(thing, prior, prior.base_vertices + np.float32([0, 0, 1]))
+        priors.follow([obj], bpy.context.evaluated_depsgraph_get())
+        assert_follows(obj, prior, prior.base_vertices + np.float32([0, 0, 1]))
     finally:
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_what_cannot_be_followed_is_told(placed):
-    thing, base, prior = placed
-    before = places(thing)
+def test_a_base_that_cannot_be_followed_is_reported(placed):
+    obj, base, prior = placed
+    before = places(obj)
     base.modifiers.new("more", "SUBSURF").levels = 1
-    assert priors.follow([thing], bpy.context.evaluated_depsgraph_get()) == 0
-    assert "follow modifiers that move vertices" in thing[priors.PROBLEM]
-    np.testing.assert_array_equal(places(thing), before)
+    assert priors.follow([obj], bpy.context.evaluated_depsgraph_get()) == 0
+    assert "follow modifiers that move vertices" in obj[priors.PROBLEM]
+    np.testing.assert_array_equal(places(obj), before)
     base.modifiers.clear()
-    priors.follow([thing], bpy.context.evaluated_depsgraph_get())
-    assert_follows(thing, prior, prior.base_vertices)
+    priors.follow([obj], bpy.context.evaluated_depsgraph_get())
+    assert_follows(obj, prior, prior.base_vertices)
     bpy.data.objects.remove(base)
-    assert priors.base_of(thing) is None
+    assert priors.base_of(obj) is None
     priors.after_frame(bpy.context.scene, bpy.context.evaluated_depsgraph_get())
 
 
 def test_shading_can_be_changed_and_it_still_follows(placed):
-    thing, base, prior = placed
+    obj, base, prior = placed
     for lit in (True, False):
-        objects.replace_mesh(thing, objects.prepare(objects.as_splat_mesh(thing), lit))
-        assert thing.data[objects.LIT] == lit
+        objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), lit))
+        assert obj.data[objects.LIT] == lit
         moved = prior.base_vertices + np.float32([0, 0, 0.25])
         base.data.vertices.foreach_set("co", moved.ravel())
         base.data.update()
-        priors.follow([thing], bpy.context.evaluated_depsgraph_get())
-        assert_follows(thing, prior, moved)
+        priors.follow([obj], bpy.context.evaluated_depsgraph_get())
+        assert_follows(obj, prior, moved)
 
 
-def test_pictures_are_those_of_the_posed_mesh(tmp_path, placed):
+def test_images_are_those_of_the_posed_mesh(tmp_path, placed):
     """Cycles draws the followed splats as it draws the mesh that ``pose`` makes."""
-    thing, base, prior = placed
-    if thing.data[objects.LIT]:
-        pytest.skip("unlit pictures are the exact ones")
+    obj, base, prior = placed
+    if obj.data[objects.LIT]:
+        pytest.skip("unlit images are the exact ones")
     moved = prior.base_vertices * np.float32([1, 1, 3])
     base.data.vertices.foreach_set("co", moved.ravel())
     base.data.update()
-    priors.follow([thing], bpy.context.evaluated_depsgraph_get())
+    priors.follow([obj], bpy.context.evaluated_depsgraph_get())
     lifted = replace(prior.pose(moved, lift=prior.export_lift), binding=None)
     # With its origin where the base has it: rays that meet edges exactly must be rounded the same way.
     prepared = objects.prepare(lifted, False) | {"origin": np.zeros(3)}
@@ -213,12 +213,12 @@ def test_pictures_are_those_of_the_posed_mesh(tmp_path, placed):
     scene.camera = camera
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.render.engine = "CYCLES"
-    objects.render_settings(scene, [thing], False)
-    pictures = []
-    for shown, hidden in ((thing, other), (other, thing)):
+    objects.render_settings(scene, [obj], False)
+    images = []
+    for shown, hidden in ((obj, other), (other, obj)):
         shown.hide_render, hidden.hide_render = False, True
         scene.render.filepath = str(tmp_path / f"{shown.name}.png")
         bpy.ops.render.render(write_still=True)
-        pictures.append(np.array(bpy.data.images.load(scene.render.filepath).pixels))
-    assert pictures[0].std() > 0.05
-    assert (np.abs(pictures[0] - pictures[1]) < 0.01).mean() > 0.99
+        images.append(np.array(bpy.data.images.load(scene.render.filepath).pixels))
+    assert images[0].std() > 0.05
+    assert (np.abs(images[0] - images[1]) < 0.01).mean() > 0.99

@@ -22,7 +22,7 @@ from meshsplats.images.writing import load_png
 
 
 def environment(path):
-    """A small environment picture, brighter above."""
+    """A small environment image, brighter above."""
     image = bpy.data.images.new("sky", 8, 4, float_buffer=True)
     values = np.ones((4, 8, 4), np.float32)
     values[2:] = 3
@@ -33,11 +33,11 @@ def environment(path):
     return path
 
 
-def test_unlit_file_renders_the_picture_again(tmp_path):
+def test_unlit_file_renders_the_image_again(tmp_path):
     mesh = random_mesh()
     views = cameras()[1:3]
     targets = [tmp_path / "a.png", tmp_path / "b.png"]
-    draw(mesh, views, pictures=targets, blend=tmp_path / "s.blend")
+    draw(mesh, views, images=targets, blend=tmp_path / "s.blend")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "s.blend"))
     scene = bpy.context.scene
     assert [c.name for c in scene.collection.children] == ["Splats", "Cameras"]
@@ -121,10 +121,10 @@ def test_command_line_draws_meshes_and_splats(tmp_path, suffix, capsys):
         "--json",
     ]
     assert main(arguments) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert len(told["pictures"]) == len(told["picture_seconds"]) == 2
-    assert told["blender"] == bpy.app.version_string
-    assert load_png(told["pictures"][1]).shape == (40, 72, 3)
+    result = json.loads(capsys.readouterr().out)
+    assert len(result["pictures"]) == len(result["image_seconds"]) == 2
+    assert result["blender"] == bpy.app.version_string
+    assert load_png(result["pictures"][1]).shape == (40, 72, 3)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "cameras.json",
         "config.json",
@@ -154,7 +154,7 @@ def test_executable_runs_the_worker_by_itself(tmp_path):
     result = draw(
         random_mesh(20),
         cameras()[:1],
-        pictures=[tmp_path / "a.png"],
+        images=[tmp_path / "a.png"],
         blend=tmp_path / "a.blend",
         executable=program,
     )
@@ -169,6 +169,6 @@ def test_errors_inside_blender_come_out_in_words(tmp_path):
     broken = tmp_path / "sky.hdr"
     broken.write_bytes(b"#?RADIANCE\nbroken")
     options = SceneOptions(light=LightOptions(hdri=broken), samples=1)
-    with pytest.raises(BlenderError, match=r"sky\.hdr: Blender cannot read this environment picture"):
-        draw(random_mesh(5), cameras()[:1], pictures=[tmp_path / "a.png"], options=options)
+    with pytest.raises(BlenderError, match=r"sky\.hdr: Blender cannot read this environment image"):
+        draw(random_mesh(5), cameras()[:1], images=[tmp_path / "a.png"], options=options)
     assert [path.name for path in tmp_path.iterdir()] == ["sky.hdr"]

@@ -1,5 +1,5 @@
 # ruff: noqa: E402
-"""Light, ground and camera round objects of an open file, and where imported objects have their origin."""
+"""Light, ground and camera around objects of an open file, and the origin of imported objects."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def ball():
     return objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
 
 
-def corners(thing):
-    places = np.array([vertex.co for vertex in thing.data.vertices])
-    world = np.array(thing.matrix_world)
+def corners(obj):
+    places = np.array([vertex.co for vertex in obj.data.vertices])
+    world = np.array(obj.matrix_world)
     return places @ world[:3, :3].T + world[:3, 3]
 
 
@@ -43,28 +43,28 @@ def test_the_origin_lies_under_the_subject(empty):
     """And the object where its file has it, upright, also after another shading and another conversion."""
     cloud, _ = ball_splats(600)
     mesh = convert(cloud, mode="flat")
-    thing = objects.add(objects.prepare(mesh, False), "ball", bpy.context.collection)
+    obj = objects.add(objects.prepare(mesh, False), "ball", bpy.context.collection)
     bpy.context.view_layer.update()
-    np.testing.assert_allclose(thing.location, (0, 0, -1), atol=0.12)
-    before = corners(thing)
+    np.testing.assert_allclose(obj.location, (0, 0, -1), atol=0.12)
+    before = corners(obj)
     # y down and z forward in the file are z up and y back here.
     np.testing.assert_allclose(before, mesh.vertices[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
-    again = objects.as_splat_mesh(thing)
+    again = objects.as_splat_mesh(obj)
     np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-5)
-    thing.location = (5, 6, 7)
-    objects.replace_mesh(thing, objects.prepare(again, True))
+    obj.location = (5, 6, 7)
+    objects.replace_mesh(obj, objects.prepare(again, True))
     bpy.context.view_layer.update()
-    assert tuple(thing.location) == (5, 6, 7)
-    np.testing.assert_allclose(corners(thing)[:, 2].min(), 7, atol=0.12)
+    assert tuple(obj.location) == (5, 6, 7)
+    np.testing.assert_allclose(corners(obj)[:, 2].min(), 7, atol=0.12)
 
 
 @pytest.mark.parametrize("lights", LIGHTS)
 def test_one_click_sets_everything_up(empty, lights):
-    thing = ball()
-    thing.location = (10, -3, 2)
+    obj = ball()
+    obj.location = (10, -3, 2)
     bpy.context.view_layer.update()
     for _ in range(2):  # a second click replaces what the first made
-        setting.set_up(empty, [thing], lights)
+        setting.set_up(empty, [obj], lights)
     names = sorted(o.name for o in empty.objects)
     lamps = {"sun": ["Sun"], "noon": ["Sun"], "overcast": [], "studio": ["Fill", "Sun"]}[lights]
     assert names == sorted(["ball", "Camera", "Ground", *lamps])
@@ -74,11 +74,11 @@ def test_one_click_sets_everything_up(empty, lights):
     from bpy_extras.object_utils import world_to_camera_view
 
     bpy.context.view_layer.update()
-    places = [thing.matrix_world @ vertex.co for vertex in list(thing.data.vertices)[::20]]
+    places = [obj.matrix_world @ vertex.co for vertex in list(obj.data.vertices)[::20]]
     seen = np.array([world_to_camera_view(empty, empty.camera, place) for place in places])
     assert (seen[:, :2] > 0).all()
     assert (seen[:, :2] < 1).all()
-    assert np.ptp(seen[:, 1]) > 0.6, "it fills the picture"
+    assert np.ptp(seen[:, 1]) > 0.6, "it fills the image"
     assert empty.cycles.use_denoising
     assert empty.view_settings.exposure == pytest.approx(LIGHTS[lights].exposure)
 
@@ -102,9 +102,9 @@ def test_white_looks_white(tmp_path, lights):
     """A white plate (display value 0.95) under each named light, shown by the default exposure."""
     mesh, camera = plate(0.95)
     options = SceneOptions(light=LIGHTS[lights], samples=32, denoise=True)
-    draw(mesh, [camera], pictures=[tmp_path / "a.png"], options=options)
-    picture = load_png(tmp_path / "a.png")
-    middle = picture[14:22, 20:28].mean()
+    draw(mesh, [camera], images=[tmp_path / "a.png"], options=options)
+    image = load_png(tmp_path / "a.png")
+    middle = image[14:22, 20:28].mean()
     assert 0.88 * 255 < middle < 254, middle
 
 
@@ -115,7 +115,7 @@ def test_the_ground_fades_into_the_background(tmp_path, background):
     small = SplatMesh(mesh.vertices * 0.3, mesh.faces, mesh.colors, normals=mesh.normals)
     camera = look_at((0, -0.5, -3), (-0.7, -0.3, 0), width=16, height=160, fov=6.6)  # 60 degrees high
     options = SceneOptions(light=LightOptions(), samples=32, background=background, denoise=True)
-    draw(small, [camera], pictures=[tmp_path / "a.png"], options=options)
+    draw(small, [camera], images=[tmp_path / "a.png"], options=options)
     column = load_png(tmp_path / "a.png").mean(axis=(1, 2))
     np.testing.assert_allclose(column[0], 255 * np.mean(background), atol=2)
     change = column[-1] - column[0]
@@ -130,20 +130,20 @@ def test_values_of_light_do_not_change_with_exposure(tmp_path):
     values = []
     for exposure in (0.0, 2.0):
         options = SceneOptions(light=LightOptions(exposure=exposure), samples=4)
-        draw(mesh, [camera], pictures=[tmp_path / "a.exr"], options=options)
+        draw(mesh, [camera], images=[tmp_path / "a.exr"], options=options)
         values.append(pictures.read_pixels(tmp_path / "a.exr"))
     np.testing.assert_array_equal(*values)
 
 
 @pytest.mark.parametrize("suffix", ["png", "exr"])
-def test_a_picture_that_is_not_whole_is_told(tmp_path, monkeypatch, suffix):
-    """Blender says nothing of a full disk; what it leaves is cut off."""
+def test_a_truncated_image_is_an_error(tmp_path, monkeypatch, suffix):
+    """Blender does not report a full disk, and leaves a truncated file."""
     mesh, camera = plate(0.5)
     path = tmp_path / f"a.{suffix}"
-    draw(mesh, [camera], pictures=[path])
+    draw(mesh, [camera], images=[path])
     pictures._check_written(path, 48 * 36)
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(OSError, match="wrote no picture"):
+    with pytest.raises(OSError, match="wrote no image"):
         pictures._check_written(path, 48 * 36)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 0))
     with pytest.raises(OSError) as caught:

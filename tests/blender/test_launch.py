@@ -1,4 +1,4 @@
-"""What is missing, too old, broken or in the way is said in words, and nothing is left behind."""
+"""Anything missing, too old, broken or in the way is a clear error, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_missing_bpy_names_the_extra_and_the_environment(monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bpy" else real(name))
     with pytest.raises(MissingDependencyError, match=r"pip install '\.\[blender\]'.*--executable"):
-        draw(random_mesh(3), cameras()[:1], pictures=["a.png"])
+        draw(random_mesh(3), cameras()[:1], images=["a.png"])
 
 
 def test_executable_that_is_not_blender(program, tmp_path):
@@ -69,10 +69,10 @@ def test_what_blender_said_last_is_in_the_error(program, tmp_path):
     crashing = program("Blender 5.0.1", "echo 'no memory for the render'; exit 3")
     target = tmp_path / "a.png"
     with pytest.raises(BlenderError, match=r"exit code 3.*no memory for the render"):
-        draw(random_mesh(3), cameras()[:1], pictures=[target], executable=crashing)
+        draw(random_mesh(3), cameras()[:1], images=[target], executable=crashing)
     killed = program("Blender 5.0.1", "kill -9 $$")
     with pytest.raises(BlenderError, match=r"SIGKILL.*fewer triangles"):
-        draw(random_mesh(3), cameras()[:1], pictures=[target], executable=killed)
+        draw(random_mesh(3), cameras()[:1], images=[target], executable=killed)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["blender"]
 
 
@@ -80,10 +80,10 @@ def test_folders_that_cannot_be_written_in_are_told_first(program, tmp_path):
     blender = program("Blender 5.0.1", f"touch {tmp_path}/started")
     places = [tmp_path / "nowhere"] + [Path("/proc")] * Path("/proc/self").exists()
     for folder in places:
-        for outputs in ({"pictures": [folder / "a.png"]}, {"blend": folder / "a.blend"}):
-            with pytest.raises(OSError, match="cannot write in the folder") as told:
+        for outputs in ({"images": [folder / "a.png"]}, {"blend": folder / "a.blend"}):
+            with pytest.raises(OSError, match="cannot write in the folder") as caught:
                 draw(random_mesh(3), cameras()[:1], executable=blender, **outputs)
-            assert told.value.filename == str(folder)
+            assert caught.value.filename == str(folder)
     assert not (tmp_path / "started").exists()
 
 
@@ -206,7 +206,7 @@ def test_leftovers_of_crashes_are_removed(program, tmp_path, monkeypatch):
             draw(
                 random_mesh(3),
                 cameras()[:1],
-                pictures=[tmp_path / "a.png"],
+                images=[tmp_path / "a.png"],
                 executable=program("Blender 5.0.1", "exit 3"),
             )
         assert sorted(path.name for path in tmp_path.iterdir()) == [
@@ -217,17 +217,17 @@ def test_leftovers_of_crashes_are_removed(program, tmp_path, monkeypatch):
 
 
 def test_a_full_disk_inside_blender_is_a_full_disk(program, tmp_path):
-    told = launch.worker.MARK + json.dumps({"error": [errno.ENOSPC, "no space left", "/disk/a.png"]})
-    blender = program("Blender 5.0.1", f"echo '{told}'; exit 1")
+    line = launch.worker.MARK + json.dumps({"error": [errno.ENOSPC, "no space left", "/disk/a.png"]})
+    blender = program("Blender 5.0.1", f"echo '{line}'; exit 1")
     with pytest.raises(OSError, match="no space left") as caught:
-        draw(random_mesh(3), cameras()[:1], pictures=[tmp_path / "a.png"], executable=blender)
+        draw(random_mesh(3), cameras()[:1], images=[tmp_path / "a.png"], executable=blender)
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, "/disk/a.png")
 
 
 def test_what_blender_says_is_passed_on(program, tmp_path):
     stages = [
         {"stage": "Sample 4/16", "share": 0.25, "left": "00:10.1"},
-        {"picture": "a", "seconds": 1, "processor": 1},
+        {"image": "a", "seconds": 1, "processor": 1},
     ]
     lines = "\n".join(f"echo '{launch.worker.MARK}{json.dumps(stage)}'" for stage in stages)
     ahead, seen = [], []
@@ -235,7 +235,7 @@ def test_what_blender_says_is_passed_on(program, tmp_path):
         draw(
             random_mesh(3),
             cameras()[:1],
-            pictures=[tmp_path / "a.png"],
+            images=[tmp_path / "a.png"],
             executable=program("Blender 5.0.1", lines + "\nexit 1"),
             announce=ahead.append,
             progress=seen.append,
@@ -262,14 +262,14 @@ def test_what_blender_says_is_passed_on(program, tmp_path):
 )
 def test_blenders_words_are_understood(text, share, left, capsys):
     """As versions 4.2 and 5.0 print them."""
-    launch.worker.tell_stage(text)
+    launch.worker.report_stage(text)
     said = capsys.readouterr().out
     if share is None:
         assert said == ""
         return
-    told = json.loads(said.removeprefix(launch.worker.MARK))
-    assert (told["share"], told["left"]) == (share, left)
-    assert told["stage"] in text
+    message = json.loads(said.removeprefix(launch.worker.MARK))
+    assert (message["share"], message["left"]) == (share, left)
+    assert message["stage"] in text
 
 
 @linux
@@ -279,7 +279,7 @@ def test_missing_graphics_libraries_are_named(program, monkeypatch, tmp_path):
 
     monkeypatch.setattr(ctypes, "CDLL", absent)
     with pytest.raises(MissingDependencyError, match=r"libEGL\.so\.1.*apt install libegl1.*--engine cycles"):
-        launch.run_job({}, {}, [], SceneOptions(engine="eevee"), limit=1, executable=program("Blender 5.0.1"))
+        launch.run_job([], [], SceneOptions(engine="eevee"), limit=1, executable=program("Blender 5.0.1"))
 
 
 @linux
@@ -289,7 +289,7 @@ def test_missing_system_libraries_are_named(monkeypatch, tmp_path):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(MissingDependencyError, match=r"libSM\.so\.6: cannot open.*apt install .*libsm6"):
-        draw(random_mesh(3), cameras()[:1], pictures=[tmp_path / "a.png"])
+        draw(random_mesh(3), cameras()[:1], images=[tmp_path / "a.png"])
     assert not (tmp_path / "a.png").exists()
 
 

@@ -1,4 +1,4 @@
-"""Options that contradict each other or lie out of range are told before any work."""
+"""Options that contradict each other or are out of range are refused before any work."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from meshsplats.blender.options import LIGHTS, check_environment
         (SceneOptions(engine="povray"), "engine must be one of cycles, eevee"),
         (SceneOptions(samples=0), "samples is the side of the sample grid, 1 to 16, got 0"),
         (SceneOptions(samples=17), "1 to 16"),
-        (SceneOptions(light=LightOptions(), samples=70000), "samples a pixel, 1 to 65536"),
+        (SceneOptions(light=LightOptions(), samples=70000), "samples per pixel, 1 to 65536"),
         (SceneOptions(background=(0, 0, 2)), "background must be RGB in"),
         (SceneOptions(threads=0), "threads"),
         (SceneOptions(denoise=True), "denoise is for lit"),
@@ -32,7 +32,7 @@ from meshsplats.blender.options import LIGHTS, check_environment
         (SceneOptions(light=LightOptions(ground="catcher"), engine="eevee"), "Cycles only"),
     ],
 )
-def test_what_cannot_be_is_told(options, words):
+def test_impossible_options_are_refused(options, words):
     with pytest.raises(ValueError, match=words):
         options.check()
 
@@ -43,7 +43,7 @@ def test_defaults_are_good():
     assert {f.name for f in fields(LightOptions)} >= {"sun", "hdri", "ground", "mirror", "glass"}
 
 
-def test_environment_pictures_are_known_by_content(tmp_path):
+def test_environment_images_are_known_by_content(tmp_path):
     good, bad = tmp_path / "sky.hdr", tmp_path / "sky.exr"
     good.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n")
     bad.write_bytes(b"\x89PNG\r\n")

@@ -54,9 +54,9 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     assert run(scene / "mesh.npz", "-o", out, *options) == 0
     printed = json.loads(capsys.readouterr().out)["scenes"][0]
     results = json.loads((out / "results.json").read_text())
-    assert set(results) == {"mesh", "before", "pictures"}
+    assert set(results) == {"mesh", "before", "images"}
     assert results["mesh"] == results["before"]
-    assert results["pictures"]["PSNR"] == pytest.approx(results["mesh"]["PSNR"], abs=0.02)  # 8 bits
+    assert results["images"]["PSNR"] == pytest.approx(results["mesh"]["PSNR"], abs=0.02)  # 8 bits
     assert set(results["mesh"]) == {"SSIM", "PSNR", "LPIPS"}
     report = json.loads((out / "report.json").read_text())
     assert report == printed

@@ -204,7 +204,7 @@ def test_without_views_held_out_the_next_command_shows_the_mesh(splats, tmp_path
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--sh-degree", "0"], "pictures of other splats.*--sh-degree was not given and is 0"),
+        (["--sh-degree", "0"], "images of other splats.*--sh-degree was not given and is 0"),
         (["--held-out", "1"], "other views.*--held-out was 2 and is 1"),
         (["--axes", "y-up"], "another mesh.*options of reading it.*--axes was auto and is y-up"),
     ],

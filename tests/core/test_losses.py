@@ -19,7 +19,7 @@ from meshsplats.finetuning.losses import l1, photometric_loss, ssim  # noqa: E40
 
 
 def pair(seed: int, *shape: int, white: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
-    """A picture and a noisy version, with equal pixels and a white part whose variance is small."""
+    """An image and a noisy version, with equal pixels and a white part whose variance is small."""
     rng = np.random.default_rng(seed)
     truth = rng.random(shape)
     rows = shape[-3]
@@ -69,7 +69,7 @@ def relative(a, b) -> float:
     return float(np.linalg.norm(a - b) / np.linalg.norm(b))
 
 
-# Near white, the variance of float32 pictures is known to few digits.
+# Near white, the variance of float32 images is known to few digits.
 @pytest.mark.parametrize(("white", "tolerance"), [(False, 1e-6), (True, 1e-5)])
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
@@ -193,7 +193,7 @@ def test_a_rectangular_mask_crops(seed, top, left, height, width):
     assert not x.grad[~mask].any()
 
 
-def test_values_under_the_mask_are_never_looked_at():
+def test_values_under_the_mask_do_not_matter():
     picture, truth = pair(6, 2, 30, 40, 3)
     mask = torch.rand(2, 30, 40, generator=torch.Generator().manual_seed(3)) < 0.6
     results = []
@@ -212,7 +212,7 @@ def test_values_under_the_mask_are_never_looked_at():
         assert torch.equal(gy, results[0][2])
 
 
-def test_a_batch_is_the_mean_of_its_pictures():
+def test_a_batch_is_the_mean_of_its_images():
     picture, truth = pair(7, 3, 25, 31, 3)
     x = picture.clone().requires_grad_()
     value = photometric_loss(x, truth)
@@ -268,7 +268,7 @@ def test_gradients_as_torch_needs_them():
     x.grad *= 3
     value.backward()
     assert torch.allclose(x.grad, 4 * once)
-    # A picture that is a view with other strides, and part of a longer computation.
+    # An image that is a view with other strides, and part of a longer computation.
     wide = picture.permute(2, 0, 1).contiguous().requires_grad_()
     (2 * ssim(wide.permute(1, 2, 0), truth)).backward()
     assert torch.allclose(wide.grad.permute(1, 2, 0), 2 * once)
@@ -305,11 +305,9 @@ def test_not_a_number_is_not_hidden():
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES.keys())
 def test_bad_arguments_are_refused(loss):
     good = torch.zeros(12, 12, 3)
-    with pytest.raises(
-        TypeError, match=r"picture must be a torch tensor, got ndarray; use torch\.from_numpy"
-    ):
+    with pytest.raises(TypeError, match=r"image must be a torch tensor, got ndarray; use torch\.from_numpy"):
         loss(good.numpy(), good)
-    with pytest.raises(TypeError, match=r"truth must be float32 .* got torch\.float64"):
+    with pytest.raises(TypeError, match=r"target must be float32 .* got torch\.float64"):
         loss(good, good.double())
     with pytest.raises(ValueError, match=r"same shape, got \(12, 12, 3\) and \(12, 12, 1\)"):
         loss(good, good[..., :1])

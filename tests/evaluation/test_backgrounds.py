@@ -45,7 +45,7 @@ def photographs(scene, color, count=3) -> Dataset:
 
 
 @pytest.mark.parametrize("name", COLORS)
-def test_photographs_tell_what_splats_were_trained_over(cloud, name):
+def test_photographs_show_what_splats_were_trained_over(cloud, name):
     data = photographs(cloud, COLORS[name])
     found = find_background(data, {"splats": cloud, "mesh": convert(cloud)})
     assert (found.color, found.name, found.reason, found.judge) == (COLORS[name], name, "best for", "splats")
@@ -112,7 +112,7 @@ def test_masked_views_do_not_count(cloud):
     assert find_background(Dataset((hidden, *data.train)), {"splats": cloud}).psnr["splats"]["black"] > 100
 
 
-def test_pictures_of_something_else_are_told(cloud):
+def test_images_of_something_else_are_reported(cloud):
     data = photographs(cloud, COLORS["black"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -120,7 +120,7 @@ def test_pictures_of_something_else_are_told(cloud):
     noise = np.random.default_rng(0)
     other = [View(v.camera, ViewImage(noise.random((32, 32, 3), np.float32))) for v in data.train]
     found = find_background(Dataset(tuple(other)), {"splats": cloud})
-    with pytest.warns(DataWarning, match=r"splats shows next to nothing of the photographs \(\d+\.\d dB\)"):
+    with pytest.warns(DataWarning, match=r"splats shows almost nothing of the photographs \(\d+\.\d dB\)"):
         warn_of_other_worlds(found)
 
 
@@ -170,18 +170,18 @@ def test_evaluate_finds_it_and_says_so_everywhere(capture, tmp_path, capsys):
     assert set(report["background_psnr"]) == {"splats", "mesh"}
     white = (*options, "--background", "white")
     assert run("evaluate", capture / "mesh.npz", *white, "-o", tmp_path / "b") == 0
-    told = capsys.readouterr()
-    assert "over white the splats scores" in told.err
-    assert "Background: white, as given" in told.out
+    output = capsys.readouterr()
+    assert "over white the splats scores" in output.err
+    assert "Background: white, as given" in output.out
     assert json.loads((tmp_path / "b" / "report.json").read_text())["background"] == [1, 1, 1]
 
 
-def test_finetune_learns_over_it(capture, tmp_path, capsys):
+def test_finetune_trains_over_it(capture, tmp_path, capsys):
     arguments = ("finetune", capture / "scene.ply", "--data", capture / "photos", "--steps", "3")
     assert run(*arguments, "-o", tmp_path / "found.npz") == 0
-    told = capsys.readouterr()
-    assert "background: black, which fits the splats best" in told.err
-    assert "--background black" in told.out  # of the command that scores it
+    output = capsys.readouterr()
+    assert "background: black, which fits the splats best" in output.err
+    assert "--background black" in output.out  # of the command that scores it
     assert json.loads((tmp_path / "found.config.json").read_text())["background"] == [0, 0, 0]
     for name in ("black", "white"):
         assert run(*arguments, "-o", tmp_path / f"{name}.npz", "--background", name) == 0

@@ -1,4 +1,4 @@
-"""compare: scores against a calculation by hand, on pictures from the renderer's own functions."""
+"""compare: scores against a calculation by hand, on images from the renderer's own functions."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.comparison import Comparison, ViewScore, compare, compare_views
+from meshsplats.evaluation.metrics import ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
@@ -34,7 +35,7 @@ def scene() -> tuple[GaussianCloud, SplatMesh, list]:
 
 
 @pytest.mark.parametrize("look", ["area", "splats"])
-def test_scores_are_those_of_the_pictures(look):
+def test_scores_are_those_of_the_images(look):
     cloud, mesh, cameras = scene()
     options = {"look": look, "background": (0, 0.5, 1)}
     views = list(compare_views(cloud, mesh, cameras, sh_degree=0, **options))
@@ -47,7 +48,7 @@ def test_scores_are_those_of_the_pictures(look):
         np.testing.assert_array_equal(view.mesh, b)
         error = np.mean((a.astype(float) - b) ** 2)
         assert view.score.psnr == pytest.approx(-10 * np.log10(error), abs=1e-6)
-        assert -1 <= view.score.ssim < 1
+        assert view.score.ssim == pytest.approx(ssim(a, b), abs=1e-6)
     result = compare(cloud, mesh, cameras, sh_degree=0, **options)
     assert result.views == tuple(view.score for view in views)
     assert result.psnr == pytest.approx(np.mean([view.score.psnr for view in views]))
@@ -64,7 +65,7 @@ def test_a_mesh_for_linear_blending_is_compared_as_it_is_shown():
         np.testing.assert_allclose(view.mesh, linear_to_srgb(drawn), atol=1e-6)
 
 
-def test_options_reach_the_pictures():
+def test_options_reach_the_images():
     cloud, mesh, cameras = scene()
     full, flat = (next(compare_views(cloud, mesh, cameras, sh_degree=d)) for d in (None, 0))
     assert np.abs(full.splats - flat.splats).max() > 0.05
@@ -72,7 +73,7 @@ def test_options_reach_the_pictures():
     assert np.abs(peeled.mesh - full.mesh).max() > 0.05
 
 
-def test_equal_pictures_in_json():
+def test_equal_images_in_json():
     """JSON has no infinity; a mean over views of which one is perfect has no figure either."""
     result = Comparison((ViewScore("a", float("inf"), 1.0), ViewScore("b", 30.0, 0.5)))
     assert json.loads(json.dumps(result.to_dict(), allow_nan=False)) == {

@@ -1,4 +1,4 @@
-"""Scores of pictures against truths that are known."""
+"""Scores of images against known ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.evaluation.benchmarks import PROTOCOLS, find_input
+from meshsplats.errors import DataWarning
+from meshsplats.evaluation.benchmarks import BENCHMARKS, Benchmark, find_input, run_benchmark
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.evaluation.report import (
     COLUMNS,
@@ -31,6 +32,7 @@ from meshsplats.evaluation.strips import image_folder, markdown_table, worst_win
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.writing import save_png
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render_splats
 
 CAMERA = Camera(np.eye(4), 10, 10, 12, 8, 24, 16, name="a/one.png")
 
@@ -76,7 +78,7 @@ def test_masked_pixels_do_not_count():
         evaluate(perfect, Dataset((), (View(CAMERA, ViewImage(wrong, None, ~mask & mask)),)))
 
 
-def test_masked_ssim_is_that_of_the_cropped_picture():
+def test_masked_ssim_is_that_of_the_cropped_image():
     rng = np.random.default_rng(0)
     a, b = rng.random((2, 30, 40, 3)).astype(np.float32)
     mask = np.zeros((30, 40), bool)
@@ -85,7 +87,7 @@ def test_masked_ssim_is_that_of_the_cropped_picture():
     assert masked_ssim(a, b, None) == pytest.approx(ssim(a, b), abs=1e-6)
 
 
-def test_floaters_are_counted_away_from_what_the_truth_shows():
+def test_floaters_are_counted_away_from_the_subject():
     """Truth: one column. The mesh fills 10 x 10 pixels, of which columns 7 to 9 lie more than 2 away."""
     alpha = np.zeros((16, 24), np.float32)
     alpha[:, 12] = 1
@@ -188,10 +190,10 @@ def test_views_are_all_scored_where_none_is_held_out():
     assert (report.about["views"], report.about["held_out"]) == (1, False)
 
 
-# ---- Pictures made elsewhere
+# ---- Images from elsewhere
 
 
-def test_pictures_by_name_and_by_order(tmp_path):
+def test_images_by_name_and_by_order(tmp_path):
     cameras = [replace(CAMERA, name=f"set/r_{i}.png") for i in (2, 10)]
     for i, name in enumerate(("r_2", "r_10")):
         save_png(tmp_path / f"{name}.png", np.full((16, 24, 3), (51 + 51 * i) / 255, np.float32))
@@ -201,13 +203,13 @@ def test_pictures_by_name_and_by_order(tmp_path):
     unnamed = [replace(CAMERA, name=f"other_{i}") for i in range(2)]
     at = image_folder(tmp_path, unnamed)
     assert at(unnamed[0], (1, 1, 1))[0][0, 0] == pytest.approx([0.2] * 3)  # 2 before 10
-    with pytest.raises(FileNotFoundError, match="2 pictures for 3 views"):
+    with pytest.raises(FileNotFoundError, match="2 images for 3 views"):
         image_folder(tmp_path, [*unnamed, CAMERA])
     with pytest.raises(FileNotFoundError, match="no folder"):
         image_folder(tmp_path / "none", unnamed)
 
 
-def test_pictures_with_alpha_go_over_the_background_and_sizes_are_checked(tmp_path):
+def test_images_with_alpha_go_over_the_background_and_sizes_are_checked(tmp_path):
     save_png(tmp_path / "one.png", np.tile(np.float32([1, 0, 0, 0.6]), (16, 24, 1)))
     color, alpha = image_folder(tmp_path, [CAMERA])(CAMERA, (0, 0, 1))
     assert np.allclose(color, [0.6, 0, 0.4], atol=1e-6)
@@ -227,7 +229,7 @@ def test_worst_window_holds_the_largest_error():
     assert left <= 17 < left + side
 
 
-# ---- Tables and protocols
+# ---- Tables and benchmarks
 
 
 def test_table_has_every_scene_and_their_mean():
@@ -268,19 +270,19 @@ def test_several_meshes_have_names_of_their_own():
         evaluate({"before": meshes["a"]}, data, before=meshes["b"])
 
 
-def test_protocols_are_those_of_the_papers_table():
-    assert len(PROTOCOLS["mipnerf360"].scenes) == 7
-    assert set(PROTOCOLS["mipnerf360-9"].scenes) - set(PROTOCOLS["mipnerf360"].scenes) == {
+def test_benchmarks_are_those_of_the_papers_table():
+    assert len(BENCHMARKS["mipnerf360"].scenes) == 7
+    assert set(BENCHMARKS["mipnerf360-9"].scenes) - set(BENCHMARKS["mipnerf360"].scenes) == {
         "flowers",
         "treehill",
     }
     outdoor = {"bicycle", "flowers", "garden", "stump", "treehill"}
-    for scene, factor in PROTOCOLS["mipnerf360-9"].scenes.items():
+    for scene, factor in BENCHMARKS["mipnerf360-9"].scenes.items():
         assert factor == (4 if scene in outdoor else 2)
-    assert set(PROTOCOLS["tanks-and-temples"].scenes) == {"train", "truck"}
-    assert set(PROTOCOLS["deep-blending"].scenes) == {"drjohnson", "playroom"}
-    for protocol in PROTOCOLS.values():
-        assert (protocol.test_every, protocol.sh_degree) == (8, 0)
+    assert set(BENCHMARKS["tanks-and-temples"].scenes) == {"train", "truck"}
+    assert set(BENCHMARKS["deep-blending"].scenes) == {"drjohnson", "playroom"}
+    for benchmark in BENCHMARKS.values():
+        assert (benchmark.test_every, benchmark.sh_degree) == (8, 0)
 
 
 def test_a_scenes_input_is_found_by_name(tmp_path):
@@ -289,3 +291,33 @@ def test_a_scenes_input_is_found_by_name(tmp_path):
     assert find_input(tmp_path, "room") == tmp_path / "room"
     (tmp_path / "room.npz").touch()
     assert find_input(tmp_path, "room") == tmp_path / "room.npz"
+
+
+@pytest.mark.filterwarnings(
+    "ignore:Two scenes. scene one is left out", "ignore:Two scenes. scene two is left out"
+)
+def test_a_benchmark_scores_each_scene_that_is_there(tmp_path):
+    from _photographs import write_photographs
+
+    benchmark = Benchmark("Two scenes", {"one": 1, "two": 1}, {"paper": (28.0, 0.8, 0.2)}, test_every=2)
+    cloud = make_scene(200)
+    cameras = orbit(cloud, 4, width=24, height=24)
+    images = [render_splats(cloud, camera).color for camera in cameras]
+    write_photographs(tmp_path / "data" / "one", cameras, np.clip(images, 0, 1))
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "one.ply").touch()
+    folders = tmp_path / "models", tmp_path / "data"
+    with pytest.warns(DataWarning, match="Two scenes: scene two is left out"):
+        result = run_benchmark(benchmark, *folders, load=lambda path: cloud)
+    assert set(result.means()) == {"mesh", "splats_sh0", "splats"}
+    assert result.means() == result.reports[0].results()
+    record = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+    assert (record["scenes"], record["missing"], record["downscale"]) == (["one"], ["two"], {"one": 1})
+    assert record["reports"][0]["views"] == 2
+    assert "# Two scenes: 1 scene of 2" in result.table()
+    assert "| reported | paper | 28.00 |" in result.table()
+    with (
+        pytest.warns(DataWarning),
+        pytest.raises(FileNotFoundError, match="none of the scenes of Two scenes"),
+    ):
+        run_benchmark(benchmark, tmp_path, tmp_path / "data", load=lambda path: cloud)

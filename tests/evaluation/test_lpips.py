@@ -256,7 +256,7 @@ def test_broken_and_hostile_files(folder, tmp_path):
             load_lpips(file, network="alex")
 
 
-def test_bad_pictures_are_refused(folder):
+def test_bad_images_are_refused(folder):
     for network, smallest in (("vgg", 16), ("alex", 31)):
         distance = load_lpips(folder, network=network)
         a, b = pictures(smallest, smallest)
@@ -265,7 +265,7 @@ def test_bad_pictures_are_refused(folder):
             ValueError, match=rf"at least {smallest} x {smallest} pixels, got {smallest - 1} x"
         ):
             distance(a[1:], b[1:])
-        with pytest.raises(ValueError, match=r"RGB pictures \(h, w, 3\), got"):
+        with pytest.raises(ValueError, match=r"RGB images \(h, w, 3\), got"):
             distance(a[..., 0], b[..., 0])
         with pytest.raises(ValueError, match="same shape"):
             distance(a, b[1:])

@@ -15,7 +15,7 @@ CONVENTIONS = ["3dgs", "valid", "reflect"]
 
 
 def pair(seed: int, *shape: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two smooth pictures that are alike, with some noise."""
+    """Two smooth images that are alike, with some noise."""
     rng = np.random.default_rng(seed)
     y, x = np.meshgrid(np.linspace(0, 3, shape[0]), np.linspace(0, 3, shape[1]), indexing="ij")
     base = 0.5 + 0.3 * np.sin(3 * x + y) * np.cos(2 * y)
@@ -54,7 +54,7 @@ def ssim_by_definition(a: np.ndarray, b: np.ndarray, convention: str) -> float:
 
 
 def mirrored(n: int) -> list[int]:
-    """Positions -5 to n + 4 in a picture whose edge pixel is repeated: 2 1 0 | 0 1 2."""
+    """Positions -5 to n + 4 in an image whose edge pixel is repeated: 2 1 0 | 0 1 2."""
     return [-1 - i if i < 0 else 2 * n - 1 - i if i >= n else i for i in range(-5, n + 5)]
 
 
@@ -94,7 +94,7 @@ def test_ssim_against_scikit_image():
 
 
 @pytest.mark.parametrize("convention", ["valid", "reflect"])
-def test_ssim_of_plain_pictures_by_hand(convention):
+def test_ssim_of_plain_images_by_hand(convention):
     # No variance: only the comparison of the means is left.
     a, b = np.full((12, 14, 3), 0.2), np.full((12, 14, 3), 0.6)
     expected = (2 * 0.2 * 0.6 + 0.0001) / (0.2**2 + 0.6**2 + 0.0001)
@@ -126,14 +126,14 @@ def test_ssim_laws(convention, seed, height, width):
     assert np.mean(by_channel) == pytest.approx(value, abs=1e-12)
 
 
-def test_ssim_of_float32_pictures_is_accurate():
+def test_ssim_of_float32_images_is_accurate():
     a, b = (p.astype(np.float32) for p in pair(5, 64, 64, 3))
     a[:32] = b[:32] = 1  # a white part, where variances cancel
     b[10, 10] = 0.99
     assert ssim(a, b) == ssim(a.astype(np.float64), b.astype(np.float64))
 
 
-def test_ssim_takes_small_pictures_except_valid():
+def test_ssim_takes_small_images_except_valid():
     a, b = pair(6, 5, 7, 3)
     for convention in ("3dgs", "reflect"):
         assert ssim(a, b, convention=convention) < 1
@@ -162,7 +162,7 @@ def test_psnr_adds_up_in_double_precision():
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
-def test_bad_pictures_are_refused(metric):
+def test_bad_images_are_refused(metric):
     good = np.zeros((12, 12, 3))
     with pytest.raises(TypeError, match="divide bytes by 255"):
         metric(good, np.zeros((12, 12, 3), np.uint8))

@@ -27,7 +27,7 @@ from meshsplats.finetuning.checkpoint import OtherRunError, load_checkpoint
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
-    LEAST_LIGHT,
+    MIN_TRANSMITTANCE,
     encoding_slope,
     importance,
     kept_faces,
@@ -42,7 +42,7 @@ from meshsplats.mesh import SplatMesh
 
 @pytest.fixture(scope="module")
 def scene():
-    """Splats, a data set of their pictures, and their mesh."""
+    """Splats, a data set of their images, and their mesh."""
     cloud = make_scene(400)
     dataset = splat_dataset(cloud, train=12, test=4, width=48, sh_degree=0)
     return cloud, dataset, convert(cloud, cameras=[view.camera for view in dataset.train])
@@ -61,7 +61,7 @@ def score(mesh: SplatMesh, dataset: Dataset) -> float:
 # ---- What it is for
 
 
-def test_held_out_pictures_get_better_and_the_loss_falls(scene):
+def test_held_out_images_get_better_and_the_loss_falls(scene):
     """At least 1 dB on views that it never saw, and 3 dB on those that it did, in ten epochs."""
     _, dataset, mesh = scene
     losses = []
@@ -144,7 +144,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]
     exposure = torch.tensor([*gain, *offset], requires_grad=True)
     behind = srgb_to_linear(np.float32(background)) if blending == "linear" else np.float32(background)
-    options = dict(face_splat=mesh.face_splat, min_transmittance=LEAST_LIGHT[blending], samples=2)
+    options = dict(face_splat=mesh.face_splat, min_transmittance=MIN_TRANSMITTANCE[blending], samples=2)
     picture = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
     if blending == "linear":
         curve = 1.055 * picture.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
@@ -161,7 +161,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
 
 
 def test_exposures_of_photographs_are_found(scene):
-    """Every second picture is darker and tinted. Fitting that gives a better mesh than painting it in."""
+    """Every second image is darker and tinted. Fitting that gives a better mesh than painting it in."""
     _, dataset, mesh = scene
     gains = np.array([[1.2, 1.15, 1.2], [0.8, 0.85, 0.8]], np.float32)
     train = []
@@ -176,9 +176,9 @@ def test_exposures_of_photographs_are_found(scene):
     assert score(fitted, photographs) > score(plain, photographs)
 
 
-def test_a_flat_wall_stays_as_even_as_the_splats_picture():
+def test_a_flat_wall_stays_as_even_as_the_splats_image():
     """The paper's stated weakness. Sigma of the pixels inside the wall, against that of the splats'
-    picture."""
+    image."""
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(-1, 1, 14), np.linspace(-1, 1, 14)), -1).reshape(-1, 2)
     n = len(grid)
@@ -260,7 +260,7 @@ def test_resuming_with_other_inputs_is_refused(scene, tmp_path):
     again = replace(run, resume=True)
     with pytest.raises(OtherRunError, match="seed was 0 and is 3"):
         finetune(mesh, dataset, make_config(steps=2, seed=3), run=again)
-    with pytest.raises(OtherRunError, match="has made 2 steps already, 1 are asked for"):
+    with pytest.raises(OtherRunError, match="has taken 2 steps already, 1 were requested"):
         finetune(mesh, dataset, make_config(steps=1), run=again)
     with pytest.raises(OtherRunError, match="another mesh"):
         finetune(mesh.prune(0.5), dataset, make_config(steps=2), run=again)
@@ -317,7 +317,7 @@ def test_every_epoch_shows_every_view_once_in_another_order():
     config = make_config()
     epochs = [[view_of_step(config, 10 * e + i, 10) for i in range(10)] for e in range(3)]
     assert all(sorted(epoch) == list(range(10)) for epoch in epochs)
-    assert epochs[0] != epochs[1] != epochs[2]
+    assert len({tuple(epoch) for epoch in epochs}) == 3
 
 
 # ---- Steps
@@ -404,7 +404,7 @@ def test_values_that_are_not_finite_name_their_view(scene, tmp_path):
 # ---- Pruning
 
 
-def test_importance_is_what_the_pictures_show():
+def test_importance_is_what_the_images_show():
     """An opaque square before another, and one behind the camera: pixels, none, and not in view."""
     camera = Camera(np.eye(4), 10, 10, 12, 8, 24, 16)
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.5
@@ -477,13 +477,13 @@ def test_relocated_splats_begin_anew_where_they_are_needed(scene):
 # ---- Runs
 
 
-def test_what_a_run_writes(scene, tmp_path):
+def test_files_of_a_run(scene, tmp_path):
     _, dataset, mesh = scene
     folder = tmp_path / "run"
-    told = []
+    progress = []
     run = RunOptions(folder, report_every=4, preview_every=5)
     config = make_config(steps=10)
-    finetune(mesh, dataset, config, run=run, on_progress=told.append)
+    finetune(mesh, dataset, config, run=run, on_progress=progress.append)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [0, 4, 8, 10]
     assert lines[0]["loss"] is None
@@ -499,10 +499,10 @@ def test_what_a_run_writes(scene, tmp_path):
     previews = [int(p.stem.removeprefix("step_")) for p in sorted((folder / "previews").iterdir())]
     assert previews == [0, 3, 5, 8, 10]  # after each quarter, and every five steps
     assert json.loads((folder / "config.json").read_text())["steps"] == 10
-    assert [p.step for p in told[:3]] == [1, 2, 3]
-    assert told[0].steps == 10
-    assert told[4].seconds_left > 0
-    assert told[-1].fraction == 1
+    assert [p.step for p in progress[:3]] == [1, 2, 3]
+    assert progress[0].steps == 10
+    assert progress[4].seconds_left > 0
+    assert progress[-1].fraction == 1
 
 
 def test_a_length_in_minutes_is_kept(scene):
@@ -510,10 +510,10 @@ def test_a_length_in_minutes_is_kept(scene):
     start = time.perf_counter()
     finetune(mesh, dataset, make_config(minutes=0.02))
     assert time.perf_counter() - start < 4
-    told = []
+    progress = []
     spent = RunOptions(spent=100.0)
-    finetune(mesh, dataset, make_config(minutes=0.02), run=spent, on_progress=told.append)
-    assert told[-1].step == 0
+    finetune(mesh, dataset, make_config(minutes=0.02), run=spent, on_progress=progress.append)
+    assert progress[-1].step == 0
 
 
 def test_what_cannot_be_tuned(scene):

@@ -21,11 +21,11 @@ from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import memory
-from meshsplats.finetuning.config import PRESETS, FinetuneConfig, make_config, rates
-from meshsplats.finetuning.initial import on_open_edges, starting_mesh, vertex_sizes
+from meshsplats.finetuning.config import PRESETS, FinetuneConfig, learning_rates, make_config
+from meshsplats.finetuning.initial import boundary_vertices, starting_mesh, vertex_sizes
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
-from meshsplats.finetuning.relocation import HALF, Usage, find_moves, halves
+from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh
 
 ROOT = Path(__file__).parents[2]
@@ -80,20 +80,22 @@ def test_rates_fall_over_the_length_and_by_step():
     config = make_config(
         color_rate=0.1, position_rate=0.2, final_share=0.01, color_step_decay=0.5, rate_steps=0
     )
-    assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
-    assert rates(config, 0, 0.5) == pytest.approx((0.01, 0.02))
-    assert rates(config, 3, 1) == pytest.approx((0.1 * 0.01 / 8, 0.002))
+    assert learning_rates(config, 0, 0) == pytest.approx((0.1, 0.2))
+    assert learning_rates(config, 0, 0.5) == pytest.approx((0.01, 0.02))
+    assert learning_rates(config, 3, 1) == pytest.approx((0.1 * 0.01 / 8, 0.002))
 
 
 def test_long_runs_move_positions_less_and_end_lower():
     config = make_config(steps=1000, color_rate=0.1, position_rate=0.2, final_share=0.04, rate_steps=250)
-    assert rates(config, 0, 0) == pytest.approx((0.1, 0.2))
+    assert learning_rates(config, 0, 0) == pytest.approx((0.1, 0.2))
     # Four times as many steps: half the rate, and half the share at the end.
-    assert rates(config, 500, 0.5) == pytest.approx((0.1 * 0.02**0.5, 0.1 * 0.02**0.5))
-    assert rates(config, 999, 0.999) == pytest.approx((0.1 * 0.02, 0.1 * 0.02), rel=0.01)
+    assert learning_rates(config, 500, 0.5) == pytest.approx((0.1 * 0.02**0.5, 0.1 * 0.02**0.5))
+    assert learning_rates(config, 999, 0.999) == pytest.approx((0.1 * 0.02, 0.1 * 0.02), rel=0.01)
     for step in (100, 250):  # short runs, and those that do not care
-        assert rates(config, step, 1) == pytest.approx((0.1 * 0.04, 0.2 * 0.04))
-        assert rates(replace(config, rate_steps=0), 4 * step, 1) == pytest.approx((0.1 * 0.04, 0.2 * 0.04))
+        assert learning_rates(config, step, 1) == pytest.approx((0.1 * 0.04, 0.2 * 0.04))
+        assert learning_rates(replace(config, rate_steps=0), 4 * step, 1) == pytest.approx(
+            (0.1 * 0.04, 0.2 * 0.04)
+        )
 
 
 @pytest.mark.parametrize(
@@ -158,14 +160,14 @@ def test_sizes_of_a_real_mesh_are_those_of_its_splats():
 
 def test_open_edges_are_those_of_one_triangle():
     tetrahedron = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], np.int32)
-    assert not on_open_edges(tetrahedron, 4).any()
-    assert on_open_edges(tetrahedron[:1], 4).tolist() == [True, True, True, False]
-    assert not on_open_edges(np.zeros((0, 3), np.int32), 0).any()
+    assert not boundary_vertices(tetrahedron, 4).any()
+    assert boundary_vertices(tetrahedron[:1], 4).tolist() == [True, True, True, False]
+    assert not boundary_vertices(np.zeros((0, 3), np.int32), 0).any()
     mesh = convert(make_scene(200), mode="flat")
-    rims = on_open_edges(mesh.faces, len(mesh.vertices))
+    rims = boundary_vertices(mesh.faces, len(mesh.vertices))
     assert np.array_equal(np.flatnonzero(~rims), np.arange(200) * 9)  # all but the centres
     shuffled = np.roll(mesh.faces[::-1], 1, axis=1)
-    assert np.array_equal(on_open_edges(shuffled, len(mesh.vertices)), rims)
+    assert np.array_equal(boundary_vertices(shuffled, len(mesh.vertices)), rims)
 
 
 # ---- Relocation
@@ -186,8 +188,8 @@ def fans(count: int, sides: int = 4) -> SplatMesh:
     )
 
 
-def usage(color: list[float], position: list[float], corners: int) -> Usage:
-    return Usage(*(np.repeat(np.array(values, np.float32), corners) for values in (color, position)))
+def usage(color: list[float], position: list[float], corners: int) -> GradientSums:
+    return GradientSums(*(np.repeat(np.array(values, np.float32), corners) for values in (color, position)))
 
 
 def test_the_idlest_splats_go_to_those_that_are_pushed_most():
@@ -195,34 +197,34 @@ def test_the_idlest_splats_go_to_those_that_are_pushed_most():
     seen = np.ones(30, bool)
     # Splat 2 is idle, 4 idler; 5 is pushed most, then 0; 3 shows too little to be halved.
     of = usage([10, 10, 1.2, 3, 1, 20], [4, 1, 9, 9, 9, 5], 5)
-    idle, needed = find_moves(mesh, of, seen, 0.5)
+    idle, needed = plan_relocation(mesh, of, seen, 0.5)
     assert (idle[:, 0] // 5).tolist() == [4, 2]
     assert (needed[:, 0] // 5).tolist() == [5, 0]
     assert np.array_equal(idle - idle[:, :1], np.tile(np.arange(5), (2, 1)))
-    assert (find_moves(mesh, of, seen, 0.2).idle[:, 0] // 5).tolist() == [4]
+    assert (plan_relocation(mesh, of, seen, 0.2).idle[:, 0] // 5).tolist() == [4]
     # What no view looks at may be all there is of its place.
     seen[20:25] = False
-    assert (find_moves(mesh, of, seen, 0.5).idle[:, 0] // 5).tolist() == [2]
+    assert (plan_relocation(mesh, of, seen, 0.5).idle[:, 0] // 5).tolist() == [2]
 
 
 def test_only_splats_of_the_commonest_form_with_vertices_of_their_own_move():
     mesh = fans(6)
     of = usage([10, 10, 1, 10, 1, 20], [1, 1, 1, 1, 1, 1], 5)
     seen = np.ones(30, bool)
-    assert len(find_moves(mesh, of, seen, 0.5).idle) == 2
+    assert len(plan_relocation(mesh, of, seen, 0.5).idle) == 2
     cut = replace(mesh, faces=np.delete(mesh.faces, 8, 0), face_splat=np.delete(mesh.face_splat, 8))
-    assert (find_moves(cut, of, seen, 0.5).idle[:, 0] // 5).tolist() == [4]
+    assert (plan_relocation(cut, of, seen, 0.5).idle[:, 0] // 5).tolist() == [4]
     faces = mesh.faces.copy()
     faces[16] = [10, 21, 22]  # a triangle of splat 4 hangs on splat 2
-    assert len(find_moves(replace(mesh, faces=faces), of, seen, 0.5).idle) == 0
-    assert len(find_moves(replace(mesh, face_splat=None), of, seen, 0.5).idle) == 0
+    assert len(plan_relocation(replace(mesh, faces=faces), of, seen, 0.5).idle) == 0
+    assert len(plan_relocation(replace(mesh, face_splat=None), of, seen, 0.5).idle) == 0
     still = usage([10, 10, 1, 10, 1, 20], [0, 0, 1, 0, 1, 0], 5)
-    assert len(find_moves(mesh, still, seen, 0.5).idle) == 0
+    assert len(plan_relocation(mesh, still, seen, 0.5).idle) == 0
 
 
 def test_halves_lie_side_by_side_along_the_longest_axis():
     fan = fans(1).vertices[None] + np.float32([3, 1, 2])
-    right, left = halves(fan)
+    right, left = split_in_halves(fan)
     if right[0, :, 0].mean() < left[0, :, 0].mean():
         right, left = left, right
     reach = lambda half, axis: (half[0, :, axis].min(), half[0, :, axis].max())  # noqa: E731
@@ -268,7 +270,7 @@ def dataset(count: int, side: int = 8) -> Dataset:
 def test_memory_is_refused_with_advice(monkeypatch):
     mesh = convert(make_scene(200))
     data = dataset(2)
-    needed = memory.needed_memory(mesh, data)
+    needed = memory.estimate_memory(mesh, data)
     monkeypatch.setattr(memory, "available_memory", lambda: needed)
     assert memory.check_memory(mesh, data) == needed
     monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
@@ -283,17 +285,17 @@ def test_splats_that_targets_are_drawn_from_count():
     views = splat_views(cloud, [view.camera for view in dataset(2).train])
     arrays = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, cloud.sh)
     pictures = 2 * 8 * 8 * (16 - 3)  # means and points, float16 with alpha, in place of bytes
-    more = memory.needed_memory(mesh, Dataset(views)) - memory.needed_memory(mesh, dataset(2))
+    more = memory.estimate_memory(mesh, Dataset(views)) - memory.estimate_memory(mesh, dataset(2))
     assert more == sum(array.nbytes for array in arrays) + pictures
 
 
 def test_memory_grows_with_what_there_is():
     mesh, data = convert(make_scene(200)), dataset(2)
-    base = memory.needed_memory(mesh, data)
-    assert memory.needed_memory(convert(make_scene(400)), data) > base
-    assert memory.needed_memory(mesh, dataset(2, 64)) > base
-    assert memory.needed_memory(mesh, dataset(9)) - base == 7 * 8 * 8 * 3
-    assert memory.needed_memory(mesh, dataset(9), cache_bytes=0) == base - 2 * 8 * 8 * 3
+    base = memory.estimate_memory(mesh, data)
+    assert memory.estimate_memory(convert(make_scene(400)), data) > base
+    assert memory.estimate_memory(mesh, dataset(2, 64)) > base
+    assert memory.estimate_memory(mesh, dataset(9)) - base == 7 * 8 * 8 * 3
+    assert memory.estimate_memory(mesh, dataset(9), cache_bytes=0) == base - 2 * 8 * 8 * 3
     assert memory.available_memory() is None or memory.available_memory() > 0
 
 
@@ -388,10 +390,10 @@ def test_resuming_drops_what_came_after_the_checkpoint(tmp_path):
     journal = Journal(tmp_path / "run")
     journal.begin({"seed": 0})
     for step in (0, 3, 6):
-        journal.note(step, loss=0.5)
+        journal.log_metrics(step, loss=0.5)
     picture = np.zeros((6, 6, 3), np.float32)
-    journal.preview(2, picture, picture)
-    journal.preview(4, picture, picture)
+    journal.save_preview(2, picture, picture)
+    journal.save_preview(4, picture, picture)
     journal.save(checkpoint(3))
     with open(tmp_path / "run" / METRICS, "a") as file:
         file.write('{"step": 7, "lo')  # a kill in the middle of a line

@@ -80,7 +80,7 @@ def test_as_many_faces_as_asked_for():
 
 def test_without_the_extra_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    monkeypatch.setattr("meshsplats.prior.surface.render", None)  # told before the work
+    monkeypatch.setattr("meshsplats.prior.surface.render", None)  # refused up front
     with pytest.raises(MissingDependencyError, match=r"extra 'base': pip install scikit-image"):
         base_surface(ball(), resolution=8, cameras=4)
 
@@ -120,7 +120,7 @@ def test_what_cannot_be_done():
         ({"resolution": 600}, "resolution must be"),
         ({"faces": 3}, "faces must be"),
         ({"cameras": 2}, "cameras must be"),
-        ({"cameras": []}, "no cameras"),
+        ({"cameras": []}, "at least one camera"),
     ]:
         with pytest.raises(ValueError, match=message):
             base_surface(mesh, **options)
@@ -170,13 +170,13 @@ def test_the_next_command_of_a_base_takes_what_there_is(tmp_path, capsys):
     save_gaussians(discs(), tmp_path / "scene.ply")
     assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.npz")]) == 0
     options = ["--resolution", "16", "--views", "8"]
-    told = []
+    printed = []
     for source, more in (("scene.ply", ["--axes", "y-up"]), ("mesh.npz", [])):
         arguments = ["base", str(tmp_path / source), "-o", str(tmp_path / f"{source}.obj"), *options, *more]
         assert main(arguments) == 0
-        told.append(capsys.readouterr().out.splitlines()[-1])
-    assert re.search(r"--splats \S*scene.ply --axes y-up -o prior.npz", told[0])
-    assert "--data photos/ -o prior.npz" in told[1]
+        printed.append(capsys.readouterr().out.splitlines()[-1])
+    assert re.search(r"--splats \S*scene.ply --axes y-up -o prior.npz", printed[0])
+    assert "--data photos/ -o prior.npz" in printed[1]
     assert (
         main(
             ["prior", str(tmp_path / "scene.ply.obj"), "--splats", str(tmp_path / "mesh.npz"), "-o", "p.npz"]

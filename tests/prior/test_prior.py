@@ -18,7 +18,7 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
 from meshsplats.prior.bind import LAYERS, SHELLS_DEPTH
-from meshsplats.prior.pattern import MOST, counts_by_area, face_pattern
+from meshsplats.prior.pattern import MAX_PER_FACE, counts_by_area, face_pattern
 
 
 def base_picture(base, camera, **options):
@@ -29,7 +29,7 @@ def base_picture(base, camera, **options):
 # ---- Dividing a face
 
 
-@pytest.mark.parametrize("count", [*range(1, 26), 100, MOST])
+@pytest.mark.parametrize("count", [*range(1, 26), 100, MAX_PER_FACE])
 def test_a_pattern_covers_the_face_once(count):
     pattern = face_pattern(count).astype(np.float64)
     assert pattern.shape == (count, 3, 3)
@@ -64,7 +64,7 @@ def test_counts_follow_areas(seed, mean):
     counts = counts_by_area(areas, mean)
     assert (np.sqrt(counts) % 1 == 0).all()
     assert counts.min() >= 1
-    assert counts.max() <= MOST
+    assert counts.max() <= MAX_PER_FACE
     order = np.argsort(areas)
     assert (np.diff(counts[order]) >= 0).all()
     assert counts.mean() == pytest.approx(mean, rel=0.15)
@@ -74,7 +74,7 @@ def test_counts_follow_areas(seed, mean):
 
 
 @pytest.mark.parametrize("triangles", [1, 4, 6, 9])
-def test_identity_the_picture_is_the_base(triangles):
+def test_identity_the_image_is_the_base(triangles):
     base = bumpy()
     mesh = bind(base, triangles=triangles, layers=1).mesh
     assert len(mesh.faces) == triangles * len(base.faces)
@@ -190,7 +190,7 @@ def test_colors_come_from_the_views_that_see_a_place():
 
 
 def test_shells_take_the_colours_that_views_show_behind_the_base():
-    """A base that floats above the sheet in the pictures, with a shell where the sheet is."""
+    """A base that floats above the sheet in the images, with a shell where the sheet is."""
     n, height = 24, 0.3
     sheet = bumpy(n)
     flat = sheet.vertices * np.float32([1, 1, 0])
@@ -236,7 +236,7 @@ def test_colours_that_are_not_there_are_an_error():
     ("options", "message"),
     [
         ({"triangles": 0}, "triangles must be"),
-        ({"triangles": MOST + 1}, "triangles must be"),
+        ({"triangles": MAX_PER_FACE + 1}, "triangles must be"),
         ({"layers": 0}, "layers must be"),
         ({"layers": 17}, "layers must be"),
     ],
@@ -360,7 +360,7 @@ def test_a_rigid_motion_is_that_of_the_camera(seed):
 
 
 def test_layers_do_not_flicker():
-    """Fifty tiny moves of the camera: coplanar layers change no more from picture to picture than one opaque
+    """Fifty tiny moves of the camera: coplanar layers change no more from image to image than one opaque
     layer does."""
     base = cube()
     opaque = bind(base, layers=1).mesh

@@ -15,7 +15,7 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import RunOptions, make_config
-from meshsplats.finetuning.bound import BoundPositions, nearest_convex, weight_units
+from meshsplats.finetuning.bound import BoundPositions, project_to_simplex, weight_units
 from meshsplats.finetuning.checkpoint import load_checkpoint, mesh_arrays, stored_mesh
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
@@ -25,7 +25,7 @@ triples = st.tuples(*[st.floats(-10, 10, width=32)] * 3)
 
 
 def views_of(mesh, count=6, side=40) -> tuple[View, ...]:
-    """What cameras round ``mesh`` see of it, with alpha."""
+    """What cameras around ``mesh`` see of it, with alpha."""
     views = []
     for camera in orbit(mesh, count, width=side, height=side, elevation=35):
         drawn = render(mesh, camera, background=(0, 0, 0))
@@ -35,7 +35,7 @@ def views_of(mesh, count=6, side=40) -> tuple[View, ...]:
 
 @pytest.fixture(scope="module")
 def task():
-    """A base whose colours are wrong, and pictures of it with the right ones."""
+    """A base whose colours are wrong, and images of it with the right ones."""
     base = bumpy(6)
     right = np.random.default_rng(7).random((len(base.vertices), 3)).astype(np.float32)
     truth = SplatMesh(base.vertices, base.faces, np.column_stack([right, base.colors[:, 3]]), up=base.up)
@@ -52,7 +52,7 @@ def check_constraint(binding) -> None:
 @given(st.lists(triples, min_size=1, max_size=20))
 def test_projection_is_the_nearest_point_of_the_simplex(rows):
     given_weights = np.array(rows, np.float32)
-    found = nearest_convex(given_weights)
+    found = project_to_simplex(given_weights)
     assert found.min() >= 0
     assert np.abs(found.sum(axis=1, dtype=np.float64) - 1).max() <= 6e-8
     # Nearest: from it, no corner of the simplex lies in the direction of the given point.
@@ -63,10 +63,12 @@ def test_projection_is_the_nearest_point_of_the_simplex(rows):
 
 def test_projection_leaves_corners_edges_and_the_inside_alone():
     kept = np.array([[1, 0, 0], [0, 0, 1], [0.25, 0, 0.75], [0.25, 0.25, 0.5]], np.float32)
-    np.testing.assert_array_equal(nearest_convex(kept), kept)
-    rounded = nearest_convex(np.random.default_rng(0).dirichlet((1, 1, 1), 10_000).astype(np.float32) * 1.1)
+    np.testing.assert_array_equal(project_to_simplex(kept), kept)
+    rounded = project_to_simplex(
+        np.random.default_rng(0).dirichlet((1, 1, 1), 10_000).astype(np.float32) * 1.1
+    )
     assert np.abs(rounded.sum(axis=1, dtype=np.float64) - 1).max() <= 6e-8
-    moved = nearest_convex(np.array([[2, 0, 0], [0.6, 0.6, -1], [0, 0, 0]], np.float32))
+    moved = project_to_simplex(np.array([[2, 0, 0], [0.6, 0.6, -1], [0, 0, 0]], np.float32))
     np.testing.assert_allclose(moved, [[1, 0, 0], [0.5, 0.5, 0], [1 / 3, 1 / 3, 1 / 3]], atol=1e-7)
 
 
@@ -105,7 +107,7 @@ def test_what_is_on_an_edge_slides_along_it():
     before = bound.weights.copy()
     bound.weights += rng.normal(size=before.shape).astype(np.float32) * 0.3
     positions = mesh.vertices.copy()
-    bound.settle(before, rows, positions)
+    bound.project(before, rows, positions)
     after = bound.binding()
     check_constraint(after)
     assert (after.weights[zero] == 0).all()
@@ -164,7 +166,7 @@ def test_the_constraint_holds_after_every_step(task, layers, spacing):
     ).any()
 
 
-def test_training_brings_the_pictures_closer_and_moves_with_the_base(task, tmp_path):
+def test_training_brings_the_images_closer_and_moves_with_the_base(task, tmp_path):
     base, data = task
     prior = bind(base, triangles=4, layers=2, spacing=0)
     config = make_config(steps=60, position_rate=0.005, color_rate=0.05, prune_epochs=0)

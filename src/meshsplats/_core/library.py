@@ -116,9 +116,10 @@ def library_path(variant: str) -> Path | None:
 
 
 def available_variants() -> list[str]:
-    """The variants that were built and that this processor runs, best first."""
+    """The variants that were built and that this processor runs, best first; none where MESHSPLATS_LIBRARY
+    takes their place."""
     baseline = library_path("baseline")
-    if baseline is None:
+    if baseline is None or os.environ.get("MESHSPLATS_LIBRARY"):
         return []
     library = ctypes.CDLL(str(baseline))
     library.ms_best_variant.restype = c_char_p
@@ -130,10 +131,13 @@ def available_variants() -> list[str]:
 @cache
 def load_core(variant: str | None = None) -> ctypes.CDLL:
     """The core's library; the best variant, or the one named by MESHSPLATS_VARIANT, unless another is asked
-    for.
+    for. MESHSPLATS_LIBRARY, the path of a library, takes the place of both: for developers, to run a core
+    built with sanitizers.
 
     Raises ImportError if the core was not built, ValueError if the processor cannot run the variant.
     """
+    if variant is None and (path := os.environ.get("MESHSPLATS_LIBRARY")):
+        return _checked(ctypes.CDLL(path))
     available = available_variants()
     if not available:
         raise ImportError(
@@ -145,7 +149,11 @@ def load_core(variant: str | None = None) -> ctypes.CDLL:
         raise ValueError(
             f"the core has no variant {wanted!r} that runs here; available: {', '.join(available)}"
         )
-    library = ctypes.CDLL(str(library_path(wanted)))
+    return _checked(ctypes.CDLL(str(library_path(wanted))))
+
+
+def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
+    """The library with the signatures of its functions. Raises ImportError if its interface is another."""
     library.ms_variant.restype = c_char_p
     if library.ms_interface_version() != INTERFACE_VERSION:
         raise ImportError(

@@ -1,4 +1,4 @@
-"""Pictures and scenes of splat meshes by Blender: exact ones, and lit ones with shadows, mirrors and glass.
+"""Images and scenes of splat meshes by Blender: exact, or lit with shadows, mirrors and glass.
 
 Blender runs as a process of its own, as the module bpy of this environment or as an installed program.
 """
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from meshsplats.blender.levels import LevelMeshes
 from meshsplats.blender.options import MAX_LAYERS, Engine, Ground, LightOptions, SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.errors import DataWarning
@@ -22,7 +23,16 @@ from meshsplats.mesh import SplatMesh
 if TYPE_CHECKING:
     from meshsplats.blender.launch import BlenderError, Progress
 
-__all__ = ["BlenderError", "Engine", "Ground", "LightOptions", "Progress", "SceneOptions", "draw"]
+__all__ = [
+    "BlenderError",
+    "Engine",
+    "Ground",
+    "LevelMeshes",
+    "LightOptions",
+    "Progress",
+    "SceneOptions",
+    "draw",
+]
 
 
 def __getattr__(name: str) -> Any:
@@ -34,10 +44,10 @@ def __getattr__(name: str) -> Any:
 
 
 def draw(
-    mesh: SplatMesh,
+    mesh: SplatMesh | LevelMeshes,
     cameras: Sequence[Camera],
     *,
-    pictures: Sequence[str | os.PathLike[str]] = (),
+    images: Sequence[str | os.PathLike[str]] = (),
     blend: str | os.PathLike[str] | None = None,
     options: SceneOptions | None = None,
     executable: str | os.PathLike[str] | None = None,
@@ -46,34 +56,34 @@ def draw(
 ) -> dict[str, Any]:
     """Has Blender render ``mesh`` from ``cameras``, or save the scene, or both; existing files are replaced.
 
-    Unlit (``options.light`` None), Cycles draws what ``meshsplats.render`` draws, and the values of an .exr
-    are those of ``Rendering.color``, in the space of the mesh's colours; a .png shows display values, for
-    which those of a mesh with linear ``blending`` are encoded (sRGB). A mesh that wants a filter gets it for
-    all cameras at once (``bake_filter``). Lit, colours are turned to linear light; an .exr holds that, a .png
-    is shown through Blender's view transform Standard (sRGB).
+    Unlit (``options.light`` None), Cycles renders what ``meshsplats.render`` does: an .exr holds
+    ``Rendering.color``, in the space of the mesh's colours, a .png display values (those of a mesh with
+    linear ``blending`` are sRGB-encoded). A mesh with a filter gets it baked for all cameras at once
+    (``bake_filter``). Lit, colours are converted to linear light; an .exr holds that, a .png shows it through
+    Blender's view transform Standard (sRGB).
 
     Args:
-        mesh: what to draw.
-        cameras: at least one for pictures; in a .blend, each is a camera and a frame of the timeline.
-        pictures: .png (8 bits) or .exr (32 bits) to write, one a camera.
+        mesh: what to render; a chain of levels of detail for a .blend, in which one is visible at a time.
+        cameras: at least one for images; in a .blend, each is a camera and a frame of the timeline.
+        images: .png (8 bits) or .exr (32 bits) to write, one per camera.
         blend: Blender file to write: mesh, material, cameras, light, world, in named collections.
-        options: how; unlit in Cycles by default.
+        options: unlit in Cycles by default.
         executable: an installed Blender, 4.2 or newer; the module bpy of this environment by default.
-        announce: called once before Blender starts, with what is ahead: ``{"triangles", "layers",
-            "bounce_limit", "samples" a pixel, "pixels" of all pictures, "mean_layers" of a pixel}``.
-        progress: called whenever Blender tells how far it is.
+        announce: called once before Blender starts, with the size of the work: ``{"triangles", "layers",
+            "bounce_limit", "samples" per pixel, "pixels" of all images, "mean_layers" of a pixel}``.
+        progress: called whenever Blender reports progress.
 
     Returns:
-        ``{"blender": its version, "build_seconds": float, "picture_seconds": [float, ...], "layers": most
+        ``{"blender": its version, "build_seconds": float, "image_seconds": [float, ...], "layers": most
         layers behind each other, "bounce_limit": int}``, and as ``build_processor_seconds`` and
-        ``picture_processor_seconds`` the processor time of all threads.
+        ``image_processor_seconds`` the processor time of all threads.
 
     Raises:
-        ValueError: options out of range, another suffix, pictures that do not match the cameras, an empty
-        mesh.
+        ValueError: options out of range, another suffix, images that do not match the cameras, an empty
+        mesh, images of a chain.
         MissingDependencyError: neither bpy nor an executable, or no OpenGL libraries for EEVEE.
-        OSError: a folder that cannot be written in, told before the work.
-        BlenderError: Blender failed; the message holds what it said.
+        OSError: a folder is not writable; raised before the work.
+        BlenderError: Blender failed; the message quotes it.
 
     Warns with a DataWarning if more layers lie behind each other than Blender can follow (1024).
     """
@@ -81,45 +91,49 @@ def draw(
 
     options = options or SceneOptions()
     options.check()
-    targets = [Path(path) for path in pictures]
+    targets = [Path(path) for path in images]
     for path in targets:
         if path.suffix.lower() not in (".png", ".exr"):
-            raise ValueError(f"{path.name!r}: Blender's pictures end in .png or .exr")
+            raise ValueError(f"{path.name!r}: Blender's images end in .png or .exr")
     if blend is not None and Path(blend).suffix.lower() != ".blend":
         raise ValueError(f"{Path(blend).name!r}: a Blender file ends in .blend")
     if targets and len(targets) != len(cameras):
-        raise ValueError(f"{len(targets)} pictures for {len(cameras)} cameras: there must be one a camera")
-    if len(mesh.faces) == 0:
+        raise ValueError(f"{len(targets)} images for {len(cameras)} cameras: expected one per camera")
+    chain = mesh if isinstance(mesh, LevelMeshes) else LevelMeshes("Splats", (mesh,), (0,))
+    if targets and len(chain.meshes) > 1:
+        raise ValueError("a chain of levels of detail makes a .blend; for images, give one mesh of it")
+    if any(len(level.faces) == 0 for level in chain.meshes):
         raise ValueError("the mesh has no triangles: there is nothing to draw")
-    launch.command(None if executable is None else Path(executable))  # told before the work
+    launch.command(None if executable is None else Path(executable))  # fail before the work
     _check_folders([*targets, *([] if blend is None else [Path(blend)])])
-    if mesh.filter_px2:
-        from meshsplats.conversion import bake_filter
-
-        mesh = bake_filter(mesh, cameras)
-    layers, limit = subject.count(mesh, cameras, options)
+    meshes = [_without_filter(level, cameras) for level in chain.meshes]
+    counted = [subject.count(level, cameras, options) for level in meshes]
+    layers, limit = max(counted)
+    finest = meshes[0]
     if layers > MAX_LAYERS:
-        _warn(mesh, cameras, layers, options)
+        _warn(meshes[counted.index((layers, limit))], cameras, layers, options)
     if announce is not None:
         samples = options.samples if options.light is not None else options.samples**2
         announce(
             {
-                "triangles": len(mesh.faces),
+                "triangles": len(finest.faces),
                 "layers": layers,
                 "bounce_limit": limit,
                 "samples": samples,
                 "pixels": sum(camera.width * camera.height for camera in cameras[: len(targets)]),
-                "mean_layers": subject.mean_layers(mesh, cameras, options.threads),
+                "mean_layers": subject.mean_layers(finest, cameras, options.threads),
             }
         )
-    arrays, facts = subject.prepare(mesh, cameras, options, layers)
+    subjects = []
+    for level, size in zip(meshes, chain.screen_sizes, strict=True):
+        arrays, facts = subject.prepare(level, cameras, options, layers)
+        subjects.append((arrays, facts | {"name": chain.name, "screen_size": size}))
     result = launch.run_job(
-        arrays,
-        facts,
+        subjects,
         cameras,
         options,
         limit=limit,
-        pictures=targets,
+        images=targets,
         blend=None if blend is None else Path(blend),
         executable=None if executable is None else Path(executable),
         progress=progress,
@@ -127,8 +141,16 @@ def draw(
     return result | {"layers": layers, "bounce_limit": limit}
 
 
+def _without_filter(mesh: SplatMesh, cameras: Sequence[Camera]) -> SplatMesh:
+    if not mesh.filter_px2:
+        return mesh
+    from meshsplats.conversion import bake_filter
+
+    return bake_filter(mesh, cameras)
+
+
 def _check_folders(paths: Iterable[Path]) -> None:
-    """Raises OSError for a folder in which no file can be made: rights alone do not tell."""
+    """Raises OSError for a folder in which no file can be created; permissions alone do not show that."""
     for folder in {path.absolute().parent for path in paths}:
         try:
             with tempfile.TemporaryFile(dir=folder):
@@ -146,7 +168,7 @@ def _warn(mesh: SplatMesh, cameras: Sequence[Camera], layers: int, options: Scen
 
     shares = [hidden_by_limit(mesh, camera, threads=options.threads) for camera in cameras[:8]]
     share = float(np.max(shares)) if shares else 0.0
-    if share < 5e-5:  # told as 0.00 %
+    if share < 5e-5:  # would read 0.00 %
         return
     warnings.warn(
         f"up to {layers} triangles lie behind each other, and Cycles follows a ray through {MAX_LAYERS}:"

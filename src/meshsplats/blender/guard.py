@@ -1,10 +1,10 @@
-"""Runs Blender and ends it when its parent ends, however that comes about; then nothing of it is left.
+"""Runs Blender and ends it when its parent process ends, however that happens; nothing is left behind.
 
 Run as a file, without this package: ``python guard.py plan.json``. The plan: ``command``, ``remove`` (files
-and folders). Standard input is a pipe from the parent that nothing is written to. It closes when the parent
-ends, by kill -9 too, or wants Blender to end; the group of processes that Blender leads is killed then.
+and folders). Standard input is a pipe from the parent that carries no data. It closes when the parent ends,
+by kill -9 too, or wants Blender to end; then Blender's process group is killed.
 
-A process of its own, because threads of Blender's Python wait while Blender works: they would notice late.
+A process of its own, because threads in Blender's Python wait while Blender works and would notice late.
 """
 
 import contextlib
@@ -17,17 +17,17 @@ import sys
 import threading
 
 MARK = "@meshsplats "
-"""Begins the lines of output that are meant for the parent process; as in ``inside.worker``."""
+"""Prefix of output lines for the parent process, as in ``inside.worker``."""
 
 
 def main(plan_path: str) -> int:
     with open(plan_path, encoding="utf-8") as file:
         plan = json.load(file)
-    # Blender leads a group of its own, so that what a script in front of it has started ends with it.
+    # Blender leads a process group of its own, so that children of a wrapper script end with it.
     process = subprocess.Popen(plan["command"], stdin=subprocess.PIPE, start_new_session=True)
     assert process.stdin is not None
     with contextlib.suppress(OSError):
-        process.stdin.write(b"\n")  # by which Blender knows that this pipe is ours
+        process.stdin.write(b"\n")  # shows the worker that this pipe is ours
         process.stdin.flush()
     abandoned = threading.Event()
 

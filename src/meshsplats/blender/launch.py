@@ -1,4 +1,4 @@
-"""Blender as a process of its own: a crash, its chatter and its memory stay out of ours."""
+"""Runs Blender as a process of its own, apart from our memory and output, and safe from its crashes."""
 
 from __future__ import annotations
 
@@ -41,29 +41,31 @@ _LIBRARIES = (
 
 @dataclass(frozen=True)
 class Progress:
-    """How far Blender is."""
+    """Progress of a Blender job."""
 
     done: int
-    """Pictures that are finished."""
-    pictures: int
-    """Those wanted."""
+    """Images finished."""
+    images: int
+    """Images in all."""
     share: float
-    """Of the picture at hand, 0 to 1: the samples taken."""
+    """Share of the samples of the current image, 0 to 1."""
     stage: str
-    """What Blender is doing, in its words."""
+    """Current step, in Blender's words."""
     left: str | None
-    """Time that Blender thinks the picture at hand still takes, where it knows."""
+    """Blender's estimate of the time left for the current image, if any."""
 
 
 class BlenderError(ChildProcessError):
-    """Blender could not do its job; the message holds what it said."""
+    """Blender failed; the message quotes it."""
 
 
 def command(executable: Path | None) -> list[str]:
     """The command line that runs the worker, without its argument.
 
-    Raises MissingDependencyError if there is no bpy (and no executable was named), FileNotFoundError or
-    ValueError for an executable that is missing, no Blender, or too old.
+    Raises:
+        MissingDependencyError: no bpy, and no executable given.
+        FileNotFoundError: the executable is missing.
+        ValueError: the executable is not Blender, or too old.
     """
     if executable is None:
         if importlib.util.find_spec("bpy") is None:
@@ -76,10 +78,10 @@ def command(executable: Path | None) -> list[str]:
         answer = subprocess.run([found, "--version"], capture_output=True, text=True, timeout=60)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ValueError(f"{found}: cannot be run as Blender ({error})") from None
-    told = answer.stdout or answer.stderr  # the latter where libraries are missing
-    version = re.search(r"Blender (\d+)\.(\d+)", told)
+    text = answer.stdout or answer.stderr  # the latter where libraries are missing
+    version = re.search(r"Blender (\d+)\.(\d+)", text)
     if version is None:
-        raise ValueError(f"{found}: not Blender; asked for its version, it says {told.strip()[:200]!r}")
+        raise ValueError(f"{found}: not Blender; asked for its version, it says {text.strip()[:200]!r}")
     if (int(version[1]), int(version[2])) < OLDEST:
         raise ValueError(f"{found}: Blender {version[1]}.{version[2]} is too old; 4.2 or newer is needed")
     flags = ["--background", "--factory-startup", "--python-exit-code", "1", "--python"]
@@ -87,46 +89,55 @@ def command(executable: Path | None) -> list[str]:
 
 
 def run_job(
-    arrays: dict[str, np.ndarray],
-    subject: dict[str, Any],
+    subjects: Sequence[tuple[dict[str, np.ndarray], dict[str, Any]]],
     cameras: Sequence[Camera],
     options: SceneOptions,
     *,
     limit: int,
-    pictures: Sequence[Path] = (),
+    images: Sequence[Path] = (),
     blend: Path | None = None,
     executable: Path | None = None,
     progress: Callable[[Progress], object] | None = None,
 ) -> dict[str, Any]:
-    """Has Blender build the scene, save ``blend`` and render ``pictures``, one a camera.
+    """Has Blender build the scene, save ``blend`` and render ``images``, one per camera.
 
-    ``arrays`` and ``subject`` are the fields of ``inside.scene.Subject``. ``progress`` is called as Blender
-    tells how far it is. Returns ``{"blender": version, "build_seconds": s, "build_processor_seconds": s,
-    "picture_seconds": [s, ...], "picture_processor_seconds": [s, ...]}``.
+    Blender ends with this process, however that ends, and leaves nothing behind (``guard``).
 
-    Raises BlenderError with Blender's own words if it fails, MissingDependencyError if the system lacks
-    libraries that it needs, besides what ``command`` raises, and OSError for an output that cannot be written
-    (a full disk; a name that another process has taken meanwhile). Blender ends with this process, however it
-    ends, and leaves nothing (``guard``).
+    Args:
+        subjects: arrays and facts, the fields of ``inside.scene.Subject``; of a chain, those of each level,
+            the finest first.
+        cameras: at least one per image.
+        limit: on transparent bounces.
+        progress: called whenever Blender reports progress.
+
+    Returns:
+        ``{"blender": version, "build_seconds": s, "build_processor_seconds": s, "image_seconds": [s, ...],
+        "image_processor_seconds": [s, ...]}``.
+
+    Raises:
+        BlenderError: Blender failed; the message quotes it.
+        MissingDependencyError: system libraries are missing; see also ``command``.
+        OSError: an output cannot be written (a full disk, a name that another process has taken meanwhile).
     """
     start = command(executable)
     if options.engine == "eevee":
         _check_graphics()
     with _scratch() as (folder, lock):
-        files = {}
-        for name, array in arrays.items():
-            files[name] = os.path.join(folder, f"{name}.npy")
-            np.save(files[name], array, allow_pickle=False)
+        stored = []
+        for level, (arrays, facts) in enumerate(subjects):
+            files = {name: os.path.join(folder, f"{name}_{level}.npy") for name in arrays}
+            for name, array in arrays.items():
+                np.save(files[name], array, allow_pickle=False)
+            stored.append((files, facts))
         job = {
-            "arrays": files,
-            "subject": subject,
+            "subjects": stored,
             "cameras": [_plain_camera(camera) for camera in cameras],
             "options": _plain_options(options),
             "limit": limit,
             "blend": None if blend is None else os.path.abspath(blend),
-            "pictures": [os.path.abspath(path) for path in pictures],
+            "images": [os.path.abspath(path) for path in images],
         }
-        outputs = [path for path in (*pictures, blend) if path is not None]
+        outputs = [path for path in (*images, blend) if path is not None]
         temporary = {os.path.abspath(path): str(temporary_beside(path)) for path in outputs}
         job["temporary"] = temporary
         job["new"] = [os.path.abspath(path) for path in outputs if is_promised(path)]
@@ -134,7 +145,7 @@ def run_job(
         try:
             for name, content in (("job.json", job), ("plan.json", plan)):
                 (folder / name).write_text(json.dumps(content), encoding="utf-8")
-            return _watch(plan, folder, lock, options, len(pictures), progress)
+            return _watch(plan, folder, lock, options, len(images), progress)
         finally:
             for path in temporary.values():  # of a Blender that crashed
                 Path(path).unlink(missing_ok=True)
@@ -142,8 +153,8 @@ def run_job(
 
 @contextmanager
 def _scratch() -> Iterator[tuple[Path, int]]:
-    """A temporary folder and a descriptor of its lock, by which others know that it is in use. Those that
-    nobody uses any more, left by processes that were killed together with their guards, are removed."""
+    """A temporary folder and the descriptor of its lock, which marks it as in use. Removes folders out of
+    use, left by processes that were killed together with their guards."""
     prefix = "meshsplats-blender-"
     for old in Path(tempfile.gettempdir()).glob(f"{prefix}*/lock"):
         with suppress(OSError):
@@ -154,7 +165,7 @@ def _scratch() -> Iterator[tuple[Path, int]]:
     while True:
         folder = Path(tempfile.mkdtemp(prefix=prefix))
         descriptor = None
-        with suppress(FileNotFoundError):  # someone has just tidied up
+        with suppress(FileNotFoundError):  # another process has just removed it
             descriptor = try_lock(folder / "lock")
         if descriptor is not None:
             break
@@ -170,18 +181,18 @@ def _watch(
     folder: Path,
     lock: int,
     options: SceneOptions,
-    pictures: int,
+    images: int,
     progress: Callable[[Progress], object] | None,
 ) -> dict[str, Any]:
     arguments = plan["command"]
     environment = dict(os.environ)
     if arguments[1] == "-m":
-        # The worker must be this very package, wherever this process found it.
-        places = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, places))
-    # Blender's own temporary files go with ours.
+        # The worker must import this very package, wherever this process found it.
+        paths = [environment.get("PYTHONPATH", ""), str(Path(worker.__file__).resolve().parents[3])]
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+    # Blender's own temporary files go into our folder.
     environment |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder))
-    result: dict[str, Any] = {"picture_seconds": [], "picture_processor_seconds": []}
+    result: dict[str, Any] = {"image_seconds": [], "image_processor_seconds": []}
     said: deque[str] = deque(maxlen=40)
     finished, failure, unloadable, status = False, None, None, None
     process = subprocess.Popen(
@@ -192,10 +203,10 @@ def _watch(
         env=environment,
         text=True,
         errors="replace",
-        start_new_session=True,  # what ends our group must leave the guard to tidy up
+        start_new_session=True,  # the guard must survive our process group to clean up
         pass_fds=() if sys.platform == "win32" else (lock,),
     )
-    at = Progress(0, pictures, 0.0, "starting", None)
+    at = Progress(0, images, 0.0, "starting", None)
     try:
         assert process.stdin is not None and process.stdout is not None  # noqa: PT018
         for line in process.stdout:
@@ -206,14 +217,14 @@ def _watch(
             if "built" in message:
                 result |= {"blender": message["blender"], "build_seconds": message["built"]}
                 result["build_processor_seconds"] = message["processor"]
-            elif "picture" in message:
-                result["picture_seconds"].append(message["seconds"])
-                result["picture_processor_seconds"].append(message["processor"])
-                at = Progress(at.done + 1, pictures, 0.0, "", None)
+            elif "image" in message:
+                result["image_seconds"].append(message["seconds"])
+                result["image_processor_seconds"].append(message["processor"])
+                at = Progress(at.done + 1, images, 0.0, "", None)
             elif "stage" in message:
                 at = replace(at, share=message["share"], stage=message["stage"], left=message["left"])
             status = message.get("ended", status)
-            if progress is not None and ("picture" in message or "stage" in message):
+            if progress is not None and ("image" in message or "stage" in message):
                 progress(at)
             finished |= "done" in message
             failure = message.get("error", failure)
@@ -259,7 +270,7 @@ def _post_mortem(status: int, said: Sequence[str], options: SceneOptions) -> str
 
 
 def _check_graphics() -> None:
-    """Raises MissingDependencyError where EEVEE cannot start for want of libraries (Linux)."""
+    """Raises MissingDependencyError where libraries that EEVEE needs are missing (Linux)."""
     if not sys.platform.startswith("linux"):
         return
     import ctypes

@@ -1,4 +1,4 @@
-"""How many layers lie behind each other: what Blender's limit on transparent bounces must allow for."""
+"""Counts layers behind each other, which decide Blender's limit on transparent bounces."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from meshsplats.rendering import render
 
 _PROBE = 2.0**-12
 PROBE_SIDE = 192
-"""Longer side in pixels of the pictures in which layers are counted: the count changes slowly over a
-picture."""
+"""Longer side in pixels of the images in which layers are counted: the count varies slowly over
+an image."""
 
 
 def count_layers(mesh: SplatMesh, camera: Camera, *, threads: int | None = None) -> np.ndarray:
-    """(h, w) int32: how many triangles each pixel's centre is covered by, hidden ones too.
+    """(h, w) int32 count of the triangles that cover each pixel's centre, hidden ones too.
 
-    Every triangle is drawn with the same tiny opacity a; n of them let (1 - a)^n of the light through, which
-    tells n, to one in a thousand.
+    All triangles are rendered with the same tiny opacity a. The transmittance of n of them is (1 - a)^n,
+    which gives n to one in a thousand.
     """
     colors = np.empty_like(mesh.colors)
     colors[:] = (0, 0, 0, _PROBE)
@@ -39,10 +39,10 @@ def most_layers(
     *,
     threads: int | None = None,
 ) -> int:
-    """The largest number of layers met from up to eight of the ``cameras`` and along ``directions``.
+    """The most layers along any ray from up to eight of the ``cameras`` and along ``directions``.
 
-    ``directions`` are (3,) unit vectors in the world frame from the subject to a far light; the scene's own
-    six axis directions stand for all the other ways that light takes.
+    ``directions`` are (3,) unit vectors in the world frame from the subject to a distant light. The scene's
+    six axis directions stand for indirect light.
     """
     if len(mesh.faces) == 0:
         return 0
@@ -51,7 +51,7 @@ def most_layers(
     reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max()) or bounds.radius
     axes = front_axes(mesh.up.astype(np.float64))
     for direction in [*directions, axes[0], axes[1], axes[2]]:
-        # From so far off that rays are nearly parallel, as a sun's are; both ways along a line meet the same.
+        # From far enough that rays are nearly parallel, as a sun's are; opposite directions count the same.
         away = 20 * reach
         angle = 2 * np.degrees(np.arctan(reach / away))
         center = bounds.center + away * np.asarray(direction, np.float64)
@@ -70,7 +70,7 @@ def most_layers(
 
 
 def bounce_limit(layers: int, largest: int = 1024) -> int:
-    """A limit on transparent bounces for a scene of so many layers: a quarter more, as not every ray was
+    """Limit on transparent bounces for a scene with ``layers``: a quarter more, as only some rays were
     tried."""
     return int(min(largest, max(64, -(-layers * 5 // 4))))
 
@@ -78,8 +78,8 @@ def bounce_limit(layers: int, largest: int = 1024) -> int:
 def hidden_by_limit(
     mesh: SplatMesh, camera: Camera, limit: int = 1024, *, threads: int | None = None
 ) -> float:
-    """Share of the pixels (0 to 1) that change by more than half a step of 8 bits if only ``limit`` layers
-    count."""
+    """Share of the pixels (0 to 1) whose alpha changes by more than half an 8-bit step if only ``limit``
+    layers are followed."""
     probe = camera.within(2 * PROBE_SIDE)
     whole = render(mesh, probe, threads=threads).alpha
     cut = render(mesh, probe, max_layers=limit, threads=threads).alpha

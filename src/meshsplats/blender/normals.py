@@ -2,9 +2,8 @@
 
 The layers of a splat mesh are tilted by chance, and crossed ones stand upright on the surface; lit by their
 own normals they look mottled. Here each splat takes the normal of the surface that it and its neighbours
-form: their centres lie in it, and the largest of their discs lie along it. Which side is out is decided by
-looking: the side
-from which cameras round the scene see the splat.
+form: their centres lie in it, and the largest of their discs lie along it. The outer side is the one from
+which cameras around the scene see the splat.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ CELL = 2.5
 clean and noisy, where 2 to 3 give the least error (see docs/blender.md)."""
 VIEWS = 24
 _SIDE = 160
-"""Pixels of the square pictures that decide what is seen."""
+"""Side in pixels of the images that decide visibility."""
 _SOLID = 0.3
 """Opacity from which a pixel counts as covered."""
 _CHUNK = 1 << 16
@@ -34,13 +33,11 @@ _CHUNK = 1 << 16
 def shading_normals(
     mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
 ) -> np.ndarray:
-    """(v, 3) float32 unit normals for lighting the surface that the splats of ``mesh`` form, pointing
-    outwards.
+    """(v, 3) float32 unit normals of the surface that the splats of ``mesh`` form, pointing outwards.
 
-    All vertices of a splat share one. A mesh with normals of its own keeps them; without ``face_splat``, each
-    triangle counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` are places from
-    which the
-    scene is seen, besides 24 round it: a room is seen from inside only.
+    All vertices of a splat share one. A mesh with normals keeps them. Without ``face_splat``, each triangle
+    counts as a splat, and a vertex takes the mean of its triangles. ``cameras`` see the scene, besides 24
+    around it: a room is visible from inside only.
     """
     if mesh.normals is not None:
         return mesh.normals
@@ -60,16 +57,16 @@ def shading_normals(
         scatter = _symmetric(total[:, 4:10] / weight - _products(mean))
         size = np.trace(scatter, axis1=1, axis2=2)[:, None, None]
         discs = _symmetric(total[:, 10:16] / weight)
-        # Both have trace 1: discs are large along the normal, the scatter of the centres is small along it.
+        # Both have trace 1: along the normal the discs' tensor is large, the scatter of the centres small.
         both = discs - np.divide(scatter, size, out=np.zeros_like(scatter), where=size > 0)
         normals[part] = np.linalg.eigh(both)[1][:, :, 2]
     outward = _seen_from(mesh, centers, cell, cameras, threads)
     side = np.einsum("ij,ij->i", normals, outward)
     normals *= np.where(side < 0, -1.0, 1.0)[:, None]
-    # Splats that nothing sees have no say here, and take over the side of those next to them.
-    say = np.where(side == 0, 1e-3, 1.0) * weights
+    # Splats that no camera sees have no weight here and take the side of their neighbours.
+    trust = np.where(side == 0, 1e-3, 1.0) * weights
     smooth = np.empty_like(normals)
-    for part, total in around.sums(say[:, None] * normals, 0.7):
+    for part, total in around.sums(trust[:, None] * normals, 0.7):
         smooth[part] = total
     flipped = np.einsum("ij,ij->i", normals, smooth) < 0
     smooth[flipped & (side != 0)] *= -1
@@ -106,8 +103,8 @@ def _unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
 
 
 def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Number of the splat that each face belongs to (f,), and of the n splats: centres (n, 3), weights
-    (n,), area times opacity, and (n, 3, 3) sums of weight times normal times normal over their triangles."""
+    """Index of the splat that each face belongs to (f,), and of the n splats: centres (n, 3), weights (n,),
+    area times opacity, and (n, 3, 3) sums of weight times normal times normal over their triangles."""
     starts = np.arange(len(mesh.faces)) if mesh.face_splat is None else splat_starts(mesh.face_splat)
     owner = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(mesh.faces))))
     weights = np.empty(len(starts))
@@ -124,20 +121,20 @@ def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
         weight = 0.5 * double * mesh.colors[faces, 3].mean(axis=1) + 1e-300  # nothing divides by zero
         normal = cross / np.maximum(double, 1e-300)[:, None]
         weights[some] = np.add.reduceat(weight, heads)
-        middles = np.add.reduceat(weight[:, None] * corners.mean(axis=1), heads)
-        centers[some] = middles / weights[some, None]
+        centroids = np.add.reduceat(weight[:, None] * corners.mean(axis=1), heads)
+        centers[some] = centroids / weights[some, None]
         products = normal[:, :, None] * normal[:, None, :]
         spread[some] = np.add.reduceat(weight[:, None, None] * products, heads)
     return owner, centers, weights / weights.max(), spread / weights.max()
 
 
 class _Neighbours:
-    """Points (n, 3) sorted into cubic cells; sums over the 27 cells round each of them."""
+    """Points (n, 3) sorted into cubic cells; sums over the 27 cells around each of them."""
 
     def __init__(self, points: np.ndarray, side: float) -> None:
         self.points, self.side = points, side
         low = points.min(axis=0)
-        # Strays far away must not make so many cells that their numbers overflow.
+        # Distant strays must not overflow the cell indices.
         steps = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64) + 1
         self.keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
         self.cells, self.cell_of = np.unique(self.keys, return_inverse=True)
@@ -145,10 +142,10 @@ class _Neighbours:
 
     def sums(self, values: np.ndarray, width: float):
         """Yields slices of points and (c, k) sums of ``values`` (n, k), weighted by a Gaussian of the
-        distance to each cell's middle with standard deviation ``width`` cells."""
+        distance to each cell's centre with standard deviation ``width`` cells."""
         count = len(self.cells)
-        held = [np.bincount(self.cell_of, values[:, k], count) for k in range(values.shape[1])]
-        cell_values = np.stack(held, axis=1)
+        totals = [np.bincount(self.cell_of, values[:, k], count) for k in range(values.shape[1])]
+        cell_values = np.stack(totals, axis=1)
         sizes = np.bincount(self.cell_of, minlength=count)
         middles = [np.bincount(self.cell_of, self.points[:, k], count) / sizes for k in range(3)]
         middle = np.stack(middles, axis=1)
@@ -175,18 +172,18 @@ def _seen_from(
     views += a_few(cameras or (), 16, _SIDE)
     seen = np.zeros_like(centers)
     for camera in views:
-        picture = render(mesh, camera, depth=True, threads=threads)
-        assert picture.depth is not None
-        solid = picture.alpha > _SOLID
-        surface = np.where(solid, picture.depth / np.where(solid, picture.alpha, 1), np.inf)
+        rendering = render(mesh, camera, depth=True, threads=threads)
+        assert rendering.depth is not None
+        solid = rendering.alpha > _SOLID
+        surface = np.where(solid, rendering.depth / np.where(solid, rendering.alpha, 1), np.inf)
         x, y, z = camera.world_to_camera[:3, :3] @ centers.T + camera.world_to_camera[:3, 3:]
         front = z > camera.near
         z = np.where(front, z, 1)
         column = camera.fx * x / z + camera.cx
         row = camera.fy * y / z + camera.cy
         inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        place = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
-        visible = inside & (z < surface[place] + tolerance)
+        pixel = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
+        visible = inside & (z < surface[pixel] + tolerance)
         away = camera.center - centers[visible]
         seen[visible] += away / np.linalg.norm(away, axis=1, keepdims=True)
     return seen

@@ -1,4 +1,4 @@
-"""What a Blender scene holds besides the mesh: the engine, light, ground, mirror and glass."""
+"""Options of a Blender scene: the engine, light, ground, mirror and glass."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Engine = Literal["cycles", "eevee"]
 Ground = Literal["plane", "catcher", "none"]
 
 MAX_LAYERS = 1024
-"""Blender's largest limit on transparent bounces: a ray that meets more layers turns black in Cycles."""
+"""Blender's largest limit on transparent bounces: rays through more layers turn black in Cycles."""
 
 
 @dataclass(frozen=True)
 class LightOptions:
-    """Light and surroundings of lit pictures. Lengths follow the subject's size."""
+    """Light and surroundings of lit images. Lengths follow the subject's size."""
 
     sun: tuple[float, float] = (-50.0, 45.0)
-    """Where the sun stands: azimuth (0 behind the viewer of the front, 90 on that viewer's right) and
+    """Direction of the sun: azimuth (0 behind the viewer of the front, 90 on that viewer's right) and
     elevation, degrees."""
     sun_strength: float = 2.5
     """Irradiance of a surface that faces the sun, W/m^2; at pi, a white one has radiance 1. 0: no sun."""
@@ -35,36 +35,36 @@ class LightOptions:
     sky_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
     """Colour of that sky: linear R G B, 0 to 1; --sky is multiplied by it."""
     hdri: Path | None = None
-    """Environment picture (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
+    """Environment image (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
     hdri_strength: float = 1.0
-    """Factor on the environment picture."""
+    """Factor on the environment image."""
     hdri_rotation: float = 0.0
-    """Degrees that the environment is turned round the up direction."""
+    """Degrees that the environment is rotated about the up direction."""
     ground: Ground = "plane"
-    """What the subject stands on: a grey plane that fades into the background; a catcher, seen only where
-    shadows fall (Cycles); or nothing."""
+    """Ground under the subject: a grey plane that fades into the background; a catcher, visible only where
+    shadows fall (Cycles); or none."""
     exposure: float = 0.35
-    """How much brighter pictures are shown than they are lit, in stops, -20 to 20: with 0.35, a white plate
-    that faces the viewer looks white. Neither the values of an .exr change nor the background."""
+    """Brightness added for display, in stops, -20 to 20: with 0.35, a white plate that faces the viewer looks
+    white. Values of an .exr and the background do not change."""
     mirror: bool = False
     """A mirror behind the subject."""
     glass: bool = False
     """A glass ball beside the subject."""
     roughness: float = 1.0
-    """Roughness of the splats' surface, 0 to 1; it shows with --specular."""
+    """Roughness of the splats' surface, 0 to 1; visible with --specular."""
     specular: float = 0.0
-    """Highlights of the splats' surface, 0 to 1; 0.5 is plastic. Splats have their own highlights painted
-    on."""
+    """Highlights of the splats' surface, 0 to 1; 0.5 is plastic. Splats have highlights of their own baked
+    in."""
     bounces: int = 4
-    """How often light is scattered on its way, 0 to 64; layers that it passes through are not counted."""
+    """Most scattering events of a light path, 0 to 64; layers that it passes through do not count."""
 
     @property
     def fill_direction(self) -> tuple[float, float]:
-        """Where the second sun stands, as ``sun``."""
+        """Direction of the second sun, as ``sun``."""
         return (-self.sun[0], 20.0)
 
     def check(self) -> None:
-        """Raises ValueError for a value out of range, FileNotFoundError for a missing environment picture."""
+        """Raises ValueError for a value out of range, FileNotFoundError for a missing environment image."""
         azimuth, elevation = self.sun
         if not (np.isfinite(azimuth) and -90 <= elevation <= 90):
             raise ValueError(f"sun must be an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
@@ -111,20 +111,20 @@ lamp on the left, a weaker one on the right."""
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """How Blender draws the mesh."""
+    """How Blender renders the mesh."""
 
     light: LightOptions | None = None
-    """None: colours as they are, the picture that ``meshsplats.render`` draws. Else lit by these."""
+    """None: unlit colours, the image of ``meshsplats.render``. Otherwise lit by these."""
     engine: Engine = "cycles"
-    """cycles: exact order and ray-traced light. eevee: quick; triangles are sorted for each camera."""
+    """cycles: exact order and ray-traced light. eevee: fast; triangles are sorted for each camera."""
     samples: int = 1
-    """Unlit: side of the grid of samples in each pixel, as in ``render``. Lit: samples a pixel."""
+    """Unlit: side of the grid of samples in each pixel, as in ``render``. Lit: samples per pixel."""
     background: Annotated[tuple[float, float, float] | None, "RGB"] = (1.0, 1.0, 1.0)
-    """Display RGB behind everything; None: transparent. With an environment picture, that is seen instead."""
+    """Display RGB behind everything; None: transparent. An environment image replaces it."""
     denoise: bool = False
     """Cycles, lit: remove noise with OpenImageDenoise."""
     threads: int | None = None
-    """At most this many; all processors by default."""
+    """At most this many; default: all processors."""
 
     def check(self) -> None:
         """Raises ValueError for values out of range and choices that contradict each other."""
@@ -132,14 +132,14 @@ class SceneOptions:
             raise ValueError(f"engine must be one of {', '.join(get_args(Engine))}, got {self.engine!r}")
         top = 16 if self.light is None else 65536
         if not 1 <= self.samples <= top:
-            what = "the side of the sample grid" if self.light is None else "the number of samples a pixel"
+            what = "the side of the sample grid" if self.light is None else "the number of samples per pixel"
             raise ValueError(f"samples is {what}, 1 to {top}, got {self.samples}")
         if self.background is not None and not all(0 <= v <= 1 for v in self.background):
             raise ValueError(f"background must be RGB in [0, 1], got {self.background}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         if self.denoise and (self.light is None or self.engine != "cycles"):
-            raise ValueError("denoise is for lit pictures in Cycles: others have no noise, or another kind")
+            raise ValueError("denoise is for lit images in Cycles: others have no noise, or another kind")
         if self.light is not None:
             self.light.check()
             if self.engine == "eevee" and self.light.ground == "catcher":
@@ -153,5 +153,5 @@ def check_environment(path: Path) -> None:
         start = file.read(10)
     if not (start.startswith((b"#?RADIANCE", b"#?RGBE")) or start[:4] == b"\x76\x2f\x31\x01"):
         raise ValueError(
-            f"{path}: an environment picture is a Radiance .hdr or an OpenEXR file; this is neither"
+            f"{path}: an environment image is a Radiance .hdr or an OpenEXR file; this is neither"
         )

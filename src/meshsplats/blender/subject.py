@@ -1,4 +1,4 @@
-"""A mesh made ready for Blender: colours in the right space, shading normals, and what lies where."""
+"""Prepares a mesh for Blender: colours in the right space, shading normals, bounds."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ SELF_SHADOW = 3.0
 _CASTS = 0.25
 """Opacity from which a splat casts a shadow in EEVEE."""
 _SUNK = 1.0
-"""How far below the surface the stand-in that casts it lies, in spacings: deeper, thin parts lose their
-shadow; less deep, it falls on the surface itself."""
+"""Depth of the shadow caster below the surface, in spacings: deeper, thin parts lose their shadow; shallower,
+the surface shadows itself."""
 
 
 def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> tuple[int, int]:
@@ -37,12 +37,12 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
         if options.light.fill > 0:
             directions.append(_world_direction(axes, *options.light.fill_direction))
     layers = most_layers(mesh, cameras, directions, threads=options.threads)
-    # An unlit picture is exact or it is not: a high limit costs nothing where there are no layers.
+    # Unlit images must be exact, and a high limit costs nothing where there are no layers.
     return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
 
 
 def mean_layers(mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None = None) -> float:
-    """How many triangles lie behind each other in a pixel, on average over the pictures."""
+    """Mean number of triangles behind each other in a pixel, over the images."""
     some = a_few(cameras, 4, PROBE_SIDE)
     return float(np.mean([count_layers(mesh, camera, threads=threads).mean() for camera in some] or [0.0]))
 
@@ -50,7 +50,7 @@ def mean_layers(mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None 
 def prepare(
     mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions, layers: int
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and facts: the fields of ``inside.scene.Subject``."""
+    """Arrays and facts, the fields of ``inside.scene.Subject``; ``layers`` as from ``count``."""
     bounds = scene_bounds(mesh)
     up = mesh.up.astype(np.float64)
     facts = {
@@ -79,7 +79,7 @@ def prepare(
 
 
 def lowest(bounds: Bounds, up: np.ndarray) -> float:
-    """Height along the unit ``up`` of the lowest part of a subject, but for strays; scene units."""
+    """Height along the unit ``up`` (3,) of the lowest part of a subject, without strays; scene units."""
     heights = bounds.points @ up
     weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(heights))
     return weighted_quantile(heights, weights, _FLOOR)
@@ -88,9 +88,12 @@ def lowest(bounds: Bounds, up: np.ndarray) -> float:
 def lit_arrays(
     mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
 ) -> tuple[dict[str, np.ndarray], float]:
-    """What a lit material needs: ``colors`` (v, 4) in linear light, ``normals`` (v, 3), ``faces`` (f, 3)
-    wound so that they face out; and the distance, scene units, within which layers must not shade each
-    other."""
+    """Arrays for a lit material and its self-shadow distance.
+
+    Returns:
+        ``colors`` (v, 4) in linear light, ``normals`` (v, 3), and ``faces`` (f, 3) wound to face outwards;
+        and the distance, scene units, within which layers must not shade each other.
+    """
     colors = mesh.colors
     if mesh.blending == "display":
         colors = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
@@ -100,15 +103,14 @@ def lit_arrays(
 
 
 def _caster(mesh: SplatMesh, normals: np.ndarray, depth: float) -> dict[str, np.ndarray]:
-    """``caster_vertices``, ``caster_faces``: a solid stand-in that casts the shadow in EEVEE, whose shadow
-    maps know no distance within which layers must not shade each other. It lies a little below the surface,
-    without what is faint."""
+    """``caster_vertices``, ``caster_faces``: a solid mesh without faint splats, a little below the surface,
+    that casts the shadow in EEVEE. Its shadow maps have no self-shadow distance."""
     faces = mesh.faces[mesh.colors[mesh.faces, 3].max(axis=1) > _CASTS]
     return {"caster_vertices": mesh.vertices - np.float32(depth) * normals, "caster_faces": faces}
 
 
 def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:
-    """(f, 3) the faces of ``mesh``, wound so that each has the shading normals on its front."""
+    """(f, 3) the faces of ``mesh``, wound so that their fronts agree with the shading normals."""
     a, b, c = mesh.faces.T
     own = np.cross(mesh.vertices[b] - mesh.vertices[a], mesh.vertices[c] - mesh.vertices[a])
     back = np.einsum("ij,ij->i", own, normals[a] + normals[b] + normals[c]) < 0
@@ -116,7 +118,7 @@ def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:
 
 
 def _world_direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
-    """(3,) unit vector in the splats' world; ``axes`` as from ``front_axes``."""
+    """(3,) unit vector in the splats' world from degrees; ``axes`` as from ``front_axes``."""
     a, e = np.radians(azimuth), np.radians(elevation)
     right, up, forward = axes
     return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up

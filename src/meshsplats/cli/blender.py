@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 
 import tyro
 
+from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
 from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
@@ -89,7 +90,7 @@ class Blender:
     """
 
     input: tyro.conf.Positional[Path]
-    """Splats, a model folder, or a mesh."""
+    """Splats, a model folder, a mesh, or a chain of levels of detail (levels.json; for a .blend)."""
     output: Output
     """A .png or .exr for one view, a folder for several, or a .blend with a camera for each view."""
     lit: bool = False
@@ -130,9 +131,11 @@ class Blender:
 
         suffix = self.output.suffix.lower()
         options = self._options(suffix)
+        chain = self._chain(suffix)
         command(self.executable)
         start = time.perf_counter()
-        scene = self.part.of(load_scene(self.input, self.reading))
+        files = [level.path for level in chain.levels] if chain else [self.input]
+        scene, *coarser = (self.part.of(load_scene(file, self.reading)) for file in files)
         cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800)
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
@@ -146,13 +149,17 @@ class Blender:
             [*pictures, *([blend] if blend else []), *records], self.force, None if suffix else self.output
         )
         mesh = _converted(scene, self.lit)
+        subject: SplatMesh | LevelMeshes = mesh
+        if chain:
+            levels = [mesh, *(_converted(level, self.lit) for level in coarser)]
+            subject = LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
         if not suffix:
             self.output.mkdir(exist_ok=True)
         with _shown(len(pictures)) as show:
             result = draw(
-                mesh,
+                subject,
                 cameras,
-                pictures=pictures,
+                images=pictures,
                 blend=blend,
                 options=options,
                 executable=self.executable,
@@ -162,6 +169,16 @@ class Blender:
         save_cameras(cameras, records[0])
         write_json(records[1], configuration("blender", self))
         self._report(result, cameras, pictures, len(mesh.faces), time.perf_counter() - start)
+
+    def _chain(self, suffix: str) -> Chain | None:
+        """The chain of levels of detail that the input names, or None."""
+        if not is_chain(self.input):
+            return None
+        if suffix != ".blend":
+            raise UsageError(
+                f"{self.input}: a chain of levels of detail makes a .blend; for images, give one mesh of it"
+            )
+        return read_chain(self.input)
 
     def _options(self, suffix: str) -> SceneOptions:
         """What Blender is asked for, or UsageError for options that contradict each other or would do
@@ -322,6 +339,6 @@ class _Lines:
 
 
 def _words(at: Progress) -> str:
-    which = f"picture {min(at.done + 1, at.pictures)} of {at.pictures}" if at.pictures > 1 else ""
+    which = f"picture {min(at.done + 1, at.images)} of {at.images}" if at.images > 1 else ""
     left = f"{at.left} left" if at.left else ""
     return ", ".join(filter(None, [which, at.stage, left]))

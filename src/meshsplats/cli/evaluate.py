@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +27,6 @@ from meshsplats.cli.common import (
     configuration,
     load_scene,
     parse_color,
-    plural,
     track,
     view_names,
     write_json,
@@ -37,9 +35,15 @@ from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import WHITE, Dataset
-from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import Background
-from meshsplats.evaluation.benchmarks import PROTOCOLS, Protocol, find_input
+from meshsplats.evaluation.benchmarks import (
+    BENCHMARKS,
+    Benchmark,
+    Candidates,
+    convert_scene,
+    run_benchmark,
+)
 from meshsplats.evaluation.report import SSIM_CONVENTION, Report, ScoredView, evaluate
 from meshsplats.evaluation.strips import (
     image_folder,
@@ -130,7 +134,7 @@ class Evaluate:
         self._check()
         start = time.perf_counter()
         if self.protocol is not None:
-            reports = self._run_protocol(PROTOCOLS[self.protocol])
+            reports = self._run_benchmark(BENCHMARKS[self.protocol])
         else:
             self._check_outputs(self.output)
             meshes = {name: self._load_mesh(path) for name, path in mesh_names(self.mesh).items()}
@@ -258,7 +262,7 @@ class Evaluate:
             dataset,
             before=before,
             splats=splats,
-            pictures=pictures,
+            images=pictures,
             samples=self.samples,
             lpips=lpips,
             fit_exposure=self.fit_exposure,
@@ -278,83 +282,42 @@ class Evaluate:
         _write_text(folder / TABLE, markdown_table([report], notes=_notes([report])))
         return report
 
-    def _run_protocol(self, protocol: Protocol) -> list[Report]:
+    def _run_benchmark(self, benchmark: Benchmark) -> list[Report]:
+        """Scores the scenes of ``benchmark`` and writes the files of each and those of all."""
         assert self.data is not None
         (folder,) = self.mesh
         self._check_outputs(self.output)
-        found = []
-        for scene, factor in protocol.scenes.items():
-            source = find_input(folder, scene)
-            if source is None or not (self.data / scene).is_dir():
-                missing = f"{self.data / scene}" if source else f"{folder / scene}(.npz, .ply, ...)"
-                warnings.warn(
-                    f"{protocol.title}: scene {scene} is left out, no {missing}", DataWarning, stacklevel=2
-                )
-                continue
-            found.append((scene, source, self.downscale or factor))
-        if not found:
-            raise FileNotFoundError(
-                f"none of the scenes of {protocol.title} ({', '.join(protocol.scenes)}) is both in"
-                f" {folder} and in {self.data}"
-            )
-        reports = []
-        for scene, source, factor in found:
-            dataset = load_dataset(self.data / scene, downscale=factor, test_every=protocol.test_every)
-            given = load_scene(source, self.reading)
-            judge = "splats" if isinstance(given, GaussianCloud) else "mesh"
-            background = self._background(dataset, {judge: given}, source)
-            dataset = dataset.over(background.color)
-            mesh, splats, before = self._prepared(given, dataset)
+
+        def score(scene: str, dataset: Dataset, background: Background, candidates: Candidates) -> Report:
+            mesh, splats, before = candidates
             self.output.mkdir(exist_ok=True)
-            reports.append(
-                self._score(self.output / scene, dataset, background, {"mesh": mesh}, splats, before)
-            )
-        means = {
-            name: {
-                key: _mean([r.results().get(name, {}).get(key) for r in reports])
-                for key in ("SSIM", "PSNR", "LPIPS")
-            }
-            for name in reports[0].results()
-        }
-        write_json(self.output / RESULTS, means)
-        write_json(self.output / PER_VIEW, {r.scene: r.per_view() for r in reports})
-        write_json(
-            self.output / REPORT,
-            {
-                "protocol": self.protocol,
-                "scenes": [scene for scene, _, _ in found],
-                "missing": sorted(set(protocol.scenes) - {scene for scene, _, _ in found}),
-                "downscale": {scene: factor for scene, _, factor in found},
-                "test_every": protocol.test_every,
-                "background": {r.scene: r.about["background"] for r in reports},
-                "ssim_convention": SSIM_CONVENTION,
-                "mean": means,
-                "reported": {name: list(values) for name, values in protocol.reported.items()},
-                "reports": [r.to_dict() for r in reports],
-            },
+            return self._score(self.output / scene, dataset, background, {"mesh": mesh}, splats, before)
+
+        result = run_benchmark(
+            benchmark,
+            folder,
+            self.data,
+            lambda source: load_scene(source, self.reading),
+            prepare=convert_scene if self.tune is None else self._tuned_candidates,
+            score=score,
+            background=None if self.background is None else parse_color(self.background),
+            downscale=self.downscale,
+            threads=self.threads,
         )
-        title = f"{protocol.title}: {plural(len(found), 'scene')} of {len(protocol.scenes)}"
-        table = markdown_table(reports, title=title, reported=protocol.reported, notes=_notes(reports))
-        _write_text(self.output / TABLE, table)
-        return reports
+        write_json(self.output / RESULTS, result.means())
+        write_json(self.output / PER_VIEW, result.per_view())
+        write_json(self.output / REPORT, {"protocol": self.protocol, **result.to_dict()})
+        _write_text(self.output / TABLE, result.table(_notes(result.reports)))
+        return list(result.reports)
 
-    def _prepared(
-        self, scene: GaussianCloud | SplatMesh, dataset: Dataset
-    ) -> tuple[SplatMesh, GaussianCloud | None, SplatMesh | None]:
-        """Mesh, splats and the mesh before tuning, of what was found for a scene."""
-        if isinstance(scene, SplatMesh):
-            if self.tune is None:
-                return scene, None, None
-            return _tuned(scene, dataset, self.tune, self.threads), None, scene
-        cameras = [view.camera for view in dataset.train]
-        if self.tune is None:
-            from meshsplats.conversion import convert
-
-            return convert(scene, cameras=cameras), scene, None
+    def _tuned_candidates(self, scene: GaussianCloud | SplatMesh, dataset: Dataset) -> Candidates:
         from meshsplats.finetuning import starting_mesh
 
-        mesh = starting_mesh(scene, cameras, preset=self.tune)
-        return _tuned(mesh, dataset, self.tune, self.threads), scene, mesh
+        assert self.tune is not None
+        if isinstance(scene, SplatMesh):
+            return Candidates(_tuned(scene, dataset, self.tune, self.threads), None, scene)
+        mesh = starting_mesh(scene, [view.camera for view in dataset.train], preset=self.tune)
+        return Candidates(_tuned(mesh, dataset, self.tune, self.threads), scene, mesh)
 
 
 def mesh_names(paths: Sequence[Path]) -> dict[str, Path]:
@@ -387,11 +350,6 @@ def _save_strips(folder: Path, name: str, scored: ScoredView, amplify: float) ->
         save_png(folder / part / name, make(scored, amplify))
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known and len(known) == len(values) else None
-
-
 def _write_text(path: Path, text: str) -> None:
     from meshsplats._files.atomic import write_text
 
@@ -400,7 +358,7 @@ def _write_text(path: Path, text: str) -> None:
 
 def _notes(reports: Sequence[Report]) -> list[str]:
     """What a reader of the table has to know of the scenes' backgrounds."""
-    told = [(report.scene, report.about["background_told"]) for report in reports]
+    told = [(report.scene, report.about["background_description"]) for report in reports]
     if len(told) == 1:
         return [f"Background: {told[0][1]}."]
     return [f"Background of {scene}: {text}." for scene, text in told]

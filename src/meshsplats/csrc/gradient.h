@@ -395,7 +395,8 @@ class GradientTile {
 
     // Interpolates an entry, without regard to what lies in front and behind; returns the depth.
     template <bool ATTRIBUTES>
-    Lanes evaluate(const BlockSamples &samples, const TapeEntry entry, EntryFragments &f) {
+    __attribute__((always_inline)) Lanes evaluate(const BlockSamples &samples, const TapeEntry entry,
+                                                  EntryFragments &f) {
         MS_ASSERT(entry.mask_count >= 1);
         const PackedTape::IndexedLanes *mask = masks_ + entry.first_mask;
         Lanes q, linear[4];  // 1 / depth, RGBA / depth
@@ -437,7 +438,7 @@ class GradientTile {
 
     // Adds the entry in a slot to the moments of its triangles.
     template <bool ATTRIBUTES>
-    void add_moments(const BlockSamples &samples, uint32_t slot) {
+    __attribute__((always_inline)) void add_moments(const BlockSamples &samples, uint32_t slot) {
         const EntryFragments &f = fragments_[slot];
         const VisibleEntry visible = visible_[slot];
         const TapeEntry entry = entries_[visible.entry];

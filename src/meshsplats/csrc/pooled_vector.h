@@ -17,15 +17,20 @@
 namespace ms {
 
 // Keeps freed memory for the next image: the system hands out zeroed pages, and zeroing them takes longer
-// than using them. Thread-safe.
+// than using them. Thread-safe. Not used with the address sanitizer, which has to see every allocation.
 class MemoryPool {
   public:
     static constexpr std::size_t HUGE_PAGE = (std::size_t)2 << 20;
     static constexpr std::size_t MIN_POOLED = (std::size_t)64 << 10;  // smaller allocations bypass the pool
     static constexpr std::size_t MAX_CACHED = (std::size_t)256 << 20;
+#if defined(__SANITIZE_ADDRESS__)
+    static constexpr bool ENABLED = false;
+#else
+    static constexpr bool ENABLED = true;
+#endif
 
     static void *allocate(std::size_t bytes) {
-        if (bytes < MIN_POOLED) return ::operator new(bytes, std::align_val_t(SMALL_ALIGNMENT));
+        if (!ENABLED || bytes < MIN_POOLED) return ::operator new(bytes, std::align_val_t(SMALL_ALIGNMENT));
         const std::size_t size = size_class(bytes);
         if (void *p = pool().take_cached(size)) return p;
         void *p = ::operator new(size, std::align_val_t(alignment_of(size)));
@@ -38,7 +43,7 @@ class MemoryPool {
 
     // `bytes` must be the size that was allocated.
     static void deallocate(void *p, std::size_t bytes) noexcept {
-        if (bytes < MIN_POOLED) return ::operator delete(p, std::align_val_t(SMALL_ALIGNMENT));
+        if (!ENABLED || bytes < MIN_POOLED) return ::operator delete(p, std::align_val_t(SMALL_ALIGNMENT));
         const std::size_t size = size_class(bytes);
         if (size > MAX_CACHED) return release(p, size);
         pool().cache(p, size);

@@ -1,4 +1,4 @@
-"""Which background a capture is drawn over: the one that its splats were trained over."""
+"""The background that a capture is rendered over: the one that its splats were trained with."""
 
 from __future__ import annotations
 
@@ -22,42 +22,42 @@ from meshsplats.mesh import SplatMesh
 
 BLACK = (0.0, 0.0, 0.0)
 CANDIDATES: Mapping[str, tuple[float, float, float]] = {"black": BLACK, "white": WHITE}
-"""What splats are trained over."""
-LOOKED_AT = 8
-"""Most photographs, evenly spread, that the candidates are compared on."""
-STRANGE = 12.0
-"""dB below which pictures are not of what the photographs show: an even grey reaches nearly as much."""
-MATTERS = 0.1
-"""dB by which another background has to be better before a warning says so."""
-_MOST_BYTES = 1 << 20
+"""The backgrounds that splats are usually trained with."""
+MAX_VIEWS = 8
+"""Maximum number of photographs, evenly spread, that the candidates are compared on."""
+UNRELATED_PSNR = 12.0
+"""dB below which images do not show the content of the photographs: a uniform grey reaches nearly as much."""
+WARNING_GAIN = 0.1
+"""dB by which another background must be better for a warning."""
+_MAX_BYTES = 1 << 20
 
 Reason = Literal["given", "model folder", "usual", "best for"]
 
 
 @dataclass(frozen=True)
 class Background:
-    """A background, and why it was chosen."""
+    """A background, and the reason for it."""
 
     color: tuple[float, float, float]
     """Display RGB in [0, 1]."""
     reason: Reason
-    """given; named by the model folder; usual: white, behind pictures with alpha; best for: of black and
-    white the one over which ``judge`` comes closer to the photographs."""
+    """given: by the caller. model folder: named by it. usual: white, for images with alpha. best for: that of
+    black and white over which ``judge`` is closer to the photographs."""
     judge: str = ""
-    """Name of what was judged first."""
+    """Name of the scene that was scored first."""
     psnr: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """For each scene that was judged and each background, its name or ``#rrggbb``: mean PSNR in dB on some of
-    the photographs."""
+    """Mean PSNR in dB on some of the photographs, by scene and by background, its name or ``#rrggbb``."""
 
     @property
     def name(self) -> str:
+        """black, white, or ``#rrggbb``."""
         return color_name(self.color)
 
     def describe(self) -> str:
-        """In a few words, for people."""
+        """The background and its reason in a few words."""
         if self.reason != "best for":
-            told = {"given": "as given", "model folder": "as the model folder says", "usual": "as usual"}
-            return f"{self.name}, {told[self.reason]}"
+            reasons = {"given": "as given", "model folder": "as the model folder says", "usual": "as usual"}
+            return f"{self.name}, {reasons[self.reason]}"
         other = next(name for name in CANDIDATES if name != self.name)
         scores = self.psnr[self.judge]
         return (
@@ -66,11 +66,11 @@ class Background:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Colour, description and scores, for JSON."""
         scores = {scene: dict(found) for scene, found in self.psnr.items()}
         return {
             "background": list(self.color),
-            "background_told": self.describe(),
+            "background_description": self.describe(),
             "background_psnr": scores,
         }
 
@@ -83,18 +83,25 @@ def find_background(
     named: Sequence[float] | None = None,
     threads: int | None = None,
 ) -> Background:
-    """The background that pictures of ``scenes`` are to be drawn over beside the photographs of ``dataset``.
+    """Finds the background for rendering ``scenes`` against the photographs of ``dataset``.
 
-    Photographs without alpha say nothing of what is behind what splats leave open, but the splats were
-    trained over one colour, and lose decibels over another. It is ``given``, or ``named`` by what they came
-    with (``model_background``); else white where the photographs have alpha, as it is usual; else the one of
-    black and white over which the first of ``scenes`` (by name; splats before meshes made of them) has the
-    higher mean PSNR, on up to ``LOOKED_AT`` training views. Splats are drawn with all they have.
+    Photographs without alpha do not show the background behind transparent splats, but the splats were
+    trained with one colour and lose decibels over another. Use the result with ``dataset.over(found.color)``.
 
-    ``dataset.over(found.color)`` puts it to use. Warns with a DataWarning that names every scene that loses
-    more than ``MATTERS`` dB by it.
+    Args:
+        scenes: splats and meshes by name; splats before meshes that were made from them. With neither
+            ``given`` nor ``named``, and photographs without alpha, the background is that of black and white
+            over which the first scene has the higher mean PSNR, on up to ``MAX_VIEWS`` training views. Splats
+            are rendered with all spherical harmonics. Photographs with alpha usually mean white.
+        given: display RGB in [0, 1] of the caller's choice.
+        named: display RGB in [0, 1] from the model folder (``model_background``).
+        threads: maximum number of threads; all processors by default.
+
+    Returns:
+        The background with its reason and the scores. A DataWarning names each scene that loses more than
+        ``WARNING_GAIN`` dB by it.
     """
-    views = evenly(dataset.train or dataset.views, LOOKED_AT)
+    views = evenly(dataset.train or dataset.views, MAX_VIEWS)
     chosen = given if given is not None else named
     reason: Reason = "given" if given is not None else "model folder"
     candidates = dict(CANDIDATES)
@@ -111,11 +118,11 @@ def find_background(
     found = Background(_rgb(chosen), reason, judge, scores)
     for name, psnrs in scores.items():
         best = max(psnrs, key=lambda color: psnrs[color])
-        if psnrs[best] > psnrs[found.name] + MATTERS:
+        if psnrs[best] > psnrs[found.name] + WARNING_GAIN:
             warnings.warn(
                 f"over {found.name} the {name} scores {psnrs[found.name]:.2f} dB on some of the photographs,"
-                f" over {best} {psnrs[best]:.2f}, which it seems to be made for: compared over"
-                f" {found.name}, it looks worse than it is",
+                f" over {best} {psnrs[best]:.2f}, which it seems to be made for: over {found.name} its scores"
+                " are too low",
                 DataWarning,
                 stacklevel=2,
             )
@@ -123,12 +130,12 @@ def find_background(
 
 
 def warn_of_other_worlds(found: Background) -> None:
-    """A DataWarning if what was judged shows hardly anything of the photographs."""
+    """Issues a DataWarning if the scene that was scored shows almost nothing of the photographs."""
     scores = found.psnr.get(found.judge)
-    if scores and max(scores.values()) < STRANGE:
+    if scores and max(scores.values()) < UNRELATED_PSNR:
         warnings.warn(
-            f"the {found.judge} shows next to nothing of the photographs ({max(scores.values()):.1f} dB): the"
-            " cameras and what they look at seem to be of different worlds, moved, turned or scaled;"
+            f"the {found.judge} shows almost nothing of the photographs ({max(scores.values()):.1f} dB): the"
+            " cameras and the scene seem to be in different frames, moved, rotated or scaled;"
             " docs/datasets.md, 'One world', has the usual reasons",
             DataWarning,
             stacklevel=2,
@@ -136,8 +143,10 @@ def warn_of_other_worlds(found: Background) -> None:
 
 
 def model_background(path: str | os.PathLike[str]) -> tuple[float, float, float] | None:
-    """What the model folder at ``path``, or that a splat file at ``path`` lies in, says that it was trained
-    over: ``white_background`` in the ``cfg_args`` of the 3DGS code. None if nothing says so."""
+    """The training background of the model folder ``path``, or of the one that the splat file ``path`` is in.
+
+    It is ``white_background`` in the ``cfg_args`` of the 3DGS code. None if it is not there.
+    """
     path = Path(path)
     folders = [path] if path.is_dir() else []
     if path.parent.name.startswith("iteration_") and path.parent.parent.name == "point_cloud":
@@ -145,12 +154,12 @@ def model_background(path: str | os.PathLike[str]) -> tuple[float, float, float]
     for folder in folders:
         try:
             with open(folder / "cfg_args", "rb") as file:
-                text = file.read(_MOST_BYTES).decode("utf-8", "replace")
+                text = file.read(_MAX_BYTES).decode("utf-8", "replace")
         except OSError:
             continue
-        said = re.search(r"\bwhite_background\s*=\s*(True|False)\b", text)
-        if said:
-            return WHITE if said[1] == "True" else BLACK
+        setting = re.search(r"\bwhite_background\s*=\s*(True|False)\b", text)
+        if setting:
+            return WHITE if setting[1] == "True" else BLACK
     return None
 
 
@@ -163,7 +172,7 @@ def color_name(color: Sequence[float]) -> str:
 
 
 def _opaque(view: View) -> bool:
-    """Whether a photograph leaves nothing open."""
+    """Whether an image has no transparent pixel."""
     alpha = view.alpha
     return alpha is None or bool((alpha >= 1).all())
 
@@ -179,7 +188,7 @@ def _scores(
     colors: Mapping[str, tuple[float, float, float]],
     threads: int | None,
 ) -> dict[str, float]:
-    """Mean PSNR by background."""
+    """Mean PSNR of ``scene`` on ``views`` in dB, by background."""
     from meshsplats.rendering import render, render_splats
 
     linear = isinstance(scene, SplatMesh) and scene.blending == "linear"
@@ -189,12 +198,12 @@ def _scores(
         if mask is not None and not mask.any():
             continue
         draw: Any = render_splats if isinstance(scene, GaussianCloud) else render
-        drawn = draw(scene, view.camera, background=BLACK, threads=threads)
-        through = 1 - drawn.alpha[..., None]
+        rendered = draw(scene, view.camera, background=BLACK, threads=threads)
+        transmittance = 1 - rendered.alpha[..., None]
         for name, color in colors.items():
-            behind = np.asarray(color, np.float32)
-            picture = drawn.color + through * (srgb_to_linear(behind) if linear else behind)
-            picture = np.clip(linear_to_srgb(picture) if linear else picture, 0, 1)
-            truth = np.clip(view.load().over(color), 0, 1)
-            found[name].append(min(psnr(picture, truth, mask=mask), 200.0))
+            display = np.asarray(color, np.float32)
+            image = rendered.color + transmittance * (srgb_to_linear(display) if linear else display)
+            image = np.clip(linear_to_srgb(image) if linear else image, 0, 1)
+            target = np.clip(view.load().over(color), 0, 1)
+            found[name].append(min(psnr(image, target, mask=mask), 200.0))
     return {name: float(np.mean(values)) if values else 0.0 for name, values in found.items()}

@@ -1,4 +1,4 @@
-"""compare: the picture of the splats against the picture of the mesh, from the same cameras."""
+"""compare: images of the splats against images of the mesh, from the same cameras."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewScore:
-    """How close the two pictures of one view are."""
+    """Similarity of the two images of one view."""
 
     name: str
     psnr: float
-    """dB; inf for equal pictures."""
+    """dB; inf for equal images."""
     ssim: float
     """In [-1, 1], in the convention of 3DGS (``metrics.ssim``)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedView:
-    """The two pictures of one view, and how close they are."""
+    """The two images of one view, and their similarity."""
 
     camera: Camera
     splats: np.ndarray
-    """(h, w, 3) float32 in [0, 1]: the splats, in the look that was asked for."""
+    """(h, w, 3) float32 display RGB in [0, 1]: the splats, in the requested look."""
     mesh: np.ndarray
-    """(h, w, 3) float32 in [0, 1]."""
+    """(h, w, 3) float32 display RGB in [0, 1]: the mesh."""
     score: ViewScore
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores of all views. The mean PSNR is the mean of the views' PSNR, as papers give it."""
+    """Scores of all views. The mean PSNR is the mean of the PSNR of the views, as in papers."""
 
     views: tuple[ViewScore, ...]
 
@@ -55,7 +55,7 @@ class Comparison:
         return float(np.mean([view.ssim for view in self.views]))
 
     def to_dict(self) -> dict:
-        """For JSON, which knows no infinity: the PSNR of equal pictures is null."""
+        """All scores, for JSON. JSON has no infinity: the PSNR of equal images is null."""
         rows = [asdict(view) for view in self.views] + [{"psnr": self.psnr, "ssim": self.ssim}]
         for row in rows:
             row["psnr"] = row["psnr"] if math.isfinite(row["psnr"]) else None
@@ -74,29 +74,36 @@ def compare_views(
     max_layers: int | None = None,
     threads: int | None = None,
 ) -> Iterator[ComparedView]:
-    """The views one by one, so that only one pair of pictures is in memory.
+    """Compares ``cloud`` and ``mesh`` view by view; only one pair of images is in memory at a time.
 
-    Parameters
-    ----------
-    look: what the mesh is compared with. 'area': the mean over each pixel's area, which programs that take
-        several samples a pixel show. 'splats': what a 3DGS viewer shows at this size of the image.
-    sh_degree: spherical harmonics of the splats up to this degree; all by default. A mesh has one colour a
-        vertex: 0 leaves the change of colour with the view out of the comparison.
-    background, threads: as in ``render``, display RGB; pictures are clipped to [0, 1] as they are when saved.
-        A mesh made for blending in linear light is drawn so, and encoded for display after.
-    samples, max_layers: as in ``render``, for the mesh; samples: by default as many as it needs for 'area',
-        1 for 'splats'.
+    Images are clipped to [0, 1], as when they are saved. A mesh for blending in linear light is blended so
+    and then encoded for display.
+
+    Args:
+        look: look of the splats. 'area': the mean over each pixel's area, as programs show that take several
+            samples per pixel. 'splats': the image of a 3DGS viewer at this image size.
+        sh_degree: spherical harmonics of the splats up to this degree; all by default. A mesh has one colour
+            per vertex: 0 excludes view-dependent colour from the comparison.
+        background: display RGB in [0, 1].
+        samples: samples along each side of a pixel, for the mesh. None: as many as it needs for 'area', 1 for
+            'splats'.
+        max_layers: as in ``render``, for the mesh.
+        threads: maximum number of threads; all processors by default.
+
+    Yields:
+        A ``ComparedView`` for each camera, in their order.
     """
     from meshsplats.evaluation.metrics import psnr, ssim
-    from meshsplats.evaluation.report import image_of
-    from meshsplats.rendering.looks import check_look, draw_splats, mesh_samples
+    from meshsplats.rendering.looks import check_look, draw_splats, image_of, mesh_samples
 
     check_look(look)
     samples = mesh_samples(look, mesh, cameras) if samples is None else samples
     options: dict[str, Any] = {"samples": samples, "max_layers": max_layers, "threads": threads}
     for i, camera in enumerate(cameras):
-        drawn = draw_splats(cloud, camera, look, sh_degree=sh_degree, background=background, threads=threads)
-        a = np.clip(drawn.color, 0, 1)
+        rendered = draw_splats(
+            cloud, camera, look, sh_degree=sh_degree, background=background, threads=threads
+        )
+        a = np.clip(rendered.color, 0, 1)
         b = np.clip(image_of(mesh, camera, background, **options)[0], 0, 1)
         yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))
 
@@ -113,7 +120,7 @@ def compare(
     max_layers: int | None = None,
     threads: int | None = None,
 ) -> Comparison:
-    """PSNR and SSIM of the mesh's pictures against the splats', view by view. Options are those of
+    """PSNR and SSIM of the mesh's images against the splats', view by view. Options are those of
     ``compare_views``.
 
     Raises ValueError without cameras.

@@ -1,7 +1,7 @@
-"""LPIPS, the learned perceptual distance of pictures (Zhang et al. 2018), version 0.1: VGG-16, AlexNet.
+"""LPIPS, the learned perceptual distance of images (Zhang et al. 2018), version 0.1: VGG-16, AlexNet.
 
-The trained weights are not part of this package and nothing is downloaded. Two files are needed for a
-network, in PyTorch's format or as safetensors with the same names of tensors:
+The trained weights are not part of this package, and nothing is downloaded. Each network needs two files, in
+PyTorch's format or as safetensors with the same tensor names:
 
 ==========  ===============================  ================================================================
 network     features, from torchvision       weights of the channels, from the package ``lpips``, folder v0.1
@@ -10,8 +10,7 @@ network     features, from torchvision       weights of the channels, from the p
 ``'alex'``  ``alexnet-owt-7be5be79.pth``     ``alex.pth``
 ==========  ===============================  ================================================================
 
-The state of a whole ``lpips.LPIPS`` module, saved as one file, will do as well. Needs torch (extra
-``torch``).
+One file with the state of a whole ``lpips.LPIPS`` module also works. Needs torch (extra ``torch``).
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 
 from meshsplats.errors import GET_TORCH, FileFormatError, MissingDependencyError
-from meshsplats.evaluation.metrics import checked_pictures
+from meshsplats.evaluation.metrics import checked_images
 from meshsplats.formats.safetensors import load_safetensors
 
 if TYPE_CHECKING:
@@ -37,9 +36,9 @@ Network = Literal["vgg", "alex"]
 Paths = str | os.PathLike[str]
 
 SUFFIXES = (".pth", ".pt", ".safetensors")
-"""Endings of files that are looked for in a folder."""
+"""Suffixes of the files of weights in a folder."""
 
-# Mean and spread of ImageNet's colours, for pictures in [-1, 1].
+# Mean and standard deviation of ImageNet's colours, for images in [-1, 1].
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPSILON = 1e-10
@@ -47,7 +46,7 @@ _KINDS = ("weight", "bias")
 
 
 class _Conv(NamedTuple):
-    """A convolution with ReLU; ``number`` is its place in torchvision's ``features``."""
+    """A convolution with ReLU; ``number`` is its index in torchvision's ``features``."""
 
     number: int
     inputs: int
@@ -62,11 +61,11 @@ class _Layout:
     stages: tuple[tuple[_Conv, ...], ...]
     """Features are compared at the end of each stage."""
     pool: int
-    """Before some stages, the maximum over so many pixels squared, for every second pixel."""
+    """Side of the max-pooling window before some stages; its stride is 2."""
     pooled: tuple[int, ...]
-    """Numbers of these stages."""
+    """Indices of these stages."""
     smallest: int
-    """Side of the smallest picture that leaves a pixel everywhere."""
+    """Side of the smallest image that leaves a pixel at every stage."""
     features: str
     heads: str
 
@@ -103,9 +102,9 @@ _LAYOUTS = {
 
 
 class Lpips:
-    """The distance under one network, with its weights in memory (59 MB for VGG, 10 MB for AlexNet).
+    """The LPIPS distance of one network, with its weights in memory (59 MB for VGG, 10 MB for AlexNet).
 
-    Made by :func:`load_lpips`; called with two pictures it returns their distance.
+    Created by :func:`load_lpips`. Calling it with two images returns their distance.
     """
 
     def __init__(self, network: Network, weights: dict[str, torch.Tensor]) -> None:
@@ -114,28 +113,32 @@ class Lpips:
         self._weights = weights
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
-        """The distance of two pictures, 0 for equal ones; smaller is more alike.
+        """The distance of two images: 0 for equal images, smaller is closer.
 
-        ``a`` and ``b`` are (h, w, 3) float RGB in [0, 1], of one shape. Published tables of splatting methods
-        use VGG; values of the two networks are not comparable.
+        Published tables of splatting methods use VGG; values of the two networks are not comparable.
 
-        Raises TypeError and ValueError as ``metrics.psnr`` does, and ValueError for pictures that are not RGB
-        or smaller than 16 x 16 (VGG) or 31 x 31 pixels (AlexNet).
+        Args:
+            a, b: (h, w, 3) float RGB in [0, 1], of one shape.
+
+        Raises:
+            TypeError: as ``metrics.psnr`` does.
+            ValueError: as ``metrics.psnr`` does; images that are not RGB, or smaller than 16 x 16 (VGG) or
+                31 x 31 pixels (AlexNet).
         """
         import torch
 
-        a, b = checked_pictures(a, b)
+        a, b = checked_images(a, b)
         if a.ndim != 3 or a.shape[2] != 3:
-            raise ValueError(f"LPIPS compares RGB pictures (h, w, 3), got {a.shape}")
+            raise ValueError(f"LPIPS compares RGB images (h, w, 3), got {a.shape}")
         smallest = self._layout.smallest
         if min(a.shape[:2]) < smallest:
             raise ValueError(
                 f"LPIPS with network {self.network!r} needs at least {smallest} x {smallest} pixels, got"
                 f" {a.shape[0]} x {a.shape[1]}"
             )
-        pictures = np.stack([a, b]).astype(np.float32).transpose(0, 3, 1, 2)
+        images = np.stack([a, b]).astype(np.float32).transpose(0, 3, 1, 2)
         with torch.inference_mode():
-            x = torch.from_numpy(np.ascontiguousarray(pictures))
+            x = torch.from_numpy(np.ascontiguousarray(images))
             shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (_SHIFT, _SCALE))
             return self._distance((2 * x - 1 - shift) / scale)
 
@@ -156,14 +159,23 @@ class Lpips:
 
 
 def load_lpips(weights: Paths | Sequence[Paths] | None, *, network: Network = "vgg") -> Lpips | None:
-    """The distance with trained weights from files; None where ``weights`` is None, to be shown as "n/a".
+    """Loads trained weights from files.
 
-    ``weights`` is a folder, a file, or several files, which together hold all tensors (see above). Of a
-    folder every ``.pth``, ``.pt`` and ``.safetensors`` file is taken whose name begins with the network's,
-    ``vgg`` or ``alex``. PyTorch files are read with ``weights_only``: code in them is never run.
+    Args:
+        weights: a folder, a file, or several files, which together hold all tensors (see above). From a
+            folder it reads every ``.pth``, ``.pt`` and ``.safetensors`` file whose name begins with the
+            network's, ``vgg`` or ``alex``. PyTorch files are read with ``weights_only``: code in them is
+            never run.
+        network: 'vgg' or 'alex'.
 
-    Raises FileNotFoundError if a file is missing, FileFormatError if one cannot be read or is not of this
-    network, ValueError for an unknown network, MissingDependencyError without torch.
+    Returns:
+        The distance; None if ``weights`` is None.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        FileFormatError: a file cannot be read or is of another network.
+        ValueError: an unknown network.
+        MissingDependencyError: torch is missing.
     """
     if network not in get_args(Network):
         raise ValueError(f"network must be one of {', '.join(get_args(Network))}, got {network!r}")
@@ -194,7 +206,7 @@ def load_lpips(weights: Paths | Sequence[Paths] | None, *, network: Network = "v
 
 
 def _wanted(layout: _Layout) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of all tensors."""
+    """Names and shapes of all tensors of a network."""
     shapes: dict[str, tuple[int, ...]] = {}
     for number, stage in enumerate(layout.stages):
         for conv in stage:
@@ -205,7 +217,7 @@ def _wanted(layout: _Layout) -> dict[str, tuple[int, ...]]:
 
 
 def _known_name(name: str) -> str | None:
-    """A tensor's name here, from that in torchvision's files or in those of the package lpips."""
+    """Our name of a tensor, from its name in torchvision's files or in those of the package lpips."""
     match = re.fullmatch(r"(?:features|net\.slice\d)\.(\d+)\.(weight|bias)", name)
     if match:
         return f"features.{match[1]}.{match[2]}"
@@ -250,7 +262,7 @@ def _tensors(path: Path) -> dict[str, torch.Tensor]:
     except (OSError, FileFormatError):
         raise
     except Exception as error:
-        # Broken files end in errors of many kinds, some with pages of advice to read them in unsafe ways.
+        # Broken files raise many kinds of errors, some with long advice to load them in unsafe ways.
         raise FileFormatError(f"{path}: not a file of weights ({type(error).__name__})") from error
     if not isinstance(content, dict) or not all(
         isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in content.items()
@@ -269,7 +281,7 @@ def _checked(tensor: torch.Tensor, name: str, shape: tuple[int, ...], path: Path
         )
     if not tensor.is_floating_point() or tensor.is_sparse or tensor.is_quantized:
         raise FileFormatError(f"{path}: {name} must hold floats, got {tensor.dtype}, {tensor.layout}")
-    # A copy: parts of large files would keep the whole file in memory.
+    # A copy, since a view would keep the whole file in memory.
     tensor = tensor.detach().float().clone()
     if not math.isfinite(float(tensor.sum())):
         raise FileFormatError(f"{path}: {name} has values that are not finite")

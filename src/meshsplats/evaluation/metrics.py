@@ -1,4 +1,4 @@
-"""How close two pictures are: PSNR, and SSIM in its three conventions. NumPy alone."""
+"""Image metrics: PSNR, and SSIM in three conventions. NumPy alone."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ WINDOW = 11
 SIGMA = 1.5
 """Standard deviation of the SSIM window in pixels."""
 C1, C2 = 0.01**2, 0.03**2
-"""The constants that keep SSIM's quotients stable, for pictures in [0, 1]."""
+"""The constants that keep SSIM's quotients stable, for images in [0, 1]."""
 
 
 def psnr(a: np.ndarray, b: np.ndarray, *, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, 10 log10(1 / mean squared difference); inf for equal pictures.
+    """Peak signal-to-noise ratio in dB, 10 log10(1 / mean squared difference); inf for equal images.
 
-    ``a`` and ``b`` are float pictures of one shape, (h, w) or (h, w, c), with 1 as the peak value. Values
-    outside [0, 1] are taken as they are: clip first to judge a picture as it will be saved. ``mask`` (h, w)
-    bool marks the pixels that count; None counts all.
+    Args:
+        a, b: float images of one shape, (h, w) or (h, w, c), with 1 as the peak value. Values outside [0, 1]
+            are not clipped: clip first to score an image as it will be saved.
+        mask: (h, w) bool, True where pixels count; None: all pixels count.
 
-    Raises TypeError for pictures or masks of another type, ValueError for shapes that differ, values that are
-    not finite, and pictures or masks without a pixel.
+    Raises:
+        TypeError: images or masks of another type.
+        ValueError: shapes that differ, values that are not finite, images or masks without a pixel.
     """
-    a, b = checked_pictures(a, b)
+    a, b = checked_images(a, b)
     if mask is not None:
         mask = np.asarray(mask)
         if mask.dtype != bool:
             raise TypeError(f"mask must be boolean, got dtype {mask.dtype}")
         if mask.shape != a.shape[:2]:
-            raise ValueError(f"mask must have shape {a.shape[:2]} like the pictures, got {mask.shape}")
+            raise ValueError(f"mask must have shape {a.shape[:2]} like the images, got {mask.shape}")
         if not mask.any():
             raise ValueError("mask must mark at least one pixel, got none")
         a, b = a[mask], b[mask]
@@ -41,37 +43,41 @@ def psnr(a: np.ndarray, b: np.ndarray, *, mask: np.ndarray | None = None) -> flo
 
 
 def ssim(a: np.ndarray, b: np.ndarray, *, convention: SsimConvention = "3dgs") -> float:
-    """Mean structural similarity (Wang et al. 2004) over pixels and channels, in [-1, 1]; 1 for equal
-    pictures.
+    """Mean structural similarity (Wang et al. 2004) over pixels and channels, in [-1, 1]; 1 for equal images.
 
-    ``a`` and ``b`` are float pictures of one shape, (h, w) or (h, w, c), with 1 as the peak value; values
-    outside [0, 1] are taken as they are. Local means, variances and covariance (of the population, no n - 1)
-    are weighted by an 11 x 11 Gaussian window, sigma 1.5. Near the border three ``convention`` s are in use,
-    whose values differ in the third decimal place:
+    Local means, variances and covariance (of the population, no n - 1) are weighted by an 11 x 11 Gaussian
+    window, sigma 1.5. Three conventions for the border are in use, whose values differ in the third decimal
+    place:
 
-    - ``'3dgs'``: zeros outside the picture, one window a pixel; what Gaussian splatting papers report;
-    - ``'valid'``: only windows that lie in the picture, (h - 10) x (w - 10) of them; what
-      ``skimage.metrics.structural_similarity`` with this window returns;
-    - ``'reflect'``: the picture mirrored at its border with the edge pixel repeated (c b a | a b c), one
-    window a
-      pixel: mode 'reflect' of ``scipy.ndimage``, 'symmetric' of ``numpy.pad``.
+    - ``'3dgs'``: zeros outside the image, one window per pixel; Gaussian splatting papers report this.
+    - ``'valid'``: only the (h - 10) x (w - 10) windows inside the image; the value of
+      ``skimage.metrics.structural_similarity`` with this window.
+    - ``'reflect'``: the image mirrored at its border with the edge pixel repeated (c b a | a b c), one window
+      per pixel; mode 'reflect' of ``scipy.ndimage``, 'symmetric' of ``numpy.pad``.
 
-    Raises TypeError for pictures of another type, ValueError for shapes that differ, values that are not
-    finite, an unknown convention, and pictures smaller than the window where the convention is 'valid'.
+    Args:
+        a, b: float images of one shape, (h, w) or (h, w, c), with 1 as the peak value. Values outside [0, 1]
+            are not clipped.
+        convention: treatment of the border.
+
+    Raises:
+        TypeError: images of another type.
+        ValueError: shapes that differ, values that are not finite, an unknown convention, images smaller than
+            the window with convention 'valid'.
     """
-    a, b = checked_pictures(a, b)
+    a, b = checked_images(a, b)
     if convention not in get_args(SsimConvention):
         known = ", ".join(get_args(SsimConvention))
         raise ValueError(f"convention must be one of {known}, got {convention!r}")
     if convention == "valid" and min(a.shape[:2]) < WINDOW:
         raise ValueError(
-            f"convention 'valid' needs pictures of at least {WINDOW} x {WINDOW} pixels, got {a.shape[0]} x"
+            f"convention 'valid' needs images of at least {WINDOW} x {WINDOW} pixels, got {a.shape[0]} x"
             f" {a.shape[1]}; use '3dgs' or 'reflect'"
         )
-    a, b = (_padded_channels(picture, convention) for picture in (a, b))
+    a, b = (_padded_channels(image, convention) for image in (a, b))
     height = a.shape[1] - WINDOW + 1
     total = 0.0
-    # Strips bound the working memory and stay in the cache.
+    # Strips bound the working set, so that it stays in the cache.
     for top in range(0, height, _STRIP):
         rows = slice(top, min(top + _STRIP, height) + WINDOW - 1)
         for strip_a, strip_b in zip(a[:, rows], b[:, rows], strict=True):
@@ -79,21 +85,21 @@ def ssim(a: np.ndarray, b: np.ndarray, *, convention: SsimConvention = "3dgs") -
     return total / (a.shape[0] * height * (a.shape[2] - WINDOW + 1))
 
 
-def checked_pictures(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two pictures of one shape as arrays; errors as :func:`psnr` says."""
+def checked_images(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two images of one shape as arrays; raises the errors of :func:`psnr`."""
     a, b = np.asarray(a), np.asarray(b)
-    for picture in (a, b):
-        if picture.dtype.kind != "f":
+    for image in (a, b):
+        if image.dtype.kind != "f":
             raise TypeError(
-                f"pictures must hold floats in [0, 1], got dtype {picture.dtype}; divide bytes by 255"
+                f"images must hold floats in [0, 1], got dtype {image.dtype}; divide bytes by 255"
             )
     if a.shape != b.shape:
-        raise ValueError(f"pictures must have the same shape, got {a.shape} and {b.shape}")
+        raise ValueError(f"images must have the same shape, got {a.shape} and {b.shape}")
     if a.ndim not in (2, 3) or a.size == 0:
-        raise ValueError(f"pictures must have shape (h, w) or (h, w, c) and a pixel, got {a.shape}")
-    for picture in (a, b):
-        if not np.isfinite(picture).all():
-            raise ValueError("pictures must be finite, got NaN or infinite values")
+        raise ValueError(f"images must have shape (h, w) or (h, w, c) and a pixel, got {a.shape}")
+    for image in (a, b):
+        if not np.isfinite(image).all():
+            raise ValueError("images must be finite, got NaN or infinite values")
     return a, b
 
 
@@ -101,7 +107,7 @@ _STRIP = 32  # rows of windows computed together
 
 
 def _half_window() -> np.ndarray:
-    """The window's weights along one axis from its middle outwards."""
+    """Weights of the window along one axis, from its centre outwards."""
     weights = np.exp(-0.5 * (np.arange(WINDOW // 2 + 1) / SIGMA) ** 2)
     return weights / (weights[0] + 2 * weights[1:].sum())
 
@@ -109,9 +115,9 @@ def _half_window() -> np.ndarray:
 _HALF_WINDOW = _half_window()
 
 
-def _padded_channels(picture: np.ndarray, convention: SsimConvention) -> np.ndarray:
-    """(c, h, w), with the border that the convention asks for."""
-    channels = picture.reshape(*picture.shape[:2], -1).transpose(2, 0, 1)
+def _padded_channels(image: np.ndarray, convention: SsimConvention) -> np.ndarray:
+    """(c, h, w): the channels, padded for ``convention``."""
+    channels = image.reshape(*image.shape[:2], -1).transpose(2, 0, 1)
     margin = WINDOW // 2
     sides = ((0, 0), (margin, margin), (margin, margin))
     if convention == "3dgs":
@@ -122,7 +128,7 @@ def _padded_channels(picture: np.ndarray, convention: SsimConvention) -> np.ndar
 
 
 def _filtered(x: np.ndarray) -> np.ndarray:
-    """Means under the window, which is separable, at every place where it lies in ``x`` (h, w)."""
+    """Weighted means over all windows inside ``x`` (h, w). The window is separable."""
     middle = WINDOW // 2
     for _ in range(2):
         count = len(x) - WINDOW + 1
@@ -137,7 +143,7 @@ def _filtered(x: np.ndarray) -> np.ndarray:
 
 
 def _ssim_sum(a: np.ndarray, b: np.ndarray) -> float:
-    """Sum of SSIM over the windows that lie in ``a`` and ``b`` (h, w)."""
+    """Sum of SSIM over all windows inside ``a`` and ``b`` (h, w)."""
     mean_a, mean_b = _filtered(a), _filtered(b)
     # SSIM needs only the sum of the two variances.
     squares = mean_a**2 + mean_b**2

@@ -1,4 +1,4 @@
-"""What goes with scores: strips and crops of the pictures, tables, and pictures that were made elsewhere."""
+"""Presentation of scores: image strips and crops, tables; and images from elsewhere to score."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from meshsplats.evaluation.report import ImageAt, Report, ScoredView
 from meshsplats.images.writing import amplified_error, strip
 
 CROP_SHARE = 4
-"""A crop's side is this part of the picture's shorter side."""
+"""The shorter side of an image divided by the side of its crop."""
 CROP_SCALE = 3
-"""Crops are enlarged so many times, without smoothing."""
+"""Factor by which crops are enlarged, without smoothing."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
 
 def view_strip(scored: ScoredView, amplify: float) -> np.ndarray:
-    """(h', w', 3): truth | each method | error of the first method, under captions with the PSNR."""
-    pictures = [scored.truth, *scored.pictures.values()]
-    captions = ["truth", *(f"{name} {scored.scores[name].psnr:.2f} dB" for name in scored.pictures)]
-    first = next(iter(scored.pictures.values()))
+    """(h', w', 3): ground truth, each method, and the amplified error of the first, with captions."""
+    images = [scored.target, *scored.images.values()]
+    captions = ["truth", *(f"{name} {scored.scores[name].psnr:.2f} dB" for name in scored.images)]
+    first = next(iter(scored.images.values()))
     return strip(
-        [*pictures, amplified_error(scored.truth, first, amplify)], [*captions, f"error x {amplify:g}"]
+        [*images, amplified_error(scored.target, first, amplify)], [*captions, f"error x {amplify:g}"]
     )
 
 
 def view_crop(scored: ScoredView, amplify: float) -> np.ndarray:
-    """The same of the part where the first method's error is largest, enlarged."""
-    first = next(iter(scored.pictures.values()))
-    top, left, side = worst_window(np.square(first - scored.truth).sum(axis=2))
+    """The same for the crop with the largest error of the first method, enlarged."""
+    first = next(iter(scored.images.values()))
+    top, left, side = worst_window(np.square(first - scored.target).sum(axis=2))
     part = (slice(top, top + side), slice(left, left + side))
 
-    def enlarged(picture: np.ndarray) -> np.ndarray:
-        return picture[part].repeat(CROP_SCALE, axis=0).repeat(CROP_SCALE, axis=1)
+    def enlarged(image: np.ndarray) -> np.ndarray:
+        return image[part].repeat(CROP_SCALE, axis=0).repeat(CROP_SCALE, axis=1)
 
-    pictures = [enlarged(p) for p in (scored.truth, *scored.pictures.values())]
+    images = [enlarged(p) for p in (scored.target, *scored.images.values())]
     return strip(
-        [*pictures, enlarged(amplified_error(scored.truth, first, amplify))],
-        ["truth", *scored.pictures, "error"],
+        [*images, enlarged(amplified_error(scored.target, first, amplify))],
+        ["truth", *scored.images, "error"],
     )
 
 
@@ -56,17 +56,18 @@ def worst_window(error: np.ndarray) -> tuple[int, int, int]:
 
 
 def image_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> ImageAt:
-    """Pictures made elsewhere, one file for each of ``cameras``.
+    """Images from elsewhere, one file for each of ``cameras``.
 
-    A file belongs to the view of its name, without folder and suffix; or, if there are as many files as views
-    and none fits by name, files in natural order (2 before 10) belong to views in theirs. Pictures with alpha
-    are composited over the background.
+    Files are matched to views by name, without folder and suffix. If no name matches and there are as many
+    files as views, files in natural order (2 before 10) are matched to the views in their order. Images with
+    alpha are composited over the background.
 
-    Raises FileNotFoundError for a missing folder or picture, ValueError for a picture of another size.
+    Raises FileNotFoundError for a missing folder or image; the result raises ValueError for an image of
+    another size than its camera's.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise FileNotFoundError(f"no folder of pictures at {folder}")
+        raise FileNotFoundError(f"no folder of images at {folder}")
     files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
     by_name = {p.stem: p for p in files}
     stems = [Path(camera.name).stem for camera in cameras]
@@ -77,25 +78,26 @@ def image_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> I
     else:
         missing = [stem for stem in stems if stem not in by_name]
         raise FileNotFoundError(
-            f"{folder}: {len(files)} pictures for {len(cameras)} views, none named {missing[0]!r}"
+            f"{folder}: {len(files)} images for {len(cameras)} views, none named {missing[0]!r}"
             f" ({len(missing)} missing); name them as the views, or give exactly one for each view"
         )
-    place = {id(camera): path for camera, path in zip(cameras, chosen, strict=True)}
+    paths = {id(camera): path for camera, path in zip(cameras, chosen, strict=True)}
 
     def at(camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray | None]:
         from meshsplats.images.writing import load_png
 
-        pixels = load_png(place[id(camera)]).astype(np.float32) / 255
+        path = paths[id(camera)]
+        pixels = load_png(path).astype(np.float32) / 255
         if pixels.shape[:2] != (camera.height, camera.width):
             raise ValueError(
-                f"{place[id(camera)]} has {pixels.shape[1]} x {pixels.shape[0]} pixels, the view"
+                f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels, the view"
                 f" {camera.width} x {camera.height}"
             )
         if pixels.shape[2] == 3:
             return pixels, None
         alpha = pixels[..., 3]
-        behind = np.asarray(background, np.float32)
-        return pixels[..., :3] * alpha[..., None] + (1 - alpha[..., None]) * behind, alpha
+        over = np.asarray(background, np.float32)
+        return pixels[..., :3] * alpha[..., None] + (1 - alpha[..., None]) * over, alpha
 
     return at
 
@@ -107,12 +109,14 @@ def markdown_table(
     reported: Mapping[str, tuple[float, float, float]] | None = None,
     notes: Sequence[str] = (),
 ) -> str:
-    """A table of the scenes' means by method, with the mean over the scenes where there are several, and
-    figures ``reported`` elsewhere (PSNR, SSIM, LPIPS); ``notes`` follow it. Columns without a value are left
-    out."""
-    heads, table = score_table(reports, reported or {})
+    """A Markdown table of the scores of each scene and method, and their means over several scenes.
+
+    ``reported`` adds figures of the literature (PSNR, SSIM, LPIPS) by name; ``notes`` follow the table.
+    Columns without a value are left out.
+    """
+    header, table = score_table(reports, reported or {})
     lines = [f"# {title}", ""] if title else []
-    lines += [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    lines += [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
     lines += [f"| {' | '.join(row)} |" for row in table]
     return "\n".join([*lines, *(f"\n{note}" for note in notes)]) + "\n"
 
@@ -125,13 +129,13 @@ _COLUMNS = {
     "PSNR fitted": ("mean", "psnr_exposure", 2),
     "floater px": ("mean", "floaters", 1),
 }
-"""Head, statistic, score and digits."""
+"""Header: statistic, score and number of digits."""
 
 
 def score_table(
     reports: Sequence[Report], reported: Mapping[str, tuple[float, float, float]]
 ) -> tuple[list[str], list[list[str]]]:
-    """Heads and rows of ``markdown_table``."""
+    """Header and rows of ``markdown_table``."""
     rows: list[tuple[str, str, list[float | None]]] = []
     for report in reports:
         for scores in report.methods:

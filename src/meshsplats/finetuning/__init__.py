@@ -1,6 +1,6 @@
-"""Fine-tuning meshes on pictures: ``finetune``, its configuration, losses, optimiser and checkpoints.
+"""Fine-tuning of meshes on images: ``finetune``, its configuration, losses, optimiser and checkpoints.
 
-Nothing but the package itself is needed; ``meshsplats.finetuning.losses`` has the losses for torch.
+Needs NumPy alone. ``meshsplats.finetuning.losses`` has the same losses as torch functions.
 """
 
 from meshsplats.finetuning.config import (

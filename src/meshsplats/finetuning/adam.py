@@ -1,4 +1,4 @@
-"""Adam on the rows of an array that a view reached. Takes NumPy arrays or torch tensors; needs no torch."""
+"""Adam on the rows of an array that a view reaches. Takes NumPy arrays or torch tensors; needs no torch."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ from meshsplats._core.kernels import adam_rows
 
 
 class RowAdam:
-    """Adam (Kingma & Ba 2015) for one array whose gradient reaches few rows a step.
+    """Adam (Kingma & Ba 2015) for one array of which each gradient reaches only a few rows.
 
     Follows ``torch.optim.SparseAdam``: rows left out keep their values and their moments, and the bias
-    corrections go by the number of all steps. Concretely, in step t, for each chosen row i and column j,
+    corrections use the number of all steps. Concretely, in step t, for each selected row i and column j,
 
         mean[i, j]   += (1 - beta1) * (gradient[i, j] - mean[i, j])
         square[i, j] += (1 - beta2) * (gradient[i, j]**2 - square[i, j])
         rate[i]       = lr * scale[i] * sqrt(1 - beta2**t) / (1 - beta1**t)
         values[i, j] -= rate[i] * mean[i, j] / (sqrt(square[i, j]) + eps)
 
-    and values end clamped to ``bounds``. A step reads and writes the chosen rows only, once each.
+    after which the values are clamped to ``bounds``. A step reads and writes the selected rows only, once
+    each.
 
     Args:
         values: (v, k) float32, C-contiguous: a NumPy array, or a torch tensor on the CPU (a leaf that
-            requires a gradient, too). It is changed in place by :meth:`step`, which holds no copy.
+            requires a gradient, too). :meth:`step` changes it in place; no copy is kept.
         lr: learning rate, positive. The attribute of this name may be set between steps.
-        betas: decay of the two moments, in [0, 1).
+        betas: decay rates of the two moments, in [0, 1).
         eps: positive.
-        scale: (v,) non-negative factors of the learning rate, None for 1; positions are optimised in units of
-            each splat's size in this way.
+        scale: (v,) non-negative factors of the learning rate, one per row; None for 1. Positions, for
+            instance, are optimised in units of each splat's size.
         bounds: smallest and largest value, for instance (0, 1) for colours.
-        threads: at most this many; all processors by default. The result does not depend on it.
+        threads: maximum number of threads; all processors by default. The result does not depend on it.
 
     Attributes:
         mean, square: (v, k) float32, the first and second moment.
-        steps: number of steps made.
+        steps: number of steps taken.
 
     Raises:
-        TypeError: arrays of other types. ValueError: wrong shapes, values out of range, tensors elsewhere
-        than on the CPU.
+        TypeError: arrays of other types.
+        ValueError: wrong shapes, values out of range, tensors that are not on the CPU.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class RowAdam:
         threads: int | None = None,
     ) -> None:
         self._values = values
-        self._array = _shared("values", values, writeable=True)
+        self._array = _float32_array("values", values, writeable=True)
         if self._array.ndim != 2 or 0 in self._array.shape[1:]:
             raise ValueError(f"values must have shape (v, k), got {self._array.shape}")
         if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
@@ -87,20 +88,25 @@ class RowAdam:
         self._lr = float(value)
 
     def step(self, gradient: Any, rows: Any = None) -> None:
-        """One step along ``gradient``, (v, k) float32 like the values, of which only chosen rows are read.
+        """Takes one step along ``gradient``, (v, k) float32 like the values.
 
-        ``rows`` names the rows: int32 row numbers in increasing order, a (v,) mask of bool or uint8 (0: left
-        out), or None for every row. NumPy arrays or torch tensors.
+        Args:
+            gradient: NumPy array or torch tensor. Only the selected rows are read.
+            rows: the selected rows: a (v,) bool mask, int32 indices in increasing order, or None for all
+                rows. NumPy array or torch tensor.
 
-        Raises TypeError and ValueError as the class does, and ValueError for row numbers that are out of
-        range or do not increase; nothing has changed then.
+        Raises:
+            TypeError, ValueError: as the class does, and ValueError for indices that are out of range or do
+                not increase. Nothing has changed then.
         """
-        array = _shared("gradient", gradient)
+        array = _float32_array("gradient", gradient)
         if array.shape != self._array.shape:
             raise ValueError(
                 f"gradient must have shape {self._array.shape} like the values, got {array.shape}"
             )
-        chosen = _checked_rows(rows, len(self._array))
+        selected = None if rows is None else _mask_or_indices(rows, len(self._array))
+        if selected is not None and selected.dtype not in (bool, np.int32):
+            raise TypeError(f"rows must be a bool mask or int32 indices, got {selected.dtype}")
         steps = self.steps + 1
         step = self.lr * math.sqrt(1 - self.betas[1] ** steps) / (1 - self.betas[0] ** steps)
         adam_rows(
@@ -108,7 +114,7 @@ class RowAdam:
             self.mean,
             self.square,
             array,
-            chosen,
+            selected,
             step=step,
             betas=self.betas,
             eps=self.eps,
@@ -117,10 +123,10 @@ class RowAdam:
             threads=self.threads,
         )
         self.steps = steps
-        _mark_changed(self._values)
+        _bump_version(self._values)
 
     def state(self) -> dict[str, np.ndarray]:
-        """What a checkpoint has to hold: ``mean``, ``square`` and ``steps``, copied."""
+        """Copies of ``mean``, ``square`` and ``steps``, for a checkpoint."""
         return {
             "mean": self.mean.copy(),
             "square": self.square.copy(),
@@ -128,9 +134,9 @@ class RowAdam:
         }
 
     def load_state(self, state: Mapping[str, np.ndarray]) -> None:
-        """Goes on from ``state``, made by :meth:`state` for values of the same shape.
+        """Resumes from ``state``, made by :meth:`state` for values of the same shape.
 
-        Raises ValueError if something is missing, of another shape, or impossible.
+        Raises ValueError if an entry is missing, has another shape, or is impossible.
         """
         missing = {"mean", "square", "steps"} - set(state)
         if missing:
@@ -149,56 +155,64 @@ class RowAdam:
         self.mean, self.square, self.steps = mean, square, int(steps)
 
     def select(self, values: Any, rows: Any) -> RowAdam:
-        """The optimiser for an array that kept only some rows, as after pruning.
+        """The optimiser for an array that keeps only some rows, as after pruning.
 
-        ``values`` is the new array, ``rows`` the rows of the old one that it holds, as in :meth:`step`
-        (numbers in any order here). Moments, scales, steps and options are taken over.
+        Args:
+            values: the new array.
+            rows: the rows of the old array that it holds: a (v,) bool mask, or indices in any order.
 
-        Raises ValueError if the numbers of rows differ, or row numbers are out of range.
+        Returns:
+            An optimiser with the moments and scales of these rows, and the same steps and options.
+
+        Raises:
+            TypeError: rows of another type.
+            ValueError: another number of rows than ``values`` has, indices out of range.
         """
-        index = np.asarray(_array(rows))
-        if index.dtype in (bool, np.uint8):
-            _checked_rows(index, len(self._array))
-            index = np.flatnonzero(index)
-        if index.ndim != 1 or index.dtype.kind not in "iu":
-            raise TypeError(f"rows must be row numbers or a mask, got {index.dtype} of shape {index.shape}")
-        if index.size and not (index.min() >= 0 and index.max() < len(self._array)):
-            raise ValueError(f"rows must lie in [0, {len(self._array)}), got {index.min()} to {index.max()}")
-        wanted = (len(index), self._array.shape[1])
-        if np.shape(_array(values)) != wanted:
-            raise ValueError(f"values must have shape {wanted}, got {np.shape(_array(values))}")
+        selected = _mask_or_indices(rows, len(self._array))
+        indices = np.flatnonzero(selected) if selected.dtype == bool else selected
+        if indices.size and not (indices.min() >= 0 and indices.max() < len(self._array)):
+            raise ValueError(
+                f"rows must lie in [0, {len(self._array)}), got {indices.min()} to {indices.max()}"
+            )
+        expected = (len(indices), self._array.shape[1])
+        if np.shape(_as_numpy(values)) != expected:
+            raise ValueError(f"values must have shape {expected}, got {np.shape(_as_numpy(values))}")
         result = RowAdam(
             values,
             lr=self.lr,
             betas=self.betas,
             eps=self.eps,
-            scale=None if self.scale is None else self.scale[index],
+            scale=None if self.scale is None else self.scale[indices],
             bounds=self.bounds,
             threads=self.threads,
         )
-        result.mean, result.square, result.steps = self.mean[index], self.square[index], self.steps
+        result.mean, result.square, result.steps = self.mean[indices], self.square[indices], self.steps
         return result
 
     def restart(self, rows: np.ndarray, like: np.ndarray, scale: np.ndarray | None = None) -> None:
-        """Rows whose values were set anew forget where they were going; how far they go in a step they take
-        from the rows ``like``. Row numbers have any one shape; ``scale`` are new factors of the rate."""
+        """Zeroes the first moment of ``rows`` and copies the second from the rows ``like``, after their
+        values were replaced.
+
+        ``rows`` and ``like`` are index arrays of one shape; ``scale`` of that shape replaces their factors of
+        the learning rate.
+        """
         self.mean[rows] = 0
         self.square[rows] = self.square[like]
         if scale is not None and self.scale is not None:
             self.scale[rows] = scale
 
 
-def _array(given: Any) -> Any:
-    """The NumPy array that shares the memory of a torch tensor; anything else as it is."""
-    if hasattr(given, "detach"):
-        if given.device.type != "cpu":
-            raise ValueError(f"tensors must be on the CPU, got one on {given.device}; use .cpu()")
-        return given.detach().numpy()
-    return given
+def _as_numpy(array: Any) -> Any:
+    """The NumPy array that shares the memory of a torch tensor; anything else unchanged."""
+    if hasattr(array, "detach"):
+        if array.device.type != "cpu":
+            raise ValueError(f"tensors must be on the CPU, got one on {array.device}; use .cpu()")
+        return array.detach().numpy()
+    return array
 
 
-def _shared(name: str, given: Any, writeable: bool = False) -> np.ndarray:
-    array = _array(given)
+def _float32_array(name: str, value: Any, writeable: bool = False) -> np.ndarray:
+    array = _as_numpy(value)
     if not isinstance(array, np.ndarray) or array.dtype != np.float32:
         got = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
         raise TypeError(f"{name} must be a float32 array or tensor, got {got}")
@@ -212,31 +226,29 @@ def _shared(name: str, given: Any, writeable: bool = False) -> np.ndarray:
 def _checked_scale(scale: Any, length: int) -> np.ndarray | None:
     if scale is None:
         return None
-    array = np.array(_array(scale), np.float32, order="C")
+    array = np.array(_as_numpy(scale), np.float32, order="C")
     if array.shape != (length,):
-        raise ValueError(f"scale must have shape ({length},), one factor a row, got {array.shape}")
+        raise ValueError(f"scale must have shape ({length},), one factor per row, got {array.shape}")
     if not (np.isfinite(array).all() and (array >= 0).all()):
         raise ValueError("scale must be finite and not negative")
     return array
 
 
-def _checked_rows(rows: Any, length: int) -> np.ndarray | None:
-    if rows is None:
-        return None
-    array = _array(rows)
-    if not isinstance(array, np.ndarray) or array.dtype not in (np.int32, np.uint8, bool):
+def _mask_or_indices(rows: Any, length: int) -> np.ndarray:
+    """``rows`` as a contiguous array: a (length,) bool mask or (n,) integers."""
+    array = _as_numpy(rows)
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "bi":
         got = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
-        raise TypeError(f"rows must be int32 row numbers or a mask of bool or uint8, got {got}")
-    mask = array.dtype != np.int32
-    if array.ndim != 1 or (mask and len(array) != length):
-        wanted = f"({length},)" if mask else "(n,)"
-        raise ValueError(f"rows must have shape {wanted}, got {array.shape}")
-    array = np.ascontiguousarray(array)
-    return array.view(bool) if array.dtype == np.uint8 else array
+        raise TypeError(f"rows must be a bool mask or int32 indices, got {got}")
+    is_mask = array.dtype == bool
+    if array.ndim != 1 or (is_mask and len(array) != length):
+        expected = f"({length},)" if is_mask else "(n,)"
+        raise ValueError(f"rows must have shape {expected}, got {array.shape}")
+    return np.ascontiguousarray(array)
 
 
-def _mark_changed(values: Any) -> None:
-    """Tells autograd that a tensor changed, so that a graph made before the step is refused."""
+def _bump_version(values: Any) -> None:
+    """Marks a tensor as changed in place, so that autograd refuses graphs recorded before the step."""
     if hasattr(values, "detach"):
         from torch.autograd.graph import increment_version
 

@@ -1,8 +1,8 @@
-"""Checkpoints: everything a fine-tuning needs to go on, in one safetensors file that is whole or not there.
+"""Checkpoints: everything needed to resume a fine-tuning, in one safetensors file that is written atomically.
 
-Arrays are named ``mesh.*``, ``positions.*``, ``colors.*`` and ``exposure.*``; the file's metadata holds,
-under ``meshsplats``, a JSON text with the step, the time used, the configuration, and what the run was made
-of.
+Arrays are named ``mesh.*``, ``positions.*``, ``colors.*``, ``exposure.*`` and ``usage.*``. The entry
+``meshsplats`` of the file's metadata is a JSON text with the step, the time used, the configuration, and
+fingerprints of the inputs.
 """
 
 from __future__ import annotations
@@ -31,35 +31,39 @@ _REQUIRED = ("version", "step", "seconds", "config", "mesh", "dataset", "losses"
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A fine-tuning between two steps."""
+    """The state of a fine-tuning between two steps."""
 
     step: int
-    """Steps made."""
+    """Number of steps taken."""
     seconds: float
     """Time used for them."""
     config: dict[str, Any]
     """``FinetuneConfig.to_dict``."""
     mesh: str
-    """``fingerprint`` of the mesh that the run began with."""
+    """``mesh_fingerprint`` of the initial mesh."""
     dataset: str
-    """``fingerprint`` of the views."""
+    """``dataset_fingerprint`` of the views."""
     arrays: dict[str, np.ndarray]
+    """Arrays of ``State``, by name."""
     losses: tuple[float, ...] = ()
-    """Of the steps since the last line of the metrics."""
+    """Losses of the steps since the last line of the metrics."""
     views: int | None = None
-    """Number of training views; None: not known, of a checkpoint by an earlier meshsplats."""
+    """Number of training views; None: unknown, in checkpoints of earlier versions."""
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
-    """Writes ``checkpoint``, in place of an older one of that name once it is whole."""
+    """Writes ``checkpoint`` to ``path``, atomically replacing an earlier one."""
     names = ("step", "seconds", "config", "mesh", "dataset", "losses", "views")
     header = {name: getattr(checkpoint, name) for name in names}
     save_safetensors(path, checkpoint.arrays, {_KEY: json.dumps({"version": VERSION, **header})})
 
 
 def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoint:
-    """The checkpoint at ``path``; with ``only_header`` without its arrays. FileFormatError if it is broken,
-    of another kind, or of a later version; FileNotFoundError if there is none."""
+    """Loads the checkpoint at ``path``; with ``only_header`` without its arrays.
+
+    Raises FileNotFoundError if there is none, FileFormatError if it is broken, of another kind, or of a later
+    version.
+    """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}: leave out --resume to begin anew")
@@ -86,23 +90,27 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
         or not (views is None or (isinstance(views, int) and views > 0))
     ):
         raise FileFormatError(f"{path}: broken: step {step!r}, seconds {seconds!r}")
-    made_of = str(header["mesh"]), str(header["dataset"])
-    return Checkpoint(step, float(seconds), config, *made_of, arrays, tuple(losses), views)
+    fingerprints = str(header["mesh"]), str(header["dataset"])
+    return Checkpoint(step, float(seconds), config, *fingerprints, arrays, tuple(losses), views)
 
 
 class OtherRunError(ValueError):
-    """A checkpoint is of another run than the one that is to go on with it; the message says what differs."""
+    """The checkpoint to resume from belongs to another run; the message names the differences."""
 
 
 def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset: str) -> None:
-    """OtherRunError if ``found`` is not of the run with this configuration, mesh and data set (as
-    fingerprints). The length may differ, so that a run can be made longer."""
-    wanted = config.to_dict()
-    names = [name for name in wanted if name not in LENGTHS and found.config.get(name) != wanted[name]]
+    """Raises OtherRunError unless ``found`` has this configuration and these fingerprints of its inputs.
+
+    The length may differ, so that a run can be extended.
+    """
+    current = config.to_dict()
+    names = [name for name in current if name not in LENGTHS and found.config.get(name) != current[name]]
     if names:
-        told = ", ".join(f"{name} was {found.config.get(name)!r} and is {wanted[name]!r}" for name in names)
+        changes = ", ".join(
+            f"{name} was {found.config.get(name)!r} and is {current[name]!r}" for name in names
+        )
         raise OtherRunError(
-            f"the checkpoint is of another configuration: {told}; give the same options as before"
+            f"the checkpoint is of another configuration: {changes}; give the same options as before"
         )
     if found.mesh != mesh:
         raise OtherRunError(
@@ -111,13 +119,13 @@ def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset
         )
     if found.dataset != dataset:
         raise OtherRunError(
-            "the checkpoint was made with other views or pictures of other splats, or by an earlier"
+            "the checkpoint was made with other views or images of other splats, or by an earlier"
             " meshsplats: give the same data set or splats and the same options of the views"
         )
 
 
 def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:
-    """The arrays of a mesh under the names that a checkpoint has for them."""
+    """The arrays of a mesh, by their names in a checkpoint."""
     arrays = {
         "mesh.vertices": mesh.vertices,
         "mesh.faces": mesh.faces,
@@ -135,7 +143,7 @@ def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:
 
 
 def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
-    """The mesh in a checkpoint's arrays. FileFormatError if something is missing or does not fit."""
+    """The mesh in a checkpoint's arrays. FileFormatError if an array is missing or does not fit."""
     prefix = "mesh.attribute."
     try:
         binding = None
@@ -161,7 +169,7 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
 
 
 def mesh_fingerprint(mesh: SplatMesh) -> str:
-    """Changes with every bit of positions, triangles, colours, binding, blending and filter."""
+    """Hash of the positions, triangles, colours, binding, blending and filter of ``mesh``."""
     digest = hashlib.sha256(mesh.blending.encode())
     if mesh.filter_px2:
         digest.update(repr(mesh.filter_px2).encode())
@@ -175,19 +183,19 @@ def mesh_fingerprint(mesh: SplatMesh) -> str:
 
 
 def dataset_fingerprint(dataset: Dataset) -> str:
-    """Changes with the cameras, names and backgrounds of the views, the splats that they are drawn from and
-    how, and which are held out; pictures are not looked at."""
+    """Hash of the cameras, names and backgrounds of the views, the split, and the splats that images are
+    rendered from, with their options. Image files are not read."""
     digest = hashlib.sha256(repr((len(dataset.train), len(dataset.test))).encode())
     for view in dataset.views:
         camera = view.camera
         lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height)
         digest.update(repr((view.name, lens, view.background)).encode())
         digest.update(camera.world_to_camera.tobytes())
-    drawn = [view.source for view in dataset.views if isinstance(view.source, RenderedSplats)]
-    for source in drawn:
+    rendered = [view.source for view in dataset.views if isinstance(view.source, RenderedSplats)]
+    for source in rendered:
         degree = source.cloud.sh_degree if source.sh_degree is None else source.sh_degree
         digest.update(repr((source.look, degree, source.samples, source.cloud.kernel)).encode())
-    for splats in {id(source.cloud): source.cloud for source in drawn}.values():
+    for splats in {id(source.cloud): source.cloud for source in rendered}.values():
         for array in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.sh):
             digest.update(repr(array.shape).encode())
             digest.update(array.data)

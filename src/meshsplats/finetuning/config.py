@@ -1,4 +1,4 @@
-"""What a fine-tuning does: its configuration, the presets, and what can be told wrong before any work."""
+"""The configuration of a fine-tuning, validated up front, its presets, and its learning rates."""
 
 from __future__ import annotations
 
@@ -12,94 +12,97 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 Unit = Literal["splat", "scene"]
-Backdrop = Literal["mixed", "random", "white", "black"]
-BACKDROPS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+BackgroundMode = Literal["mixed", "random", "white", "black"]
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
 
 FEWEST_VIEWS, MOST_VIEWS = 200, 1000
-"""Pictures of splats to learn from: in a short run, and in the longest."""
+"""Number of training images rendered from splats: for a short run, and for the longest."""
 
 
 @dataclass(frozen=True)
 class FinetuneConfig:
-    """Every choice that changes the result. The defaults are those of the preset 'default'.
+    """All options that change the result. The defaults are those of the preset 'default'.
 
-    The loss of a step, one picture, is ``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM) + l2_weight * L2``
-    with L1 and L2 the means of the differences' sizes and squares, and SSIM in the convention of 3DGS.
+    Each step compares one rendered image with its target. The loss is ``(1 - ssim_weight) * L1 + ssim_weight
+    * (1 - SSIM) + l2_weight * L2``, where L1 and L2 are the mean absolute and mean squared difference, and
+    SSIM follows the convention of 3DGS.
     """
 
     preset: str = "default"
-    """The preset that these values began from; a name for the record."""
+    """Name of the preset that these values started from, for the record."""
     epochs: float | None = None
-    """Length: so many times all training views. Of the three lengths exactly one is given."""
+    """Length in epochs: passes over all training views. Exactly one of epochs, steps and minutes is given."""
     steps: int | None = 1000
-    """Length: so many steps, one view each."""
+    """Length in steps, of one view each."""
     minutes: float | None = None
-    """Length: so much time, with what came before (reading, converting, drawing the targets). The one length
-    whose result depends on the machine's speed."""
+    """Length in minutes, including what came before (reading, converting, rendering the targets). The only
+    length whose result depends on the machine's speed."""
     color_rate: float = 0.02
-    """Adam's rate of red, green, blue and opacity, which lie in [0, 1]: about how far one step moves them."""
+    """Adam's learning rate of red, green, blue and opacity, in [0, 1]: about how much one step changes
+    them."""
     position_rate: float = 0.02
-    """Adam's rate of the positions, in ``position_unit``; 0: they stay."""
+    """Adam's learning rate of the vertex positions, in ``position_unit``. 0: positions are fixed."""
     position_unit: Unit = "splat"
-    """splat: the size of the splat that a vertex belongs to. scene: scene units, as the paper has it."""
+    """Unit of position_rate. splat: the size of the splat that a vertex belongs to. scene: scene units, as in
+    the paper."""
     soft_edges: bool = True
-    """Opacities that are 0 at the mesh's open edges, as on the rims of fans, stay 0. An edge that shows has
-    no gradient that would move it back, and opacities, which cannot fall below 0, would drift up there."""
+    """Keep opacities of 0 on the boundary of the mesh, such as the rims of fans, at 0. Visible edges get no
+    gradient that would move them back, and opacities, which are clamped at 0, would drift upwards there."""
     final_share: float = 0.1
-    """Both rates fall exponentially over the whole length, to this share of what they were."""
+    """Exponential decay: both learning rates fall to this fraction of their initial value over the run."""
     rate_steps: int = 250
-    """Runs of more steps than these move positions less in each, at ``sqrt(rate_steps / steps)`` of the rate,
-    and both rates fall that much further: what a short run needs to arrive is noise in a long one. 0: rates
-    do not depend on the length."""
+    """In runs of more steps than this, multiply the learning rate of positions, and the final fraction of
+    both, by ``sqrt(rate_steps / steps)``: the step size that a short run needs is noise in a long one. 0:
+    learning rates do not depend on the number of steps."""
     color_step_decay: float = 1.0
-    """The colour rate is also multiplied by this after every step."""
+    """Additional decay of the colour learning rate: its factor per step, whatever the length of the run."""
     beta1: float = 0.5
-    """Adam's memory of the gradient. Short: the next views look at other vertices, or from elsewhere."""
+    """Adam's decay rate of the first moment. Low: consecutive views see other vertices, or from elsewhere."""
     beta2: float = 0.9
-    """Adam's memory of the gradient's square. Short, for a vertex is seen tens of times, not thousands."""
+    """Adam's decay rate of the second moment. Low: a vertex is seen tens of times, not thousands."""
     epsilon: float = 1e-15
-    """Adam's smallest divisor."""
+    """Adam's epsilon, added to the denominator."""
     ssim_weight: float = 0.4
-    """Share of SSIM, 0 to 1."""
+    """Weight of SSIM against L1 in the loss, 0 to 1."""
     l2_weight: float = 50.0
-    """Weight of the mean square difference, added to the others."""
-    background: Backdrop = "mixed"
-    """Behind pictures that have alpha; random: another colour in every step, so that what should be empty
-    becomes so; mixed: that in every fourth step, and in the others the data set's own background, on which
-    pictures are shown and compared. Photographs without alpha are drawn on the latter."""
+    """Weight of the mean squared difference (L2) in the loss."""
+    background: BackgroundMode = "mixed"
+    """Background of images with alpha. random: a new colour in every step, so that empty regions become
+    transparent. mixed: random in every fourth step, otherwise the background of the data set, on which images
+    are shown and evaluated. Photographs without alpha always use the background of the data set."""
     exposure: bool = False
-    """Photographs: fit a gain and an offset a channel for each training picture, so that changes of light
-    between them are not painted into the mesh. Their means stay 1 and 0."""
+    """For photographs: fit a gain and an offset per colour channel for each training image, so that exposure
+    differences are not baked into the mesh. Their means over all images stay 1 and 0."""
     exposure_rate: float = 0.002
-    """Adam's rate of gains and offsets."""
+    """Adam's learning rate of these gains and offsets."""
     prune_epochs: float = 5.0
-    """The mesh is pruned, as the next two options say, each time so many epochs have passed; 0: never."""
+    """Epochs between two prunings of the mesh (prune_opacity, prune_importance). 0: no pruning."""
     prune_opacity: float = 1 / 255
-    """Pruning drops triangles all of whose corners have less opacity than this, and vertices that are then
-    part of no triangle."""
+    """Prune triangles whose corners all have less opacity than this, and the vertices that no triangle then
+    uses."""
     prune_importance: float = 0.0
-    """Pruning also drops splats of which all training views together show less than so many pixels, because
-    they are too faint or hidden by others; those that lie outside every view stay. 0: none."""
+    """Also prune splats that contribute less than this many pixels to all training views together, because
+    they are faint or occluded. Splats outside every view are kept. 0: none."""
     relocate_share: float = 0.0
-    """At most this share of the splats is moved at a time: those that show next to nothing take over halves
-    of those that are needed most; 0: none, and none on a base mesh. For long runs: what was halved has to
-    settle again."""
+    """Largest fraction of the splats that is relocated at a time (densification with a fixed number of
+    triangles): splats that are almost invisible each take over half of a splat that is needed most. For long
+    runs, since the halves have to converge again. 0, or on a base mesh: none."""
     relocate_epochs: float = 1.0
-    """They are moved each time so many epochs have passed, in the first half of the run."""
+    """Epochs between two relocations, in the first half of the run."""
     blending: Literal["mesh", "display", "linear"] = "mesh"
-    """Space in which the triangles are blended: as the mesh says; display values; or linear light, for
-    exports that will be lit or blended by engines that work in linear light."""
+    """Colour space in which triangles are blended. mesh: that of the mesh. display: display values. linear:
+    linear light, for exports to engines that light or blend in linear light."""
     samples: int | None = None
-    """Side of the grid of samples in each pixel. None: 2, for images that are means over each pixel's area,
-    photographs among them; 1 for those of a splat viewer (``Dataset.look``)."""
+    """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
+    photographs; 1 for images of a splat viewer (``Dataset.look``)."""
     point_share: float = 0.4
-    """Images of splats that are means over each pixel's area: at first, for this share of the run, the mesh
-    learns from their values at the pixels' centres, at one sample a pixel. That is quicker, and shows detail
-    finer than a pixel as it is. 0: from means alone."""
+    """For rendered images that are means over each pixel's area: for this initial fraction of the run, train
+    on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
+    pixel without averaging. 0: train on means only."""
     seed: int = 0
-    """Of the views' order and the random backgrounds. The same seed gives the same result to the last bit,
-    with any number of threads, unless the length is given in minutes."""
+    """Seed of the order of the views and of random backgrounds. The same seed gives the same bits, with any
+    number of threads, unless the length is given in minutes."""
 
     def __post_init__(self) -> None:
         for name, low, high, whole in _RANGES:
@@ -112,7 +115,7 @@ class FinetuneConfig:
                 raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
         for name, kind in [
             ("position_unit", get_args(Unit)),
-            ("background", get_args(Backdrop)),
+            ("background", get_args(BackgroundMode)),
             ("blending", ("mesh", "display", "linear")),
         ]:
             if getattr(self, name) not in kind:
@@ -125,21 +128,21 @@ class FinetuneConfig:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
 
     def total_steps(self, views: int) -> int | None:
-        """Number of steps with so many training views; None where time is the limit."""
+        """Number of steps with this number of training views; None if the length is given in minutes."""
         if self.minutes is not None:
             return None
         return int(self.steps) if self.steps is not None else max(1, round((self.epochs or 0) * views))
 
     def prune_interval(self, views: int) -> int:
-        """Number of steps from one pruning to the next; 0: never."""
+        """Number of steps between two prunings; 0: never."""
         return max(1, round(self.prune_epochs * views)) if self.prune_epochs else 0
 
     def relocate_interval(self, views: int) -> int:
-        """Number of steps from one relocation to the next; 0: never."""
+        """Number of steps between two relocations; 0: never."""
         return max(1, round(self.relocate_epochs * views)) if self.relocate_share else 0
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """All fields, for JSON."""
         return asdict(self)
 
 
@@ -197,9 +200,9 @@ PRESETS: Mapping[str, FinetuneConfig] = {
     "paper": _PAPER,
     "published": replace(_PAPER, preset="published", color_rate=1e-2, position_rate=1e-6, prune_opacity=1e-4),
 }
-"""default: measured to be the best at equal time. paper: the values in the text of arXiv 2502.07754, whose
-colour rate is left open there and taken from its code. published: those of its code, with SSIM and background
-as they were meant. ``docs/finetuning.md`` has the table."""
+"""default: the best in our measurements at equal time. paper: the values in the text of arXiv 2502.07754,
+with the colour learning rate of its code, since the text gives none. published: the values of its code, with
+SSIM and background as intended. ``docs/finetuning.md`` has the table."""
 
 
 class FinetuneChanges(TypedDict, total=False):
@@ -263,20 +266,23 @@ def with_changes(config: FinetuneConfig, **changes: Unpack[FinetuneChanges]) -> 
 
 
 def worthwhile_views(config: FinetuneConfig) -> int:
-    """Number of pictures of splats for so long a run: few are drawn sooner and seen more often, but a long
-    run learns them by heart."""
+    """Number of training images to render from splats for a run of this length.
+
+    Few images are rendered sooner and seen more often, but a long run overfits them.
+    """
     wanted = 60 * config.minutes if config.minutes is not None else (config.steps or 0) / 2
     return round(min(max(wanted, FEWEST_VIEWS), MOST_VIEWS))
 
 
-def rates(config: FinetuneConfig, step: int, fraction: float) -> tuple[float, float]:
-    """Rates of colours and of positions for step number ``step`` (from 0), ``fraction`` (0 to 1) of the way.
+def learning_rates(config: FinetuneConfig, step: int, fraction: float) -> tuple[float, float]:
+    """Learning rates of colours and of positions in step ``step`` (from 0).
 
-    The number of all steps is taken to be ``step / fraction``, which suits runs of a stated time, too.
+    ``fraction`` (0 to 1) of the run is over. The total number of steps is estimated as ``step / fraction``,
+    which also holds for runs whose length is given in minutes.
     """
-    slowed = 1.0
+    slowdown = 1.0
     if config.rate_steps and step > config.rate_steps * fraction:
-        slowed = math.sqrt(config.rate_steps * fraction / step)
-    decay = (config.final_share * slowed) ** min(max(fraction, 0.0), 1.0)
+        slowdown = math.sqrt(config.rate_steps * fraction / step)
+    decay = (config.final_share * slowdown) ** min(max(fraction, 0.0), 1.0)
     color = config.color_rate * decay * config.color_step_decay**step
-    return max(color, 1e-12), config.position_rate * decay * slowed
+    return max(color, 1e-12), config.position_rate * decay * slowdown

@@ -1,4 +1,4 @@
-"""Where a fine-tuning begins: the mesh it starts from, the unit of each vertex, and its open edges."""
+"""The initial state of a fine-tuning: the mesh, the unit of each vertex, and the mesh's boundary."""
 
 from __future__ import annotations
 
@@ -51,12 +51,11 @@ def starting_mesh(
 
 
 def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
-    """(v,) float32 sizes in scene units: the side of a square with twice the area of a vertex' typical
-    triangle.
+    """(v,) float32 size of each vertex in scene units: the square root of twice its triangles' area.
 
-    Triangles count together where they come from one splat (``face_splat``), else each by itself; a vertex
-    that several share takes the mean of theirs. Vertices without area take the smallest size that there is,
-    so that they hardly move; all sizes are 0 if no triangle has an area.
+    The triangles of one splat (``face_splat``) share the mean of their sizes. A vertex of several triangles
+    takes the mean of theirs. Vertices without area take the smallest size in the mesh, so that they hardly
+    move; all sizes are 0 if no triangle has an area.
     """
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -65,12 +64,14 @@ def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
         starts = splat_starts(mesh.face_splat)
         counts = np.diff(np.append(starts, len(size)))
         size = np.repeat(np.add.reduceat(size, starts) / counts, counts)
-    return means_at_vertices(mesh, size)
+    return vertex_means(mesh, size)
 
 
-def means_at_vertices(mesh: SplatMesh, values: np.ndarray) -> np.ndarray:
-    """(v,) float32: for each vertex the mean of its triangles' ``values`` (f,) >= 0. Vertices for which that
-    is 0 take the smallest of the others; all are 0 if all values are."""
+def vertex_means(mesh: SplatMesh, values: np.ndarray) -> np.ndarray:
+    """(v,) float32: for each vertex the mean of its triangles' ``values``, (f,) >= 0.
+
+    Vertices whose mean is 0 take the smallest positive one; all are 0 if all values are.
+    """
     v = len(mesh.vertices)
     total = np.bincount(mesh.faces.ravel(), np.repeat(values, 3), v)
     uses = np.bincount(mesh.faces.ravel(), minlength=v)
@@ -81,14 +82,14 @@ def means_at_vertices(mesh: SplatMesh, values: np.ndarray) -> np.ndarray:
     return result.astype(np.float32)
 
 
-def on_open_edges(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """(vertices,) bool: the vertices of edges that only one of the triangles ``faces`` (f, 3) has."""
+def boundary_vertices(faces: np.ndarray, count: int) -> np.ndarray:
+    """(count,) bool: the vertices on the boundary, on edges of exactly one of the triangles (f, 3)."""
     low = np.minimum(faces, np.roll(faces, -1, axis=1)).astype(np.int64)
     high = np.maximum(faces, np.roll(faces, -1, axis=1))
-    edges = np.sort((low * vertices + high).ravel())
+    edges = np.sort((low * count + high).ravel())
     differs = np.concatenate([[True], edges[1:] != edges[:-1], [True]])
-    alone = edges[differs[:-1] & differs[1:]] if len(edges) else edges
-    result = np.zeros(vertices, bool)
-    result[alone // max(vertices, 1)] = True
-    result[alone % max(vertices, 1)] = True
+    boundary = edges[differs[:-1] & differs[1:]] if len(edges) else edges
+    result = np.zeros(count, bool)
+    result[boundary // max(count, 1)] = True
+    result[boundary % max(count, 1)] = True
     return result

@@ -1,4 +1,4 @@
-"""Ctrl-C and kill as a wish to stop after the step at hand."""
+"""SIGINT and SIGTERM stop a run after the current step."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from types import TracebackType
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run was asked to stop and has saved what it had.
+    """A signal stopped a run, after it saved a checkpoint.
 
     Attributes:
-        step: steps made.
+        step: number of steps taken.
         signal: number of the signal.
     """
 
@@ -21,9 +21,11 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopSignals:
-    """While the block runs, the first SIGINT or SIGTERM is kept in ``received`` instead of ending the
-    process; a second SIGINT raises KeyboardInterrupt at once. Elsewhere than in the main thread, where Python
-    handles no signals, nothing changes."""
+    """Context manager that stores the first SIGINT or SIGTERM in ``received`` instead of ending the process.
+
+    A second SIGINT raises KeyboardInterrupt at once. Outside the main thread, where Python handles no
+    signals, it has no effect.
+    """
 
     def __init__(self) -> None:
         self.received: int | None = None

@@ -1,4 +1,4 @@
-"""The folder of a run: configuration, metrics.jsonl, previews and the checkpoint."""
+"""The folder of a run: its configuration, metrics.jsonl, previews and checkpoint."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ CHECKPOINT, METRICS, CONFIGURATION, PREVIEWS = (
     "previews",
 )
 ERROR_FACTOR = 4.0
-"""By how much the previews' errors are amplified."""
+"""Amplification of the error in previews."""
 
 
 class Journal:
-    """What a run writes while it goes on. Metrics have a JSON object a line: always ``step`` and ``time``
-    (ISO 8601, local with its offset), and what is said of the step."""
+    """Writes the files of a run.
+
+    Each line of the metrics is a JSON object with ``step``, ``time`` (ISO 8601, local time with its offset)
+    and the scores of that step.
+    """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
@@ -37,24 +40,26 @@ class Journal:
         return self.folder / CHECKPOINT
 
     def begin(self, config: dict[str, Any]) -> None:
-        """Makes the folder where it is missing (not the one above it) and removes what an older run left."""
+        """Creates the folder if needed (but not its parent) and removes the files of an earlier run."""
         self.folder.mkdir(exist_ok=True)
         self.checkpoint_path.unlink(missing_ok=True)
         for preview in self._previews():
             preview.unlink()
-        self._configure(config)
+        self._write_config(config)
         write_text(self.folder / METRICS, "")
 
-    def _configure(self, config: dict[str, Any]) -> None:
+    def _write_config(self, config: dict[str, Any]) -> None:
         write_text(self.folder / CONFIGURATION, json.dumps(config, indent=1) + "\n")
 
     def resume(self, config: dict[str, Any], check: Callable[[Checkpoint], None]) -> Checkpoint:
-        """The checkpoint, once ``check`` let it pass. ``config`` takes the place of the earlier one, which
-        may have been of another length. Metrics and previews of later steps, which will be made again, are
-        dropped."""
+        """Loads the checkpoint, after ``check`` accepted it.
+
+        ``config`` replaces the earlier configuration, whose length may differ. Metrics and previews of steps
+        after the checkpoint are deleted, since these steps are repeated.
+        """
         checkpoint = load_checkpoint(self.checkpoint_path)
         check(checkpoint)
-        self._configure(config)
+        self._write_config(config)
         kept = [line for line in self.metrics() if line["step"] <= checkpoint.step]
         write_text(self.folder / METRICS, "".join(json.dumps(line) + "\n" for line in kept))
         for preview in self._previews():
@@ -65,18 +70,18 @@ class Journal:
     def save(self, checkpoint: Checkpoint) -> None:
         save_checkpoint(checkpoint, self.checkpoint_path)
 
-    def note(self, step: int, **values: Any) -> None:
-        """Adds a line to the metrics, with the time of day."""
+    def log_metrics(self, step: int, **values: Any) -> None:
+        """Appends a line to the metrics, with the current time."""
         now = datetime.now().astimezone().isoformat(timespec="seconds")
         line = json.dumps({"step": step, **values, "time": now}, allow_nan=False) + "\n"
         try:
             with open(self.folder / METRICS, "a", encoding="utf-8") as file:
                 file.write(line)
-        except OSError as error:  # of a full disk, say, which names no file
+        except OSError as error:  # of a full disk, for instance, which names no file
             raise OSError(error.errno, error.strerror, str(self.folder / METRICS)) from None
 
     def metrics(self) -> list[dict[str, Any]]:
-        """All lines; what a kill left half-written is left out."""
+        """All complete lines; one that was cut off when the process was killed is skipped."""
         try:
             text = (self.folder / METRICS).read_text(encoding="utf-8")
         except FileNotFoundError:
@@ -91,13 +96,13 @@ class Journal:
                 lines.append(entry)
         return lines
 
-    def preview(self, step: int, truth: np.ndarray, picture: np.ndarray) -> None:
-        """Writes truth | mesh | error of one view."""
+    def save_preview(self, step: int, target: np.ndarray, image: np.ndarray) -> None:
+        """Writes a strip of ground truth, mesh and error of one view, both images (h, w, 3) in [0, 1]."""
         (self.folder / PREVIEWS).mkdir(exist_ok=True)
-        error = amplified_error(truth, picture, ERROR_FACTOR)
+        error = amplified_error(target, image, ERROR_FACTOR)
         captions = ("truth", f"mesh, step {step}", f"error x {ERROR_FACTOR:g}")
         path = self.folder / PREVIEWS / f"step_{step:07d}.png"
-        save_png(path, strip([truth, picture, error], captions))
+        save_png(path, strip([target, image, error], captions))
 
     def _previews(self) -> list[Path]:
         found = (self.folder / PREVIEWS).glob("step_*.png")

@@ -1,4 +1,4 @@
-"""Losses between pictures, as torch functions: L1, SSIM in the 3DGS convention, and their weighted sum.
+"""Losses between images, as torch functions: L1, SSIM in the 3DGS convention, and their weighted sum.
 
 Value and gradient come from the compiled core in one pass. Both have the same bits in every run, with any
 number of threads.
@@ -19,39 +19,39 @@ SSIM_WEIGHT = 0.4
 
 
 def l1(
-    picture: torch.Tensor,
-    truth: torch.Tensor,
+    image: torch.Tensor,
+    target: torch.Tensor,
     *,
     mask: torch.Tensor | None = None,
     threads: int | None = None,
 ) -> torch.Tensor:
-    """Mean of |picture - truth| over channels and pixels, () float32. The gradient where they are equal is 0.
+    """Mean of |image - target| over channels and pixels, () float32. Where they are equal, the gradient is 0.
 
     Arguments and errors are those of :func:`photometric_loss`.
     """
-    return _weighted(picture, truth, mask, 1, 0, 0, threads)
+    return _weighted(image, target, mask, 1, 0, 0, threads)
 
 
 def ssim(
-    picture: torch.Tensor,
-    truth: torch.Tensor,
+    image: torch.Tensor,
+    target: torch.Tensor,
     *,
     mask: torch.Tensor | None = None,
     threads: int | None = None,
 ) -> torch.Tensor:
-    """Mean structural similarity in [-1, 1], () float32: larger is more alike, so 1 - ssim is the loss.
+    """Mean structural similarity in [-1, 1], () float32. Larger is closer, so the loss is 1 - ssim.
 
     The convention is that of Gaussian splatting, ``metrics.ssim(..., convention='3dgs')``: one 11 x 11
-    Gaussian window of sigma 1.5 a pixel and channel, zeros outside the picture.
+    Gaussian window of sigma 1.5 per pixel and channel, zeros outside the image.
 
     Arguments and errors are those of :func:`photometric_loss`.
     """
-    return _weighted(picture, truth, mask, 0, 1, 0, threads)
+    return _weighted(image, target, mask, 0, 1, 0, threads)
 
 
 def photometric_loss(
-    picture: torch.Tensor,
-    truth: torch.Tensor,
+    image: torch.Tensor,
+    target: torch.Tensor,
     *,
     ssim_weight: float = SSIM_WEIGHT,
     mask: torch.Tensor | None = None,
@@ -60,15 +60,18 @@ def photometric_loss(
     """``(1 - ssim_weight) * L1 + ssim_weight * (1 - SSIM)``, () float32.
 
     Args:
-        picture, truth: (h, w, c) or (b, h, w, c) float32 on the CPU, channels last, with 1 as the peak value.
+        image, target: (h, w, c) or (b, h, w, c) float32 on the CPU, channels last, with 1 as the peak value.
             Either may require a gradient; there is no second derivative, RuntimeError. Arrays that are not
             contiguous are copied.
         ssim_weight: in [0, 1]; 0.4 is the paper's value, 0.2 that of 3DGS.
-        mask: (h, w) or (b, h, w) bool, True where pixels count. Pixels that do not count are treated as the
-            outside of the picture: they are zeros in the windows of their neighbours, have no window, and get
-            no gradient. So a rectangular mask gives the loss of the cropped picture, and values under the
-            mask are never looked at. In a batch every pixel that counts weighs the same.
-        threads: at most this many; all processors by default.
+        mask: (h, w) or (b, h, w) bool, True where pixels count. Masked pixels are treated as outside of the
+            image: they are zeros in the windows of their neighbours, have no window, and get no gradient. So
+            a rectangular mask gives the loss of the cropped image, and masked values may be anything. In a
+            batch every pixel that counts has the same weight.
+        threads: maximum number of threads; all processors by default.
+
+    Returns:
+        () float32, the same bits with any number of threads.
 
     Raises:
         TypeError: not tensors, or of other types than float32 and bool.
@@ -77,22 +80,22 @@ def photometric_loss(
     """
     if not 0 <= ssim_weight <= 1:
         raise ValueError(f"ssim_weight must lie in [0, 1], got {ssim_weight}")
-    return _weighted(picture, truth, mask, 1 - ssim_weight, -ssim_weight, ssim_weight, threads)
+    return _weighted(image, target, mask, 1 - ssim_weight, -ssim_weight, ssim_weight, threads)
 
 
-def _weighted(picture, truth, mask, l1_weight, ssim_weight, constant, threads):
-    _check(picture, truth, mask)
+def _weighted(image, target, mask, l1_weight, ssim_weight, constant, threads):
+    _check(image, target, mask)
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
-    # A mask may be a view or hold one picture: numbers of pixels are exact in any case.
-    pixels = int(mask.sum()) if mask is not None else picture.shape[:-1].numel()
+    # From the mask itself, which may be a view: the number of pixels is exact.
+    pixels = int(mask.sum()) if mask is not None else image.shape[:-1].numel()
     if pixels == 0:
         raise ValueError(f"mask must mark at least one pixel, got none of {mask.numel()}")
     return _Weighted.apply(
-        picture,
-        truth,
+        image,
+        target,
         mask,
-        pixels * picture.shape[-1],
+        pixels * image.shape[-1],
         (l1_weight, ssim_weight, constant),
         threads,
         torch.is_grad_enabled(),
@@ -102,32 +105,32 @@ def _weighted(picture, truth, mask, l1_weight, ssim_weight, constant, threads):
 class _Weighted(torch.autograd.Function):
     """constant + l1_weight * mean |x - y| + ssim_weight * mean SSIM.
 
-    Gradients are made with the value, which needs most of the same numbers.
+    The forward pass computes the gradients with the value, since both share most of the work.
     """
 
     @staticmethod
-    def forward(ctx, picture, truth, mask, count, weights, threads, gradients):
-        x, y = (_batch(tensor, 4) for tensor in (picture, truth))
+    def forward(ctx, image, target, mask, count, weights, threads, gradients):
+        x, y = (_batch(tensor, 4) for tensor in (image, target))
         inside = None if mask is None else _batch(mask, 3)
         l1_weight, ssim_weight, constant = weights
         rates = dict(l1_rate=l1_weight / count, ssim_rate=ssim_weight / count, threads=threads)
         wanted = [needed and gradients for needed in ctx.needs_input_grad[:2]]
         result = compare_images(x, y, inside, gradient=wanted[0], **rates)
-        # Both sums are symmetric, so the truth's gradient is that of the pictures the other way round.
+        # Both sums are symmetric, so the gradient of the target is that of the image with both exchanged.
         other = compare_images(y, x, inside, gradient=True, **rates).gradient if wanted[1] else None
         ctx.save_for_backward(
             *(
-                None if gradient is None else torch.from_numpy(gradient).view(picture.shape)
+                None if gradient is None else torch.from_numpy(gradient).view(image.shape)
                 for gradient in (result.gradient, other)
             )
         )
         value = constant + l1_weight * (result.l1 / count) + ssim_weight * (result.ssim / count)
-        return picture.new_tensor(value)
+        return image.new_tensor(value)
 
     @staticmethod
     def backward(ctx, cotangent):
         if torch.is_grad_enabled():
-            # Without this a second derivative through the picture would silently be left out.
+            # Otherwise a second derivative through the image would silently be missing.
             raise RuntimeError("losses have no second derivative: call backward without create_graph=True")
         gradients = (None if gradient is None else gradient * cotangent for gradient in ctx.saved_tensors)
         return *gradients, None, None, None, None, None
@@ -138,37 +141,37 @@ def _batch(tensor: torch.Tensor, dimensions: int):
     return (tensor if tensor.ndim == dimensions else tensor[None]).contiguous().numpy()
 
 
-def _check(picture, truth, mask) -> None:
-    for name, tensor in (("picture", picture), ("truth", truth)):
+def _check(image, target, mask) -> None:
+    for name, tensor in (("image", image), ("target", target)):
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(
                 f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.from_numpy"
             )
         if tensor.dtype != torch.float32:
             raise TypeError(f"{name} must be float32 with values in [0, 1], got {tensor.dtype}")
-    if picture.shape != truth.shape:
+    if image.shape != target.shape:
         raise ValueError(
-            f"picture and truth must have the same shape, got {tuple(picture.shape)} and {tuple(truth.shape)}"
+            f"image and target must have the same shape, got {tuple(image.shape)} and {tuple(target.shape)}"
         )
-    if picture.ndim not in (3, 4) or picture.numel() == 0:
+    if image.ndim not in (3, 4) or image.numel() == 0:
         raise ValueError(
-            f"pictures must have shape (h, w, c) or (b, h, w, c) and a pixel, got {tuple(picture.shape)}"
+            f"images must have shape (h, w, c) or (b, h, w, c) and a pixel, got {tuple(image.shape)}"
         )
-    if picture.shape[-1] > MAX_CHANNELS:
+    if image.shape[-1] > MAX_CHANNELS:
         raise ValueError(
-            f"pictures must be channels last with at most {MAX_CHANNELS} channels, got"
-            f" {tuple(picture.shape)}; bring (c, h, w) into order with permute(1, 2, 0)"
+            f"images must be channels last with at most {MAX_CHANNELS} channels, got"
+            f" {tuple(image.shape)}; bring (c, h, w) into order with permute(1, 2, 0)"
         )
     if mask is not None:
         if not isinstance(mask, torch.Tensor) or mask.dtype != torch.bool:
             got = mask.dtype if isinstance(mask, torch.Tensor) else type(mask).__name__
             raise TypeError(f"mask must be a boolean torch tensor, got {got}")
-        if mask.shape != picture.shape[:-1]:
-            raise ValueError(f"mask must have shape {tuple(picture.shape[:-1])}, got {tuple(mask.shape)}")
-    for tensor in (picture, truth, mask):
+        if mask.shape != image.shape[:-1]:
+            raise ValueError(f"mask must have shape {tuple(image.shape[:-1])}, got {tuple(mask.shape)}")
+    for tensor in (image, target, mask):
         if tensor is not None and tensor.device.type != "cpu":
-            raise ValueError(f"pictures and mask must be on the CPU, got {tensor.device}; use .cpu()")
+            raise ValueError(f"images and mask must be on the CPU, got {tensor.device}; use .cpu()")
 
 
 MAX_CHANNELS = 64
-"""Pictures with more channels are taken for pictures whose channels do not come last."""
+"""Maximum number of channels; with more, the channels are probably not the last axis."""

@@ -1,5 +1,4 @@
-"""How much memory a fine-tuning needs, and whether the machine has it: told before the work, not found
-out."""
+"""Estimates the memory of a fine-tuning up front, and checks that the machine has it."""
 
 from __future__ import annotations
 
@@ -10,25 +9,27 @@ from meshsplats.datasets.views import CACHE_BYTES, Dataset
 from meshsplats.mesh import SplatMesh
 
 VERTEX_BYTES = 7 * 4 * 6 + 4
-"""Values, gradients, two moments and their copies while a checkpoint is written, for position and colour, and
-the size of the vertex' splat."""
+"""Per vertex: position and colour, each with its gradient, two moments and their copies while a checkpoint is
+written, and the size of the splat."""
 BOUND_BYTES = 36 + 12 * 4
-"""More for a vertex that is bound to a base mesh: corners, weights and their copies."""
+"""Additionally per vertex bound to a base mesh: corners, weights and their copies."""
 FILTER_BYTES = 2 * 24 + 4 + 4 + 12
-"""More for a vertex drawn with a filter: where it is before and after, its splat, and its gradient."""
+"""Additionally per vertex drawn with the low-pass filter: positions before and after, splat, and gradient."""
 FACE_BYTES = 12 + 4 + 4 + 64
-"""A triangle, its splat and depth group, and the renderer's lists of them."""
+"""Per triangle: indices, splat and depth group, and the renderer's tile lists."""
 PIXEL_BYTES = 12 * 12 + 64
-"""Pictures, truth and gradients of one step, and the fragments that wait in the renderer's tiles."""
-FACE_KEPT, MOST_KEPT = 250, 256 << 20
-"""Arrays of the compiled core for each triangle, which it keeps from picture to picture, and most of them."""
+"""Per pixel of one step: images, target and gradients, and the renderer's fragment queues."""
+FACE_POOL_BYTES, POOL_LIMIT = 250, 256 << 20
+"""Arrays that the compiled core keeps from image to image: bytes per triangle, and their limit in all."""
 BASE_BYTES = 75 << 20
 """Python and the libraries."""
 
 
-def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BYTES) -> int:
-    """Bytes of the whole process that fine-tunes ``mesh`` on ``dataset``, at its peak, estimated from sizes
-    alone."""
+def estimate_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BYTES) -> int:
+    """Peak memory in bytes of the whole process that fine-tunes ``mesh`` on ``dataset``.
+
+    It is estimated from array sizes; ``cache_bytes`` is the limit of the data set's image cache.
+    """
     views = dataset.views
     vertex = VERTEX_BYTES + (BOUND_BYTES if mesh.binding is not None else 0)
     vertex += FILTER_BYTES if mesh.filter_px2 else 0
@@ -38,7 +39,7 @@ def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BY
     return (
         BASE_BYTES
         + sum(array.nbytes for array in arrays)
-        + min(len(mesh.faces) * FACE_KEPT, MOST_KEPT)
+        + min(len(mesh.faces) * FACE_POOL_BYTES, POOL_LIMIT)
         + len(mesh.vertices) * vertex
         + len(mesh.faces) * FACE_BYTES
         + pixels * PIXEL_BYTES
@@ -47,8 +48,7 @@ def needed_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_BY
 
 
 def available_memory() -> int | None:
-    """Bytes this process may still take: what the system calls available, and what a container leaves; None
-    where neither is known."""
+    """Bytes that this process may still allocate, by the system and the container; None if unknown."""
     found = []
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
@@ -70,18 +70,18 @@ def available_memory() -> int | None:
 
 
 def check_memory(mesh: SplatMesh, dataset: Dataset, *, cache_bytes: int = CACHE_BYTES) -> int:
-    """``needed_memory``; MemoryError with advice if it is more than ``available_memory``."""
-    needed = needed_memory(mesh, dataset, cache_bytes)
+    """Returns ``estimate_memory``; raises MemoryError with advice if it exceeds ``available_memory``."""
+    needed = estimate_memory(mesh, dataset, cache_bytes)
     available = available_memory()
     if available is not None and needed > available:
         raise MemoryError(
-            f"fine-tuning {len(mesh.vertices):,} vertices on {len(dataset.views):,} pictures needs about"
+            f"fine-tuning {len(mesh.vertices):,} vertices on {len(dataset.views):,} images needs about"
             f" {readable(needed)}, {readable(available)} are free: convert fewer splats (--max-splats), use"
-            " smaller pictures (--downscale, --width), or keep fewer of them in memory (--cache)"
+            " smaller images (--downscale, --width), or keep fewer of them in memory (--cache)"
         )
     return needed
 
 
 def readable(size: float) -> str:
-    """1.5 GB."""
+    """A size in bytes for people: 1.5 GB, 20 MB."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

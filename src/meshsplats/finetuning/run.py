@@ -1,9 +1,9 @@
-"""finetune: the loop, with reports, checkpoints and a way to stop."""
+"""finetune: the training loop, with scores, previews, checkpoints and interruption."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ import numpy as np
 from meshsplats._arrays import evenly
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.evaluation.report import image_of, masked_ssim
+from meshsplats.evaluation.report import masked_ssim
 from meshsplats.finetuning.checkpoint import (
     Checkpoint,
     OtherRunError,
@@ -28,46 +28,47 @@ from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.looks import image_of
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from meshsplats.finetuning.config import FinetuneChanges
 
-RELOCATED = 0.5
-"""Splats are moved in this share of the run: those moved later would not settle any more."""
+RELOCATION_END = 0.5
+"""Splats are relocated in this first share of the run: later ones would not converge."""
 
-WRITING = 1.5
-"""Seconds kept back, of a run whose length is a time, for what follows it: writing the mesh, drawing its
-preview. In short runs a hundredth of the time."""
+WRAP_UP_SECONDS = 1.5
+"""Time that a run with a length in minutes reserves for writing the mesh and rendering its preview. In short
+runs it is a hundredth of the length."""
 
-PREVIEWS = 4
-"""Previews that each run has at least."""
+MIN_PREVIEWS = 4
+"""Minimum number of previews per run."""
 
-WATCHED_VIEWS = 8
-"""Most held-out views that are scored while a run goes on."""
+SCORED_VIEWS = 8
+"""Maximum number of held-out views that are scored during a run."""
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What does not change the result: where the run is written down, how often, and with what."""
+    """Options that do not change the result: output folder, intervals of logging, resources."""
 
     folder: Path | None = None
-    """Folder for checkpoint, metrics, previews and configuration; None: nothing is written."""
+    """Folder for checkpoint, metrics, previews and configuration. None: nothing is written."""
     resume: bool = False
-    """Go on from the checkpoint in ``folder``."""
+    """Resume from the checkpoint in ``folder``."""
     report_every: int = 100
-    """Steps from one score on held-out views to the next; 0: only at the end."""
+    """Steps between two scores on held-out views. 0: only at the end."""
     preview_every: int = 500
-    """Steps from one preview picture to the next; in short runs there is one after each quarter. 0: none."""
+    """Steps between two preview images; also one after each quarter of the run. 0: none."""
     checkpoint_seconds: float = 30.0
-    """Time from one checkpoint to the next."""
+    """Seconds between two checkpoints."""
     threads: int | None = None
-    """At most so many; all processors by default."""
+    """Maximum number of threads. None: all processors."""
     spent: float = 0.0
-    """Seconds already used, which count where the length is given in minutes."""
+    """Seconds already used, which count if the length is given in minutes."""
     cache_bytes: int = CACHE_BYTES
-    """Of the data set, for the memory estimate."""
+    """Limit of the data set's image cache, for the memory estimate."""
 
     def __post_init__(self) -> None:
         for name in ("report_every", "preview_every"):
@@ -83,22 +84,24 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is."""
+    """Progress of a run, after a step."""
 
     step: int
+    """Number of steps taken."""
     steps: int | None
-    """In all; None where time is the limit."""
+    """Total number of steps; None if the length is given in minutes."""
     fraction: float
-    """0 to 1."""
+    """Share of the run that is over, 0 to 1."""
     loss: float | None
-    """Of the last step; None before the first."""
+    """Loss of the last step; None before the first."""
     held_out: float | None
-    """Mean PSNR on held-out views, dB, when last scored; None without such views."""
+    """Last mean PSNR on held-out views, in dB; None without such views."""
     seconds: float
-    """Used so far."""
+    """Time used so far."""
     seconds_left: float | None
-    """Estimate."""
+    """Estimated remaining time; None if unknown."""
     triangles: int
+    """Number of triangles, which pruning reduces."""
 
 
 def finetune(
@@ -110,15 +113,15 @@ def finetune(
     on_progress: Callable[[Progress], None] | None = None,
     **changes: Unpack[FinetuneChanges],
 ) -> SplatMesh:
-    """``mesh`` with positions, colours and opacities optimised so that its pictures are those of the training
-    views of ``dataset``: photographs (``load_dataset``) or the splats' own pictures (``splat_dataset``).
+    """Optimises positions, colours and opacities of ``mesh`` on the training views of ``dataset``.
 
-    Triangles stay as they are, apart from those that are pruned. The result has no normals, for the old ones
-    would not fit it.
+    The targets are photographs (``load_dataset``) or images of the splats themselves (``splat_dataset``). The
+    result has the triangles of ``mesh`` except those that were pruned. It has no normals, since those of
+    ``mesh`` would not fit it.
 
     Args:
-        config: what is done; the preset 'default' by default.
-        run: where it is written down, and whether it goes on from a checkpoint.
+        config: the configuration; the preset 'default' by default.
+        run: output folder, resumption from a checkpoint, logging and resources.
         on_progress: called after every step.
         changes: fields of ``FinetuneConfig`` in place of those of ``config``: ``finetune(mesh, data,
             minutes=2)``.
@@ -126,9 +129,9 @@ def finetune(
     Raises:
         TypeError: a field that does not exist.
         ValueError: no training view, an empty mesh. OtherRunError: the checkpoint is of another run.
-        MemoryError: it would not fit; nothing was written.
-        DivergenceError: a view gave values that are not finite; names it.
-        Interrupted: after SIGINT or SIGTERM, with a checkpoint, if there is a folder.
+        MemoryError: the estimated memory is not available; nothing was written.
+        DivergenceError: the loss or a gradient is not finite; the message names the view.
+        Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
     """
     config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()
     if not dataset.train:
@@ -137,89 +140,113 @@ def finetune(
         raise ValueError("the mesh has no triangles: there is nothing to fine-tune")
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
-    prints = (mesh_fingerprint(mesh), dataset_fingerprint(dataset)) if journal is not None else ("", "")
+    loop = TrainingLoop(
+        _run_start(mesh, dataset, config, run, journal), dataset, config, run, journal, on_progress
+    )
+    return loop.run()
+
+
+@dataclass(frozen=True, eq=False)
+class RunStart:
+    """Where a run starts: before its first step, or at a checkpoint."""
+
+    state: State
+    fingerprints: tuple[str, str]
+    """Those of the mesh and the data set; empty for a run without checkpoints."""
+    step: int = 0
+    """Number of steps already taken."""
+    seconds: float = 0.0
+    """Time used for them."""
+    losses: tuple[float, ...] = ()
+    """Losses of the steps since the last line of the metrics."""
+
+
+def _run_start(
+    mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, options: RunOptions, journal: Journal | None
+) -> RunStart:
+    """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
-    if journal is not None and run.resume:
-        total = config.total_steps(views)
+    if journal is None:
+        return RunStart(State.begin(mesh, views, config, options.threads), ("", ""))
+    fingerprints = mesh_fingerprint(mesh), dataset_fingerprint(dataset)
+    if not options.resume:
+        state = State.begin(mesh, views, config, options.threads)
+        journal.begin(config.to_dict())
+        return RunStart(state, fingerprints)
+    total = config.total_steps(views)
 
-        def check(found: Checkpoint) -> None:
-            check_same_run(found, config, *prints)
-            if total is not None and found.step > total:
-                raise OtherRunError(f"the run has made {found.step:,} steps already, {total:,} are asked for")
+    def check(found: Checkpoint) -> None:
+        check_same_run(found, config, *fingerprints)
+        if total is not None and found.step > total:
+            raise OtherRunError(f"the run has taken {found.step:,} steps already, {total:,} were requested")
 
-        found = journal.resume(config.to_dict(), check)
-        blending = "linear" if config.blending == "linear" else mesh.blending
-        state = State.resume(found.arrays, blending, views, config, run.threads)
-        step, spent, losses = found.step, found.seconds, found.losses
-    else:
-        state = State.begin(mesh, views, config, run.threads)
-        step, spent, losses = 0, 0.0, ()
-        if journal is not None:
-            journal.begin(config.to_dict())
-    return _Run(state, dataset, config, run, journal, prints, step, spent, losses, on_progress).go()
+    found = journal.resume(config.to_dict(), check)
+    blending = "linear" if config.blending == "linear" else mesh.blending
+    state = State.resume(found.arrays, blending, views, config, options.threads)
+    return RunStart(state, fingerprints, found.step, found.seconds, found.losses)
 
 
-class _Run:
-    """The loop and its clock."""
+class TrainingLoop:
+    """The loop over all steps, with its clock and its output."""
 
     def __init__(
         self,
-        state: State,
+        start: RunStart,
         dataset: Dataset,
         config: FinetuneConfig,
-        run: RunOptions,
+        options: RunOptions,
         journal: Journal | None,
-        prints: tuple[str, str],
-        step: int,
-        spent: float,
-        losses: Sequence[float],
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
-        self.state, self.dataset, self.config, self.run, self.journal = state, dataset, config, run, journal
-        self.prints, self.step, self.on_progress = prints, step, on_progress
+        self.dataset, self.config, self.options = dataset, config, options
+        self.journal, self.on_progress = journal, on_progress
+        # The start itself is not kept: pruning replaces its state, whose memory is then free.
+        self.state, self.step, self.losses = start.state, start.step, list(start.losses)
+        self.fingerprints, self.first_step = start.fingerprints, start.step
         self.steps = config.total_steps(len(dataset.train))
-        self.began = time.perf_counter() - (spent or run.spent)
-        self.saved_at = time.perf_counter()
-        self.first, self.first_seconds = step, self.seconds
-        self.losses = list(losses)
+        self.start_time = time.perf_counter() - (start.seconds or options.spent)
+        self.first_seconds = self.seconds
+        self.save_time = time.perf_counter()
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = self.save_cost = self.step_cost = 0.0
-        watched = evenly(dataset.test, WATCHED_VIEWS)
-        self.watched: tuple[View, ...] = watched
-        self.quarter = int(PREVIEWS * self.fraction)
+        self.scored_views: tuple[View, ...] = evenly(dataset.test, SCORED_VIEWS)
+        self.quarter = int(MIN_PREVIEWS * self.fraction)
 
     @property
     def seconds(self) -> float:
-        return time.perf_counter() - self.began
+        """Time used so far, including that before a resumed run's checkpoint."""
+        return time.perf_counter() - self.start_time
 
     @property
     def limit(self) -> float | None:
-        """Seconds after which no step begins; what follows the last step has to fit, too."""
+        """Seconds after which no step begins, so that the last report and the result are written in time."""
         if self.config.minutes is None:
             return None
-        whole = 60 * self.config.minutes
-        closing = 1.5 * (self.report_cost + self.save_cost) + self.step_cost + min(0.01 * whole, WRITING)
-        return max(whole - closing, 0)
+        total = 60 * self.config.minutes
+        reserve = 1.5 * (self.report_cost + self.save_cost) + self.step_cost
+        return max(total - (reserve + min(0.01 * total, WRAP_UP_SECONDS)), 0)
 
     @property
     def fraction(self) -> float:
+        """Share of the run that is over, 0 to 1."""
         if self.limit is not None:
             return min(1.0, self.seconds / self.limit) if self.limit > 0 else 1.0
         return self.step / self.steps if self.steps else 1.0
 
-    def go(self) -> SplatMesh:
+    def run(self) -> SplatMesh:
+        """Takes all steps. Interrupted, after a checkpoint, if a signal arrived."""
         views = self.dataset.train
-        interval = self.config.prune_interval(len(views))
-        moves = self.config.relocate_interval(len(views))
+        prune_interval = self.config.prune_interval(len(views))
+        relocate_interval = self.config.relocate_interval(len(views))
         with StopSignals() as signals:
             if self.step == 0:
                 self._report()
-                self._preview()
-                self._save()
+                self._save_preview()
+                self._save_checkpoint()
             while not self._done():
                 if signals.received is not None:
-                    self._save()
+                    self._save_checkpoint()
                     raise Interrupted(self.step, signals.received)
                 start = time.perf_counter()
                 loss = make_step(self.state, views, self.step, self.fraction)
@@ -228,22 +255,23 @@ class _Run:
                 if loss is not None:
                     self.losses.append(loss)
                     self.last_loss = loss
-                if interval and self.step % interval == 0 and not self._done():
+                if prune_interval and self.step % prune_interval == 0 and not self._done():
                     self.state = self.state.prune(kept_faces(self.state, views))
-                if moves and self.step % moves == 0 and self.fraction <= RELOCATED:
+                due = relocate_interval and self.step % relocate_interval == 0
+                if due and self.fraction <= RELOCATION_END:
                     relocate(self.state, views)
-                every = self.run.report_every
-                if every and self.step % every == 0 and not self._done():
+                report_interval = self.options.report_every
+                if report_interval and self.step % report_interval == 0 and not self._done():
                     self._report()
                 if self._preview_is_due():
-                    self._preview()
-                if time.perf_counter() - self.saved_at >= self.run.checkpoint_seconds:
-                    self._save()
-                self._tell()
-            if not self.run.resume or self.step > self.first:
+                    self._save_preview()
+                if time.perf_counter() - self.save_time >= self.options.checkpoint_seconds:
+                    self._save_checkpoint()
+                self._notify()
+            if not self.options.resume or self.step > self.first_step:
                 self._report()
-                self._save()
-            self._tell()
+                self._save_checkpoint()
+            self._notify()
             if signals.received is not None:
                 raise Interrupted(self.step, signals.received)
         return self.state.result()
@@ -254,23 +282,24 @@ class _Run:
         return self.step >= (self.steps or 0)
 
     def _report(self) -> None:
+        """Scores the held-out views and writes a line of the metrics."""
         start = time.perf_counter()
         loss = float(np.mean(self.losses)) if self.losses else None
-        similar = None
-        if self.watched:
+        mean_ssim = None
+        if self.scored_views:
             mesh = self.state.result()
             scores = []
-            for view in self.watched:
-                picture, truth = np.clip(self._picture(mesh, view), 0, 1), np.clip(view.image, 0, 1)
-                decibels = min(psnr(picture, truth, mask=view.mask), 200.0)
-                scores.append((decibels, masked_ssim(picture, truth, view.mask, self.run.threads)))
-            self.held_out, similar = (float(mean) for mean in np.mean(scores, axis=0))
+            for view in self.scored_views:
+                image, target = np.clip(self._render(mesh, view), 0, 1), np.clip(view.image, 0, 1)
+                decibels = min(psnr(image, target, mask=view.mask), 200.0)
+                scores.append((decibels, masked_ssim(image, target, view.mask, self.options.threads)))
+            self.held_out, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))
         if self.journal is not None:
-            self.journal.note(
+            self.journal.log_metrics(
                 self.step,
                 loss=loss,
                 psnr=self.held_out,
-                ssim=similar,
+                ssim=mean_ssim,
                 triangles=len(self.state.mesh.faces),
                 seconds=round(self.seconds, 3),
             )
@@ -278,48 +307,47 @@ class _Run:
         self.report_cost = time.perf_counter() - start
 
     def _preview_is_due(self) -> bool:
-        quarter, every = int(PREVIEWS * self.fraction), self.run.preview_every
+        quarter, interval = int(MIN_PREVIEWS * self.fraction), self.options.preview_every
         passed, self.quarter = quarter > self.quarter, quarter
-        return bool(every) and (passed or self.step % every == 0)
+        return bool(interval) and (passed or self.step % interval == 0)
 
-    def _preview(self) -> None:
-        if self.journal is None or not self.run.preview_every:
+    def _save_preview(self) -> None:
+        if self.journal is None or not self.options.preview_every:
             return
-        view = (self.watched or self.dataset.train)[0]
-        picture = np.clip(self._picture(self.state.result(), view), 0, 1)
-        self.journal.preview(self.step, np.clip(view.image, 0, 1), picture)
+        view = (self.scored_views or self.dataset.train)[0]
+        image = np.clip(self._render(self.state.result(), view), 0, 1)
+        self.journal.save_preview(self.step, np.clip(view.image, 0, 1), image)
 
-    def _picture(self, mesh: SplatMesh, view: View) -> np.ndarray:
-        samples, threads = samples_of(view, self.config), self.run.threads
+    def _render(self, mesh: SplatMesh, view: View) -> np.ndarray:
+        samples, threads = samples_of(view, self.config), self.options.threads
         return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
 
-    def _save(self) -> None:
-        self.saved_at = time.perf_counter()
+    def _save_checkpoint(self) -> None:
+        self.save_time = time.perf_counter()
         if self.journal is None:
             return
-        arrays = self.state.arrays()
-        config = self.config.to_dict()
         self.journal.save(
             Checkpoint(
                 self.step,
                 self.seconds,
-                config,
-                *self.prints,
-                arrays,
+                self.config.to_dict(),
+                *self.fingerprints,
+                self.state.arrays(),
                 tuple(self.losses),
                 len(self.dataset.train),
             )
         )
-        self.save_cost = time.perf_counter() - self.saved_at
+        self.save_cost = time.perf_counter() - self.save_time
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
+        """Calls ``on_progress``."""
         if self.on_progress is None:
             return
         left = None
         if self.limit is not None:
             left = max(self.limit - self.seconds, 0.0)
-        elif self.steps is not None and self.step > self.first:
-            pace = (self.seconds - self.first_seconds) / (self.step - self.first)
+        elif self.steps is not None and self.step > self.first_step:
+            pace = (self.seconds - self.first_seconds) / (self.step - self.first_step)
             left = pace * (self.steps - self.step)
         self.on_progress(
             Progress(

@@ -1,4 +1,4 @@
-"""What a fine-tuning changes: positions, colours and exposures, with their optimisers."""
+"""The optimised parameters of a fine-tuning, positions, colours and exposures, with their optimisers."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
-from meshsplats.finetuning.initial import on_open_edges, vertex_sizes
-from meshsplats.finetuning.relocation import HALF, Usage, find_moves, halves
+from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
+from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)
 
 
 class Gradients(NamedTuple):
-    """Of the loss of one picture. float32, C-contiguous."""
+    """Gradients of the loss of one image; float32, C-contiguous."""
 
     vertices: np.ndarray
     """(v, 3)."""
     colors: np.ndarray
     """(v, 4)."""
     exposure: np.ndarray | None = None
-    """(6,): gain and offset of this view; None if they are not fitted."""
+    """(6,): gain and offset of this view's exposure; None if exposures are not fitted."""
 
     def finite(self) -> bool:
-        """Whether all are finite."""
-        # A sum of finite numbers may overflow, but then training has failed, too.
+        """Whether all values are finite."""
+        # A sum of finite numbers may overflow, but such a run has diverged, too.
         with np.errstate(over="ignore", invalid="ignore"):
             return all(bool(np.isfinite(part.sum())) for part in self if part is not None)
 
 
 class State:
-    """The mesh in the making.
+    """The optimisation state.
 
     Attributes:
         vertices: (v, 3) float32, scene units, changed in place.
         colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, changed in place.
-        mesh: the mesh it began with, as far as it was not dropped: triangles, their splats, attributes.
+        mesh: the initial mesh without pruned triangles: triangles, their splats, attributes.
         sizes: (v,) float32, the unit of each vertex' position or, on a base mesh, of its weights.
-        bound: the weights that are optimised instead of positions where the mesh is bound to a base, else
-            None; ``vertices`` follow them.
-        exposures: (views, 6) float32: gain and offset of red, green and blue of each training view; None if
+        bound: for a mesh that is bound to a base, the barycentric weights that are optimised in place of
+            positions, and that determine ``vertices``; otherwise None.
+        exposures: (views, 6) float32: gain and offset of red, green and blue for each training view; None if
             they are not fitted.
     """
 
@@ -71,15 +71,16 @@ class State:
             unit = sizes if config.position_unit == "splat" else None
             self._positions = adam(self.vertices, lr=1.0, scale=unit)
         self._colors = adam(self.colors, lr=1.0, bounds=(0, 1))
-        # Of the triangles alone, so that a resumed run has the same.
-        self._edges = on_open_edges(mesh.faces, len(mesh.vertices)) if config.soft_edges else None
+        # Depends on the triangles alone, so that a resumed run finds the same boundary.
+        self._boundary = boundary_vertices(mesh.faces, len(mesh.vertices)) if config.soft_edges else None
         self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
-        self._usage = Usage.none(len(mesh.vertices)) if config.relocate_share and self.bound is None else None
+        relocates = config.relocate_share and self.bound is None
+        self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
 
     @classmethod
     def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
-        """That of a mesh before the first step."""
-        mesh = replace(mesh, normals=None)  # they would not follow the positions
+        """The state before the first step, for ``views`` training views."""
+        mesh = replace(mesh, normals=None)  # positions change, normals would not
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
         if config.blending == "linear" and mesh.blending == "display":
@@ -108,18 +109,19 @@ class State:
         config: FinetuneConfig,
         threads: int | None,
     ) -> State:
-        """That of a checkpoint. FileFormatError if its arrays do not fit each other."""
+        """The state in a checkpoint's arrays. FileFormatError if they do not fit each other."""
         mesh = stored_mesh(arrays, blending)
         try:
-            sizes = _of_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
-            exposures = _of_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
+            sizes = _checked_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
+            exposures = _checked_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
             state = cls(mesh, sizes, exposures, config, threads)
             for name, adam in state._optimisers().items():
                 part = {key: arrays[f"{name}.{key}"] for key in ("mean", "square", "steps")}
                 adam.load_state(part)
-            if state._usage is not None:
-                parts = (_of_shape(arrays[name], (len(mesh.vertices),)) for name in state._usage.arrays())
-                state._usage = Usage(*(part.copy() for part in parts))
+            if state._sums is not None:
+                shape = (len(mesh.vertices),)
+                parts = (_checked_shape(arrays[name], shape) for name in state._sums.arrays())
+                state._sums = GradientSums(*(part.copy() for part in parts))
         except KeyError as error:
             raise FileFormatError(f"the checkpoint lacks {error}") from None
         except (ValueError, TypeError) as error:
@@ -127,18 +129,18 @@ class State:
         return state
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What ``resume`` needs."""
+        """All arrays that ``resume`` needs, by their names in a checkpoint."""
         arrays = mesh_arrays(self.result()) | {"sizes": self.sizes}
         if self.exposures is not None:
             arrays["exposure.values"] = self.exposures
         for name, adam in self._optimisers().items():
             arrays |= {f"{name}.{key}": value for key, value in adam.state().items()}
-        if self._usage is not None:
-            arrays |= self._usage.arrays()
+        if self._sums is not None:
+            arrays |= self._sums.arrays()
         return arrays
 
     def result(self) -> SplatMesh:
-        """The mesh as it is now."""
+        """The current mesh."""
         return replace(
             self.mesh,
             vertices=self.vertices.copy(),
@@ -147,58 +149,61 @@ class State:
         )
 
     def step(self, gradients: Gradients, color_rate: float, position_rate: float, view: int) -> None:
-        """One step of Adam along ``gradients`` on what training view number ``view`` reached."""
-        # Nothing in a picture moves without its opacity mattering; one column is quick to look through.
+        """One step of Adam along ``gradients`` for the vertices that the training view of index ``view``
+        reached."""
+        # A vertex has a gradient only if its opacity has one, and a single column is quick to scan.
         reached = gradients.colors[:, 3] != 0
         opacity = self.colors[:, 3]
-        clear = None if self._edges is None else self._edges & (opacity == 0)
-        if self._usage is not None:
-            self._usage.add(gradients.colors, gradients.vertices, self.sizes, reached)
+        transparent = None if self._boundary is None else self._boundary & (opacity == 0)
+        if self._sums is not None:
+            self._sums.add(gradients.colors, gradients.vertices, self.sizes, reached)
         self._colors.lr = color_rate
         self._colors.step(gradients.colors, reached)
-        if clear is not None:
-            opacity[clear] = 0
+        if transparent is not None:
+            opacity[transparent] = 0
         if position_rate > 0:
             self._positions.lr = position_rate
             if self.bound is None:
                 self._positions.step(gradients.vertices, reached)
             else:
-                # A vertex in a corner of its face has nowhere to go.
+                # A vertex in a corner of its face stays there.
                 movable = reached & (self.bound.weights < 1).all(axis=1)
                 rows = np.flatnonzero(movable)
                 before = self.bound.weights[rows]
                 self._positions.step(self.bound.gradient(gradients.vertices, rows), movable)
-                self.bound.settle(before, rows, self.vertices)
+                self.bound.project(before, rows, self.vertices)
         if self._exposures is not None and self.exposures is not None and gradients.exposure is not None:
-            towards = np.zeros_like(self.exposures)
-            towards[view] = gradients.exposure
-            self._exposures.step(towards, np.array([view], np.int32))
-            # A gain of all pictures and one of the mesh's colours would be the same: means stay.
+            grad = np.zeros_like(self.exposures)
+            grad[view] = gradients.exposure
+            self._exposures.step(grad, np.array([view], np.int32))
+            # A gain common to all images is equivalent to other mesh colours: the means stay fixed.
             mean = self.exposures.mean(axis=0, dtype=np.float64) - [1, 1, 1, 0, 0, 0]
             self.exposures -= mean.astype(np.float32)
 
-    def relocate(self, looked_at: np.ndarray) -> int:
-        """Lets splats that show next to nothing though they are ``looked_at``, (v,) bool, take over halves of
-        those that are needed most, as far as the configuration allows; returns how many. What was seen of
-        them so far is forgotten."""
-        if self._usage is None:
+    def relocate(self, in_view: np.ndarray) -> int:
+        """Relocates splats that are almost invisible (see ``relocation``) and restarts the gradient sums.
+
+        ``in_view`` (v,) bool marks the vertices in any view. Returns the number of relocated splats, at most
+        ``relocate_share`` of all.
+        """
+        if self._sums is None:
             return 0
-        idle, needed = find_moves(self.mesh, self._usage, looked_at, self.config.relocate_share)
+        idle, needed = plan_relocation(self.mesh, self._sums, in_view, self.config.relocate_share)
         if len(idle):
             positions, colors = self.vertices, self.colors
-            positions[needed], positions[idle] = halves(positions[needed])
+            positions[needed], positions[idle] = split_in_halves(positions[needed])
             colors[idle] = colors[needed]
-            # Sizes are the sides of squares.
+            # Sizes are square roots of areas.
             self.sizes[needed] *= np.sqrt(np.float32(HALF))
             self.sizes[idle] = self.sizes[needed]
             for rows in (idle, needed):
                 self._positions.restart(rows, needed, self.sizes[rows])
                 self._colors.restart(rows, needed)
-        self._usage.clear()
+        self._sums.clear()
         return len(idle)
 
     def prune(self, keep: np.ndarray) -> State:
-        """Only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
+        """The state with only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
         if keep.all():
             return self
         used = np.zeros(len(self.mesh.vertices), bool)
@@ -206,14 +211,14 @@ class State:
         mesh = self.result().keep_faces(keep)
         smaller = State(mesh, self.sizes[used], self.exposures, self.config, self.threads)
         rows = np.flatnonzero(used)
-        places = smaller.vertices if smaller.bound is None else smaller.bound.weights
-        smaller._positions = self._positions.select(places, rows)
+        positions = smaller.vertices if smaller.bound is None else smaller.bound.weights
+        smaller._positions = self._positions.select(positions, rows)
         smaller._colors = self._colors.select(smaller.colors, rows)
         if self._exposures is not None:
             every = np.arange(len(self._exposures.mean))
             smaller._exposures = self._exposures.select(smaller.exposures, every)
-        if self._usage is not None:
-            smaller._usage = Usage(self._usage.color[used], self._usage.position[used])
+        if self._sums is not None:
+            smaller._sums = GradientSums(self._sums.color[used], self._sums.position[used])
         return smaller
 
     def _optimisers(self) -> dict[str, RowAdam]:
@@ -221,9 +226,7 @@ class State:
         return found if self._exposures is None else found | {"exposure": self._exposures}
 
 
-def _of_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
-        raise ValueError(
-            f"an array of shape {array.shape}, {array.dtype}; finite float32 of shape {shape} expected"
-        )
+        raise ValueError(f"expected finite float32 of shape {shape}, got {array.dtype} of {array.shape}")
     return array

@@ -1,6 +1,6 @@
-"""Mesh prior: splats bound to the faces of a classical mesh, trained on it and edited with it.
+"""Mesh priors: splats bound to the faces of a classical mesh, trained on it and edited with it.
 
-Binding and posing need NumPy alone; training (``train``) the extra ``finetune``.
+Needs NumPy alone; ``base_surface`` needs the extra ``base``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Colours of a surface from the pictures that see it."""
+"""Colours of a surface, projected from images."""
 
 from __future__ import annotations
 
@@ -12,27 +12,30 @@ from meshsplats.datasets.views import View
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 
-BEST = 4
-"""Views that a place takes its colour from: those that look at it most squarely."""
-MOST_VIEWS = 128
-"""Most views, evenly spread, that are looked at."""
+BEST_VIEWS = 4
+"""Number of views that determine the colour of a point: those that see it most frontally."""
+MAX_VIEWS = 128
+"""Maximum number of views, evenly spread, that are used."""
 _SOLID = 0.5
-"""Opacity from which a pixel of a picture with alpha has a colour of its own."""
+"""Minimum alpha of a pixel whose colour is used."""
 _TOLERANCE = 1.5
-"""Pixels, laid on the surface, that a place may lie behind what is drawn there and still count as seen."""
+"""Depth tolerance of visibility, in pixels at the depth of the point."""
 _GRAZING = 0.1
-"""Cosine below which a view sees a place too slantwise to tell its colour."""
-_ROUNDS = 64
-"""Rings of the base that colours spread over from what was seen."""
+"""Cosine below which the angle is too grazing to use a view's colour."""
+_RINGS = 64
+"""Maximum number of rings of base faces that colours spread over into unseen regions."""
 
 
 def colors_from_views(binding: Binding, views: Sequence[View], *, threads: int | None = None) -> np.ndarray:
-    """(v, 3) float32 display RGB at the vertices of ``binding`` on its base, as the ``views`` show them.
+    """Colours of the vertices of ``binding``, projected from the ``views``.
 
-    A place counts as seen where the base itself does not hide it, or by no more than what lies above its
-    layer. Its colour is the mean over the ``BEST`` views with the largest cosine between the base's normal
-    (either side) and the direction to the camera, weighted by its square. Places that no view sees take the
-    colours next to them on the base; mid grey where no view sees anything.
+    A vertex counts as visible unless the base occludes it by more than its layer's distance from the base.
+    Its colour is the mean over the ``BEST_VIEWS`` views with the largest cosine between the base's normal (of
+    either side) and the direction to the camera, weighted by the squared cosine. Unseen vertices take the
+    colours next to them on the base; mid grey if no view sees any vertex.
+
+    Returns:
+        (v, 3) float32 display RGB.
     """
     base = SplatMesh(
         binding.base_vertices,
@@ -41,24 +44,24 @@ def colors_from_views(binding: Binding, views: Sequence[View], *, threads: int |
     )
     points, normals = binding.positions().astype(np.float64), binding.normals()
     depths = np.abs(binding.layers * binding.lift)
-    scores = np.zeros((len(points), BEST), np.float32)
-    colors = np.zeros((len(points), BEST, 3), np.float32)
-    for view in evenly(views, MOST_VIEWS):
-        rows, score, color = _seen(base, points, normals, depths, view, threads)
-        # In place of the least of the best so far, where it is better.
-        least = scores[rows].argmin(axis=1)
-        better = score > scores[rows, least]
-        rows, least = rows[better], least[better]
-        scores[rows, least] = score[better]
-        colors[rows, least] = color[better]
+    scores = np.zeros((len(points), BEST_VIEWS), np.float32)
+    colors = np.zeros((len(points), BEST_VIEWS, 3), np.float32)
+    for view in evenly(views, MAX_VIEWS):
+        rows, score, color = _visible_points(base, points, normals, depths, view, threads)
+        # A better view replaces the worst of the best so far.
+        worst = scores[rows].argmin(axis=1)
+        better = score > scores[rows, worst]
+        rows, worst = rows[better], worst[better]
+        scores[rows, worst] = score[better]
+        colors[rows, worst] = color[better]
     weights = np.square(scores)
     total = weights.sum(axis=1)
     seen = total > 0
     result = np.einsum("vb,vbc->vc", weights, colors) / np.where(seen, total, 1)[:, None]
-    return _filled(binding, result.astype(np.float32), seen)
+    return _fill_unseen(binding, result.astype(np.float32), seen)
 
 
-def _seen(
+def _visible_points(
     base: SplatMesh,
     points: np.ndarray,
     normals: np.ndarray,
@@ -66,11 +69,11 @@ def _seen(
     view: View,
     threads: int | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers of the points that ``view`` sees, the cosines at which it does, and their colours (k, 3).
+    """Indices (k,) of the points that ``view`` sees, cosines (k,) of the viewing angle, and colours (k, 3).
 
-    ``depths`` (n,) are how far from the base they lie.
+    ``depths`` (n,) are the distances of the points from the base.
     """
-    camera, picture = view.camera, view.load()
+    camera, image = view.camera, view.load()
     x, y, z = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
     front = z > camera.near
     depth = np.where(front, z, 1)
@@ -79,30 +82,29 @@ def _seen(
         front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
     )
     place = row[rows].astype(np.int64), column[rows].astype(np.int64)
-    away = camera.center - points[rows]
-    cosine = np.abs(np.einsum("ij,ij->i", away, normals[rows])) / np.linalg.norm(away, axis=1)
+    to_camera = camera.center - points[rows]
+    cosine = np.abs(np.einsum("ij,ij->i", to_camera, normals[rows])) / np.linalg.norm(to_camera, axis=1)
     drawn = render(base, camera, depth=True, threads=threads)
     assert drawn.depth is not None
-    # Where nothing is drawn at the middle of its pixel, a point at an outline is in front of all there is.
+    # A point at a silhouette whose pixel centre misses the base has nothing in front of it.
     solid = drawn.alpha > 0.5
     surface = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)[place]
     slack = _TOLERANCE * z[rows] / min(camera.fx, camera.fy) + depths[rows]
     slack /= np.maximum(cosine, 0.25)
     keep = (z[rows] <= surface + slack) & (cosine > _GRAZING)
-    color = picture.over((0, 0, 0))
-    if picture.alpha is not None:
+    color = image.over((0, 0, 0))
+    if image.alpha is not None:
         alpha = view.alpha
         assert alpha is not None
         keep &= alpha[place] > _SOLID
         color = color / np.maximum(alpha, 1e-6)[..., None]
-    if picture.mask is not None:
-        keep &= picture.mask[place]
+    if image.mask is not None:
+        keep &= image.mask[place]
     return rows[keep], cosine[keep].astype(np.float32), np.clip(color[place][keep], 0, 1)
 
 
-def _filled(binding: Binding, colors: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """``colors`` with those of unseen places taken from what lies next to them, outwards from what was
-    seen."""
+def _fill_unseen(binding: Binding, colors: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """``colors`` (v, 3) with those of unseen vertices filled in from their neighbours on the base."""
     if seen.all():
         return colors
     if not seen.any():
@@ -117,21 +119,21 @@ def _filled(binding: Binding, colors: np.ndarray, seen: np.ndarray) -> np.ndarra
             sums[:, c] += np.bincount(corners[seen, k], share * colors[seen, c], n)
     known = weight > 0
     at_base = np.where(known[:, None], sums / np.where(known, weight, 1)[:, None], 0)
-    for _ in range(_ROUNDS):
-        here = known[faces]
-        open_faces = faces[here.any(axis=1) & ~here.all(axis=1)]
-        if not len(open_faces):
+    for _ in range(_RINGS):
+        at_corner = known[faces]
+        front = faces[at_corner.any(axis=1) & ~at_corner.all(axis=1)]
+        if not len(front):
             break
-        told = known[open_faces]
-        mean = (at_base[open_faces] * told[..., None]).sum(axis=1) / told.sum(axis=1)[:, None]
-        target, value = open_faces[~told], np.repeat(mean, (~told).sum(axis=1), axis=0)
-        number = np.bincount(target, minlength=n)
-        fresh = number > 0
+        known_corner = known[front]
+        mean = (at_base[front] * known_corner[..., None]).sum(axis=1) / known_corner.sum(axis=1)[:, None]
+        target, value = front[~known_corner], np.repeat(mean, (~known_corner).sum(axis=1), axis=0)
+        count = np.bincount(target, minlength=n)
+        filled = count > 0
         for c in range(3):
-            at_base[fresh, c] = np.bincount(target, value[:, c], n)[fresh] / number[fresh]
-        known |= fresh
+            at_base[filled, c] = np.bincount(target, value[:, c], n)[filled] / count[filled]
+        known |= filled
     at_base[~known] = colors[seen].mean(axis=0, dtype=np.float64)
     result = colors.copy()
-    mixed = np.einsum("vk,vkc->vc", binding.weights[~seen].astype(np.float64), at_base[corners[~seen]])
-    result[~seen] = np.clip(mixed, 0, 1)
+    blend = np.einsum("vk,vkc->vc", binding.weights[~seen].astype(np.float64), at_base[corners[~seen]])
+    result[~seen] = np.clip(blend, 0, 1)
     return result

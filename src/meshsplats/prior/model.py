@@ -1,4 +1,4 @@
-"""MeshPrior: splats on a base mesh, that go where the base goes."""
+"""MeshPrior: splats on a base mesh that move with it."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from meshsplats.base_mesh import BaseMesh
 from meshsplats.mesh import SplatMesh
 
 LIFT = 2e-5
-"""Distance between two layers in exported meshes, as a share of the diagonal of the base's box: enough for
-the float32 positions that ray tracers and engines compute with, too little to be seen."""
+"""Distance between two layers of exported meshes, relative to the diagonal of the base's bounding box: enough
+for the float32 positions of ray tracers and engines, and too small to be visible."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshPrior:
     """A splat mesh whose vertices are bound to the faces of a base mesh.
 
-    Moving the base moves the splats: ``pose`` computes them from new positions of the base's vertices, with
-    no training. ``save_mesh(prior.mesh, path)`` keeps the binding in `.npz` and `.glb`; ``load_prior`` reads
-    it back.
+    The splats move with the base: ``pose`` computes them from new positions of the base's vertices, without
+    training. ``save_mesh(prior.mesh, path)`` stores the binding in `.npz` and `.glb`; ``load_prior`` reads it
+    back.
+
+    Raises ValueError for a mesh without a binding.
     """
 
     mesh: SplatMesh
-    """As the base stands in ``mesh.binding``, with the base's normals as shading normals."""
+    """The splats in the pose of the base in ``mesh.binding``, with the base's normals as shading normals."""
 
     def __post_init__(self) -> None:
         if self.mesh.binding is None:
@@ -42,20 +44,20 @@ class MeshPrior:
 
     @property
     def base_faces(self) -> np.ndarray:
-        """(m, 3) int32 vertex numbers of the base."""
+        """(m, 3) int32 vertex indices of the base's triangles."""
         assert self.mesh.binding is not None
         return self.mesh.binding.base_faces
 
     @property
     def lift(self) -> float:
-        """Scene units from one layer to the next, below 0 inwards; 0: all lie in the base."""
+        """Distance between layers in scene units, negative inwards; 0: all layers lie in the base."""
         assert self.mesh.binding is not None
         return self.mesh.binding.lift
 
     @property
     def export_lift(self) -> float:
-        """Scene units between two layers that exported meshes are given where the prior's own layers are
-        coplanar: ``LIFT`` times the diagonal of the box round the base."""
+        """Distance between layers of exported meshes, in scene units: ``lift``, or for coplanar layers
+        ``LIFT`` times the diagonal of the base's bounding box."""
         binding = self.mesh.binding
         assert binding is not None
         if binding.lift or not binding.layers.any():
@@ -64,53 +66,60 @@ class MeshPrior:
         return LIFT * float(np.linalg.norm(np.ptp(used, axis=0)))
 
     def pose(self, vertices: np.ndarray | None = None, *, lift: float | None = None) -> SplatMesh:
-        """The splats on the base with its vertices at (n, 3) ``vertices``, the stored ones by default.
+        """The splats on a posed base.
 
-        Every vertex is the weighted sum of the new corners of its face, which layers above 0 have moved by
-        ``lift`` (scene units) a layer along the new base's normals. By default that is the prior's own,
-        scaled as the base is: by the square root of the ratio of its areas. Where it is 0, layers are
-        coplanar, which this project's renderer draws in their order (``depth_group``); for other programs
-        use ``export_lift``. Shading normals are the new base's. The binding in the result has the new base.
+        Every vertex is the barycentric combination of the posed corners of its face, which layers above 0
+        have moved along the posed base's normals.
 
-        Raises ValueError for another number of vertices, and for positions that are not finite.
+        Args:
+            vertices: (n, 3) posed positions of the base's vertices; the stored ones by default.
+            lift: distance between layers in scene units. By default that of the prior, scaled with the base:
+                by the square root of the ratio of its areas. With 0 the layers are coplanar, and this
+                project's renderer blends them in their order (``depth_group``); for other programs use
+                ``export_lift``.
+
+        Returns:
+            The mesh with the posed base's shading normals, and a binding to the posed base.
+
+        Raises:
+            ValueError: another number of vertices, or positions that are not finite.
         """
         binding = self.mesh.binding
         assert binding is not None
-        places = binding.base_vertices
+        positions = binding.base_vertices
         if vertices is not None:
-            places = checked_array("vertices", vertices, np.float32, (None, 3))
-            if len(places) != len(binding.base_vertices):
-                raise ValueError(
-                    f"the base has {len(binding.base_vertices):,} vertices, got positions of {len(places):,}"
-                )
-        moved = binding.moved(places, binding.lift if lift is None else lift)
+            positions = checked_array("vertices", vertices, np.float32, (None, 3))
+            if len(positions) != len(binding.base_vertices):
+                count = len(binding.base_vertices)
+                raise ValueError(f"the base has {count:,} vertices, got positions of {len(positions):,}")
+        posed = binding.moved(positions, binding.lift if lift is None else lift)
         if lift is None and binding.lift and binding.area > 0:
-            moved = binding.moved(places, binding.lift * (moved.area / binding.area) ** 0.5)
-        return replace(self.mesh, vertices=moved.positions(), normals=moved.normals(), binding=moved)
+            posed = binding.moved(positions, binding.lift * (posed.area / binding.area) ** 0.5)
+        return replace(self.mesh, vertices=posed.positions(), normals=posed.normals(), binding=posed)
 
     def check_topology(self, base: BaseMesh) -> None:
-        """ValueError that says what differs unless ``base`` has the same vertices in the same triangles."""
-        wanted, found = self.base_faces, base.faces
-        counts = (len(self.base_vertices), len(wanted)), (len(base.vertices), len(found))
+        """Raises ValueError unless ``base`` has the number of vertices and the triangles of this base."""
+        expected, found = self.base_faces, base.faces
+        counts = (len(self.base_vertices), len(expected)), (len(base.vertices), len(found))
         advice = "move its vertices only, and export them in their order, as .obj and .ply do"
         if counts[0] != counts[1]:
             raise ValueError(
                 f"the edited base has {counts[1][0]:,} vertices and {counts[1][1]:,} triangles, the splats"
                 f" are bound to one of {counts[0][0]:,} and {counts[0][1]:,}: {advice}"
             )
-        differ = (wanted != found).any(axis=1)
+        differ = (expected != found).any(axis=1)
         if differ.any():
             first = int(differ.argmax())
             raise ValueError(
                 f"the edited base has other triangles ({int(differ.sum()):,} of {len(found):,}; the first is"
-                f" number {first}, {found[first].tolist()} instead of {wanted[first].tolist()}): {advice}"
+                f" number {first}, {found[first].tolist()} instead of {expected[first].tolist()}): {advice}"
             )
 
 
 def load_prior(path: str | os.PathLike[str]) -> MeshPrior:
-    """The mesh prior in a `.npz` or `.glb` file.
+    """Loads the mesh prior in a `.npz` or `.glb` file.
 
-    Raises what ``load_mesh`` raises, and ValueError for a mesh that is bound to no base.
+    Raises the errors of ``load_mesh``, and ValueError for a mesh that is bound to no base.
     """
     from meshsplats.formats.meshes import load_mesh
 

@@ -1,4 +1,4 @@
-"""Which side of a base is its inner one, and where shells on that side would stand out of it."""
+"""The interior side of a base mesh, and where shells on that side would protrude through the surface."""
 
 from __future__ import annotations
 
@@ -13,26 +13,27 @@ from meshsplats.cameras.trajectories import dome
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 
-LOOKS = 24
-"""Most pictures that the base is looked at in."""
-SIDE = 320
-"""Longer side of these, in pixels, at most."""
+MAX_VIEWS = 24
+"""Maximum number of depth images."""
+MAX_SIDE = 320
+"""Maximum of their longer side, in pixels."""
 _TOLERANCE = 1.5
-"""Pixels, laid on the surface, by which a point must stand out before it counts."""
+"""Depth tolerance of protrusion, in pixels at the depth of the point."""
 
 
 @dataclass(frozen=True, eq=False)
-class Looks:
-    """A base seen from several places."""
+class DepthViews:
+    """Depth images of a base mesh."""
 
     cameras: list[Camera]
     nearest: list[np.ndarray]
-    """(h, w) float32 least depth of the base in the pixels round each pixel; infinite where it is in none."""
+    """For each camera (h, w) float32, the smallest depth in the 3 x 3 pixels around each pixel; infinite
+    where the base covers none of them."""
     facing: bool
-    """Whether more of what is seen shows the side that the normals point to than the other."""
+    """Whether most covered pixels show the side that the normals point to."""
 
-    def standing_out(self, points: np.ndarray) -> np.ndarray:
-        """(k,) bool: which of ``points`` (k, 3) a camera sees before the base or beside it."""
+    def protruding(self, points: np.ndarray) -> np.ndarray:
+        """(k,) bool: which of ``points`` (k, 3) any camera sees in front of the base or beside it."""
         result = np.zeros(len(points), bool)
         for camera, nearest in zip(self.cameras, self.nearest, strict=True):
             matrix = camera.world_to_camera
@@ -47,26 +48,29 @@ class Looks:
         return result
 
 
-def look_at_base(
+def render_depth_views(
     vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera], *, threads: int | None = None
-) -> Looks:
-    """The base of ``vertices`` (n, 3) and ``faces`` (m, 3) from up to ``LOOKS`` of the ``cameras``, evenly
-    spread; from all round where there are none."""
+) -> DepthViews:
+    """Renders the base mesh of ``vertices`` (n, 3) and ``faces`` (m, 3) with depth.
+
+    The views are up to ``MAX_VIEWS`` of the ``cameras``, evenly spread; without cameras, views from all
+    directions.
+    """
     normals = surface_normals(vertices, faces)
     colors = np.ones((len(vertices), 4), np.float32)
     base = SplatMesh(vertices, faces, colors, attributes={"normal": normals})
     if cameras:
-        chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, LOOKS).round().astype(int)]
-        chosen = [camera.within(SIDE) for camera in dict.fromkeys(chosen)]
+        chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, MAX_VIEWS).round().astype(int)]
+        chosen = [camera.within(MAX_SIDE) for camera in dict.fromkeys(chosen)]
     else:
-        chosen = dome(base, LOOKS, whole=True, width=SIDE, height=SIDE)
+        chosen = dome(base, MAX_VIEWS, whole=True, width=MAX_SIDE, height=MAX_SIDE)
     nearest, front = [], 0.0
     for camera in chosen:
         drawn = render(base, camera, depth=True, attributes=["normal"], threads=threads)
         assert drawn.depth is not None
         solid = drawn.alpha > 0.5
         depth = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)
-        nearest.append(_least_around(depth))
+        nearest.append(_neighbourhood_minimum(depth))
         rows, columns = np.nonzero(solid)
         ray = np.stack(
             [
@@ -77,11 +81,11 @@ def look_at_base(
         )
         world = camera.world_to_camera[:3, :3].T @ ray
         front -= float(np.sign(np.einsum("ck,kc->k", world, drawn.attributes["normal"][solid])).sum())
-    return Looks(chosen, nearest, front >= 0)
+    return DepthViews(chosen, nearest, front >= 0)
 
 
-def _least_around(depth: np.ndarray) -> np.ndarray:
-    """Least of each pixel and its eight neighbours."""
+def _neighbourhood_minimum(depth: np.ndarray) -> np.ndarray:
+    """Minimum of each pixel and its eight neighbours."""
     wide = np.pad(depth, 1, constant_values=np.inf)
     h, w = depth.shape
     return np.minimum.reduce([wide[i : i + h, j : j + w] for i in range(3) for j in range(3)])

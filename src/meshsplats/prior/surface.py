@@ -1,4 +1,4 @@
-"""A base mesh from splats: the surface that depth pictures from all round agree on."""
+"""A base mesh from splats: depth images from all directions, fused into a closed surface."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from meshsplats.prior.color_projection import colors_from_views
 from meshsplats.rendering import render
 
 MAX_RESOLUTION = 512
+"""Maximum number of voxels along the longest side of the grid."""
 TRUNCATION = 3.0
-"""Voxels before and behind a depth within which it says how far away the surface is."""
+"""Truncation of signed distances, in voxels."""
 _SOLID = 0.5
-"""Opacity from which a pixel shows the surface; less is empty space to the end of the ray."""
-_COVERED = 0.002
-"""Share of the opacity that may lie beyond each side of the box: strays must not make it large."""
+"""Minimum alpha of a pixel that shows the surface; below it the whole ray is empty."""
+_OUTLIERS = 0.002
+"""Share of the opacity that may lie beyond each side of the box, so that floaters do not enlarge it."""
 _MARGIN = 0.05
-_LEAST_PART = 0.01
-"""Separate parts with a smaller share of the largest part's volume than this are left out."""
+"""Margin around the box, relative to its longest side."""
+_MIN_PART = 0.01
+"""Connected parts with a smaller volume, relative to the largest part, are removed."""
 
 
 def base_surface(
@@ -40,23 +42,27 @@ def base_surface(
     threads: int | None = None,
     progress: Callable[[], object] | None = None,
 ) -> BaseMesh:
-    """A closed, coloured surface of ``scene``, an object: the base for a mesh prior where there is none.
+    """A closed, coloured surface of an object, to serve as the base of a mesh prior.
 
-    The scene is drawn from all round as a mesh, with depths. Each picture tells the voxels of a grid how far
-    before or behind the surface they lie, up to ``TRUNCATION`` voxels, and the means make a signed distance
-    (TSDF; Curless and Levoy 1996). What no picture sees is inside. The surface where it is 0 is found by
-    marching cubes, and edges are collapsed where that changes its shape least (Garland and Heckbert 1997).
-    Small separate parts are left out. Needs the extra ``base``.
+    The scene is rendered as a mesh from all directions, with depth. The depth images are fused into a
+    truncated signed distance function (TSDF; Curless and Levoy 1996) on a voxel grid, in which unobserved
+    voxels count as interior. Marching cubes extracts its zero level set, and quadric edge collapses (Garland
+    and Heckbert 1997) reduce the number of faces. Small separate parts are removed. Needs the extra ``base``.
 
     Args:
-        scene: splats, which are converted for the purpose, or a mesh, fine-tuned say.
-        resolution: voxels along the longest side of the box, 8 to 512: time and memory grow with its cube.
-        faces: about so many triangles, at least 4, where the grid gives more; 0: all of them.
-        cameras: to look from, with the whole object in their pictures; or a number to be placed all round.
-        threads: at most this many; all processors by default.
-        progress: called after each picture.
+        scene: splats, which are converted first, or a mesh, for instance a fine-tuned one.
+        resolution: voxels along the longest side of the box, 8 to 512. Time and memory grow with its cube.
+        faces: approximate maximum number of triangles, at least 4; 0: no maximum.
+        cameras: cameras that see the whole object, or a number of cameras to place around it, 4 to 1000.
+        threads: maximum number of threads; all processors by default.
+        progress: called after each image.
 
-    Raises ValueError for options out of range, and where the pictures show nothing solid.
+    Returns:
+        The base mesh with vertex colours, in scene units.
+
+    Raises:
+        ValueError: options out of range, or images that show nothing solid.
+        MissingDependencyError: the libraries of the extra ``base`` are missing.
     """
     if not 8 <= resolution <= MAX_RESOLUTION:
         raise ValueError(f"resolution must be 8 to {MAX_RESOLUTION} voxels, got {resolution}")
@@ -72,13 +78,13 @@ def base_surface(
     else:
         placed = cameras
     if not placed:
-        raise ValueError("there are no cameras to look from")
-    _libraries()  # before the work
+        raise ValueError("cameras must hold at least one camera")
+    _libraries()  # fails early
     mesh = scene
     if isinstance(mesh, GaussianCloud):
         from meshsplats.conversion import convert
 
-        # As wide as a viewer draws them: gaps between splats would be holes in the surface.
+        # As wide as viewers draw splats: gaps between them would be holes in the surface.
         mesh = convert(mesh, cameras=placed, look="splats")
     low, voxel, shape = _grid(scene, resolution)
     total, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -88,36 +94,38 @@ def base_surface(
         assert drawn.depth is not None
         solid = drawn.alpha >= _SOLID
         depth = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)
-        _add(total, weight, depth, camera, low, voxel)
+        _integrate(total, weight, depth, camera, low, voxel)
         views.append(View(camera, ViewImage(np.clip(drawn.color, 0, 1), drawn.alpha)))
         if progress is not None:
             progress()
     field = np.where(weight > 0, total / np.where(weight > 0, weight, 1), -1)
-    for axis in range(3):  # closed at the border
+    for axis in range(3):  # the surface is closed at the border of the grid
         sides = np.moveaxis(field, axis, 0)
         sides[0] = sides[-1] = 1
     vertices, triangles = isosurface(field, faces)
     if not len(triangles):
-        raise ValueError("nothing solid is seen from all round: this makes bases of objects, not of haze")
+        raise ValueError("the images show nothing solid: this makes bases of objects, not of haze")
     points = (low + voxel * vertices).astype(np.float32)
     colors = np.ones((len(points), 4), np.float32)
-    colors[:, :3] = colors_from_views(_at_vertices(points, triangles), views, threads=threads)
+    colors[:, :3] = colors_from_views(_vertex_binding(points, triangles), views, threads=threads)
     return BaseMesh(points, triangles, colors, up=guess_up(scene))
 
 
 def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) float64 vertices, in steps of the grid, and (m, 3) int32 triangles of the surface where
-    ``field`` (x, y, z) passes 0, wound so that they face where it is positive; about ``faces`` of them where
-    there would be more, unless that is 0.
+    """The surface where ``field``, an (x, y, z) grid, is 0.
 
-    Parts of the inside with less than ``_LEAST_PART`` of the volume of the largest are left out.
+    The triangles face the positive side. Parts of the interior with less than ``_MIN_PART`` of the volume of
+    the largest part are removed. ``faces`` is the approximate maximum number of triangles; 0: no maximum.
+
+    Returns:
+        (n, 3) float64 vertices in grid steps, (m, 3) int32 triangles.
     """
     label, marching_cubes, simplify = _libraries()
     part = label(field < 0, connectivity=1)
     sizes = np.bincount(part.ravel())
-    if len(sizes) == 1 or sizes[0] == 0:  # all outside, or all inside
+    if len(sizes) == 1 or sizes[0] == 0:  # all exterior, or all interior
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    small = sizes < _LEAST_PART * sizes[1:].max()
+    small = sizes < _MIN_PART * sizes[1:].max()
     small[0] = False
     vertices, triangles, _, _ = marching_cubes(
         np.where(small[part], -field, field), 0.0, gradient_direction="descent", allow_degenerate=False
@@ -140,13 +148,13 @@ def _libraries() -> tuple[Callable[..., Any], ...]:
 
 
 def _grid(scene: GaussianCloud | SplatMesh, resolution: int) -> tuple[np.ndarray, float, tuple[int, ...]]:
-    """Lowest corner, side of a voxel and number of grid points of the box round ``scene``."""
+    """Lowest corner (3,), side of a voxel and number of grid points of the box around ``scene``."""
     bounds = scene_bounds(scene)
     if not len(bounds.points):
         raise ValueError("the scene is empty")
     weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(bounds.points))
     sides = [
-        [weighted_quantile(bounds.points[:, k], weights, share) for share in (_COVERED, 1 - _COVERED)]
+        [weighted_quantile(bounds.points[:, k], weights, share) for share in (_OUTLIERS, 1 - _OUTLIERS)]
         for k in range(3)
     ]
     low, high = np.array(sides, np.float64).T
@@ -158,10 +166,10 @@ def _grid(scene: GaussianCloud | SplatMesh, resolution: int) -> tuple[np.ndarray
     return low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 1)
 
 
-def _add(
+def _integrate(
     total: np.ndarray, weight: np.ndarray, depth: np.ndarray, camera: Camera, low: np.ndarray, voxel: float
 ) -> None:
-    """Adds what the (h, w) ``depth`` of one picture says, slab by slab."""
+    """Adds the truncated distances of one (h, w) ``depth`` image to the grid, slab by slab."""
     matrix = camera.world_to_camera
     y, z = np.meshgrid(*(low[k] + voxel * np.arange(total.shape[k]) for k in (1, 2)), indexing="ij")
     for i in range(total.shape[0]):
@@ -174,18 +182,18 @@ def _add(
         seen = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         at = np.where(seen, row, 0).astype(np.intp), np.where(seen, column, 0).astype(np.intp)
         distance = (depth[at] - place[2]) / (TRUNCATION * voxel)
-        told = seen & (distance >= -1)
-        total[i] += np.where(told, np.minimum(distance, 1), 0)
-        weight[i] += told
+        observed = seen & (distance >= -1)
+        total[i] += np.where(observed, np.minimum(distance, 1), 0)
+        weight[i] += observed
 
 
-def _at_vertices(points: np.ndarray, faces: np.ndarray) -> Binding:
-    """Every vertex of a mesh bound to itself, in a face that has it."""
+def _vertex_binding(points: np.ndarray, faces: np.ndarray) -> Binding:
+    """Every vertex of a mesh bound to itself, in one of its faces."""
     face = np.zeros(len(points), np.int32)
     corner = np.zeros(len(points), np.intp)
     for k in range(3):
         face[faces[:, k]], corner[faces[:, k]] = np.arange(len(faces)), k
-    # A vertex' last entry may mix corners of two faces: look again which corner it is in its face.
+    # Duplicate assignments may mix entries of two faces: find the corner again in the final face.
     corner = (faces[face] == np.arange(len(points))[:, None]).argmax(axis=1)
     weights = np.eye(3, dtype=np.float32)[corner]
     return Binding(points, faces, face, weights, np.zeros(len(points), np.int32))

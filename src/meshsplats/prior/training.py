@@ -1,4 +1,4 @@
-"""train: a mesh prior brought closer to pictures."""
+"""train: optimises a mesh prior on images."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ CHOICES = {
     "ssim_weight": 0.0,
     "l2_weight": 5.0,
 }
-"""Where training a prior differs from the preset 'default' of fine-tuning."""
+"""Differences from the preset 'default' of fine-tuning."""
 
 
 def prior_config(**changes: Any) -> FinetuneConfig:
-    """The configuration that ``train`` has by default, with ``changes`` as in ``make_config``."""
+    """The default configuration of ``train``, with ``changes`` as in ``make_config``."""
     from meshsplats.finetuning import make_config
 
     return make_config("default", **{**CHOICES, **changes})
@@ -37,19 +37,27 @@ def train(
     run: RunOptions | None = None,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> MeshPrior:
-    """``prior`` with weights, colours and opacities optimised on the training views of ``dataset``:
-    photographs, or the splats' own pictures.
+    """Optimises barycentric weights, colours and opacities of ``prior`` on the training views of ``dataset``.
 
-    The loop is that of ``finetune``, with its losses, optimiser, pruning and checkpoints; positions are moved
-    by their weights on the base's faces, which after every step are not negative and have the sum 1. Rates of
-    positions are in units of the triangles' size (``position_unit`` 'splat') or of the scene.
+    The targets are photographs or images of splats. The loop is that of ``finetune``, with its losses,
+    optimiser, pruning and checkpoints. In place of positions it optimises their barycentric weights on the
+    base's faces, which are projected onto the simplex after every step. The learning rate of positions is in
+    units of the triangles' size (``position_unit`` 'splat') or of the scene.
 
-    Arguments and errors are those of ``finetune``, but ``config`` is ``prior_config()`` by default.
+    Args:
+        prior: the initial mesh prior, from ``bind``.
+        dataset: the training views, and held-out views to score.
+        config: the configuration; ``prior_config()`` by default.
+        run: output folder, logging and resources, as for ``finetune``.
+        on_progress: called after every step.
+
+    Returns:
+        The trained prior on the same base.
+
+    Raises:
+        The errors of ``finetune``.
     """
     from meshsplats.finetuning import finetune
 
-    return MeshPrior(
-        MeshPrior(
-            finetune(prior.mesh, dataset, config or prior_config(), run=run, on_progress=on_progress)
-        ).pose()
-    )
+    trained = finetune(prior.mesh, dataset, config or prior_config(), run=run, on_progress=on_progress)
+    return MeshPrior(MeshPrior(trained).pose())  # posed, with shading normals

@@ -1,4 +1,4 @@
-"""What runs inside Blender, 4.2 or newer: needs its module bpy and NumPy, nothing else.
+"""Code that runs inside Blender 4.2 or newer; needs its module bpy and NumPy only.
 
 The command line runs it through ``worker``; Blender's extension imports it directly.
 """
@@ -13,4 +13,4 @@ MISSING = (
     f" 3.11{_HERE} and a NumPy of its own: python3.11 -m venv blender-env && blender-env/bin/pip install"
     " '.[blender]', in the folder of the sources; or name an installed Blender: --executable /path/to/blender"
 )
-"""Said where bpy is needed and not there."""
+"""Message for a missing bpy."""

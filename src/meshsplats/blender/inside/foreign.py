@@ -10,21 +10,22 @@ from meshsplats.colors import linear_to_srgb
 from meshsplats.mesh import Blending, SplatMesh
 
 _OPACITIES = ("displayOpacity",)
-"""Attributes that hold the opacity apart from the colour, as USD has it."""
+"""Attributes that hold opacity apart from colour, as in USD."""
 _OWNERS = ("face_splat", "splat")
-"""Attributes of the faces that may hold the number of the splat."""
+"""Face attributes that may hold the index of the splat."""
 
 
-def splat_mesh(thing: Any) -> SplatMesh:
-    """The mesh of ``thing``, an object with vertex colours that Blender or another add-on made, in its own
-    frame.
+def splat_mesh(obj: Any) -> SplatMesh:
+    """The mesh of ``obj``, an object with vertex colours from another importer, in its own frame.
 
-    The colours are taken for linear light, as Blender keeps colours: .glb and .usd hold it so, and a .ply
-    comes in so with the importer's default, sRGB. They come back as display colours, unless a .glb says that
-    its mesh was made for blending in linear light. Of colours that differ at the corners of a vertex, the
-    mean is taken. Raises ValueError for an object without triangles or colours.
+    Blender keeps colours as linear light: .glb and .usd store them so, and the .ply importer converts them by
+    default. They are returned as display colours, unless a .glb says that its mesh was made for blending in
+    linear light. Colours that differ between the corners of a vertex are averaged.
+
+    Raises:
+        ValueError: the object has no triangles or no colours.
     """
-    data: Any = thing.data if thing is not None and thing.type == "MESH" else None
+    data: Any = obj.data if obj is not None and obj.type == "MESH" else None
     if data is None or not len(data.color_attributes):
         raise ValueError("the object has no vertex colours")
     faces = np.empty(len(data.loops), np.int32)
@@ -43,8 +44,8 @@ def splat_mesh(thing: Any) -> SplatMesh:
     blending = _blending(data)
     if blending == "display":
         colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
-    # Up in Blender's world, as the object lies in it.
-    up = np.array(thing.matrix_world.to_3x3().inverted_safe())[:, 2]
+    # Up in Blender's world, in the frame of the object.
+    up = np.array(obj.matrix_world.to_3x3().inverted_safe())[:, 2]
     return SplatMesh(
         vertices.reshape(-1, 3),
         faces.reshape(-1, 3),
@@ -56,8 +57,8 @@ def splat_mesh(thing: Any) -> SplatMesh:
 
 
 def _blending(data: Any) -> Blending:
-    """What our .glb files say of themselves. Blender keeps it with the mesh: as properties, or, where a
-    number is too large for one, as Python would print it."""
+    """Blending as noted in our .glb files. Blender keeps the note with the mesh: as properties, or, where an
+    integer is too large for one, as Python's text of it."""
     note = data.get("meshsplats")
     if isinstance(note, str):
         return "linear" if "'blending': 'linear'" in note else "display"
@@ -82,7 +83,7 @@ def _at_vertices(data: Any, attribute: Any, name: str, width: int, corners: np.n
 
 
 def _owner(data: Any) -> np.ndarray | None:
-    """(f,) int32 number of each face's splat, where the file held it."""
+    """(f,) int32 index of each face's splat, where the file held it."""
     for name in _OWNERS:
         attribute = data.attributes.get(name)
         if attribute is not None and (attribute.domain, attribute.data_type) == ("FACE", "INT"):

@@ -11,8 +11,8 @@ from meshsplats.cameras.framing import front_axes
 
 
 def to_blender(up: np.ndarray) -> np.ndarray:
-    """(3, 3) float64 rotation from the world frame to Blender's for a unit ``up``: the scene stands
-    upright, its front towards -y, where Blender's front view looks from."""
+    """(3, 3) float64 rotation from the world frame to Blender's for a unit ``up``: the scene stands upright
+    and faces -y, as Blender's front view expects."""
     right, upward, forward = front_axes(np.asarray(up, np.float64))
     return np.stack([right, forward, upward])
 

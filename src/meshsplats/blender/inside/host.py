@@ -1,4 +1,4 @@
-"""The module bpy, or an error that says where it comes from."""
+"""The module bpy, or an error that says how to install it."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.meshes import COLOR, NORMAL
 
 SELF_SHADOW = "Self-shadow distance"
-"""Name and label of the node that holds the distance within which layers do not shade each other."""
+"""Name and label of the node with the distance within which layers do not shade each other."""
 
 
 class _Tree:
@@ -31,16 +31,16 @@ class _Tree:
     def math(self, operation: str, x: int, y: int, a: Any, b: Any) -> Any:
         """Output of a Math node; a and b are sockets or numbers."""
         node = self.node("ShaderNodeMath", x, y, operation=operation)
-        for place, value in enumerate((a, b)):
+        for index, value in enumerate((a, b)):
             if isinstance(value, (int, float)):
-                node.inputs[place].default_value = value
+                node.inputs[index].default_value = value
             else:
-                self.link(value, node.inputs[place])
+                self.link(value, node.inputs[index])
         return node.outputs[0]
 
 
 def unlit(name: str = "Splats, unlit", *, attribute: str = COLOR) -> Any:
-    """Shows the colours of ``attribute`` as they are, composited by opacity: from any side, in mirrors and
+    """Emits the colours of ``attribute`` unchanged, composited by opacity: from any side, in mirrors and
     through glass."""
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
@@ -60,12 +60,12 @@ def lit(
     smooth: bool = True,
     attribute: str = COLOR,
 ) -> Any:
-    """A surface that lights and shadows act on, its linear colours and opacity in ``attribute``.
+    """A diffuse, translucent surface with linear colours and opacity from ``attribute``.
 
-    Many translucent layers make one surface, and each is shaded as if it lay in that surface: by the smoothed
-    normal in the attribute ``splat_normal`` (``smooth`` False: by the triangle's own). A ray that starts on
-    one layer does not see the others within ``self_shadow`` (scene units): they would shade it by chance,
-    half of it on average. Shadows of things farther off than that are not touched.
+    Many translucent layers form one surface, so each is shaded by the smoothed normal of that surface
+    (attribute ``splat_normal``; ``smooth`` False: by the triangle's own). Rays that start on a layer ignore
+    layers within ``self_shadow`` (scene units), which would shade half of it by chance. Shadows of objects
+    farther away stay.
     """
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
@@ -80,7 +80,7 @@ def lit(
         )
         tree.link(normal.outputs["Vector"], turned.inputs[0])
         tree.link(turned.outputs[0], surface.inputs["Normal"])
-        # The correction for bump maps darkens wherever the shading normal leaves the triangle's own.
+        # Bump map correction darkens wherever the shading normal differs from the triangle's own.
         versions.set_if_there(material.cycles, use_bump_map_correction=False)
     if specular > 0:
         gloss = tree.node("ShaderNodeBsdfGlossy", 3, 2)
@@ -88,7 +88,7 @@ def lit(
         if smooth:
             tree.link(turned.outputs[0], gloss.inputs["Normal"])
         coat = tree.node("ShaderNodeMixShader", 4, 2)
-        # As in the Principled shader: 0.5 stands for 4 % reflected head on, the index of refraction 1.5.
+        # As in the Principled shader: 0.5 means 4 % reflected head on, index of refraction 1.5.
         versions.socket(coat.inputs, "Fac", "Factor").default_value = 0.08 * specular
         tree.link(shader, coat.inputs[1])
         tree.link(gloss.outputs[0], coat.inputs[2])
@@ -103,7 +103,7 @@ def lit(
 
 
 def _translucent(tree: _Tree, material: Any, alpha: Any, shader: Any) -> None:
-    """Ends ``material`` with ``shader`` over what is behind it, by ``alpha``."""
+    """Completes ``material``: ``shader`` composited over the background by ``alpha``."""
     clear = tree.node("ShaderNodeBsdfTransparent", 5, 3)
     mix = tree.node("ShaderNodeMixShader", 6, 1)
     out = tree.node("ShaderNodeOutputMaterial", 7, 1)
@@ -111,9 +111,9 @@ def _translucent(tree: _Tree, material: Any, alpha: Any, shader: Any) -> None:
     tree.link(clear.outputs[0], mix.inputs[1])
     tree.link(shader, mix.inputs[2])
     tree.link(mix.outputs[0], out.inputs["Surface"])
-    # 'AUTO' would make every triangle a light: minutes of set-up and twice the memory at millions of them.
+    # 'AUTO' makes every triangle a light: minutes of set-up and twice the memory for millions of them.
     material.cycles.emission_sampling = "NONE"
-    # EEVEE: blended in the order of the faces, seen from both sides, all layers.
+    # EEVEE: all layers, both sides, blended in face order.
     material.surface_render_method = "BLENDED"
     versions.set_if_there(
         material, use_transparency_overlap=True, show_transparent_back=True, use_transparent_shadow=True
@@ -132,13 +132,13 @@ def plain(name: str, color: tuple[float, float, float]) -> Any:
 
 
 def fading(name: str, color: tuple[float, float, float], inner: float, outer: float) -> Any:
-    """A matt surface of linear ``color`` that can be seen through the more, the farther from the object's
-    origin it is: not at all up to ``inner``, wholly from ``outer`` on, scene units."""
+    """A matt surface of linear ``color`` that fades with the distance from the object's origin: opaque up to
+    ``inner``, fully transparent from ``outer`` on; scene units."""
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
-    place = tree.node("ShaderNodeTexCoord", 0, 2)
+    position = tree.node("ShaderNodeTexCoord", 0, 2)
     away = tree.node("ShaderNodeVectorMath", 1, 2, operation="LENGTH")
-    tree.link(place.outputs["Object"], away.inputs[0])
+    tree.link(position.outputs["Object"], away.inputs[0])
     share = tree.node("ShaderNodeMapRange", 2, 2, interpolation_type="SMOOTHSTEP")
     tree.link(away.outputs["Value"], share.inputs["Value"])
     share.inputs["From Min"].default_value = inner
@@ -156,7 +156,7 @@ def fading(name: str, color: tuple[float, float, float], inner: float, outer: fl
 
 
 def mirror(name: str = "Mirror") -> Any:
-    """A perfect mirror that keeps 95 % of the light."""
+    """A perfect mirror that reflects 95 % of the light."""
     material = bpy.data.materials.new(name)
     tree = _Tree(material)
     surface = tree.node("ShaderNodeBsdfPrincipled", 0)
@@ -175,8 +175,7 @@ def glass(name: str = "Glass") -> Any:
     surface = tree.node("ShaderNodeBsdfGlass", 0)
     surface.inputs["Roughness"].default_value = 0
     surface.inputs["IOR"].default_value = 1.45
-    # Light that reaches a place through glass is a caustic, which path tracing finds late: let shadows rays
-    # pass.
+    # Light through glass is a caustic, which path tracing samples poorly: let shadow rays pass instead.
     path = tree.node("ShaderNodeLightPath", 0, 2)
     clear = tree.node("ShaderNodeBsdfTransparent", 0, 1)
     clear.inputs[0].default_value = (0.9, 0.9, 0.9, 1)

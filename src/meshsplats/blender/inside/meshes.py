@@ -8,13 +8,16 @@ import numpy as np
 
 from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
+from meshsplats.cameras.framing import SAMPLE
 
 COLOR = "Color"
-"""Attribute with RGBA: display values where the picture is unlit, linear light where it is lit."""
+"""Attribute with RGBA: display values where the image is unlit, linear light where it is lit."""
 NORMAL = "splat_normal"
 """Attribute with the shading normal, in the object's own frame."""
 SPLAT = "splat"
-"""Attribute of the faces: number of the splat that each was made from."""
+"""Face attribute: index of the splat that each was made from."""
+_VISIBLE = 0.1
+"""Opacity from which a vertex counts as visible."""
 
 
 def make_mesh(
@@ -27,11 +30,10 @@ def make_mesh(
     face_splat: np.ndarray | None = None,
     edges: bool = True,
 ) -> Any:
-    """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored as they
-    are.
+    """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored unchanged.
 
-    ``edges`` False leaves out the edges, and without ``normals`` shades flat: renderers need no edges, an
-    unlit material no normals, and both take as long as all the rest.
+    ``edges`` False skips the edges and, without ``normals``, shades flat: renderers need no edges, an unlit
+    material no normals, and both take as long as all the rest.
     """
     mesh = make_plain(name, vertices, faces)
     color = mesh.attributes.new(COLOR, "FLOAT_COLOR", "POINT")
@@ -49,14 +51,14 @@ def make_mesh(
     elif normals is None:
         versions.shade_flat(mesh)
     if normals is not None:
-        # Cycles lights no side of a surface that its own normal, as smooth as the mesh says, does not face.
+        # Cycles lights only the side that the mesh's own (smooth) normals face.
         versions.set_normals(mesh, normals)
     return mesh
 
 
 def make_plain(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """A bpy mesh of (v, 3) float32 vertices and (f, 3) int32 faces. Its edges are left to ``mesh.update``,
-    which looks for them whether asked to or not."""
+    """A bpy mesh of (v, 3) float32 vertices and (f, 3) int32 faces, without edges: ``mesh.update`` adds
+    them."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(vertices))
     versions.set_positions(mesh, vertices)
@@ -68,23 +70,38 @@ def make_plain(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 
 def make_object(mesh: Any, name: str, rotation: np.ndarray, collection: Any) -> Any:
-    """An object of ``mesh`` in ``collection``, turned by the (3, 3) ``rotation``."""
+    """An object of ``mesh`` in ``collection``, rotated by ``rotation`` (3, 3)."""
     from mathutils import Matrix
 
-    thing = bpy.data.objects.new(name, mesh)
-    thing.matrix_world = Matrix(np.asarray(rotation, np.float64).tolist()).to_4x4()
-    collection.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, mesh)
+    obj.matrix_world = Matrix(np.asarray(rotation, np.float64).tolist()).to_4x4()
+    collection.objects.link(obj)
+    return obj
 
 
 def set_faces(mesh: Any, faces: np.ndarray) -> None:
-    """Puts the faces of ``mesh``, made without edges, in another order."""
+    """Reorders the faces of ``mesh``, which has no edges."""
     versions.set_corners(mesh, faces)
     mesh.update()
 
 
 def far_to_near(vertices: np.ndarray, faces: np.ndarray, world_to_camera: np.ndarray) -> np.ndarray:
-    """(f,) order of the faces for a painter: descending depth of their middles. Frame: that of the
-    vertices."""
+    """(f,) back-to-front order of the faces (painter's algorithm): descending depth of their centroids.
+    ``vertices`` (v, 3) in the world frame of ``world_to_camera`` (4, 4)."""
     depth = vertices @ world_to_camera[2, :3].astype(np.float32)
     return np.argsort(-depth[faces].sum(axis=1), kind="stable")
+
+
+def world_points(obj: Any) -> np.ndarray:
+    """(k, 3) float64 sample of the visible vertices of ``obj``, in Blender's world."""
+    data = obj.data
+    vertices = np.empty(3 * len(data.vertices), np.float32)
+    data.vertices.foreach_get("co", vertices)
+    points = vertices.reshape(-1, 3).astype(np.float64)
+    if COLOR in data.attributes and len(points):
+        colors = np.empty(4 * len(points), np.float32)
+        data.attributes[COLOR].data.foreach_get("color", colors)
+        points = points[colors[3::4] > _VISIBLE]
+    points = points[:: -(-max(len(points), 1) // SAMPLE)]
+    world = np.array(obj.matrix_world)
+    return points @ world[:3, :3].T + world[:3, 3]

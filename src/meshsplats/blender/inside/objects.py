@@ -1,13 +1,14 @@
-"""Splat meshes as objects of an open Blender file: what the extension does."""
+"""Splat meshes as objects of an open Blender file, for the extension."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import foreign, frame, materials, meshes, pictures, priors, versions
+from meshsplats.blender.inside import foreign, frame, levels, materials, meshes, pictures, priors, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
@@ -22,17 +23,16 @@ LIT = "meshsplats_lit"
 LINEAR = "meshsplats_linear"
 """Property of the mesh data: whether the mesh was made for blending in linear light."""
 UP = "meshsplats_up"
-"""Property of the mesh data: what points up in its own frame."""
+"""Property of the mesh data: its up direction, in its own frame."""
 ORIGIN = "meshsplats_origin"
-"""Property of the mesh data: where the object's origin lies in the mesh's own frame: under the subject."""
+"""Property of the mesh data: the object's origin, under the subject, in the mesh's own frame."""
 LAYERS = "meshsplats_layers"
 """Property of the mesh data: most layers behind each other."""
 
 
 def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
-    """All that takes time and does not touch Blender: may run in another thread. Coplanar layers of a mesh
-    prior are set apart, as exports are; a filter is made part of the triangles, for pictures of the whole
-    subject."""
+    """Everything that takes time and does not touch Blender, so that it may run in another thread. Coplanar
+    layers of a mesh prior are separated, as in exports; a filter is baked for images of the whole subject."""
     if mesh.binding is not None and mesh.normals is not None:
         prior = MeshPrior(mesh)
         mesh = prior.pose(lift=prior.export_lift)
@@ -42,34 +42,62 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
     if lit:
         made, arrays["self_shadow"] = lit_arrays(mesh)
         arrays |= made
-    # What hangs on a base keeps the base's frame.
+    # Splats on a base keep the base's frame.
     origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
     return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh), "origin": origin}
 
 
 def foot(mesh: SplatMesh) -> np.ndarray:
-    """(3,) float64 the point under the middle of the subject of ``mesh``, at the height of its lowest part;
-    frame of the mesh."""
+    """(3,) float64 point under the centre of the subject of ``mesh``, at the height of its lowest part; frame
+    of the mesh."""
     bounds, up = scene_bounds(mesh), mesh.up.astype(np.float64)
     return bounds.center + (lowest(bounds, up) - bounds.center @ up) * up
 
 
 def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
-    """A new object in ``collection``, upright in Blender's frame, with its material; that of a mesh prior
-    hangs on an object of its base, which it follows. The object's origin lies under the subject."""
+    """A new object in ``collection``, upright in Blender's frame, with its material. Its origin lies under
+    the subject. The splats of a mesh prior are a child of a new object of their base, which they follow."""
     rotation = frame.to_blender(prepared["mesh"].up)
-    thing = meshes.make_object(_data(prepared, name), name, rotation, collection)
-    thing.location = (rotation @ prepared["origin"]).tolist()  # where the file has it
+    obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
+    obj.location = (rotation @ prepared["origin"]).tolist()
     if prepared["mesh"].binding is not None:
-        priors.give_base(thing, prepared["mesh"].binding, collection)
-    bpy.context.view_layer.objects.active = thing
-    return thing
+        priors.give_base(obj, prepared["mesh"].binding, collection)
+    bpy.context.view_layer.objects.active = obj
+    return obj
 
 
-def replace_mesh(thing: Any, prepared: dict[str, Any]) -> None:
-    """Gives ``thing`` another mesh and material; its place, parent, modifiers and name stay."""
-    old = thing.data
-    thing.data = _data(prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}, old.name)
+def add_chain(
+    prepared: Sequence[dict[str, Any]], name: str, screen_sizes: Sequence[int], collection: Any
+) -> list[Any]:
+    """New objects for the levels of a chain, the finest first, each in a collection of its own inside a new
+    one called ``name``. All stand where the finest does, and only that is visible (``levels.show``)."""
+    homes = levels.add_collections(name, screen_sizes, collection)
+    origin = prepared[0]["origin"]
+    objs = [add(p | {"origin": origin}, home.name, home) for p, home in zip(prepared, homes, strict=True)]
+    levels.tie(objs)
+    bpy.context.view_layer.objects.active = objs[0]
+    return objs
+
+
+def splat_objects(scene: Any) -> list[Any]:
+    """The splat meshes of ``scene``, hidden ones too."""
+    return [obj for obj in scene.objects if obj.type == "MESH" and LAYERS in obj.data]
+
+
+def count_layers(objs: Iterable[Any]) -> int:
+    """Most layers behind each other of ``objs``; of the levels of a chain, one is shown at a time."""
+    most: dict[tuple[bool, str], int] = {}
+    for obj in objs:
+        chain = levels.chain_of(obj)
+        key = (True, chain.name) if chain is not None else (False, obj.name)
+        most[key] = max(most.get(key, 0), int(obj.data.get(LAYERS, 256)))
+    return sum(most.values())
+
+
+def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
+    """Gives ``obj`` another mesh and material; its transform, parent, modifiers and name stay."""
+    old = obj.data
+    obj.data = _data(prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}, old.name)
     if old.users == 0:
         bpy.data.meshes.remove(old)
 
@@ -90,21 +118,35 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
         data.materials.append(materials.lit(self_shadow=prepared["self_shadow"]))
     else:
         data.materials.append(materials.unlit())
-    data[UP] = mesh.up.tolist()
-    data[ORIGIN] = prepared["origin"].tolist()
-    data[LIT] = prepared["lit"]
-    data[LINEAR] = mesh.blending == "linear"
-    data[LAYERS] = prepared["layers"]
+    mark(
+        data,
+        up=mesh.up,
+        origin=prepared["origin"],
+        lit=prepared["lit"],
+        linear=mesh.blending == "linear",
+        layers=prepared["layers"],
+    )
     return data
 
 
-def as_splat_mesh(thing: Any) -> SplatMesh:
-    """The unlit mesh that ``thing`` was made from, frame and colours as in its file.
+def mark(data: Any, *, up: np.ndarray, origin: np.ndarray, lit: bool, linear: bool, layers: int) -> None:
+    """Stores with the mesh ``data`` the facts that ``as_splat_mesh`` and ``render_settings`` need; ``up``
+    (3,) and ``origin`` (3,) in the frame of the splats."""
+    data[UP] = np.asarray(up, np.float64).tolist()
+    data[ORIGIN] = np.asarray(origin, np.float64).tolist()
+    data[LIT] = lit
+    data[LINEAR] = linear
+    data[LAYERS] = layers
 
-    Raises ValueError for an object that is not a mesh of triangles with the colours of this project.
+
+def as_splat_mesh(obj: Any) -> SplatMesh:
+    """The unlit mesh that ``obj`` was made from, in the frame and colours of its file.
+
+    Raises:
+        ValueError: not a mesh of triangles that MeshSplats made.
     """
-    data: Any = getattr(thing, "data", None)
-    if thing is None or thing.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
+    data: Any = getattr(obj, "data", None)
+    if obj is None or obj.type != "MESH" or LIT not in data or meshes.COLOR not in data.attributes:
         raise ValueError("the object was not made by MeshSplats")
     vertices = np.empty(3 * len(data.vertices), np.float32)
     data.vertices.foreach_get("co", vertices)
@@ -136,22 +178,27 @@ def as_splat_mesh(thing: Any) -> SplatMesh:
         up=up,
         blending=blending,
     )
-    if priors.base_of(thing) is None:
+    if priors.base_of(obj) is None:
         return found
-    binding = priors.binding_of(thing)
+    binding = priors.binding_of(obj)
     return replace(found, vertices=binding.positions(), normals=binding.normals(), binding=binding)
 
 
-def render_settings(scene: Any, things: list[Any], lit: bool, light: LightOptions | None = None) -> int:
-    """Sets the scene up for ``things``: engine settings, colour management and the limit on transparent
-    bounces, which is returned. The engine stays the one chosen (Cycles where it is neither Cycles nor
-    EEVEE). One scene cannot be right for both unlit meshes of display and of linear blending: where there are
-    both, it is for the former. Lit pictures are denoised, and shown as ``light`` exposes them."""
+def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions | None = None) -> int:
+    """Sets up engine, colour management and bounce limits of the scene for ``objs``.
+
+    Keeps the engine, or chooses Cycles where it is neither Cycles nor EEVEE. A scene cannot be right for
+    unlit meshes of both display and linear blending: display wins. Lit images are denoised, with the exposure
+    of ``light``.
+
+    Returns:
+        The limit on transparent bounces.
+    """
     light = light or LightOptions(exposure=0.0)
     engine = "eevee" if "EEVEE" in scene.render.engine else "cycles"
     versions.enable_cycles()
-    layers = sum(int(thing.data.get(LAYERS, 256)) for thing in things)
-    linear = bool(things) and all(thing.data.get(LINEAR) for thing in things)
+    layers = count_layers(objs)
+    linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs)
     limit = bounce_limit(layers)
     if lit:
         pictures.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)
@@ -161,18 +208,19 @@ def render_settings(scene: Any, things: list[Any], lit: bool, light: LightOption
     return limit
 
 
-def clash(things: list[Any], lit: bool) -> str:
-    """What cannot be right in one unlit scene of ``things``, or ''."""
-    kinds = {bool(thing.data.get(LINEAR)) for thing in things}
+def clash(objs: list[Any], lit: bool) -> str:
+    """Message if ``objs`` cannot all be right in one unlit scene, else ''."""
+    kinds = {bool(obj.data.get(LINEAR)) for obj in objs}
     if lit or len(kinds) < 2:
         return ""
     return "some meshes blend display values and others linear light: unlit, the latter look too dark here"
 
 
-def dress(thing: Any, lit: bool) -> None:
-    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) what a mesh of our own has: display
-    colours for the exact picture, or linear ones, smoothed normals and a lit material.
+def dress(obj: Any, lit: bool) -> None:
+    """Gives a mesh from one of Blender's own importers (.glb, .ply, .usd) our colours and material: display
+    colours for the exact image, or linear ones, smoothed normals and a lit material.
 
-    Raises ValueError if the object has no colours or other faces than triangles.
+    Raises:
+        ValueError: the object has no colours, or faces that are not triangles.
     """
-    replace_mesh(thing, prepare(foreign.splat_mesh(thing), lit))
+    replace_mesh(obj, prepare(foreign.splat_mesh(obj), lit))

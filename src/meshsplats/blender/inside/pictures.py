@@ -1,4 +1,4 @@
-"""Render settings of Blender, and pictures from it."""
+"""Blender's render settings, and rendering to image files."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from meshsplats.blender.inside.host import bpy
 
 
 def exact_settings(scene: Any, engine: str, *, linear: bool = False) -> None:
-    """Colours come out as they went in, with no dither and one sample at each pixel's centre: without a view
-    transform, or, where they are ``linear`` light, encoded for display (sRGB)."""
+    """Settings that render colours unchanged: no dither, one sample at each pixel's centre, no view
+    transform. Colours that are ``linear`` light are encoded for display (sRGB)."""
     _common(scene, engine, "Standard" if linear else "Raw")
     cycles = scene.cycles
     cycles.samples = 1
     cycles.pixel_filter_type = "GAUSSIAN"
-    # The first sample lies at the pixel's centre; so narrow a filter keeps it there.
+    # The first sample lies at the pixel's centre; a filter this narrow keeps it there.
     cycles.filter_width = 0.01
     cycles.max_bounces = 0
     cycles.use_denoising = False
@@ -42,8 +42,15 @@ def lit_settings(
     raytracing: bool = False,
     exposure: float = 0.0,
 ) -> None:
-    """Linear light, shown with the view transform Standard (sRGB) and ``exposure`` in stops; ``limit`` layers
-    may lie behind each other. ``raytracing``: EEVEE traces what mirrors and glass show."""
+    """Settings for linear light, shown with the view transform Standard (sRGB).
+
+    Args:
+        samples: per pixel.
+        limit: most layers that a ray may pass.
+        bounces: how often light is scattered.
+        raytracing: EEVEE traces rays for mirrors and glass.
+        exposure: in stops.
+    """
     _common(scene, engine, "Standard")
     scene.view_settings.exposure = exposure
     cycles = scene.cycles
@@ -58,7 +65,7 @@ def lit_settings(
     cycles.caustics_reflective = False
     cycles.caustics_refractive = False
     cycles.use_denoising = denoise
-    # The light tree leaves out lights behind a triangle, though its smoothed normal may face them.
+    # The light tree skips lights behind a triangle, though its smoothed normal may face them.
     cycles.use_light_tree = False
     _layers(scene, limit)
     scene.eevee.taa_render_samples = samples
@@ -73,7 +80,7 @@ def _layers(scene: Any, limit: int) -> None:
 
 
 def _common(scene: Any, engine: str, view: str) -> None:
-    # Both engines are set up, so that one can be changed for the other.
+    # Sets up both engines, so that the user can switch.
     scene.render.engine = versions.engine_name(engine)
     scene.render.dither_intensity = 0
     scene.display_settings.display_device = "sRGB"
@@ -88,37 +95,40 @@ def _common(scene: Any, engine: str, view: str) -> None:
 
 
 def render_to(scene: Any, path: Path, factor: int = 1, *, scratch: Path | None = None) -> None:
-    """Renders to ``path``, .png (8 bits) or .exr (32 bits). ``factor`` > 1: the mean of that many squared
-    pixels becomes one; the larger picture lies in the folder ``scratch`` meanwhile, by default beside
-    ``path``."""
+    """Renders to ``path``, .png (8 bits) or .exr (32 bits).
+
+    Args:
+        factor: blocks of ``factor`` x ``factor`` pixels are averaged into one.
+        scratch: folder for the larger image meanwhile; by default that of ``path``.
+    """
     transparent = scene.render.film_transparent
-    picture = scene.render.image_settings
-    picture.color_mode = "RGBA" if transparent else "RGB"
+    settings = scene.render.image_settings
+    settings.color_mode = "RGBA" if transparent else "RGB"
     if factor == 1:
-        _format(picture, path.suffix)
+        _format(settings, path.suffix)
         _render(scene, path)
         return
     large = (scratch or path.parent) / f"{path.stem}.large.exr"
     try:
-        _format(picture, ".exr")
+        _format(settings, ".exr")
         _render(scene, large)
         small = _mean(read_pixels(large), factor)
     finally:
         if large.exists():
             large.unlink()
-    _format(picture, path.suffix)
+    _format(settings, path.suffix)
     _save(small, path, scene)
 
 
-def _format(picture: Any, suffix: str) -> None:
+def _format(settings: Any, suffix: str) -> None:
     if suffix == ".exr":
-        picture.file_format = "OPEN_EXR"
-        picture.color_depth = "32"
-        picture.exr_codec = "ZIP"
+        settings.file_format = "OPEN_EXR"
+        settings.color_depth = "32"
+        settings.exr_codec = "ZIP"
     else:
-        picture.file_format = "PNG"
-        picture.color_depth = "8"
-        picture.compression = 50
+        settings.file_format = "PNG"
+        settings.color_depth = "8"
+        settings.compression = 50
 
 
 def _render(scene: Any, path: Path) -> None:
@@ -130,11 +140,11 @@ def _render(scene: Any, path: Path) -> None:
 
 
 def _whole_exr(data: bytes) -> bool:
-    """Whether all chunks that an OpenEXR file speaks of are in it (https://openexr.com, file layout). Blender
-    is not asked: version 5.0 aborts on a file that is cut off."""
+    """Whether an OpenEXR file holds all chunks of its offset table (https://openexr.com, file layout).
+    Blender's own reader will not do: version 5.0 aborts on a truncated file."""
     if len(data) < 9 or data[:4] != b"\x76\x2f\x31\x01":
         return False
-    if data[5] & 0x1A:  # tiled, deep or of several parts: none that Blender writes here
+    if data[5] & 0x1A:  # tiled, deep or multi-part: Blender writes none of these here
         return True
     at, found = 8, {}
     try:
@@ -154,7 +164,7 @@ def _whole_exr(data: bytes) -> bool:
 
 
 def _check_written(path: Path, pixels: int) -> None:
-    """OSError for a picture that is not whole: Blender says nothing of a full disk."""
+    """Raises OSError for a missing or truncated image: Blender does not report a full disk."""
     try:
         if path.suffix == ".png":
             with open(path, "rb") as file:
@@ -167,7 +177,7 @@ def _check_written(path: Path, pixels: int) -> None:
         return
     if shutil.disk_usage(path.parent).free < 16 * pixels:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), os.fspath(path))
-    raise OSError(f"{path}: Blender wrote no picture")
+    raise OSError(f"{path}: Blender wrote no image")
 
 
 def read_pixels(path: Path) -> np.ndarray:
@@ -196,7 +206,7 @@ def _save(pixels: np.ndarray, path: Path, scene: Any) -> None:
     height, width = pixels.shape[:2]
     image = bpy.data.images.new("mean", width, height, alpha=True, float_buffer=True)
     try:
-        # The space of Blender's own results: the scene's view transform is applied as to them.
+        # The colour space of Blender's render results, so that the view transform applies to it as to them.
         image.colorspace_settings.name = "Linear Rec.709"
         image.alpha_mode = "PREMUL"
         image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())

@@ -1,8 +1,8 @@
 """Mesh priors in an open Blender file: the base as an object of its own, and splats that follow it.
 
-The splats are a child of the base, so they go where it goes; when its vertices move against each other (edit
-mode, shape keys, an armature, cloth, soft bodies), ``follow`` computes theirs from them, as does
-``MeshPrior.pose``. The extension calls it after every change and on every frame.
+The splats are a child of the base, so they move with it. When the base deforms (edit mode, shape keys, an
+armature, cloth, soft bodies), ``follow`` computes their vertices from its own, as ``MeshPrior.pose`` does.
+The extension calls it after every change and on every frame.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from meshsplats.blender.inside import meshes, versions
 from meshsplats.blender.inside.host import bpy
 
 BASE = "meshsplats_base"
-"""Property of the splats' object: the object of their base."""
+"""Property of the splats' object: the object of its base."""
 PROBLEM = "meshsplats_problem"
-"""Property of the splats' object: why it could not follow its base; empty if it did."""
+"""Property of the splats' object: why it could not follow its base; empty if it could."""
 LIFT = "meshsplats_lift"
 """Property of the mesh data: distance between layers."""
 FACE, WEIGHTS, LAYER = "splat_base_face", "splat_base_weights", "splat_layer"
@@ -27,7 +27,7 @@ FACE, WEIGHTS, LAYER = "splat_base_face", "splat_base_weights", "splat_layer"
 
 
 def store(data: Any, binding: Binding) -> None:
-    """Keeps ``binding`` with the bpy mesh ``data`` of its splats, but for the base, which is an object."""
+    """Stores ``binding`` with the bpy mesh ``data`` of its splats, except the base, which is an object."""
     for name, kind, key, values in [
         (FACE, "INT", "value", binding.vertex_face),
         (WEIGHTS, "FLOAT_VECTOR", "vector", binding.weights),
@@ -38,41 +38,42 @@ def store(data: Any, binding: Binding) -> None:
     data[LIFT] = binding.lift
 
 
-def give_base(thing: Any, binding: Binding, collection: Any) -> Any:
-    """Makes the base of ``thing``, the object of its splats, as an object in ``collection``: drawn as wire,
-    left out of pictures, at the splats' place, which hang on it from now on. Returns it."""
-    data = meshes.make_plain(f"{thing.name} base", binding.base_vertices, binding.base_faces)
+def give_base(obj: Any, binding: Binding, collection: Any) -> Any:
+    """Makes the base of ``obj``, the object of the splats, as an object in ``collection``: drawn as wire, not
+    rendered, with the transform of the splats, which become its child. Returns it."""
+    data = meshes.make_plain(f"{obj.name} base", binding.base_vertices, binding.base_faces)
     data.update(calc_edges=True)
-    base = bpy.data.objects.new(f"{thing.name} base", data)
+    base = bpy.data.objects.new(f"{obj.name} base", data)
     base.display_type = "WIRE"
     base.hide_render = True
-    base.matrix_world = thing.matrix_world.copy()
+    base.matrix_world = obj.matrix_world.copy()
     collection.objects.link(base)
-    thing.parent = base
-    thing.matrix_parent_inverse.identity()
-    thing.matrix_basis.identity()
-    thing[BASE] = base
-    thing[PROBLEM] = ""
+    obj.parent = base
+    obj.matrix_parent_inverse.identity()
+    obj.matrix_basis.identity()
+    obj[BASE] = base
+    obj[PROBLEM] = ""
     return base
 
 
-def base_of(thing: Any) -> Any:
-    """The object of the base that ``thing`` follows; None if it follows none, or that has been deleted."""
-    base = thing.get(BASE) if thing is not None and thing.type == "MESH" else None
-    if base is None or base.type != "MESH" or FACE not in thing.data.attributes:
+def base_of(obj: Any) -> Any:
+    """The object of the base that ``obj`` follows; None if there is none, or it was deleted."""
+    base = obj.get(BASE) if obj is not None and obj.type == "MESH" else None
+    if base is None or base.type != "MESH" or FACE not in obj.data.attributes:
         return None
     return base
 
 
-def binding_of(thing: Any) -> Binding:
-    """The binding of ``thing`` to its base as that stands without modifiers.
+def binding_of(obj: Any) -> Binding:
+    """The binding of ``obj`` to its base without modifiers.
 
-    Raises ValueError if the base has other vertices or faces than the splats were bound to.
+    Raises:
+        ValueError: the base does not have the vertices or faces that the splats were bound to.
     """
-    base = base_of(thing)
+    base = base_of(obj)
     if base is None:
         raise ValueError("the object is bound to no base")
-    data = thing.data
+    data = obj.data
     count = len(data.vertices)
     face, layers = np.empty(count, np.int32), np.empty(count, np.int32)
     weights = np.empty(3 * count, np.float32)
@@ -88,39 +89,39 @@ def binding_of(thing: Any) -> Binding:
     )
 
 
-def follow(things: Iterable[Any], depsgraph: Any) -> int:
-    """Moves the splats ``things`` to where their bases are in ``depsgraph``, modifiers and simulations done;
-    returns how many. What went wrong stands in the object's property ``PROBLEM``."""
+def follow(objs: Iterable[Any], depsgraph: Any) -> int:
+    """Moves the splats ``objs`` with their bases as evaluated in ``depsgraph``, with modifiers and
+    simulations. Returns how many moved; the property ``PROBLEM`` of the others says why not."""
     moved = 0
-    for thing in things:
+    for obj in objs:
         problem = ""
         try:
-            _move(thing, depsgraph)
+            _move(obj, depsgraph)
             moved += 1
         except ValueError as error:
             problem = str(error)
-        if thing.get(PROBLEM) != problem:
-            thing[PROBLEM] = problem
+        if obj.get(PROBLEM) != problem:
+            obj[PROBLEM] = problem
     return moved
 
 
 def followers(scene: Any) -> list[Any]:
     """The objects of ``scene`` that follow a base."""
-    return [thing for thing in scene.objects if base_of(thing) is not None]
+    return [obj for obj in scene.objects if base_of(obj) is not None]
 
 
-def _move(thing: Any, depsgraph: Any) -> None:
-    binding, base = binding_of(thing), base_of(thing)
-    places = _evaluated(base, depsgraph)
-    if len(places) != len(binding.base_vertices):
+def _move(obj: Any, depsgraph: Any) -> None:
+    binding, base = binding_of(obj), base_of(obj)
+    vertices = _evaluated(base, depsgraph)
+    if len(vertices) != len(binding.base_vertices):
         raise ValueError(
-            f"the base has {len(binding.base_vertices):,} vertices, with its modifiers {len(places):,}:"
+            f"the base has {len(binding.base_vertices):,} vertices, with its modifiers {len(vertices):,}:"
             " splats follow modifiers that move vertices, not those that add some"
         )
-    if not np.isfinite(places).all():
-        raise ValueError("the base has vertices at no finite place")
-    moved = binding.moved(places, binding.lift)
-    data = thing.data
+    if not np.isfinite(vertices).all():
+        raise ValueError("the base has vertices that are not finite")
+    moved = binding.moved(vertices, binding.lift)
+    data = obj.data
     versions.set_positions(data, moved.positions())
     if meshes.NORMAL in data.attributes:
         normals = moved.normals()
@@ -130,8 +131,8 @@ def _move(thing: Any, depsgraph: Any) -> None:
 
 
 def _evaluated(base: Any, depsgraph: Any) -> np.ndarray:
-    """(n, 3) float32 vertices of the object ``base`` in its own frame, as it is drawn."""
-    if base.mode == "EDIT":  # what is being edited has no evaluated mesh yet
+    """(n, 3) float32 vertices of the object ``base`` as displayed, in its own frame."""
+    if base.mode == "EDIT":  # no evaluated mesh while it is edited
         import bmesh
 
         edited = bmesh.from_edit_mesh(base.data)
@@ -145,18 +146,18 @@ def _evaluated(base: Any, depsgraph: Any) -> np.ndarray:
 
 
 def _coordinates(mesh: Any) -> np.ndarray:
-    places = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", places)
-    return places.reshape(-1, 3)
+    coordinates = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", coordinates)
+    return coordinates.reshape(-1, 3)
 
 
 def after_update(scene: Any, depsgraph: Any) -> None:
-    """Follows the bases whose shape has changed, a handler of ``depsgraph_update_post``. Splats that are
-    moved change too, but are no bases."""
-    waiting = followers(scene)
-    if waiting:
+    """Follows the bases whose shape has changed, a handler of ``depsgraph_update_post``. Moved splats change
+    too, but are no bases."""
+    following = followers(scene)
+    if following:
         changed = {update.id.original for update in depsgraph.updates if update.is_updated_geometry}
-        follow([t for t in waiting if base_of(t) in changed or base_of(t).data in changed], depsgraph)
+        follow([t for t in following if base_of(t) in changed or base_of(t).data in changed], depsgraph)
 
 
 def after_frame(scene: Any, depsgraph: Any) -> None:

@@ -1,14 +1,14 @@
-"""A whole Blender scene of a mesh: what the command line renders and saves."""
+"""A whole Blender scene of a mesh, as the command line renders and saves it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import frame, materials, meshes, pictures, stage, versions
+from meshsplats.blender.inside import frame, levels, materials, meshes, objects, pictures, stage, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.camera import Camera
@@ -17,20 +17,20 @@ from meshsplats.colors import srgb_to_linear
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The mesh as Blender gets it, and what was found out about it."""
+    """The mesh as Blender gets it, and its bounds."""
 
     vertices: np.ndarray
     """(v, 3) float32, world frame of the splats."""
     faces: np.ndarray
     """(f, 3) int32."""
     colors: np.ndarray
-    """(v, 4) float32: linear light where lit, else as composited."""
+    """(v, 4) float32: linear light if lit, else as composited."""
     up: np.ndarray
-    """(3,) direction that points up in the world frame."""
+    """(3,) up direction in the world frame."""
     center: np.ndarray
-    """(3,) middle of the subject, world frame."""
+    """(3,) centre of the subject, world frame."""
     radius: float
-    """Distance from there within which most of it lies, scene units."""
+    """Distance from ``center`` within which most of it lies, scene units."""
     floor: float
     """Height of its lowest part along ``up``, scene units."""
     reach: float
@@ -40,24 +40,26 @@ class Subject:
     self_shadow: float
     """Distance within which layers do not shade each other, scene units."""
     linear: bool = False
-    """Whether the mesh was made for blending in linear light: unlit colours are linear light then, too."""
+    """Whether the mesh was made for blending in linear light: then unlit colours are linear light, too."""
     normals: np.ndarray | None = None
-    """(v, 3) float32 unit shading normals, where lit."""
+    """(v, 3) float32 unit shading normals, if lit."""
     face_splat: np.ndarray | None = None
     """(f,) int32."""
     caster_vertices: np.ndarray | None = None
     """(w, 3) float32 stand-in that casts the shadow in EEVEE."""
     caster_faces: np.ndarray | None = None
     """(g, 3) int32."""
+    screen_size: int = 0
+    """Of a level of detail: side in pixels of the images for which it was made; else 0."""
     name: str = "Splats"
 
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """What was made."""
+    """A scene that was built."""
 
     scene: Any
-    thing: Any
+    obj: Any
     """The object of the splats."""
     cameras: list[Any]
     rotation: np.ndarray
@@ -65,28 +67,37 @@ class Built:
 
 
 def build(
-    subject: Subject, cameras: Sequence[Camera], options: SceneOptions, limit: int, *, edges: bool
+    subject: Subject,
+    cameras: Sequence[Camera],
+    options: SceneOptions,
+    limit: int,
+    *,
+    edges: bool,
+    coarser: Sequence[Subject] = (),
 ) -> Built:
-    """An empty file with the subject, its cameras and surroundings, ready to render.
+    """A new file with the subject, its cameras and surroundings, ready to render.
 
-    ``limit`` is that of transparent bounces; ``edges`` as in ``meshes.make_mesh``.
+    Args:
+        limit: that of transparent bounces.
+        edges: as in ``meshes.make_mesh``.
+        coarser: further levels of detail, if the subject is one; hidden at first (``levels.show``).
     """
     bpy.ops.wm.read_factory_settings(use_empty=True)
     versions.enable_cycles()
     scene = bpy.context.scene
     scene.name = "MeshSplats"
     rotation = frame.to_blender(subject.up)
-    splats = stage.collection("Splats")
-    mesh = meshes.make_mesh(
-        subject.name,
-        subject.vertices,
-        subject.faces,
-        subject.colors,
-        normals=subject.normals,
-        face_splat=subject.face_splat,
-        edges=edges,
-    )
-    thing = meshes.make_object(mesh, subject.name, rotation, splats)
+    if subject.screen_size:
+        chain = [subject, *coarser]
+        homes = levels.add_collections(subject.name, [level.screen_size for level in chain], scene.collection)
+        objs = [
+            _add_splats(replace(level, name=home.name), options, rotation, edges, home)
+            for level, home in zip(chain, homes, strict=True)
+        ]
+        levels.tie(objs)
+        obj = objs[0]
+    else:
+        obj = _add_splats(subject, options, rotation, edges, stage.collection("Splats", lasting=True))
     center = rotation @ subject.center
     home = stage.collection("Cameras")
     made = []
@@ -96,30 +107,10 @@ def build(
         made.append(stage.add_camera(camera, camera.name or f"view_{i:04d}", rotation, reach, home))
     light = options.light
     if light is None:
-        mesh.materials.append(materials.unlit())
-        behind = np.array(options.background or (0, 0, 0))
-        stage.even_world((srgb_to_linear(behind) if subject.linear else behind).tolist())
+        background = np.array(options.background or (0, 0, 0))
+        stage.even_world((srgb_to_linear(background) if subject.linear else background).tolist())
         pictures.exact_settings(scene, options.engine, linear=subject.linear)
     else:
-        material = materials.lit(
-            self_shadow=subject.self_shadow,
-            roughness=light.roughness,
-            specular=light.specular,
-            smooth=subject.normals is not None,
-        )
-        mesh.materials.append(material)
-        if subject.caster_vertices is not None and subject.caster_faces is not None:
-            caster = meshes.make_plain(
-                f"{subject.name} shadow", subject.caster_vertices, subject.caster_faces
-            )
-            if edges:
-                caster.update(calc_edges=True)
-            caster.materials.append(materials.plain("Shadow", stage.GREY))
-            stand_in = meshes.make_object(caster, caster.name, rotation, splats)
-            stand_in.visible_camera = False
-            stand_in.parent = thing
-            stand_in.matrix_parent_inverse = thing.matrix_world.inverted()
-            thing.visible_shadow = False
         viewer = np.array(made[0].matrix_world.translation) if made else None
         floor = np.array([center[0], center[1], subject.floor])
         surround(floor, subject.radius, light, viewer, options.background)
@@ -141,8 +132,53 @@ def build(
     _timeline(scene, made)
     if made:
         stage.aim(scene, cameras[0], made[0])
-    bpy.context.view_layer.objects.active = thing
-    return Built(scene, thing, made, rotation)
+    bpy.context.view_layer.objects.active = obj
+    return Built(scene, obj, made, rotation)
+
+
+def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, edges: bool, home: Any) -> Any:
+    """The object of ``subject`` in the collection ``home``, with its material and, for EEVEE's shadows, its
+    stand-in."""
+    mesh = meshes.make_mesh(
+        subject.name,
+        subject.vertices,
+        subject.faces,
+        subject.colors,
+        normals=subject.normals,
+        face_splat=subject.face_splat,
+        edges=edges,
+    )
+    obj = meshes.make_object(mesh, subject.name, rotation, home)
+    light = options.light
+    objects.mark(
+        mesh,
+        up=subject.up,
+        origin=np.zeros(3),
+        lit=light is not None,
+        linear=subject.linear,
+        layers=subject.layers,
+    )
+    if light is None:
+        mesh.materials.append(materials.unlit())
+        return obj
+    material = materials.lit(
+        self_shadow=subject.self_shadow,
+        roughness=light.roughness,
+        specular=light.specular,
+        smooth=subject.normals is not None,
+    )
+    mesh.materials.append(material)
+    if subject.caster_vertices is not None and subject.caster_faces is not None:
+        caster = meshes.make_plain(f"{subject.name} shadow", subject.caster_vertices, subject.caster_faces)
+        if edges:
+            caster.update(calc_edges=True)
+        caster.materials.append(materials.plain("Shadow", stage.GREY))
+        stand_in = meshes.make_object(caster, caster.name, rotation, home)
+        stand_in.visible_camera = False
+        stand_in.parent = obj
+        stand_in.matrix_parent_inverse = obj.matrix_world.inverted()
+        obj.visible_shadow = False
+    return obj
 
 
 def surround(
@@ -152,8 +188,8 @@ def surround(
     viewer: np.ndarray | None,
     background: Sequence[float] | None,
 ) -> None:
-    """Sun, world, ground, mirror and glass round a subject of this ``radius`` that stands at ``floor`` (3,),
-    placed for someone at ``viewer`` (3,); Blender's frame. ``background``: display RGB that cameras see."""
+    """Adds sun, world, ground, mirror and glass around a subject of ``radius`` that stands at ``floor`` (3,),
+    placed for a viewer at ``viewer`` (3,); Blender's frame. ``background``: display RGB that cameras see."""
     if light.sun_strength > 0:
         direction = frame.sun_direction(*light.sun)
         home = stage.collection("Lights")
@@ -167,7 +203,7 @@ def surround(
     else:
         seen = None
         if background is not None:
-            # The background is shown as it was asked for, however pictures are exposed.
+            # The displayed background does not depend on the exposure.
             seen = (srgb_to_linear(np.array(background)) / 2**light.exposure).tolist()
         stage.even_world([light.sky * part for part in light.sky_color], seen)
     home = stage.collection("Surroundings")
@@ -180,18 +216,18 @@ def surround(
             towards = level / np.linalg.norm(level)
     right = np.array([-towards[1], towards[0], 0.0])
     if light.mirror:
-        # A little to the left and turned to the viewer, so that the back of the subject shows in it.
-        place = floor - 1.5 * radius * towards - 0.7 * radius * right
+        # A little to the left and turned to the viewer, so that it shows the back of the subject.
+        position = floor - 1.5 * radius * towards - 0.7 * radius * right
         facing = towards + 0.45 * right
-        stage.add_mirror(place, facing / np.linalg.norm(facing), 2.6 * radius, 2.2 * radius, home)
+        stage.add_mirror(position, facing / np.linalg.norm(facing), 2.6 * radius, 2.2 * radius, home)
     if light.glass:
         size = 0.35 * radius
-        place = floor + 0.9 * radius * towards + 0.95 * radius * right + [0, 0, 1.001 * size]
-        stage.add_glass_ball(place, size, home)
+        position = floor + 0.9 * radius * towards + 0.95 * radius * right + [0, 0, 1.001 * size]
+        stage.add_glass_ball(position, size, home)
 
 
 def _timeline(scene: Any, cameras: Sequence[Any]) -> None:
-    """One frame a camera, so that the timeline steps through the views."""
+    """One frame per camera, so that the timeline steps through the views."""
     scene.frame_start, scene.frame_end = 0, max(len(cameras) - 1, 0)
     if len(cameras) > 1:
         for i, camera in enumerate(cameras):

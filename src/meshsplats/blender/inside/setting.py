@@ -1,4 +1,4 @@
-"""Sun, sky, ground and a camera round splat meshes in an open Blender file, as the command line sets them
+"""Sun, sky, ground and a camera around splat meshes in an open Blender file, as the command line sets them
 up."""
 
 from __future__ import annotations
@@ -9,21 +9,25 @@ import numpy as np
 
 from meshsplats.blender.inside import meshes, objects, scene, stage
 from meshsplats.blender.options import LIGHTS, LightOptions
-from meshsplats.cameras.framing import SAMPLE, scene_bounds, weighted_quantile
+from meshsplats.cameras.framing import scene_bounds, weighted_quantile
 from meshsplats.cameras.trajectories import orbit
 
-_SEEN = 0.1
-"""Opacity from which a vertex counts."""
 _FLOOR = 0.002
 """Share of the vertices that may lie below the ground."""
 UP = (0.0, 0.0, 1.0)
 
 
-def set_up(view: Any, things: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
-    """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``things`` and, with ``camera``, a
-    camera that sees all of them at the scene's resolution; in place of what an earlier call made. Returns the
-    light. ValueError if ``things`` have no vertices that can be seen."""
-    points = np.concatenate([world_points(thing) for thing in things] or [np.zeros((0, 3))])
+def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = True) -> LightOptions:
+    """Gives the scene ``view`` the named ``lights``, a sky, a ground under ``objs`` and, with ``camera``, a
+    camera that sees all of them at the scene's resolution. Replaces those of an earlier call.
+
+    Returns:
+        The light.
+
+    Raises:
+        ValueError: ``objs`` have no visible vertices.
+    """
+    points = np.concatenate([meshes.world_points(obj) for obj in objs] or [np.zeros((0, 3))])
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
     light, bounds = LIGHTS[lights], scene_bounds(points)
@@ -40,20 +44,5 @@ def set_up(view: Any, things: list[Any], lights: str = "sun", *, camera: bool = 
         viewer = seen.center
     floor = np.array([bounds.center[0], bounds.center[1], low])
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
-    objects.render_settings(view, things, True, light)
+    objects.render_settings(view, objs, True, light)
     return light
-
-
-def world_points(thing: Any) -> np.ndarray:
-    """(k, 3) float64 some of the vertices of ``thing`` that can be seen, in Blender's world."""
-    data = thing.data
-    vertices = np.empty(3 * len(data.vertices), np.float32)
-    data.vertices.foreach_get("co", vertices)
-    points = vertices.reshape(-1, 3).astype(np.float64)
-    if meshes.COLOR in data.attributes and len(points):
-        colors = np.empty(4 * len(points), np.float32)
-        data.attributes[meshes.COLOR].data.foreach_get("color", colors)
-        points = points[colors[3::4] > _SEEN]
-    points = points[:: -(-max(len(points), 1) // SAMPLE)]
-    world = np.array(thing.matrix_world)
-    return points @ world[:3, :3].T + world[:3, 3]

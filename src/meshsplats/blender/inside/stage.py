@@ -1,5 +1,5 @@
-"""What surrounds the mesh in Blender: cameras, sun, sky, ground, mirror, glass ball, each in a named
-collection."""
+"""The surroundings of the mesh in Blender: cameras, sun, sky, ground, mirror and glass ball, in named
+collections."""
 
 from __future__ import annotations
 
@@ -17,28 +17,29 @@ GREY = (0.6, 0.6, 0.6)
 MADE = "meshsplats_stage"
 """Property of the collections that were made here."""
 FADES = (1.5, 10.0)
-"""From where to where the ground fades, in radii of the subject."""
+"""Distances between which the ground fades, in radii of the subject."""
 
 
-def collection(name: str) -> Any:
-    """A new collection in the scene, marked as made here (``clear``)."""
+def collection(name: str, *, lasting: bool = False) -> Any:
+    """A new collection in the scene; unless ``lasting``, ``clear`` removes it."""
     made = bpy.data.collections.new(name)
-    made[MADE] = True
+    if not lasting:
+        made[MADE] = True
     bpy.context.scene.collection.children.link(made)
     return made
 
 
 def clear() -> None:
-    """Removes the collections that were made here from the scene, with all that is in them."""
+    """Removes the collections made here from the scene, with everything in them."""
     for old in [c for c in bpy.context.scene.collection.children_recursive if c.get(MADE)]:
-        for thing in list(old.objects):
-            bpy.data.objects.remove(thing)
+        for obj in list(old.objects):
+            bpy.data.objects.remove(obj)
         bpy.data.collections.remove(old)
 
 
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
-    """A Blender camera like ``camera``; what is farther than ``reach`` is cut off. Its pixel aspect is the
-    scene's: see ``aim``."""
+    """A Blender camera like ``camera`` that clips beyond ``reach``. The pixel aspect belongs to the scene:
+    see ``aim``."""
     from mathutils import Matrix
 
     data = bpy.data.cameras.new(name)
@@ -49,16 +50,16 @@ def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, ho
         setattr(data, key, settings[key])
     data.clip_start = camera.near
     data.clip_end = reach
-    thing = bpy.data.objects.new(name, data)
-    thing.matrix_world = Matrix(frame.camera_pose(camera, rotation).tolist())
-    home.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, data)
+    obj.matrix_world = Matrix(frame.camera_pose(camera, rotation).tolist())
+    home.objects.link(obj)
+    return obj
 
 
-def aim(scene: Any, camera: Camera, thing: Any, factor: int = 1) -> None:
-    """Renders are taken by ``thing``, the Blender camera of ``camera``, at ``factor`` times its pixels."""
+def aim(scene: Any, camera: Camera, obj: Any, factor: int = 1) -> None:
+    """Makes ``obj``, the Blender camera of ``camera``, the active one, at ``factor`` times its resolution."""
     settings = frame.lens(camera)
-    scene.camera = thing
+    scene.camera = obj
     scene.render.resolution_x = camera.width * factor
     scene.render.resolution_y = camera.height * factor
     scene.render.resolution_percentage = 100
@@ -77,7 +78,7 @@ def add_sun(
     name: str = "Sun",
 ) -> Any:
     """A sun in ``direction`` (3,), Blender's frame; irradiance in W/m^2, size in degrees, linear ``color``.
-    ``detail``: smallest thing that EEVEE's shadow maps resolve, scene units."""
+    ``detail``: smallest feature that EEVEE's shadow maps resolve, scene units."""
     from mathutils import Vector
 
     data = bpy.data.lights.new(name, "SUN")
@@ -85,11 +86,11 @@ def add_sun(
     data.color = tuple(color)
     data.angle = float(np.radians(size))
     versions.set_if_there(data, use_shadow=True, shadow_maximum_resolution=detail)
-    thing = bpy.data.objects.new(name, data)
-    thing.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
-    thing.location = (direction * 5).tolist()
-    home.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, data)
+    obj.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
+    obj.location = (direction * 5).tolist()
+    home.objects.link(obj)
+    return obj
 
 
 def even_world(light: Sequence[float], seen: Sequence[float] | None = None) -> Any:
@@ -118,57 +119,56 @@ def _background(tree: Any, color: Sequence[float]) -> Any:
 
 
 def environment_world(path: str, strength: float, rotation: float) -> Any:
-    """A world lit by the environment picture at ``path``, packed into the file, turned by ``rotation``
+    """A world lit by the environment image at ``path``, packed into the file, turned by ``rotation``
     degrees."""
     image = bpy.data.images.load(path)
     if 0 in image.size:
-        raise ValueError(f"{path}: Blender cannot read this environment picture")
+        raise ValueError(f"{path}: Blender cannot read this environment image")
     image.pack()
     world = bpy.data.worlds.new("World")
     tree = versions.node_tree(world)
-    place = tree.nodes.new("ShaderNodeTexCoord")
+    coordinates = tree.nodes.new("ShaderNodeTexCoord")
     turn = tree.nodes.new("ShaderNodeMapping")
     turn.inputs["Rotation"].default_value[2] = float(np.radians(rotation))
-    picture = tree.nodes.new("ShaderNodeTexEnvironment")
-    picture.image = image
+    texture = tree.nodes.new("ShaderNodeTexEnvironment")
+    texture.image = image
     light = tree.nodes.new("ShaderNodeBackground")
     light.inputs["Strength"].default_value = strength
     out = tree.nodes.new("ShaderNodeOutputWorld")
-    tree.links.new(place.outputs["Generated"], turn.inputs["Vector"])
-    tree.links.new(turn.outputs[0], picture.inputs["Vector"])
-    tree.links.new(picture.outputs[0], light.inputs["Color"])
+    tree.links.new(coordinates.outputs["Generated"], turn.inputs["Vector"])
+    tree.links.new(turn.outputs[0], texture.inputs["Vector"])
+    tree.links.new(texture.outputs[0], light.inputs["Color"])
     tree.links.new(light.outputs[0], out.inputs["Surface"])
     bpy.context.scene.world = world
     return world
 
 
 def add_ground(center: np.ndarray, radius: float, catcher: bool, home: Any) -> Any:
-    """A level square at ``center`` (3,) under a subject of this ``radius``, a hundred times as large. It
-    fades into what is behind it, so that no horizon is seen; a ``catcher`` is seen only where shadows
-    fall."""
+    """A level square at ``center`` (3,) under a subject of ``radius``, a hundred times as large. It fades
+    into the background, so that there is no horizon; a ``catcher`` is visible only where shadows fall."""
     reach = 100 * radius
     corners = [(-reach, -reach, 0), (reach, -reach, 0), (reach, reach, 0), (-reach, reach, 0)]
-    thing = _faces("Ground", corners, [(0, 1, 2, 3)], home)
-    thing.location = center.tolist()
+    obj = _faces("Ground", corners, [(0, 1, 2, 3)], home)
+    obj.location = center.tolist()
     material = (
         materials.plain("Ground", GREY)
         if catcher
         else materials.fading("Ground", GREY, FADES[0] * radius, FADES[1] * radius)
     )
-    thing.data.materials.append(material)
-    thing.is_shadow_catcher = catcher
-    return thing
+    obj.data.materials.append(material)
+    obj.is_shadow_catcher = catcher
+    return obj
 
 
 def add_mirror(center: np.ndarray, facing: np.ndarray, width: float, height: float, home: Any) -> Any:
-    """An upright mirror, its lower edge's middle at ``center`` (3,), that faces the level direction
-    ``facing``."""
+    """An upright mirror that faces the horizontal direction ``facing`` (3,); ``center`` (3,) is the middle of
+    its lower edge."""
     corners = [(-width / 2, 0, 0), (width / 2, 0, 0), (width / 2, 0, height), (-width / 2, 0, height)]
-    thing = _faces("Mirror", corners, [(0, 1, 2, 3)], home)
-    thing.location = center.tolist()
-    thing.rotation_euler[2] = float(np.arctan2(facing[0], -facing[1]))
-    thing.data.materials.append(materials.mirror())
-    return thing
+    obj = _faces("Mirror", corners, [(0, 1, 2, 3)], home)
+    obj.location = center.tolist()
+    obj.rotation_euler[2] = float(np.arctan2(facing[0], -facing[1]))
+    obj.data.materials.append(materials.mirror())
+    return obj
 
 
 def add_glass_ball(center: np.ndarray, radius: float, home: Any) -> Any:
@@ -181,16 +181,16 @@ def add_glass_ball(center: np.ndarray, radius: float, home: Any) -> Any:
     shape.to_mesh(mesh)
     shape.free()
     mesh.shade_smooth()
-    thing = bpy.data.objects.new("Glass ball", mesh)
-    thing.location = center.tolist()
-    home.objects.link(thing)
+    obj = bpy.data.objects.new("Glass ball", mesh)
+    obj.location = center.tolist()
+    home.objects.link(obj)
     mesh.materials.append(materials.glass())
-    return thing
+    return obj
 
 
 def _faces(name: str, corners: Sequence, faces: Sequence, home: Any) -> Any:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(corners, [], faces)
-    thing = bpy.data.objects.new(name, mesh)
-    home.objects.link(thing)
-    return thing
+    obj = bpy.data.objects.new(name, mesh)
+    home.objects.link(obj)
+    return obj

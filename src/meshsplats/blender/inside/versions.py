@@ -1,4 +1,4 @@
-"""What differs between Blender 4.2 and 5.x, and nowhere else."""
+"""The differences between Blender 4.2 and 5.x, all in one place."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def socket(sockets: Any, *names: str) -> Any:
 def set_positions(mesh: Any, vertices: np.ndarray) -> None:
     """Gives the vertices of a bpy mesh their (v, 3) positions."""
     flat = np.ascontiguousarray(vertices, np.float32).ravel()
-    # The attribute is filled by one copy, ``vertices`` one number at a time: a hundredth of the time.
+    # One copy fills the attribute, in a hundredth of the time that ``vertices`` takes value by value.
     if "position" in mesh.attributes:
         mesh.attributes["position"].data.foreach_set("vector", flat)
     else:
@@ -50,24 +50,23 @@ def set_positions(mesh: Any, vertices: np.ndarray) -> None:
 def set_corners(mesh: Any, faces: np.ndarray) -> None:
     """Gives the corners of a bpy mesh of triangles their vertices, (f, 3)."""
     flat = np.ascontiguousarray(faces, np.int32).ravel()
-    if ".corner_vert" in mesh.attributes:  # as above; but the name is Blender's own affair
+    if ".corner_vert" in mesh.attributes:  # as above; the name is internal to Blender
         mesh.attributes[".corner_vert"].data.foreach_set("value", flat)
     else:
         mesh.loops.foreach_set("vertex_index", flat)
 
 
 def shade_flat(mesh: Any) -> None:
-    """Gives each face of a bpy mesh its own normal, so that no vertex normals are computed and stored."""
+    """Shades each face of a bpy mesh flat, so that no vertex normals are computed and stored."""
     flat = mesh.attributes.new("sharp_face", "BOOLEAN", "FACE")
     flat.data.foreach_set("value", np.ones(len(mesh.polygons), bool))
 
 
 def set_normals(mesh: Any, normals: np.ndarray) -> None:
-    """Gives each vertex of a bpy mesh its (v, 3) normal; the faces must wind so that their own agree with
-    it."""
+    """Gives each vertex of a bpy mesh its (v, 3) normal; the winding of the faces must agree with it."""
     normals = np.ascontiguousarray(normals, np.float32)
     if bpy.app.version < (4, 5, 0):
-        if not len(mesh.edges):  # which Blender reads here
+        if not len(mesh.edges):  # Blender reads them here
             mesh.update(calc_edges=True)
         mesh.normals_split_custom_set_from_vertices(normals)
         return
@@ -82,14 +81,14 @@ def set_normals(mesh: Any, normals: np.ndarray) -> None:
 
 
 def set_if_there(owner: Any, **values: Any) -> None:
-    """Sets those properties that this version of Blender has."""
+    """Sets the properties that this version of Blender has."""
     for name, value in values.items():
         if hasattr(owner, name):
             setattr(owner, name, value)
 
 
 def enable_cycles() -> None:
-    """Cycles is an add-on; with a bare user configuration it may be off."""
+    """Enables the add-on Cycles, which may be off in a bare user configuration."""
     import addon_utils
 
     if not hasattr(bpy.types.Scene, "cycles"):

@@ -1,4 +1,4 @@
-"""Carries out a job inside Blender: ``python -m meshsplats.blender.inside.worker job.json``, or Blender
+"""Runs a job inside Blender: ``python -m meshsplats.blender.inside.worker job.json``, or Blender
 itself with ``--python worker.py -- job.json``. ``meshsplats.blender.launch`` writes the job and reads the
 result."""
 
@@ -17,16 +17,16 @@ if __package__ in (None, ""):  # run as a file by Blender, whose Python does not
     sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 MARK = "@meshsplats "
-"""Begins the lines of output that are meant for the parent process."""
+"""Prefix of output lines for the parent process."""
 
 
-def tell(**message: object) -> None:
+def report(**message: object) -> None:
     print(MARK + json.dumps(message), flush=True)
 
 
 def end_with_parent() -> None:
-    """Blender ends when the process that started it does: at once where the kernel sees to it (Linux), else
-    as soon as Python gets its turn, by the pipe on standard input."""
+    """Ends Blender when the process that started it ends: at once where the kernel does it (Linux), else as
+    soon as Python runs, by the pipe on standard input."""
     if sys.platform.startswith("linux"):
         import ctypes
         import signal
@@ -34,7 +34,7 @@ def end_with_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
     def watch() -> None:
-        if os.read(0, 1):  # else a script in front of Blender has not passed the pipe on
+        if os.read(0, 1):  # nothing comes if a wrapper script has not passed the pipe on
             while os.read(0, 4096):
                 pass
             os._exit(1)
@@ -42,15 +42,15 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def tell_stage(text: str, *_: object) -> None:
-    """Passes on what Blender says of the picture at hand."""
+def report_stage(text: str, *_: object) -> None:
+    """Reports Blender's status text of the current image."""
     sample = re.search(r"Sample (\d+)/(\d+)", text)
     left = re.search(r"Remaining: ?([\d:.]+)", text)
     share = int(sample[1]) / max(int(sample[2]), 1) if sample else 0.0
     words = [part.strip() for part in text.split("|")]
     stage = sample[0] if sample else words[-1]
     if sample or "Updating" in stage or "Building" in stage:
-        tell(stage=stage[:60], share=share, left=left[1] if left else None)
+        report(stage=stage[:60], share=share, left=left[1] if left else None)
 
 
 def main(job_path: str) -> None:
@@ -62,7 +62,7 @@ def main(job_path: str) -> None:
     except ModuleNotFoundError:
         raise
     except ImportError as error:
-        tell(unloadable=str(error))
+        report(unloadable=str(error))
         sys.exit(1)
 
     from meshsplats._files.atomic import atomic_path
@@ -74,62 +74,60 @@ def main(job_path: str) -> None:
     if bpy.app.version < versions.OLDEST:
         raise ValueError(f"Blender 4.2 or newer is needed, this is {bpy.app.version_string}")
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
-    arrays = {name: np.load(file, allow_pickle=False) for name, file in job["arrays"].items()}
-    subject = Subject(**arrays, **job["subject"])
+    subject, *coarser = (
+        Subject(**{name: np.load(file, allow_pickle=False) for name, file in arrays.items()}, **facts)
+        for arrays, facts in job["subjects"]
+    )
     light = job["options"].pop("light")
     if light is not None:
         light["hdri"] = Path(light["hdri"]) if light["hdri"] else None
         light = LightOptions(**light)
     options = SceneOptions(light=light, **job["options"])
-    if (
-        light is not None
-        and job["pictures"]
-        and all(path.lower().endswith(".exr") for path in job["pictures"])
-    ):
-        # Values of light: nothing is shown, and the background is one of them.
+    if light is not None and job["images"] and all(path.lower().endswith(".exr") for path in job["images"]):
+        # An .exr holds linear light without exposure, the background too.
         options = replace(options, light=replace(light, exposure=0.0))
     cameras = [Camera(np.array(c.pop("world_to_camera")), **c) for c in job["cameras"]]
     temporary, new = job["temporary"], job["new"]
-    blend, targets = job["blend"], [Path(target) for target in job["pictures"]]
+    blend, targets = job["blend"], [Path(target) for target in job["images"]]
 
     start, processor = time.perf_counter(), time.process_time()
     sort = options.engine == "eevee"
     if sort and cameras:
-        subject = _for_painter(subject, cameras[0])
-    built = build(subject, cameras, options, job["limit"], edges=bool(blend))
-    tell(
+        subject, *coarser = (_for_painter(level, cameras[0]) for level in (subject, *coarser))
+    built = build(subject, cameras, options, job["limit"], edges=bool(blend), coarser=coarser)
+    report(
         built=round(time.perf_counter() - start, 3),
         processor=round(time.process_time() - processor, 3),
         blender=bpy.app.version_string,
     )
     if blend:
         bpy.context.preferences.filepaths.save_version = 0
-        with atomic_path(blend, temporary=Path(temporary[blend]), new=blend in new) as place:
-            bpy.ops.wm.save_as_mainfile(filepath=str(place), copy=True, compress=True, check_existing=False)
-        tell(saved=blend)
+        with atomic_path(blend, temporary=Path(temporary[blend]), new=blend in new) as path:
+            bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=True, check_existing=False)
+        report(saved=blend)
     factor = options.samples if light is None else 1
-    bpy.app.handlers.render_stats.append(tell_stage)
+    bpy.app.handlers.render_stats.append(report_stage)
     for i, target in enumerate(targets):
-        camera, thing = cameras[i], built.cameras[i]
+        camera, obj = cameras[i], built.cameras[i]
         if sort and i > 0:
             order = meshes.far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
-            meshes.set_faces(built.thing.data, subject.faces[order])
-        built.scene.frame_set(i)  # where the timeline puts camera i before the lens
-        stage.aim(built.scene, camera, thing, factor)
+            meshes.set_faces(built.obj.data, subject.faces[order])
+        built.scene.frame_set(i)  # the timeline makes camera i the active one
+        stage.aim(built.scene, camera, obj, factor)
         start, processor = time.perf_counter(), time.process_time()
         name = str(target)
-        with atomic_path(target, temporary=Path(temporary[name]), new=name in new) as place:
-            pictures.render_to(built.scene, place, factor, scratch=Path(job_path).parent)
-        tell(
-            picture=str(target),
+        with atomic_path(target, temporary=Path(temporary[name]), new=name in new) as path:
+            pictures.render_to(built.scene, path, factor, scratch=Path(job_path).parent)
+        report(
+            image=str(target),
             seconds=round(time.perf_counter() - start, 3),
             processor=round(time.process_time() - processor, 3),
         )
-    tell(done=True)
+    report(done=True)
 
 
 def _for_painter(subject, camera):
-    """``subject`` with its faces in the order in which EEVEE has to draw them for ``camera``."""
+    """``subject`` with its faces sorted back to front for ``camera``, as EEVEE needs them."""
     from meshsplats.blender.inside.meshes import far_to_near
 
     order = far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
@@ -146,7 +144,7 @@ if __name__ == "__main__":
 
         traceback.print_exc()
         if isinstance(error, OSError) and error.filename is not None:
-            tell(error=[error.errno, error.strerror, os.fsdecode(error.filename)])
+            report(error=[error.errno, error.strerror, os.fsdecode(error.filename)])
             sys.exit(1)
-        tell(error=f"{type(error).__name__}: {error}")
+        report(error=f"{type(error).__name__}: {error}")
         sys.exit(1)
