@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats._geometry import vertex_normals
 
 _ROWS = 1 << 15
 SUM_TOLERANCE = 1e-6
@@ -106,7 +107,8 @@ class Binding:
     @cached_property
     def base_normals(self) -> np.ndarray:
         """(n, 3) float64 unit normals of the base at its vertices, which seams do not interrupt."""
-        return surface_normals(self.base_vertices, self.base_faces, self._same_place)
+        vertices = self.base_vertices.astype(np.float64)
+        return vertex_normals(vertices, self.base_faces, same_place=self._same_place)
 
     @property
     def area(self) -> float:
@@ -149,27 +151,3 @@ def check_numbers(name: str, numbers: np.ndarray, count: int, of: str) -> None:
         raise ValueError(
             f"{name} must number the {count:,} {of} from 0, got {numbers.min()} to {numbers.max()}"
         )
-
-
-def surface_normals(
-    vertices: np.ndarray, faces: np.ndarray, same_place: np.ndarray | None = None
-) -> np.ndarray:
-    """(n, 3) float64 unit normals of a mesh at its vertices: area-weighted means of the triangles there.
-
-    ``same_place`` (n,) has a number a place for vertices to be treated as one; without it, each is by itself.
-    A vertex without area round it gets a normal of +z.
-    """
-    number = np.arange(len(vertices)) if same_place is None else same_place
-    count = int(number.max()) + 1 if len(number) else 0
-    points = np.asarray(vertices, np.float64)
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    # Twice the area times the normal.
-    own = np.cross(b - a, c - a)
-    sums = np.zeros((count, 3))
-    for k in range(3):
-        corner = number[faces[:, k]]
-        for axis in range(3):
-            sums[:, axis] += np.bincount(corner, own[:, axis], minlength=count)
-    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))
-    sums[length == 0] = (0, 0, 1)
-    return (sums / np.where(length > 0, length, 1)[:, None])[number]

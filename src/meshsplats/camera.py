@@ -93,13 +93,30 @@ class Camera:
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
     def sees(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool: points (n, 3) in front of the camera that project into the picture."""
-        matrix = self.world_to_camera.astype(np.float32)
-        x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).T
-        front = z > self.near
-        depth = np.where(front, z, 1)
-        u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
-        return front & (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
+        """(n,) bool: points (n, 3) beyond the near plane that project into the image."""
+        return self.in_image(self.project(points)[0])
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Image positions and depths of world ``points`` (n, 3).
+
+        Returns:
+            (n, 2) x and y in pixels from the image's top left corner, NaN for points that are not beyond the
+            near plane; and (n,) depth z in the camera's frame. Both are float32 for float32 points, else
+            float64.
+        """
+        points = np.asarray(points)
+        if points.dtype != np.float32:
+            points = points.astype(np.float64, copy=False)
+        matrix = self.world_to_camera.astype(points.dtype, copy=False)
+        x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
+        beyond = np.where(z > self.near, z, points.dtype.type(np.nan))
+        return np.stack([self.fx * x / beyond + self.cx, self.fy * y / beyond + self.cy]).T, z
+
+    def in_image(self, positions: np.ndarray) -> np.ndarray:
+        """(n,) bool: which of ``positions`` (n, 2), as from ``project``, lie in the image."""
+        x, y = positions.T
+        with np.errstate(invalid="ignore"):  # NaN lies nowhere
+            return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
 
 
 def a_few(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats._geometry import rotation_rows
 
 Kernel = Literal["3dgs", "antialiased", "2dgs"]
 
@@ -90,18 +91,11 @@ class GaussianCloud:
     @property
     def rotations(self) -> np.ndarray:
         """(n, 3, 3) float32 rotation matrices; columns are the splat's own axes in the world frame."""
-        w, x, y, z = self.quaternions.T
-        rows = np.empty((len(self), 3, 3), np.float32)
-        rows[:, 0, 0] = 1 - 2 * (y * y + z * z)
-        rows[:, 0, 1] = 2 * (x * y - w * z)
-        rows[:, 0, 2] = 2 * (x * z + w * y)
-        rows[:, 1, 0] = 2 * (x * y + w * z)
-        rows[:, 1, 1] = 1 - 2 * (x * x + z * z)
-        rows[:, 1, 2] = 2 * (y * z - w * x)
-        rows[:, 2, 0] = 2 * (x * z - w * y)
-        rows[:, 2, 1] = 2 * (y * z + w * x)
-        rows[:, 2, 2] = 1 - 2 * (x * x + y * y)
-        return rows
+        matrices = np.empty((len(self), 3, 3), np.float32)
+        for i, row in enumerate(rotation_rows(*self.quaternions.T)):
+            for j, entry in enumerate(row):
+                matrices[:, i, j] = entry
+        return matrices
 
     def select(self, index: np.ndarray) -> GaussianCloud:
         """The splats chosen by a boolean mask or an index array, in that order."""

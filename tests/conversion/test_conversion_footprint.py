@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from meshsplats._geometry import spacing
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at, orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion import footprint as module
-from meshsplats.conversion.footprint import Views, spacing
+from meshsplats.conversion.footprint import Views
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh

@@ -15,7 +15,7 @@ import pytest
 from _meshes import assert_same, random_mesh
 
 from meshsplats import SplatMesh, load_mesh, save_mesh
-from meshsplats.formats.gltf.writer import up_quaternion, vertex_normals
+from meshsplats.formats.gltf.writer import computed_normals, up_quaternion
 
 SQUARE = SplatMesh(
     vertices=[[0, 0, 2], [1, 0, 2], [1, 1, 2], [0, 1, 2]],
@@ -182,7 +182,7 @@ def test_vertex_normals_weigh_by_area_and_never_vanish():
     # A triangle of area 2 facing +z and one of area 1 facing +x meet in vertex 0; vertex 5 has a sliver only.
     vertices = [[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 1, 0], [0, 0, 2], [9, 9, 9]]
     faces = [[0, 1, 2], [0, 3, 4], [5, 5, 5]]
-    normals = vertex_normals(SplatMesh(vertices, faces, np.ones((6, 4)), up=(0, 0, 1)))
+    normals = computed_normals(SplatMesh(vertices, faces, np.ones((6, 4)), up=(0, 0, 1)))
     np.testing.assert_allclose(normals[0], np.array([1, 0, 2]) / 5**0.5, rtol=1e-6)
     np.testing.assert_allclose(normals[1:], [[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0, 0, 1]])
 

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
-from meshsplats.binding import Binding, surface_normals
+from meshsplats._geometry import vertex_normals
+from meshsplats.binding import Binding
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
@@ -397,7 +398,7 @@ def test_exported_layers_are_lifted_along_the_normal():
     lifted = prior.pose(lift=lift)
     binding = lifted.binding
     # The corners of the base are moved, here of a cube, along its area-weighted normals.
-    out = prior.base_vertices + surface_normals(CUBE, CUBE_FACES) * lift
+    out = prior.base_vertices + vertex_normals(CUBE.astype(np.float64), CUBE_FACES) * lift
     for layer in range(3):
         rows = binding.layers == layer
         moved = CUBE + layer * (out - CUBE)

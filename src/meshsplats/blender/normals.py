@@ -13,10 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from meshsplats._geometry import spacing
 from meshsplats.camera import Camera, a_few
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome
-from meshsplats.conversion.footprint import spacing
 from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.rendering import render
 
@@ -175,18 +175,11 @@ def _seen_from(
     views += a_few(cameras or (), 16, _SIDE)
     seen = np.zeros_like(centers)
     for camera in views:
-        picture = render(mesh, camera, depth=True, threads=threads)
-        assert picture.depth is not None
-        solid = picture.alpha > _SOLID
-        surface = np.where(solid, picture.depth / np.where(solid, picture.alpha, 1), np.inf)
-        x, y, z = camera.world_to_camera[:3, :3] @ centers.T + camera.world_to_camera[:3, 3:]
-        front = z > camera.near
-        z = np.where(front, z, 1)
-        column = camera.fx * x / z + camera.cx
-        row = camera.fy * y / z + camera.cy
-        inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        place = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
-        visible = inside & (z < surface[place] + tolerance)
+        surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)
+        positions, z = camera.project(centers)
+        rows = np.flatnonzero(camera.in_image(positions))
+        column, row = positions[rows].T.astype(np.intp)
+        visible = rows[z[rows] < surface[row, column] + tolerance]
         away = camera.center - centers[visible]
         seen[visible] += away / np.linalg.norm(away, axis=1, keepdims=True)
     return seen

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
@@ -33,9 +34,9 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
     axes = front_axes(mesh.up.astype(np.float64))
     directions = []
     if options.light is not None:
-        directions.append(_world_direction(axes, *options.light.sun))
+        directions.append(direction(axes, *options.light.sun))
         if options.light.fill > 0:
-            directions.append(_world_direction(axes, *options.light.fill_direction))
+            directions.append(direction(axes, *options.light.fill_direction))
     layers = most_layers(mesh, cameras, directions, threads=options.threads)
     # An unlit picture is exact or it is not: a high limit costs nothing where there are no layers.
     return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
@@ -113,10 +114,3 @@ def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:
     own = np.cross(mesh.vertices[b] - mesh.vertices[a], mesh.vertices[c] - mesh.vertices[a])
     back = np.einsum("ij,ij->i", own, normals[a] + normals[b] + normals[c]) < 0
     return np.where(back[:, None], mesh.faces[:, [0, 2, 1]], mesh.faces)
-
-
-def _world_direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
-    """(3,) unit vector in the splats' world; ``axes`` as from ``front_axes``."""
-    a, e = np.radians(azimuth), np.radians(elevation)
-    right, up, forward = axes
-    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._geometry import direction
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import (
     DEFAULT_UP,
@@ -151,17 +152,10 @@ def look_around(
     cameras = []
     for i in range(count):
         # Azimuth 0 looks forward, and a turn to the right is a growing angle.
-        direction = _direction(axes, 180 - azimuth - 360 * i / count, elevation)
-        target = bounds.center + bounds.radius * direction
+        gaze = direction(axes, 180 - azimuth - 360 * i / count, elevation)
+        target = bounds.center + bounds.radius * gaze
         cameras.append(look_at(bounds.center, target, up=axes[1], name=f"view_{i:04d}", **lens))
     return cameras
-
-
-def _direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
-    """Unit vector from the subject to a camera; ``axes`` as from ``front_axes``."""
-    a, e = np.radians(azimuth), np.radians(elevation)
-    right, up, forward = axes
-    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
 
 
 def round_subject(
@@ -181,10 +175,10 @@ def round_subject(
         raise ValueError("azimuth must be finite and elevation between -90 and 90 degrees")
     bounds = scene_bounds(scene)
     axes = front_axes(guess_up(scene) if up is None else unit_up(up))
-    directions = [_direction(axes, azimuth, elevation) for azimuth, elevation in angles]
+    directions = [direction(axes, azimuth, elevation) for azimuth, elevation in angles]
     lens: dict[str, Any] = {"up": axes[1], "width": width, "height": height, "fov": fov}
     target = middle(bounds, axes)
-    around = [look_at(target + direction, target, **lens) for direction in directions]
+    around = [look_at(target + d, target, **lens) for d in directions]
     rotations = [camera.world_to_camera[:3, :3] for camera in around]
     slopes = (width / 2 / around[0].fx, height / 2 / around[0].fy)
     target, fit = fit_pictures(bounds, target, rotations, slopes)

@@ -9,9 +9,9 @@ from typing import TypeVar
 import numpy as np
 
 from meshsplats._cells import Cells
+from meshsplats._geometry import spacing
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.fans import semi_axes
-from meshsplats.conversion.footprint import spacing
 from meshsplats.conversion.selection import inside
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, splat_starts

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from meshsplats._geometry import rotation_rows
 from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.profiles import Profile
 
@@ -98,12 +99,10 @@ def semi_axes(quaternions: np.ndarray, order: np.ndarray, sigma: np.ndarray) -> 
     """(3, 3, n) float32 one-sigma semi-axes in the world frame; [k] holds x, y and z of ``sigma[:, k]`` along
     axis ``order[:, k]`` of ``quaternions`` (n, 4)."""
     n = len(quaternions)
-    w, x, y, z = np.ascontiguousarray(quaternions.T)
-    two = np.float32(2)
-    columns = np.empty((3, 3, n), np.float32)
-    columns[0] = 1 - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)
-    columns[1] = two * (x * y - w * z), 1 - two * (x * x + z * z), two * (y * z + w * x)
-    columns[2] = two * (x * z + w * y), two * (y * z - w * x), 1 - two * (x * x + y * y)
+    columns = np.empty((3, 3, n), np.float32)  # by axis, then coordinate
+    for coordinate, row in enumerate(rotation_rows(*np.ascontiguousarray(quaternions.T))):
+        for axis, entry in enumerate(row):
+            columns[axis, coordinate] = entry
     result = np.empty((order.shape[1], 3, n), np.float32)
     for k in range(order.shape[1]):
         # int64 before the product: NumPy 1 keeps the small type of an array times a scalar, and overflows.

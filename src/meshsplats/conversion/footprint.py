@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from meshsplats._geometry import spacing
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import SAMPLE
 from meshsplats.cameras.trajectories import orbit
@@ -166,57 +167,6 @@ def _from_monomials(degree: int) -> np.ndarray:
     for number, (factor, axis) in list(enumerate(MONOMIALS))[1 : values.shape[1]]:
         values[:, number] = values[:, factor] * directions[:, axis]
     return np.linalg.lstsq(values, sh_basis(directions, degree), rcond=None)[0].astype(np.float32)
-
-
-def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
-    """(n,) float32 spacing of ``points`` (n, 3) round each of them, in their units.
-
-    Concretely, the points are sorted into a cubic grid of halving cells; a point's spacing is ``side /
-    sqrt(count)`` of the smallest cell round it that holds at least ``share`` points, as if these lay on a
-    surface. Points in one spot have the spacing of the smallest cell, 2^-20 of the extent.
-    """
-    levels = 20
-    low = points.min(axis=0).astype(np.float64)
-    extent = float((points.max(axis=0) - low).max())
-    n = len(points)
-    if n == 1 or extent == 0:
-        return np.zeros(n, np.float32)
-    cells = ((points - low) * ((1 << levels) * (1 - 1e-9) / extent)).astype(np.uint64)
-    code = np.zeros(n, np.uint64)
-    for axis in range(3):
-        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
-    order = np.argsort(code)  # points of one cell get one spacing: their order does not matter
-    code = code[order]
-    found = np.full(n, extent / np.sqrt(n), np.float32)
-    settled = np.zeros(n, bool)
-    for level in range(levels + 1):
-        parent = code >> np.uint64(3 * level)
-        starts = np.flatnonzero(np.concatenate([[True], parent[1:] != parent[:-1]]))
-        counts = np.diff(np.append(starts, n))
-        enough = np.repeat(counts >= share, counts) & ~settled
-        if enough.any():
-            side = extent / (1 << (levels - level))
-            found[enough] = np.repeat(side / np.sqrt(counts), counts)[enough]
-            settled |= enough
-            if settled.all():
-                break
-    result = np.empty(n, np.float32)
-    result[order] = found
-    return result
-
-
-def _every_third_bit(values: np.ndarray) -> np.ndarray:
-    """21-bit numbers with two zero bits after each bit."""
-    v = values.astype(np.uint64)
-    for shift, mask in [
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ]:
-        v = (v | (v << np.uint64(shift))) & np.uint64(mask)
-    return v
 
 
 def pixel_sizes(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, fields, replace
 from typing import Literal, get_args
 
 import numpy as np
 
+from meshsplats._options import Range, check_choices, check_flags, check_names, check_ranges
 from meshsplats.rendering.looks import Look
 
 Mode = Literal["crossed", "flat", "3d"]
@@ -120,21 +120,9 @@ class ConversionOptions:
         return full
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
-        for name, kind in _KINDS.items():
-            if getattr(self, name) not in get_args(kind):
-                raise ValueError(
-                    f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}"
-                )
-        for name, low, high, whole in _RANGES:
-            value = getattr(self, name)
-            if value is None:
-                continue
-            number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-            if not number or not low <= value <= high or (whole and int(value) != value):
-                what = "a whole number" if whole else "a number"
-                raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
-        if not isinstance(self.shrink_faint, bool):
-            raise ValueError(f"shrink_faint must be True or False, got {self.shrink_faint!r}")
+        check_choices(self, _CHOICES)
+        check_ranges(self, _RANGES, types=(int, float, np.integer, np.floating))
+        check_flags(self, ("shrink_faint",))
         if self.mode == "3d" and self.sides % 4:  # type: ignore[operator]
             raise ValueError(f"sides must be a multiple of 4 in mode '3d', got {self.sides}")
         if self.mode == "crossed" and self.sides % 2:  # type: ignore[operator]
@@ -170,16 +158,16 @@ class ConversionOptions:
                 )
 
 
-_KINDS = {
-    "mode": Mode,
-    "look": Look,
-    "footprint": Footprint,
-    "colors": Colors,
-    "detail": Detail,
-    "budget": Budget,
+_CHOICES = {
+    "mode": get_args(Mode),
+    "look": get_args(Look),
+    "footprint": get_args(Footprint),
+    "colors": get_args(Colors),
+    "detail": get_args(Detail),
+    "budget": get_args(Budget),
 }
 
-_RANGES: list[tuple[str, float, float, bool]] = [
+_RANGES: list[Range] = [
     ("rim_radius", 0.1, 10, False),
     ("sides", 3, 64, True),
     ("rim_opacity", 0, 1, False),
@@ -235,10 +223,5 @@ number of sides of its published code."""
 
 def make_options(named: dict) -> ConversionOptions:
     """``ConversionOptions(**named)``; a misspelt name is a TypeError that says which names there are."""
-    known = [f.name for f in fields(ConversionOptions)]
-    for name in named:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
-            raise TypeError(f"convert has no option {name!r}{hint}")
+    check_names("convert", named, [f.name for f in fields(ConversionOptions)])
     return ConversionOptions(**named)

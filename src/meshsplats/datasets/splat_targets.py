@@ -351,11 +351,7 @@ def splat_views(
     color = (red, green, blue)
     store = ImageCache(cache_bytes)
     return tuple(
-        View(
-            camera,
-            RenderedSplats(cloud, camera, look, sh_degree, samples, threads, store),
-            (red, green, blue),
-        )
+        View(camera, RenderedSplats(cloud, camera, look, sh_degree, samples, threads, store), color)
         for camera in cameras
     )
 

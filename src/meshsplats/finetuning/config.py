@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, get_args
+
+from meshsplats._options import Range, check_choices, check_flags, check_names, check_ranges
 
 Unit = Literal["splat", "scene"]
 Backdrop = Literal["mixed", "random", "white", "black"]
@@ -99,24 +100,9 @@ class FinetuneConfig:
     with any number of threads, unless the length is given in minutes."""
 
     def __post_init__(self) -> None:
-        for name, low, high, whole in _RANGES:
-            value = getattr(self, name)
-            if value is None and name in (*LENGTHS, "samples"):
-                continue
-            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or not low <= value <= high or (whole and int(value) != value):
-                what = "a whole number" if whole else "a number"
-                raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
-        for name, kind in [
-            ("position_unit", get_args(Unit)),
-            ("background", get_args(Backdrop)),
-            ("blending", ("mesh", "display", "linear")),
-        ]:
-            if getattr(self, name) not in kind:
-                raise ValueError(f"{name} must be one of {', '.join(kind)}, got {getattr(self, name)!r}")
-        for name in ("exposure", "soft_edges"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
+        check_ranges(self, _RANGES, optional=(*LENGTHS, "samples"))
+        check_choices(self, _CHOICES)
+        check_flags(self, ("exposure", "soft_edges"))
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
@@ -140,7 +126,13 @@ class FinetuneConfig:
         return asdict(self)
 
 
-_RANGES: list[tuple[str, float, float, bool]] = [
+_CHOICES = {
+    "position_unit": get_args(Unit),
+    "background": get_args(Backdrop),
+    "blending": ("mesh", "display", "linear"),
+}
+
+_RANGES: list[Range] = [
     ("epochs", 0, 1e6, False),
     ("steps", 0, 10**9, True),
     ("minutes", 0, 1e5, False),
@@ -209,11 +201,7 @@ def make_config(preset: str = "default", **changes: Any) -> FinetuneConfig:
     if preset not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
     known = [f.name for f in fields(FinetuneConfig) if f.name != "preset"]
-    for name in changes:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
-            raise TypeError(f"fine-tuning has no option {name!r}{hint}")
+    check_names("fine-tuning", changes, known)
     if any(changes.get(name) is not None for name in LENGTHS):
         changes = {name: None for name in LENGTHS} | changes
     return replace(PRESETS[preset], **changes)

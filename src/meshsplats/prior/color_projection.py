@@ -71,21 +71,14 @@ def _seen(
     ``depths`` (n,) are how far from the base they lie.
     """
     camera, picture = view.camera, view.load()
-    x, y, z = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
-    front = z > camera.near
-    depth = np.where(front, z, 1)
-    column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-    rows = np.flatnonzero(
-        front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    )
-    place = row[rows].astype(np.int64), column[rows].astype(np.int64)
+    positions, z = camera.project(points)
+    rows = np.flatnonzero(camera.in_image(positions))
+    column, row = positions[rows].T.astype(np.int64)
+    place = row, column
     away = camera.center - points[rows]
     cosine = np.abs(np.einsum("ij,ij->i", away, normals[rows])) / np.linalg.norm(away, axis=1)
-    drawn = render(base, camera, depth=True, threads=threads)
-    assert drawn.depth is not None
     # Where nothing is drawn at the middle of its pixel, a point at an outline is in front of all there is.
-    solid = drawn.alpha > 0.5
-    surface = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)[place]
+    surface = render(base, camera, depth=True, threads=threads).mean_depth(min_alpha=0.5)[place]
     slack = _TOLERANCE * z[rows] / min(camera.fx, camera.fy) + depths[rows]
     slack /= np.maximum(cosine, 0.25)
     keep = (z[rows] <= surface + slack) & (cosine > _GRAZING)

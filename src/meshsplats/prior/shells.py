@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats.binding import surface_normals
+from meshsplats._geometry import vertex_normals
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import dome
 from meshsplats.mesh import SplatMesh
@@ -35,15 +35,11 @@ class Looks:
         """(k,) bool: which of ``points`` (k, 3) a camera sees before the base or beside it."""
         result = np.zeros(len(points), bool)
         for camera, nearest in zip(self.cameras, self.nearest, strict=True):
-            matrix = camera.world_to_camera
-            x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
-            rows = np.flatnonzero(z > camera.near)
-            column = np.floor(camera.fx * x[rows] / z[rows] + camera.cx)
-            row = np.floor(camera.fy * y[rows] / z[rows] + camera.cy)
-            on = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            rows, place = rows[on], (row[on].astype(np.intp), column[on].astype(np.intp))
+            positions, z = camera.project(points)
+            rows = np.flatnonzero(camera.in_image(positions))
+            column, row = positions[rows].T.astype(np.intp)
             slack = 1 + _TOLERANCE / min(camera.fx, camera.fy)
-            result[rows] |= z[rows] * slack < nearest[place]
+            result[rows] |= z[rows] * slack < nearest[row, column]
         return result
 
 
@@ -52,7 +48,7 @@ def look_at_base(
 ) -> Looks:
     """The base of ``vertices`` (n, 3) and ``faces`` (m, 3) from up to ``LOOKS`` of the ``cameras``, evenly
     spread; from all round where there are none."""
-    normals = surface_normals(vertices, faces)
+    normals = vertex_normals(np.asarray(vertices, np.float64), faces)
     colors = np.ones((len(vertices), 4), np.float32)
     base = SplatMesh(vertices, faces, colors, attributes={"normal": normals})
     if cameras:
@@ -63,10 +59,8 @@ def look_at_base(
     nearest, front = [], 0.0
     for camera in chosen:
         drawn = render(base, camera, depth=True, attributes=["normal"], threads=threads)
-        assert drawn.depth is not None
+        nearest.append(_least_around(drawn.mean_depth(min_alpha=0.5)))
         solid = drawn.alpha > 0.5
-        depth = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)
-        nearest.append(_least_around(depth))
         rows, columns = np.nonzero(solid)
         ray = np.stack(
             [

@@ -23,7 +23,7 @@ MAX_RESOLUTION = 512
 TRUNCATION = 3.0
 """Voxels before and behind a depth within which it says how far away the surface is."""
 _SOLID = 0.5
-"""Opacity from which a pixel shows the surface; less is empty space to the end of the ray."""
+"""Opacity above which a pixel shows the surface; less is empty space to the end of the ray."""
 _COVERED = 0.002
 """Share of the opacity that may lie beyond each side of the box: strays must not make it large."""
 _MARGIN = 0.05
@@ -85,10 +85,7 @@ def base_surface(
     views = []
     for camera in placed:
         drawn = render(mesh, camera, background=(0, 0, 0), depth=True, threads=threads)
-        assert drawn.depth is not None
-        solid = drawn.alpha >= _SOLID
-        depth = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)
-        _add(total, weight, depth, camera, low, voxel)
+        _add(total, weight, drawn.mean_depth(min_alpha=_SOLID), camera, low, voxel)
         views.append(View(camera, ViewImage(np.clip(drawn.color, 0, 1), drawn.alpha)))
         if progress is not None:
             progress()

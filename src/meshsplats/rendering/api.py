@@ -36,6 +36,20 @@ class Rendering:
     fragments: int = 0
     """How many samples of triangles (or splats) were blended."""
 
+    def mean_depth(self, *, min_alpha: float = 0.0, empty: float = np.inf) -> np.ndarray:
+        """(h, w) float32 mean depth z of what is seen in each pixel.
+
+        Args:
+            min_alpha: pixels of no more opacity than this are empty.
+            empty: depth of empty pixels.
+
+        Raises ValueError for a rendering without depth.
+        """
+        if self.depth is None:
+            raise ValueError("the rendering has no depth: render with depth=True")
+        covered = self.alpha > min_alpha
+        return np.where(covered, self.depth / np.where(covered, self.alpha, 1), np.float32(empty))
+
 
 def render(
     mesh: SplatMesh,

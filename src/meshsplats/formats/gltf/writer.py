@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from meshsplats._geometry import vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._validation import check_attribute_names
@@ -152,7 +153,7 @@ def _document(
     if normals is not None:
         _check_unit(normals)
     elif lit:
-        normals = vertex_normals(mesh)
+        normals = computed_normals(mesh)
         extras["normals"] = "computed"
     if normals is not None:
         attributes["NORMAL"] = buffer.accessor(normals, _FLOAT, _ARRAY_BUFFER)
@@ -294,19 +295,10 @@ def linear_colors(mesh: SplatMesh, color_type: ColorType) -> np.ndarray:
     return result
 
 
-def vertex_normals(mesh: SplatMesh) -> np.ndarray:
-    """(v, 3) float32 unit normals, the area-weighted means of the normals of the triangles round each vertex.
-    A vertex without area round it gets the mesh's up direction."""
-    corners = [mesh.faces[:, k] for k in range(3)]
-    x, y, z = np.ascontiguousarray(mesh.vertices.T)
-    edges = [[p[corners[k]] - p[corners[0]] for p in (x, y, z)] for k in (1, 2)]
-    sums = np.empty(mesh.vertices.shape, np.float64)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        weighted = edges[0][i] * edges[1][j] - edges[0][j] * edges[1][i]  # twice the area times the normal
-        sums[:, axis] = sum(np.bincount(corner, weighted, minlength=len(sums)) for corner in corners)
-    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))[:, None]
-    return np.where(length > 0, sums / np.where(length > 0, length, 1), mesh.up).astype(np.float32)
+def computed_normals(mesh: SplatMesh) -> np.ndarray:
+    """(v, 3) float32 unit normals, area-weighted means of the triangles' normals around each vertex; where
+    these have no area, the mesh's up direction."""
+    return vertex_normals(mesh.vertices, mesh.faces, fallback=mesh.up).astype(np.float32)
 
 
 def _check_unit(normals: np.ndarray) -> None:
