@@ -126,9 +126,9 @@ class Convert:
     """.glb, .usd: a material that lights and shadows act on, not one that shows the colours as they are."""
     color_type: Literal["uint16", "float32"] = "uint16"
     """.glb: how colours are stored."""
-    alpha: Literal["blend", "mask", "hash-friendly"] = "blend"
-    """.glb: blend: true opacities. For viewers that neither sort nor blend well: mask draws solid what is at
-    least 20 % opaque; hash-friendly gives each splat a cutoff of its own, right on average, grainy."""
+    alpha: Literal["blend", "mask"] = "blend"
+    """.glb: blend: true opacities. mask, for viewers that neither sort nor blend well: draws solid what is at
+    least 20 % opaque."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
