@@ -76,7 +76,7 @@ def back_and_forth(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
         threads=1,
     )
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-    picture.back(np.ones_like(picture.color), None, None, vertices=points, colors=colors)
+    picture.backward(np.ones_like(picture.color), None, None, vertices=points, colors=colors)
 
 
 def main() -> None:

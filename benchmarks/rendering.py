@@ -104,12 +104,12 @@ def run(name: str, threads: int, repeat: int) -> None:
     drawing = memory("VmHWM") - before
     before = memory("VmRSS", reset=True)
     picture = recorded()
-    picture.back(towards, None, None, vertices=points, colors=colors)
+    picture.backward(towards, None, None, vertices=points, colors=colors)
     both = memory("VmHWM") - before
 
     draw = clocked(lambda: render(mesh, camera, threads=threads), repeat)
     log = clocked(recorded, repeat)
-    back = clocked(lambda: picture.back(towards, None, None, vertices=points, colors=colors), repeat)
+    back = clocked(lambda: picture.backward(towards, None, None, vertices=points, colors=colors), repeat)
     pixels = camera.width * camera.height
     cells = (
         f"{len(mesh.faces):,}",

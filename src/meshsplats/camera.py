@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, evenly
+from meshsplats._arrays import checked_array
 
 MAX_SIDE = 1 << 15
 """Largest image side in pixels."""
@@ -117,9 +116,3 @@ class Camera:
         x, y = positions.T
         with np.errstate(invalid="ignore"):  # NaN lies nowhere
             return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
-
-
-def a_few(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:
-    """Every k-th of ``cameras``, at most ``most``, with pictures of at most ``side`` pixels: enough to learn
-    what they see."""
-    return [camera.within(side) for camera in evenly(cameras, most)]

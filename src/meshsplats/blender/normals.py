@@ -13,8 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from meshsplats._arrays import subsample
 from meshsplats._geometry import spacing
-from meshsplats.camera import Camera, a_few
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome
 from meshsplats.mesh import SplatMesh, splat_starts
@@ -172,7 +173,7 @@ def _seen_from(
 ) -> np.ndarray:
     """(n, 3) sum of the unit directions from each centre to the cameras that see it; zero where none does."""
     views = dome(mesh, VIEWS, whole=True, up=guess_up(mesh), width=_SIDE, height=_SIDE)
-    views += a_few(cameras or (), 16, _SIDE)
+    views += [camera.within(_SIDE) for camera in subsample(cameras or (), 16)]
     seen = np.zeros_like(centers)
     for camera in views:
         surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import subsample
 from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
-from meshsplats.camera import Camera, a_few
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.colors import srgb_to_linear
 from meshsplats.mesh import SplatMesh
@@ -44,7 +45,7 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
 
 def mean_layers(mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None = None) -> float:
     """How many triangles lie behind each other in a pixel, on average over the pictures."""
-    some = a_few(cameras, 4, PROBE_SIDE)
+    some = [camera.within(PROBE_SIDE) for camera in subsample(cameras, 4)]
     return float(np.mean([count_layers(mesh, camera, threads=threads).mean() for camera in some] or [0.0]))
 
 

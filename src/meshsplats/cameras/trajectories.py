@@ -11,8 +11,8 @@ from meshsplats._geometry import direction
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import (
     DEFAULT_UP,
-    Scene,
-    fit_pictures,
+    Framable,
+    fit_images,
     front_axes,
     guess_up,
     middle,
@@ -69,7 +69,7 @@ def look_at(
 
 
 def orbit(
-    scene: Scene,
+    scene: Framable,
     count: int = 60,
     *,
     elevation: float = 15.0,
@@ -99,11 +99,11 @@ def orbit(
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
-    return round_subject(scene, angles, up, width, height, fov, distance, target)
+    return around_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def dome(
-    scene: Scene,
+    scene: Framable,
     count: int = 32,
     *,
     whole: bool = False,
@@ -125,11 +125,11 @@ def dome(
     lowest = -1.0 if whole else 0.0
     heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     angles = [(i * golden % 360, float(np.degrees(np.arcsin(h)))) for i, h in enumerate(heights)]
-    return round_subject(scene, angles, up, width, height, fov, distance, target)
+    return around_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def look_around(
-    scene: Scene,
+    scene: Framable,
     count: int = 60,
     *,
     elevation: float = 0.0,
@@ -158,8 +158,8 @@ def look_around(
     return cameras
 
 
-def round_subject(
-    scene: Scene,
+def around_subject(
+    scene: Framable,
     angles: Sequence[tuple[float, float]],
     up: Sequence[float] | np.ndarray | None,
     width: int,
@@ -181,7 +181,7 @@ def round_subject(
     around = [look_at(target + d, target, **lens) for d in directions]
     rotations = [camera.world_to_camera[:3, :3] for camera in around]
     slopes = (width / 2 / around[0].fx, height / 2 / around[0].fy)
-    target, fit = fit_pictures(bounds, target, rotations, slopes)
+    target, fit = fit_images(bounds, target, rotations, slopes)
     if aim is not None:
         target = np.asarray(aim, np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():

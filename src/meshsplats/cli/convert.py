@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, a_few
+from meshsplats._arrays import subsample
+from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import orbit
@@ -326,7 +327,7 @@ class Convert:
 
         if self.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.conversion.crop)
-        views = a_few(cameras, self.fidelity, 400) or orbit(
+        views = [camera.within(400) for camera in subsample(cameras, self.fidelity)] or orbit(
             mesh, self.fidelity, elevation=15, width=400, height=400
         )
         mean = compare(cloud, mesh, views).to_dict()["mean"]

@@ -14,7 +14,7 @@ from meshsplats.conversion.baking import bake_filter
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
-from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, Views, pixel_sizes, widen
+from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.merging import simplify
 from meshsplats.conversion.options import PRESETS, ConversionOptions, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
@@ -173,7 +173,7 @@ class _Place:
         self.cloud = cloud
         self.views = None
         if cameras and "cameras" in (options.footprint, options.colors):
-            self.views = Views(cloud.means, cameras)
+            self.views = CameraCoverage(cloud.means, cameras)
         self.pixel = pixel_sizes(cloud, options, self.views, up)
         """(n,) or None, as ``pixel_sizes`` has it."""
         px2 = _filter_px2(cloud, options)

@@ -11,7 +11,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks
-from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, Views
+from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, CameraCoverage
 from meshsplats.mesh import SplatMesh, checked_filter, splat_starts
 
 NARROWEST = 1e-4
@@ -78,7 +78,7 @@ def bake_filter(
         found = _shapes(mesh, faces, starts[part] - starts[part.start])
         means[part], axes[part], variances[part] = found
     if cameras:
-        sizes = Views(means.astype(np.float32), cameras).pixel_sizes().astype(np.float64)
+        sizes = CameraCoverage(means.astype(np.float32), cameras).pixel_sizes().astype(np.float64)
         if not (sizes > 0).any():
             raise ValueError(f"none of the {len(cameras)} cameras sees any splat of the mesh")
         sizes = np.where(sizes > 0, sizes, np.median(sizes[sizes > 0]))

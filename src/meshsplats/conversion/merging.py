@@ -21,7 +21,7 @@ import numpy as np
 from meshsplats._core.library import pointer, processors, run
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
-from meshsplats.conversion.footprint import Views, pixel_sizes, widen
+from meshsplats.conversion.footprint import CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.formats._orientation import quaternions_of
@@ -186,7 +186,7 @@ def nearest(points: np.ndarray, count: int, threads: int | None = None) -> tuple
 def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> np.ndarray:
     px2 = 0.5 if cloud.kernel == "2dgs" else FILTER_PX2
     source = ConversionOptions(footprint="cameras" if cameras else "framing")
-    views = Views(cloud.means, cameras) if cameras else None
+    views = CameraCoverage(cloud.means, cameras) if cameras else None
     pixel = pixel_sizes(cloud, source, views, guess_up(None, cameras))
     assert pixel is not None
     return np.sqrt(px2) * pixel

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.views import WHITE, Dataset, View
 from meshsplats.errors import DataWarning
@@ -94,7 +94,7 @@ def find_background(
     ``dataset.over(found.color)`` puts it to use. Warns with a DataWarning that names every scene that loses
     more than ``MATTERS`` dB by it.
     """
-    views = evenly(dataset.train or dataset.views, LOOKED_AT)
+    views = subsample(dataset.train or dataset.views, LOOKED_AT)
     chosen = given if given is not None else named
     reason: Reason = "given" if given is not None else "model folder"
     candidates = dict(CANDIDATES)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import image_of, masked_ssim
@@ -175,7 +175,7 @@ class _Run:
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = self.save_cost = self.step_cost = 0.0
-        watched = evenly(dataset.test, WATCHED_VIEWS)
+        watched = subsample(dataset.test, WATCHED_VIEWS)
         self.watched: tuple[View, ...] = watched
         self.quarter = int(PREVIEWS * self.fraction)
 

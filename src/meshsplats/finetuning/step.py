@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats._core.kernels import compare_images
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.splat_targets import RenderedSplats
@@ -17,7 +17,7 @@ from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKDROPS, FinetuneConfig, rates
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
-from meshsplats.rendering.backward import TapedRendering, shown_pixels
+from meshsplats.rendering.backward import TapedRendering, visible_pixels
 
 IMPORTANCE_VIEWS = 64
 """Most training views, evenly spread, that are drawn to find out what they show of each splat."""
@@ -89,7 +89,7 @@ class Drawn:
             towards = towards * encoding_slope(self._recorded.color)
         count = self._recorded.vertex_count
         gradients = Gradients(np.zeros((count, 3), np.float32), np.zeros((count, 4), np.float32))
-        self._recorded.back(towards, None, None, vertices=gradients.vertices, colors=gradients.colors)
+        self._recorded.backward(towards, None, None, vertices=gradients.vertices, colors=gradients.colors)
         return gradients
 
 
@@ -206,7 +206,7 @@ def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
     config, mesh = state.config, state.result()
     keep = (mesh.colors[mesh.faces, 3] >= config.prune_opacity).any(axis=1)
     if config.prune_importance > 0:
-        some = evenly(views, IMPORTANCE_VIEWS)
+        some = subsample(views, IMPORTANCE_VIEWS)
         shown, before = importance(state, some)
         shown *= len(views) / len(some)  # as if all had been looked at
         corners_shown, corners_before = shown[mesh.faces].sum(axis=1), before[mesh.faces].any(axis=1)
@@ -226,7 +226,7 @@ def relocate(state: State, views: Sequence[View]) -> int:
         return 0
     positions = state.vertices
     looked_at = np.zeros(len(positions), bool)
-    for view in evenly(views, IMPORTANCE_VIEWS):
+    for view in subsample(views, IMPORTANCE_VIEWS):
         looked_at |= view.camera.sees(positions)
     return state.relocate(looked_at)
 
@@ -237,7 +237,7 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
     shown = np.zeros(len(vertices), np.float32)
     before = np.zeros(len(shown), bool)
     for view in views:
-        shown += shown_pixels(
+        shown += visible_pixels(
             vertices,
             state.mesh.faces,
             colors,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats.binding import Binding
 from meshsplats.datasets.views import View
 from meshsplats.mesh import SplatMesh
@@ -43,7 +43,7 @@ def colors_from_views(binding: Binding, views: Sequence[View], *, threads: int |
     depths = np.abs(binding.layers * binding.lift)
     scores = np.zeros((len(points), BEST), np.float32)
     colors = np.zeros((len(points), BEST, 3), np.float32)
-    for view in evenly(views, MOST_VIEWS):
+    for view in subsample(views, MOST_VIEWS):
         rows, score, color = _seen(base, points, normals, depths, view, threads)
         # In place of the least of the best so far, where it is better.
         least = scores[rows].argmin(axis=1)

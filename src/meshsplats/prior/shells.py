@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from meshsplats._arrays import spread_indices
 from meshsplats._geometry import vertex_normals
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import dome
@@ -52,8 +53,7 @@ def look_at_base(
     colors = np.ones((len(vertices), 4), np.float32)
     base = SplatMesh(vertices, faces, colors, attributes={"normal": normals})
     if cameras:
-        chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, LOOKS).round().astype(int)]
-        chosen = [camera.within(SIDE) for camera in dict.fromkeys(chosen)]
+        chosen = [cameras[i].within(SIDE) for i in spread_indices(len(cameras), LOOKS)]
     else:
         chosen = dome(base, LOOKS, whole=True, width=SIDE, height=SIDE)
     nearest, front = [], 0.0
