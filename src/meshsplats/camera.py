@@ -17,7 +17,7 @@ class Camera:
     """A pinhole camera with OpenCV axes: +x right, +y down, +z forward.
 
     Concretely, a world point p is at ``X = world_to_camera[:3, :3] @ p + world_to_camera[:3, 3]`` in the
-    camera's frame and on the picture at ``(fx * X[0] / X[2] + cx, fy * X[1] / X[2] + cy)`` pixels from the
+    camera's frame and in the image at ``(fx * X[0] / X[2] + cx, fy * X[1] / X[2] + cy)`` pixels from the
     top left corner; the centre of pixel (row, col) is at (col + 0.5, row + 0.5).
     """
 
@@ -34,7 +34,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
-    """Nothing nearer than this depth (z, scene units) is drawn."""
+    """Depth z of the near plane, scene units: nothing nearer is drawn."""
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -73,11 +73,11 @@ class Camera:
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) float64 unit direction of the picture's upper edge in the world frame."""
+        """(3,) float64 unit direction towards the image's upper edge in the world frame."""
         return -self.world_to_camera[1, :3]
 
     def scaled(self, factor: float) -> Camera:
-        """The same view on a picture ``factor`` times as large, its sides rounded to whole pixels, at least
+        """The same view with an image ``factor`` times as large, its sides rounded to whole pixels, at least
         1."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"factor must be positive, got {factor}")
@@ -88,7 +88,7 @@ class Camera:
         )
 
     def within(self, side: int) -> Camera:
-        """The same view on a picture no side of which is longer than ``side`` pixels; never a larger one."""
+        """The same view with no side of the image longer than ``side`` pixels; never a larger image."""
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
     def sees(self, points: np.ndarray) -> np.ndarray:

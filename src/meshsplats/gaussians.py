@@ -35,9 +35,9 @@ class GaussianCloud:
     sh: np.ndarray
     """(n, k, 3) spherical harmonic coefficients of the display colour, k = 1, 4, 9 or 16 (degree 0 to 3)."""
     kernel: Kernel = "3dgs"
-    """How the splats were trained to be drawn: '3dgs' (0.3 px^2 added to the projected covariance),
-    'antialiased' (the same with the opacity lowered to keep its integral) or '2dgs' (flat splats met by the
-    ray)."""
+    """Kernel that the splats were trained with: '3dgs' (0.3 px^2 added to the projected covariance),
+    'antialiased' (the same with the opacity lowered to keep its integral) or '2dgs' (flat splats intersected
+    by the ray)."""
 
     def __post_init__(self) -> None:
         means = checked_array("means", self.means, np.float32, (None, 3))
@@ -99,7 +99,7 @@ class GaussianCloud:
 
     def select(self, index: np.ndarray) -> GaussianCloud:
         """The splats chosen by a boolean mask or an index array, in that order."""
-        # Taking rows by number is several times as quick as indexing, where they are as short as these.
+        # np.take is several times as fast as indexing on rows as short as these.
         rows = np.arange(len(self))[index]
         fields = ("means", "quaternions", "scales", "opacities", "sh")
         return replace(self, **{name: np.take(getattr(self, name), rows, axis=0) for name in fields})

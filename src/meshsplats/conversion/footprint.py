@@ -70,8 +70,8 @@ class CameraCoverage:
         )
 
     def _each(self, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """For each camera: (3, k) offsets from its centre to the splats ``part``, world frame; (k,) squares of
-        their lengths; (k,) bool which of them it sees; and (k,) weights, 0 for the others."""
+        """For each camera: (3, k) offsets from its centre to the splats ``part`` in the world frame, (k,)
+        squares of their lengths, (k,) bool which of them it sees, and (k,) weights, 0 for the others."""
         points = np.ascontiguousarray((self.means[part] - self.origin).T, np.float32)
         for camera in self.cameras:
             rotation, center = camera.world_to_camera[:3, :3], camera.center - self.origin
@@ -201,8 +201,8 @@ def pixel_sizes(
     seen = sizes > 0
     if not seen.any():
         raise ValueError(
-            f"none of the {len(coverage.cameras)} cameras sees any of the {len(cloud)} splats: are they of one"
-            " scene? Choose footprint='density' or 'none' to go without them"
+            f"none of the {len(coverage.cameras)} cameras sees any of the {len(cloud)} splats: are they of"
+            " one scene? Choose footprint='density' or 'none' to go without them"
         )
     sizes = np.where(seen, sizes, np.median(sizes[seen]))
     if options.footprint == "framing":
