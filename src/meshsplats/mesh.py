@@ -1,4 +1,4 @@
-"""SplatMesh: translucent vertex-coloured triangles, the form that everything else works on."""
+"""SplatMesh: translucent vertex-coloured triangles, the representation that all steps share."""
 
 from __future__ import annotations
 
@@ -29,38 +29,39 @@ class SplatMesh:
     vertices: np.ndarray
     """(v, 3) float32 positions in the world frame, scene units."""
     faces: np.ndarray
-    """(f, 3) int32 vertex numbers. Triangles are seen from both sides."""
+    """(f, 3) int32 vertex indices. Triangles are visible from both sides."""
     colors: np.ndarray
     """(v, 4) float32 straight RGBA in [0, 1]."""
     face_splat: np.ndarray | None = None
-    """(f,) int32 number of the splat each triangle was made from, ascending; None for a mesh of other
+    """(f,) int32 index of the splat that each triangle was made from, ascending; None for a mesh of other
     origin."""
     normals: np.ndarray | None = None
     """(v, 3) float32 unit shading normals, or None."""
     depth_group: np.ndarray | None = None
-    """(f,) int32: triangles with the same number >= 0 are coplanar layers that share one depth, that of their
-    common plane, and are ordered by face number; -1 keeps a triangle's own depth."""
+    """(f,) int32: triangles with the same value >= 0 are coplanar layers that share one depth, that of their
+    common plane, and are ordered by face index; -1 keeps a triangle's own depth."""
     up: np.ndarray = field(default_factory=lambda: np.array([0, -1, 0], np.float32))
-    """(3,) float32 unit direction that points up in the world frame; splats trained from COLMAP cameras have
-    y down. Another length than 1 is corrected."""
+    """(3,) float32 direction that points up in the world frame, normalised by the constructor; splats trained
+    from COLMAP cameras have y down."""
     blending: Blending = "display"
-    """Space in which the colours were made to be blended: 'display' (sRGB-encoded, as splats are) or
-    'linear'."""
+    """Colour space for blending: 'display' (sRGB-encoded, as splats are) or 'linear'."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Further float32 arrays (v,) or (v, c) by name, one row a vertex."""
+    """Further float32 arrays (v,) or (v, c) by name, one row for each vertex."""
     filter_px2: float = 0.0
-    """Variance in square pixels, 0 to 100, of the low-pass filter that the triangles of each splat want when
-    they are drawn, as splats are drawn with one; 0: none. Needs ``face_splat``."""
+    """Variance in square pixels, 0 to 100, of the low-pass filter that ``render`` applies to the triangles of
+    each splat, as splat renderers do; 0: none. Needs ``face_splat``."""
     binding: Binding | None = None
-    """Where on the faces of a base mesh the vertices lie, for a mesh prior: each triangle on one face."""
+    """For a mesh prior: where the vertices lie on the faces of its base mesh, each triangle on one face."""
 
     def __post_init__(self) -> None:
         vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
         v = len(vertices)
         faces = checked_array("faces", self.faces, np.int32, (None, 3))
         f = len(faces)
-        if f and faces.view(np.uint32).max() >= v:  # one pass: as unsigned numbers, negative ones are large
-            raise ValueError(f"faces must number vertices 0 to {v - 1}, got {faces.min()} to {faces.max()}")
+        if f and faces.view(np.uint32).max() >= v:  # one pass: negative indices are large as unsigned ones
+            raise ValueError(
+                f"faces must be vertex indices from 0 to {v - 1}, got {faces.min()} to {faces.max()}"
+            )
         colors = checked_array("colors", self.colors, np.float32, (v, 4))
         if v and (colors.min() < 0 or colors.max() > 1):
             raise ValueError(f"colors must lie in [0, 1], got {colors.min():.4g} to {colors.max():.4g}")
@@ -71,7 +72,7 @@ class SplatMesh:
         if self.face_splat is not None:
             face_splat = checked_array("face_splat", self.face_splat, np.int32, (f,))
             if f and (face_splat[0] < 0 or (face_splat[1:] < face_splat[:-1]).any()):
-                raise ValueError("face_splat must be ascending numbers >= 0")
+                raise ValueError("face_splat must be ascending indices >= 0")
             set_("face_splat", face_splat)
         if self.depth_group is not None:
             depth_group = checked_array("depth_group", self.depth_group, np.int32, (f,))
@@ -84,7 +85,7 @@ class SplatMesh:
         length = float(np.linalg.norm(up))
         if length == 0:
             raise ValueError("up must not be the zero vector")
-        # Left as it is where rounding alone is to blame, so that a saved mesh comes back bit for bit.
+        # Kept where it differs by rounding only, so that a saved mesh is loaded bit for bit.
         set_("up", up if abs(length - 1) <= 1e-6 else up / np.float32(length))
         if self.blending not in get_args(Blending):
             known = ", ".join(get_args(Blending))
@@ -95,7 +96,7 @@ class SplatMesh:
             ndim = np.ndim(value)
             if ndim not in (1, 2):
                 raise ValueError(
-                    f"attribute {name!r} must have one row a vertex, got shape {np.shape(value)}"
+                    f"attribute {name!r} must have one row for each vertex, got shape {np.shape(value)}"
                 )
             attributes[name] = checked_array(f"attribute {name!r}", value, np.float32, (v, None)[:ndim])
         set_("attributes", MappingProxyType(attributes))
@@ -117,14 +118,13 @@ class SplatMesh:
 
     @property
     def splat_count(self) -> int | None:
-        """How many splats own at least one triangle; None where the mesh does not know."""
+        """Count of splats with at least one triangle; None without ``face_splat``."""
         if self.face_splat is None:
             return None
         return int(len(self.face_splat) > 0) + int(np.count_nonzero(np.diff(self.face_splat)))
 
     def keep_faces(self, keep: np.ndarray) -> SplatMesh:
-        """The triangles marked in ``keep`` (f,) bool, in order, without the vertices that no kept triangle
-        uses."""
+        """The triangles of the mask ``keep`` (f,) bool, in order, without vertices that none of them uses."""
         keep = np.asarray(keep, bool)
         faces = self.faces[keep]
         used = np.zeros(len(self.vertices), bool)
@@ -143,14 +143,16 @@ class SplatMesh:
         )
 
     def prune(self, min_opacity: float) -> SplatMesh:
-        """Without the triangles all of whose corners are below ``min_opacity``, and without orphaned
-        vertices."""
+        """The mesh without triangles all of whose corners have less than ``min_opacity``, and without the
+        vertices that no triangle then uses."""
         return self.keep_faces((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
 
 
 def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
-    """``px2`` as the variance of a filter for meshes with such splat numbers. ValueError where it cannot be
-    that."""
+    """``px2`` as the filter variance of a mesh with that ``face_splat``.
+
+    Raises ValueError if it is out of range, or above 0 without ``face_splat``.
+    """
     number = isinstance(px2, (int, float, np.integer, np.floating)) and not isinstance(px2, bool)
     if not number or not 0 <= px2 <= MAX_FILTER_PX2:
         raise ValueError(
@@ -158,12 +160,12 @@ def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
         )
     if px2 > 0 and face_splat is None:
         raise ValueError(
-            f"a filter of {px2:g} px^2 widens each splat's triangles together, but the mesh does not know its"
-            " splats: give face_splat, or filter_px2=0"
+            f"a filter of {px2:g} px^2 widens the triangles of each splat together, but the mesh does not"
+            " know its splats: give face_splat, or filter_px2=0"
         )
     return float(px2)
 
 
 def splat_starts(face_splat: np.ndarray) -> np.ndarray:
-    """Numbers of the first triangles of each splat, of ``face_splat`` (f,), f > 0."""
+    """Index of the first triangle of each splat in ``face_splat`` (f,), f > 0."""
     return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))

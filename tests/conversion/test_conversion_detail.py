@@ -15,7 +15,7 @@ from meshsplats.conversion.detail import (
     HIDDEN,
     LEAST,
     LEVELS,
-    LOOKED_AT,
+    MIN_VIEWS,
     TRIANGLES,
     choose_levels,
     visibility,
@@ -133,7 +133,7 @@ def test_what_is_hidden_gets_no_triangles():
     )
     views = [
         look_at((x, 0, -6), (x, 0, 0), up=(0, -1, 0), width=40, height=40, fov=40)
-        for x in np.linspace(-0.5, 0.5, LOOKED_AT)
+        for x in np.linspace(-0.5, 0.5, MIN_VIEWS)
     ]
     mesh = convert(wall, cameras=views, detail="cameras", footprint="none")
     assert np.unique(mesh.face_splat).tolist() == [0, 2, 3]

@@ -96,13 +96,13 @@ def test_a_texture_checks_itself(arguments, message):
 
 def test_a_base_checks_itself():
     vertices, faces = np.eye(3), [[0, 1, 2]]
-    with pytest.raises(ValueError, match="faces must number"):
+    with pytest.raises(ValueError, match="faces must be indices"):
         BaseMesh(vertices, [[0, 1, 3]])
     with pytest.raises(ValueError, match="colors must lie"):
         BaseMesh(vertices, faces, np.full((3, 4), 2.0))
     with pytest.raises(ValueError, match="given together"):
         BaseMesh(vertices, faces, uv=np.zeros((1, 3, 2)))
-    with pytest.raises(ValueError, match="face_texture must number the 0 textures"):
+    with pytest.raises(ValueError, match="face_texture must be indices of the 0 textures"):
         BaseMesh(vertices, faces, uv=np.zeros((1, 3, 2)), face_texture=[0])
 
 

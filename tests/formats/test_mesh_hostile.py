@@ -95,8 +95,8 @@ def test_npz_that_do_not_hold_a_mesh(tmp_path):
         ({"vertices": f4(1)}, r"'vertices' has shape \(\)"),
         ({"vertex_colors": np.ones((2, 4), f4)}, r"'vertex_colors' has shape \(2, 4\), expected \(3, 4\) or"),
         ({"faces": np.array([[0.0, 1, 2]])}, "faces must hold integers"),
-        ({"faces": np.array([[0, 1, 3]])}, "faces must number vertices 0 to 2, got 0 to 3"),
-        ({"faces": np.array([[0, 1, -1]])}, "faces must number vertices"),
+        ({"faces": np.array([[0, 1, 3]])}, "faces must be vertex indices from 0 to 2, got 0 to 3"),
+        ({"faces": np.array([[0, 1, -1]])}, "faces must be vertex indices"),
         ({"vertices": TRIANGLE + np.nan}, "vertices must be finite"),
         ({"vertices": TRIANGLE.astype(float) + 1e300}, "vertices must be finite"),
         ({"vertex_colors": np.full((3, 4), np.inf)}, "colors must be finite"),
@@ -104,7 +104,7 @@ def test_npz_that_do_not_hold_a_mesh(tmp_path):
         ({"vertices": TRIANGLE.astype(complex)}, "'vertices' must hold numbers"),
         ({"vertices": np.zeros(3, [("x", "f4")])}, "'vertices' must hold numbers"),
         ({"face_splat": np.array([1, 2])}, r"'face_splat' has shape \(2,\), expected \(1,\)"),
-        ({"face_splat": np.array([-1])}, "face_splat must be ascending numbers >= 0"),
+        ({"face_splat": np.array([-1])}, "face_splat must be ascending indices >= 0"),
         ({"up": np.zeros(3)}, "up must not be the zero vector"),
         ({"blending": np.array("additive")}, "blending must be one of display, linear"),
         ({"filter_px2": np.array(0.3)}, "does not know its splats"),
@@ -218,9 +218,10 @@ def test_ply_that_lie(tmp_path):
     refused(ply(path, body + struct.pack("<b3i", -1, 0, 1, 2), count="char"), "list of length -1|truncated")
     refused(ply(path, body + struct.pack("<I3i", 2**32 - 1, 0, 1, 2), count="uint"), "past the end")
     refused(
-        ply(path, body + struct.pack("<B3i", 3, 0, 1, 3)), "faces must number vertices 0 to 2, got 0 to 3"
+        ply(path, body + struct.pack("<B3i", 3, 0, 1, 3)),
+        "faces must be vertex indices from 0 to 2, got 0 to 3",
     )
-    refused(ply(path, body + struct.pack("<B3i", 3, 0, 1, -7)), "faces must number vertices")
+    refused(ply(path, body + struct.pack("<B3i", 3, 0, 1, -7)), "faces must be vertex indices")
     refused(ply(path, (TRIANGLE + np.inf).tobytes() + face), "vertices must be finite")
     text = b"0 0 0\n1 0 0\n0 1 0\n"
     for line in (

@@ -234,5 +234,5 @@ def test_a_checkpoint_with_a_broken_binding_is_refused(task, tmp_path):
     with pytest.raises(FileFormatError, match=r"lacks 'mesh.binding.weights'"):
         stored_mesh(lacking, "display")
     arrays["mesh.binding.vertex_face"] = arrays["mesh.binding.vertex_face"] + 10**6
-    with pytest.raises(FileFormatError, match="vertex_face must number"):
+    with pytest.raises(FileFormatError, match="vertex_face must be indices"):
         stored_mesh(arrays, "display")

@@ -196,7 +196,7 @@ def test_an_invisible_splat_has_a_shape():
     picture = TapedRendering(mesh.vertices, mesh.faces, mesh.colors, None, view, **options)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     nothing, all_pixels = np.zeros_like(picture.color), np.ones_like(picture.alpha)
-    picture.back(nothing, all_pixels, None, vertices=points, colors=colors)
+    picture.backward(nothing, all_pixels, None, vertices=points, colors=colors)
     # Of uniform density, the square has a variance of r^2 / 6: its area grows by 1 + 48 / 4.
     np.testing.assert_allclose(colors[:, 3].sum(), 2 * 4 * 13, rtol=0.01)
     np.testing.assert_array_equal(points, 0)
@@ -225,7 +225,7 @@ def test_hostile(view):
         )
         points, colors = np.zeros_like(mixed.vertices), np.zeros_like(mixed.colors)
         with np.errstate(all="ignore"):
-            picture.back(np.ones_like(picture.color), None, None, vertices=points, colors=colors)
+            picture.backward(np.ones_like(picture.color), None, None, vertices=points, colors=colors)
 
 
 # Against float64
@@ -321,7 +321,7 @@ def back(mesh: SplatMesh, threads: int | None = None) -> tuple[np.ndarray, np.nd
     )
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     towards = np.random.default_rng(0).normal(size=picture.color.shape).astype(np.float32)
-    picture.back(towards, None, None, vertices=points, colors=colors)
+    picture.backward(towards, None, None, vertices=points, colors=colors)
     return points, colors
 
 

@@ -371,6 +371,20 @@ def test_depth_and_normals_of_an_opaque_plane():
         np.testing.assert_allclose(picture.normals, np.broadcast_to(facing, (29, 37, 3)), atol=1e-6)
 
 
+def test_mean_depth_is_that_of_what_is_seen():
+    """Half opaque at depth 2 before opaque at 6: 4 in the mean; alone, its own."""
+    view = camera()
+    both = render(layers([2.0, 6.0], [0.5, 1.0]), view, depth=True)
+    np.testing.assert_allclose(both.mean_depth(), 4, rtol=1e-6)
+    alone = render(layers([2.0], 0.5), view, depth=True)
+    np.testing.assert_allclose(alone.mean_depth(), 2, rtol=1e-6)
+    assert np.isinf(alone.mean_depth(min_alpha=0.5)).all()
+    assert (alone.mean_depth(min_alpha=0.5, empty=0) == 0).all()
+    assert alone.mean_depth().dtype == np.float32
+    with pytest.raises(ValueError, match="render with depth=True"):
+        render(layers([2.0], 0.5), view).mean_depth()
+
+
 def test_vertex_normals():
     mesh = soup(6)
     normals = np.random.default_rng(6).normal(size=(60, 3))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
@@ -34,7 +34,7 @@ COVERED = 0.995
 MARGIN = 1.08
 """Room left round the subject."""
 
-Scene = GaussianCloud | SplatMesh | np.ndarray
+Framable = GaussianCloud | SplatMesh | np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def weighted_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> floa
     return float(values[order[min(np.searchsorted(total, q * total[-1]), len(order) - 1)]])
 
 
-def scene_bounds(scene: Scene) -> Bounds:
+def scene_bounds(scene: Framable) -> Bounds:
     """Robust bounds of a cloud, a mesh or points (n, 3); opacity is the weight of a splat or vertex.
 
     Raises ValueError for a scene without points, or if points (n, 3) have another shape or are not finite.
@@ -107,7 +107,7 @@ def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np
     return keep if weights[keep].sum() >= (1 - FLOATERS) * weights.sum() else np.ones(len(points), bool)
 
 
-def guess_up(scene: Scene | None = None, cameras: Sequence[Camera] | None = None) -> np.ndarray:
+def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = None) -> np.ndarray:
     """(3,) float64 unit direction that points up in the world frame.
 
     The mean up direction of ``cameras`` where they are known and agree (people hold cameras upright); else
@@ -152,7 +152,7 @@ def middle(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
     return np.array([_middle_of(along[:, k], bounds.weights) for k in range(3)]) @ axes
 
 
-def fit_pictures(
+def fit_images(
     bounds: Bounds, target: np.ndarray, rotations: Sequence[np.ndarray], slopes: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
     """Point to look at, near ``target``, and the least distance from it at which every view shows it all.
@@ -162,7 +162,7 @@ def fit_pictures(
     """
     # What is near looks larger: the middle of the box is not the middle of a picture. Two steps of least
     # squares over the views bring it there within a few pixels; a dozen of the views are enough to know.
-    some = evenly(rotations, 12)
+    some = subsample(rotations, 12)
     across = np.concatenate([rotation[:2] for rotation in some])
     for _ in range(2):
         away = max(_fitting_distance(bounds, target, rotation, slopes) for rotation in some)

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._geometry import direction
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import (
     DEFAULT_UP,
-    Scene,
-    fit_pictures,
+    Framable,
+    fit_images,
     front_axes,
     guess_up,
     middle,
@@ -68,7 +69,7 @@ def look_at(
 
 
 def orbit(
-    scene: Scene,
+    scene: Framable,
     count: int = 60,
     *,
     elevation: float = 15.0,
@@ -98,11 +99,11 @@ def orbit(
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
-    return round_subject(scene, angles, up, width, height, fov, distance, target)
+    return around_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def dome(
-    scene: Scene,
+    scene: Framable,
     count: int = 32,
     *,
     whole: bool = False,
@@ -124,11 +125,11 @@ def dome(
     lowest = -1.0 if whole else 0.0
     heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     angles = [(i * golden % 360, float(np.degrees(np.arcsin(h)))) for i, h in enumerate(heights)]
-    return round_subject(scene, angles, up, width, height, fov, distance, target)
+    return around_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def look_around(
-    scene: Scene,
+    scene: Framable,
     count: int = 60,
     *,
     elevation: float = 0.0,
@@ -151,21 +152,14 @@ def look_around(
     cameras = []
     for i in range(count):
         # Azimuth 0 looks forward, and a turn to the right is a growing angle.
-        direction = _direction(axes, 180 - azimuth - 360 * i / count, elevation)
-        target = bounds.center + bounds.radius * direction
+        gaze = direction(axes, 180 - azimuth - 360 * i / count, elevation)
+        target = bounds.center + bounds.radius * gaze
         cameras.append(look_at(bounds.center, target, up=axes[1], name=f"view_{i:04d}", **lens))
     return cameras
 
 
-def _direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
-    """Unit vector from the subject to a camera; ``axes`` as from ``front_axes``."""
-    a, e = np.radians(azimuth), np.radians(elevation)
-    right, up, forward = axes
-    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
-
-
-def round_subject(
-    scene: Scene,
+def around_subject(
+    scene: Framable,
     angles: Sequence[tuple[float, float]],
     up: Sequence[float] | np.ndarray | None,
     width: int,
@@ -181,13 +175,13 @@ def round_subject(
         raise ValueError("azimuth must be finite and elevation between -90 and 90 degrees")
     bounds = scene_bounds(scene)
     axes = front_axes(guess_up(scene) if up is None else unit_up(up))
-    directions = [_direction(axes, azimuth, elevation) for azimuth, elevation in angles]
+    directions = [direction(axes, azimuth, elevation) for azimuth, elevation in angles]
     lens: dict[str, Any] = {"up": axes[1], "width": width, "height": height, "fov": fov}
     target = middle(bounds, axes)
-    around = [look_at(target + direction, target, **lens) for direction in directions]
+    around = [look_at(target + d, target, **lens) for d in directions]
     rotations = [camera.world_to_camera[:3, :3] for camera in around]
     slopes = (width / 2 / around[0].fx, height / 2 / around[0].fy)
-    target, fit = fit_pictures(bounds, target, rotations, slopes)
+    target, fit = fit_images(bounds, target, rotations, slopes)
     if aim is not None:
         target = np.asarray(aim, np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():

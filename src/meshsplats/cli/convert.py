@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hi
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, a_few
+from meshsplats._arrays import subsample
+from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import orbit
@@ -126,9 +127,9 @@ class Convert:
     """.glb, .usd: a material that lights and shadows act on, not one that shows the colours as they are."""
     color_type: Literal["uint16", "float32"] = "uint16"
     """.glb: how colours are stored."""
-    alpha: Literal["blend", "mask", "hash-friendly"] = "blend"
-    """.glb: blend: true opacities. For viewers that neither sort nor blend well: mask draws solid what is at
-    least 20 % opaque; hash-friendly gives each splat a cutoff of its own, right on average, grainy."""
+    alpha: Literal["blend", "mask"] = "blend"
+    """.glb: blend: true opacities. mask, for viewers that neither sort nor blend well: draws solid what is at
+    least 20 % opaque."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
@@ -326,7 +327,7 @@ class Convert:
 
         if self.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.conversion.crop)
-        views = a_few(cameras, self.fidelity, 400) or orbit(
+        views = [camera.within(400) for camera in subsample(cameras, self.fidelity)] or orbit(
             mesh, self.fidelity, elevation=15, width=400, height=400
         )
         mean = compare(cloud, mesh, views).to_dict()["mean"]

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from meshsplats._arrays import spread_indices
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli import UsageError
 from meshsplats.cli.common import (
@@ -243,7 +244,7 @@ class Evaluate:
         views = dataset.test or dataset.views
         pictures = None if self.pictures is None else image_folder(self.pictures, [v.camera for v in views])
         lpips = load_lpips(list(self.lpips) or None, network=self.network)
-        shown = set(np.linspace(0, len(views) - 1, min(self.strips, len(views))).round().astype(int).tolist())
+        shown = set(spread_indices(len(views), self.strips))
         names = view_names(len(views))
         folder.mkdir(exist_ok=True)
         bar = iter(track(range(len(views)), "scoring", len(views)))

@@ -217,8 +217,7 @@ class Render:
             save_png(files.pictures[i], picture)
             if drawn.depth is None:
                 continue
-            covered = drawn.alpha > 0
-            mean = np.where(covered, drawn.depth / np.where(covered, drawn.alpha, 1), 0).astype(np.float32)
+            mean = drawn.mean_depth(empty=0)
             if unit is None:
                 save_array(files.depths[i], mean)
             else:

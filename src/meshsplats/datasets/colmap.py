@@ -16,6 +16,7 @@ from typing import IO
 
 import numpy as np
 
+from meshsplats._geometry import rotation_rows
 from meshsplats.camera import MAX_SIDE
 from meshsplats.datasets.image_files import MAX_NAME, Frame
 from meshsplats.datasets.lens import MODELS, Lens
@@ -269,10 +270,6 @@ def _frame(
         raise FileFormatError(f"{where}: its pose is no rotation and translation: {pose}")
     w, x, y, z = (q / length for q in pose[:4])
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = list(rotation_rows(w, x, y, z))
     matrix[:3, 3] = pose[4:7]
     return Frame(name, f"{images}/{name}", lenses[camera], matrix)

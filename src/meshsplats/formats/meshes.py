@@ -109,8 +109,8 @@ def save_mesh(
     - ``lit`` (`.glb`, USD; default False): a material that scene lights shade instead of one that shows the
       colours as they are.
     - ``color_type`` (`.glb`; default 'uint16'): 'float32' stores colours exactly, but larger.
-    - ``alpha`` (`.glb`; default 'blend'): 'mask' or 'hash-friendly' for viewers that do not sort; they are
-      drawn solid where opacity reaches a cutoff, one for all or one for each splat.
+    - ``alpha`` (`.glb`; default 'blend'): 'mask' for viewers that do not sort: drawn solid where opacity
+      reaches a cutoff.
     - ``compression`` (`.glb`): 'meshopt' makes files about a fifth as large, with the external program
       gltfpack. Each coordinate is moved by at most 1/131070 of the longest side of the mesh's box; triangles
       change their order a little; splat numbers and attributes are left out. Such files are for viewers;

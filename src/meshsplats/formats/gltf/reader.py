@@ -210,14 +210,6 @@ def _restore(
             result["filter_px2"] = variance
         else:
             lost.append("the filter of its splats")
-    if isinstance(note.get("alpha"), str):
-        true_alpha = _attribute(
-            document, mesh["primitives"][0]["attributes"], {"semantic": note["alpha"]}, v, 1
-        )
-        if true_alpha is None:
-            lost.append("opacities")
-        else:
-            result["colors"] = np.concatenate([colors[:, :3], np.clip(true_alpha, 0, 1)], axis=1)
     if "binding" in note:
         result["binding"] = _binding(document, dict_or_empty(note["binding"]), v)
         if result["binding"] is None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._geometry import rotation_rows
 from meshsplats.formats.gltf.document import GltfDocument
 
 INSTANCING = "EXT_mesh_gpu_instancing"
@@ -223,11 +224,7 @@ def rotation_matrix(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
     """(4, 4) matrix of a unit quaternion x, y, z, w."""
     x, y, z, w = quaternion
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = list(rotation_rows(w, x, y, z))
     return matrix
 
 

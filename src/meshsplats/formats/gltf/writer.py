@@ -17,13 +17,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from meshsplats._geometry import vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.mesh import SplatMesh
 
 ColorType = Literal["uint16", "float32"]
-Alpha = Literal["blend", "mask", "hash-friendly"]
+Alpha = Literal["blend", "mask"]
 
 MASK_CUTOFF = 0.2
 """Opacity from which ``alpha='mask'`` draws. Of 0.05 to 0.5 the best compromise over an opaque figure, a
@@ -51,22 +52,17 @@ def write_glb(
     dielectric that scene lights shade, with the mesh's normals or, where it has none, area-weighted vertex
     normals. ``color_type`` 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
 
-    ``alpha`` is how viewers are told to treat opacity. 'blend' is the truth, for viewers that sort or blend
-    well enough without. The two others are drawn solid, with the depth buffer, and need no order: 'mask'
-    draws what is at least ``MASK_CUTOFF`` opaque; 'hash-friendly' gives each splat a cutoff of its own, so
-    that among many layers each counts as often as its opacity says: right on average, and grainy.
-    docs/viewers.md compares them.
+    ``alpha`` is how viewers shall treat opacity. 'blend' is exact in viewers that sort, and good enough in
+    many that do not. 'mask' needs no order: what is at least ``MASK_CUTOFF`` opaque is drawn solid, with the
+    depth buffer. docs/viewers.md compares them.
 
     Colours of a mesh made for display blending are converted to linear; those of one made for linear
     blending are stored as they are. ``extras`` False leaves out the arrays that only this project reads.
     Raises ValueError for a mesh without triangles (glTF has no empty arrays), for normals that are not
-    of unit length, for 'hash-friendly' without ``face_splat`` and for a file beyond the 4 GiB that the
-    format can hold.
+    of unit length, and for a file beyond the 4 GiB that the format can hold.
     """
     if alpha not in get_args(Alpha):
         raise ValueError(f"alpha must be one of {', '.join(get_args(Alpha))}, got {alpha!r}")
-    if alpha == "hash-friendly" and mesh.face_splat is None:
-        raise ValueError("alpha 'hash-friendly' needs a mesh that knows its splats (face_splat); use 'mask'")
     if color_type not in get_args(ColorType):
         raise ValueError(f"color_type must be one of {', '.join(get_args(ColorType))}, got {color_type!r}")
     if not len(mesh.faces):
@@ -152,17 +148,11 @@ def _document(
     if normals is not None:
         _check_unit(normals)
     elif lit:
-        normals = vertex_normals(mesh)
+        normals = computed_normals(mesh)
         extras["normals"] = "computed"
     if normals is not None:
         attributes["NORMAL"] = buffer.accessor(normals, _FLOAT, _ARRAY_BUFFER)
     colors = linear_colors(mesh, color_type)
-    if alpha == "hash-friendly":
-        shown = _splat_cutoffs(mesh)
-        colors[:, 3] = shown if color_type == "float32" else shown * np.float32(65535) + np.float32(0.5)
-        if with_extras:
-            extras["alpha"] = "_ALPHA"
-            attributes["_ALPHA"] = buffer.accessor(mesh.colors[:, 3], _FLOAT, _ARRAY_BUFFER)
     if color_type == "uint16":
         attributes["COLOR_0"] = buffer.accessor(colors, _UINT16, _ARRAY_BUFFER, normalized=True)
     else:
@@ -193,8 +183,8 @@ def _document(
         "alphaMode": "BLEND" if alpha == "blend" else "MASK",
         "doubleSided": True,
     }
-    if alpha != "blend":
-        material["alphaCutoff"] = MASK_CUTOFF if alpha == "mask" else 0.5
+    if alpha == "mask":
+        material["alphaCutoff"] = MASK_CUTOFF
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
         "scene": 0,
@@ -216,20 +206,6 @@ def _document(
         material["extensions"] = {"KHR_materials_unlit": {}}
         document["extensionsUsed"] = ["KHR_materials_unlit"]
     return document, buffer.parts
-
-
-def _splat_cutoffs(mesh: SplatMesh) -> np.ndarray:
-    """(v,) float32 opacities that, cut at 0.5, show splat s where its true opacity is at least its own
-    cutoff.
-
-    Concretely 0.5 + (opacity - cutoff) / 2, which is linear in the opacity and so crosses 0.5 at the
-    same place inside a triangle. Multiples of the golden ratio spread the cutoffs of successive splats
-    evenly over [0, 1).
-    """
-    assert mesh.face_splat is not None
-    cutoffs = np.zeros(len(mesh.vertices), np.float32)
-    cutoffs[mesh.faces] = (mesh.face_splat * ((5**0.5 - 1) / 2) % 1)[:, None]
-    return np.float32(0.5) + (mesh.colors[:, 3] - cutoffs) / 2
 
 
 def _raw(buffer: _Buffer, values: np.ndarray) -> dict[str, Any]:
@@ -294,19 +270,10 @@ def linear_colors(mesh: SplatMesh, color_type: ColorType) -> np.ndarray:
     return result
 
 
-def vertex_normals(mesh: SplatMesh) -> np.ndarray:
-    """(v, 3) float32 unit normals, the area-weighted means of the normals of the triangles round each vertex.
-    A vertex without area round it gets the mesh's up direction."""
-    corners = [mesh.faces[:, k] for k in range(3)]
-    x, y, z = np.ascontiguousarray(mesh.vertices.T)
-    edges = [[p[corners[k]] - p[corners[0]] for p in (x, y, z)] for k in (1, 2)]
-    sums = np.empty(mesh.vertices.shape, np.float64)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        weighted = edges[0][i] * edges[1][j] - edges[0][j] * edges[1][i]  # twice the area times the normal
-        sums[:, axis] = sum(np.bincount(corner, weighted, minlength=len(sums)) for corner in corners)
-    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))[:, None]
-    return np.where(length > 0, sums / np.where(length > 0, length, 1), mesh.up).astype(np.float32)
+def computed_normals(mesh: SplatMesh) -> np.ndarray:
+    """(v, 3) float32 unit normals, area-weighted means of the triangles' normals around each vertex; where
+    these have no area, the mesh's up direction."""
+    return vertex_normals(mesh.vertices, mesh.faces, fallback=mesh.up).astype(np.float32)
 
 
 def _check_unit(normals: np.ndarray) -> None:

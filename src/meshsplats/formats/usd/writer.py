@@ -18,7 +18,7 @@ import numpy as np
 
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._validation import check_attribute_names
-from meshsplats.formats.gltf.writer import linear_colors, up_quaternion, vertex_normals
+from meshsplats.formats.gltf.writer import computed_normals, linear_colors, up_quaternion
 from meshsplats.mesh import SplatMesh
 
 
@@ -52,7 +52,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     if len(mesh.vertices):
         corners = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
         shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
-    normals = vertex_normals(mesh) if lit and mesh.normals is None else mesh.normals
+    normals = computed_normals(mesh) if lit and mesh.normals is None else mesh.normals
     if normals is not None:
         shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
         shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
