@@ -218,7 +218,8 @@ def test_ply_that_lie(tmp_path):
     refused(ply(path, body + struct.pack("<b3i", -1, 0, 1, 2), count="char"), "list of length -1|truncated")
     refused(ply(path, body + struct.pack("<I3i", 2**32 - 1, 0, 1, 2), count="uint"), "past the end")
     refused(
-        ply(path, body + struct.pack("<B3i", 3, 0, 1, 3)), "faces must be vertex indices from 0 to 2, got 0 to 3"
+        ply(path, body + struct.pack("<B3i", 3, 0, 1, 3)),
+        "faces must be vertex indices from 0 to 2, got 0 to 3",
     )
     refused(ply(path, body + struct.pack("<B3i", 3, 0, 1, -7)), "faces must be vertex indices")
     refused(ply(path, (TRIANGLE + np.inf).tobytes() + face), "vertices must be finite")
