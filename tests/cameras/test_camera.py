@@ -1,4 +1,4 @@
-"""Cameras: projection, placement round a scene, and camera files."""
+"""Cameras: projection, placement around a scene, and camera files."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_orbit_by_hand():
 
 
 def test_orbit_frames_a_ball():
-    """A unit ball is seen whole, and fills the picture: its outline lies at 1 / sin of the half angle."""
+    """A unit ball is seen whole, and fills the image: its outline lies at 1 / sin of the half angle."""
     camera = orbit(ball(20000), 1, elevation=0, fov=60, width=400, height=300)[0]
     pixels, depth = camera.project(ball(20000, seed=1))
     assert depth.min() > camera.near
@@ -144,8 +144,8 @@ def test_strays_and_surroundings_do_not_move_the_frame():
     assert np.linalg.norm(a.center - b.center) < 0.15 * np.linalg.norm(a.center)
 
 
-def test_the_subject_is_in_the_middle_of_the_pictures():
-    """A plate seen from above is nearer at its lower edge, which then takes more of the picture."""
+def test_the_subject_is_in_the_middle_of_the_images():
+    """A plate seen from above is nearer at its lower edge, which then takes more of the image."""
     rng = np.random.default_rng(0)
     plate = rng.uniform(-1, 1, (5000, 3)) * [1, 0.05, 1]
     around = orbit(plate, 4, elevation=25, azimuth=45, width=400, height=400)
@@ -273,7 +273,7 @@ def test_cameras_come_back_with_every_digit(tmp_path):
 
 BROKEN = {
     "no list": ({"cameras": [OURS]}, "JSON list of cameras, this is a JSON object$"),
-    "a data set": ({"frames": []}, "JSON object with 'frames': of a data set, which load_dataset"),
+    "a data set": ({"frames": []}, "JSON object with 'frames', a data set: read it with load_dataset"),
     "empty": ([], "no camera"),
     "no object": ([OURS, 3], "camera 1"),
     "null": ([None], "camera 0"),

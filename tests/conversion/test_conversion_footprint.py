@@ -214,8 +214,8 @@ class TestSpacing:
 
 
 class TestFraming:
-    def test_pixel_of_a_picture_that_holds_the_subject(self):
-        """Sparse splats: as if given the cameras of such pictures."""
+    def test_pixel_of_an_image_that_holds_the_subject(self):
+        """Sparse splats: as if given the cameras of such images."""
         cloud = grid(16)
         cameras = orbit(
             cloud, module.FRAMING_VIEWS, width=module.FRAMING_PIXELS, height=module.FRAMING_PIXELS

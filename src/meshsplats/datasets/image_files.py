@@ -21,7 +21,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", "
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""
 MAX_NAME = 1000
 MAX_STRETCH = 0.02
-"""How much width and height may be scaled differently before a picture is not the one the camera took."""
+"""How much width and height may be scaled differently before an image is not the one the camera took."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Frame:
     name: str
     """Name of the view."""
     file: str
-    """Path of the picture in the folder, as written there."""
+    """Path of the image in the folder, as written there."""
     lens: Lens | None
-    """None if neither the file nor the picture, which is missing, tells its size."""
+    """None if neither the file nor the image, which is missing, tells its size."""
     world_to_camera: np.ndarray
     mask: str | None = None
     """Path of its mask in the folder; None: looked for in ``masks/``."""
@@ -62,7 +62,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
 
 def find(folder: Path, name: str, where: str, *, other_suffix: bool = False) -> Path | None:
     """The file ``name`` in ``folder``, or None. A name without one of the known suffixes may lack it;
-    ``other_suffix`` admits the same picture in another format."""
+    ``other_suffix`` admits the same image in another format."""
     path = inside(folder, name, where)
     if path.is_file():
         return path
@@ -85,18 +85,18 @@ class PhotoFile:
     """As the data set has it."""
     path: Path
     lens: Lens
-    """The lens before the picture at the size it is used in."""
+    """The lens before the image at the size it is used in."""
     pinhole: Pinhole
     mask: Path | None
     has_alpha: bool
     store: ImageCache = field(repr=False)
 
     def load(self) -> ViewImage:
-        picture = self.store.find(self)
-        if picture is None:
-            picture = self._read()
-            self.store.keep(self, picture)
-        return picture
+        image = self.store.find(self)
+        if image is None:
+            image = self._read()
+            self.store.keep(self, image)
+        return image
 
     @property
     def nbytes(self) -> int:
@@ -165,11 +165,11 @@ class Album:
     no_mask: list[str] = field(default_factory=list)
 
     def views(self, frames: Iterable[Frame], where: str) -> list[Taken]:
-        """Cameras and photographs of each frame whose picture is there, in order."""
+        """Cameras and photographs of each frame whose image is there, in order."""
         result: list[Taken] = []
         masks = (self.folder / "masks").is_dir()
         for frame in frames:
-            told = f"{where}: picture {frame.name[:60]!r}"
+            told = f"{where}: image {frame.name[:60]!r}"
             full = find(self.folder, frame.file, told)
             small = self._smaller(frame.file, told)
             if frame.lens is None or (full is None and small is None):
@@ -204,8 +204,8 @@ class Album:
                 found = find(self.folder, str(beside.joinpath(*parts[i + 1 :])), where, other_suffix=True)
                 if found is None:
                     raise FileFormatError(
-                        f"{where}: {str(beside)!r} has no such picture; complete that folder, or remove it:"
-                        f" pictures are then made smaller here"
+                        f"{where}: {str(beside)!r} has no such image; complete that folder, or remove it:"
+                        f" images are then made smaller here"
                     )
                 return found
         return None
@@ -232,11 +232,11 @@ class Album:
     def report(self, where: str, found: int) -> None:
         """Warns of what is missing; FileFormatError if nothing is left."""
         if not found:
-            what = "names no pictures" if not self.missing else f"none of its pictures is there{self._hint()}"
+            what = "names no images" if not self.missing else f"none of its images is there{self._hint()}"
             raise FileFormatError(f"{where}: {what}")
         for names, text in (
-            (self.missing, "pictures are missing; their views are left out"),
-            (self.no_mask, "pictures have no mask and count wholly"),
+            (self.missing, "images are missing; their views are left out"),
+            (self.no_mask, "images have no mask and count wholly"),
         ):
             if names:
                 shown = ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
@@ -264,13 +264,13 @@ def _camera(frame: Frame, pinhole: Pinhole, where: str) -> Camera:
 
 
 def _check_shape(lens: Lens, header: Header, path: Path) -> None:
-    """FileFormatError unless the picture is the camera's, but for its scale and a pixel of rounding."""
+    """FileFormatError unless the image is the camera's, but for its scale and a pixel of rounding."""
     width, height = header.width, header.height
     stretch = (width / lens.width) / (height / lens.height)
     if abs(stretch - 1) > MAX_STRETCH + 1 / min(width, height):
         turned = ""
         if abs(stretch / (width / height) ** 2 - 1) < 0.05:
-            turned = ". It is turned: cameras belong to pictures as they are stored, before any rotation"
+            turned = ". It is turned: cameras belong to images as they are stored, before any rotation"
         raise FileFormatError(
             f"{path}: {width} x {height} pixels do not fit its camera, which took {lens.width} x"
             f" {lens.height}{turned}"
