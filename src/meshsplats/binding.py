@@ -17,7 +17,7 @@ SUM_TOLERANCE = 1e-6
 
 
 class ArrayField(NamedTuple):
-    """Declaration of an array of ``SplatMesh`` or ``Binding``: constructors, readers and writers follow it."""
+    """Declares an array of ``SplatMesh`` or ``Binding``; constructors, readers and writers follow it."""
 
     name: str
     dtype: type[np.generic]
@@ -27,8 +27,8 @@ class ArrayField(NamedTuple):
     """Length of a row; None for a single number."""
     optional: bool = False
 
-    def shape(self, counts: Mapping[str, int]) -> tuple[int | None, ...]:
-        """Shape with ``counts`` rows by ``per``; None where that count is missing."""
+    def shape(self, counts: Mapping[str, int]) -> tuple[Any, ...]:
+        """Shape with ``counts`` rows by ``per``; None (any number) where that count is missing."""
         rows = () if self.per == "mesh" else (counts.get(self.per),)
         return rows if self.columns is None else (*rows, self.columns)
 

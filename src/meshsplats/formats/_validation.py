@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
-from meshsplats.binding import Binding
 from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning
 from meshsplats.mesh import SplatMesh
 
+T = TypeVar("T")
 _BASE_BYTES = 256 << 20
 _FACTOR = 64
 
@@ -95,22 +97,11 @@ def check_attribute_names(mesh: SplatMesh) -> None:
             raise ValueError(f"attribute name {name[:40]!r} cannot be stored (NUL in it, or over 200 bytes)")
 
 
-def checked_binding(path: Path, **parts) -> Binding:
-    """A Binding of arrays from a file; what does not fit together becomes a FileFormatError naming
-    ``path``."""
+def checked(path: Path, make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+    """``make(...)`` of arrays from a file; its ValueError becomes a FileFormatError that names ``path``."""
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            return Binding(**parts)
-    except (ValueError, TypeError) as error:
-        raise FileFormatError(f"{path}: the binding to a base: {error}") from None
-
-
-def checked_mesh(path: Path, **arrays) -> SplatMesh:
-    """A SplatMesh of arrays from a file; what does not fit together becomes a FileFormatError naming
-    ``path``."""
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return SplatMesh(**arrays)
+            return make(*args, **kwargs)
     except FileFormatError:
         raise
     except (ValueError, TypeError) as error:

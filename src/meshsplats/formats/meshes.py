@@ -9,8 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
@@ -159,10 +157,9 @@ def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False) ->
     """About how large the file of ``mesh`` with this ``suffix`` will be: exact to a few kilobytes for `.npz`
     and `.ply`, within 15 % for `.glb` with colours of 16 bits, a rough figure for the others."""
     v, f = len(mesh.vertices), len(mesh.faces)
-    extra = [mesh.normals, mesh.face_splat, mesh.depth_group, *mesh.attributes.values()]
-    held = sum(array.nbytes for array in extra if array is not None)
-    if mesh.binding is not None and suffix in BOUND_SUFFIXES:
-        held += sum(value.nbytes for value in vars(mesh.binding).values() if isinstance(value, np.ndarray))
+    bound = suffix in BOUND_SUFFIXES
+    arrays = {n: a for n, a in mesh.arrays().items() if a.ndim and (bound or not n.startswith("binding."))}
+    held = sum(array.nbytes for array in arrays.values()) - 28 * v - 12 * f - 12  # beside the usual
     if suffix == ".obj":
         return 75 * v + (26 if mesh.normals is None else 50) * f
     if suffix == ".usda":

@@ -3,6 +3,7 @@ vertex colours go."""
 
 from __future__ import annotations
 
+import math
 import warnings
 import zlib
 from dataclasses import dataclass
@@ -14,10 +15,10 @@ import numpy as np
 from meshsplats.binding import Binding
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
-from meshsplats.formats._validation import checked_binding, checked_mesh, straight_colors
+from meshsplats.formats._validation import checked, straight_colors
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.scene import Placed, placed_meshes, rotation_matrix
-from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.formats.gltf.writer import camel_case, up_quaternion
 from meshsplats.mesh import Blending, SplatMesh
 
 POINTS_TO_LINES = (0, 1, 2, 3)
@@ -165,7 +166,7 @@ def _join(
                 f"{document.path}: another program has moved vertices, left out: the binding to a base mesh"
             )
             arrays["binding"] = None
-    return checked_mesh(document.path, **arrays)
+    return checked(document.path, SplatMesh, **arrays)
 
 
 # -- what our own files hold beyond glTF
@@ -197,13 +198,14 @@ def _restore(
     result: dict[str, Any] = {"up": note["up"], "blending": note["blending"]}
     lost: list[str] = []
     v = len(colors)
-    for name in ("face_splat", "depth_group"):
-        if name in note:
-            values = _raw(document, dict_or_empty(note[name]), "<i4", f)
+    for field in SplatMesh.EXTRAS:
+        if field.name in note:
+            shape = field.shape({"vertex": v, "face": f})
+            values = _raw(document, dict_or_empty(note[field.name]), field.dtype, shape)
             if values is None:
-                lost.append(name)
+                lost.append(field.name)
             else:
-                result[name] = values
+                result[field.name] = values
     if "filter_px2" in note:
         variance = float(document.numbers([note["filter_px2"]], 1, "filter_px2")[0])
         if "face_splat" in result:
@@ -240,25 +242,19 @@ def _restore(
 
 def _binding(document: GltfDocument, entry: dict[str, Any], v: int) -> Binding | None:
     """The binding of a mesh prior's v vertices; None where an array of it is gone or another."""
-    n = document.whole(entry, "baseVertexCount", "a binding")
-    m = document.whole(entry, "baseFaceCount", "a binding")
-    lift = float(document.numbers([entry.get("lift")], 1, "lift of a binding")[0])
-    wanted = {
-        "base_vertices": ("baseVertices", "<f4", (n, 3)),
-        "base_faces": ("baseFaces", "<i4", (m, 3)),
-        "vertex_face": ("vertexFace", "<i4", (v,)),
-        "weights": ("weights", "<f4", (v, 3)),
-        "layers": ("layers", "<i4", (v,)),
+    counts = {
+        "vertex": v,
+        "base vertex": document.whole(entry, "baseVertexCount", "a binding"),
+        "base face": document.whole(entry, "baseFaceCount", "a binding"),
     }
-    parts = {}
-    for name, (key, dtype, shape) in wanted.items():
-        values = _raw(
-            document, dict_or_empty(entry.get(key)), dtype, shape[0] * (3 if len(shape) == 2 else 1)
-        )
+    parts = {"lift": document.numbers([entry.get("lift")], 1, "lift of a binding")[0]}
+    for field in Binding.FIELDS:
+        stored = dict_or_empty(entry.get(camel_case(field.name)))
+        values = _raw(document, stored, field.dtype, field.shape(counts))
         if values is None:
             return None
-        parts[name] = values.reshape(shape)
-    return checked_binding(document.path, lift=lift, **parts)
+        parts[field.name] = values
+    return checked(document.path, Binding.from_arrays, parts)
 
 
 def _still_there(binding: Binding, vertices: np.ndarray) -> bool:
@@ -275,25 +271,26 @@ def _attribute(
         return np.empty((v, 0), np.float32)
     semantic = entry.get("semantic")
     if semantic is None:
-        values = _raw(document, entry, "<f4", v * columns)
-        return None if values is None else values.reshape(v, columns)
+        return _raw(document, entry, np.float32, (v, columns))
     if not isinstance(semantic, str) or semantic not in stored:
         return None
     values = document.floats(stored[semantic], semantic[:60])
     return values if values.shape == (v, columns) else None
 
 
-def _raw(document: GltfDocument, entry: dict[str, Any], dtype: str, count: int) -> np.ndarray | None:
-    """``count`` numbers of a buffer view that only our note refers to; None if the view is not the one
-    we wrote."""
+def _raw(
+    document: GltfDocument, entry: dict[str, Any], dtype: type[np.generic], shape: tuple[int, ...]
+) -> np.ndarray | None:
+    """Array of a buffer view that only our note refers to; None if the view is not the one we wrote."""
+    stored = np.dtype(dtype).newbyteorder("<")
     try:
         data, _ = document.view_bytes(entry.get("bufferView"), "meshsplats")
     except FileFormatError:
         return None
-    if len(data) != count * np.dtype(dtype).itemsize or zlib.crc32(data) != entry.get("crc32"):
+    if len(data) != math.prod(shape) * stored.itemsize or zlib.crc32(data) != entry.get("crc32"):
         return None
     document.budget.spend(len(data), "meshsplats")
-    return np.frombuffer(data, dtype).astype(np.dtype(dtype).newbyteorder("="))
+    return np.frombuffer(data, stored).astype(dtype).reshape(shape)
 
 
 # -- small change

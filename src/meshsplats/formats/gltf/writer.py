@@ -171,10 +171,8 @@ def _document(
     small = len(mesh.vertices) <= 0xFFFF
     indices = mesh.faces.reshape(-1).astype(np.uint16) if small else mesh.faces.reshape(-1).view(np.uint32)
     index_accessor = buffer.accessor(indices, _UINT16 if small else _UINT32, _ELEMENT_ARRAY_BUFFER)
-    for name in ("face_splat", "depth_group") if with_extras else ():
-        values = getattr(mesh, name)
-        if values is not None:
-            extras[name] = _raw(buffer, values)
+    if with_extras:
+        extras |= {field.name: _raw(buffer, values) for field, values in mesh.extras().items()}
     for name, values in mesh.attributes.items() if with_extras else ():
         columns = None if values.ndim == 1 else values.shape[1]
         entry: dict[str, Any] = {"name": name, "columns": columns}
@@ -246,15 +244,12 @@ def _binding(buffer: _Buffer, binding: Binding) -> dict[str, Any]:
         "baseVertexCount": len(binding.base_vertices),
         "baseFaceCount": len(binding.base_faces),
     }
-    for key, values in [
-        ("baseVertices", binding.base_vertices),
-        ("baseFaces", binding.base_faces),
-        ("vertexFace", binding.vertex_face),
-        ("weights", binding.weights),
-        ("layers", binding.layers),
-    ]:
-        entry[key] = _raw(buffer, values)
-    return entry
+    return entry | {camel_case(f.name): _raw(buffer, getattr(binding, f.name)) for f in binding.FIELDS}
+
+
+def camel_case(name: str) -> str:
+    """``name`` as glTF writes its keys."""
+    return re.sub("_(.)", lambda match: match[1].upper(), name)
 
 
 def _semantic(name: str, taken: dict[str, int]) -> str:

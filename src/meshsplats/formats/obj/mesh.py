@@ -13,7 +13,7 @@ import numpy as np
 
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import checked_mesh, straight_colors
+from meshsplats.formats._validation import checked, straight_colors
 from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import SplatMesh
 
@@ -29,7 +29,7 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
     vertices. Positions stay in the mesh's own frame; the up direction stands in a comment, which
     ``load_mesh`` reads and other programs ignore.
     """
-    lost = [n for n in ("face_splat", "depth_group") if getattr(mesh, n) is not None] + list(mesh.attributes)
+    lost = [f.name for f in mesh.extras()] + list(mesh.attributes)
     translucent = int((mesh.colors[:, 3] < 1).sum())
     if translucent:
         more = f"; also left out: {', '.join(n[:40] for n in lost[:8])}" if lost else ""
@@ -93,8 +93,9 @@ def read_obj(path: Path) -> SplatMesh:
     faces, _ = cut_polygons(np.array(lengths), np.array(corners), {})
     vertices = np.array(positions).reshape(-1, 3)
     stored = np.array(colors).reshape(-1, 3)
-    return checked_mesh(
+    return checked(
         path,
+        SplatMesh,
         vertices=vertices,
         faces=faces,
         colors=straight_colors(

@@ -17,7 +17,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import Budget, check_attribute_names, checked_mesh, straight_colors
+from meshsplats.formats._validation import Budget, check_attribute_names, checked, straight_colors
 from meshsplats.formats.ply.faces import read_faces
 from meshsplats.formats.ply.header import MAX_PROPERTIES, Element, PlyHeader, read_header
 from meshsplats.formats.ply.table import FloatTable
@@ -52,16 +52,15 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
         names += ["nx", "ny", "nz"]
     columns.append(mesh.colors)
     names += ["red", "green", "blue", "alpha"]
+    extras = mesh.extras().items()
+    tables = {field.name: values for field, values in extras if field.per == "vertex"}
     for name, values in mesh.attributes.items():
-        property_name = _ATTRIBUTE + quote(name, safe="")
-        if values.ndim == 1:
-            names.append(property_name)
-            columns.append(values[:, None])
-        else:
-            names += [f"{property_name}:{i}" for i in range(values.shape[1])]
-            columns.append(values)
-        width = "-" if values.ndim == 1 else values.shape[1]
-        header.append(f"comment meshsplats attribute {property_name} {width}")
+        stored = _ATTRIBUTE + quote(name, safe="")
+        tables[stored] = values
+        header.append(f"comment meshsplats attribute {stored} {'-' if values.ndim == 1 else values.shape[1]}")
+    for stored, values in tables.items():
+        names += _properties(stored, None if values.ndim == 1 else values.shape[1])
+        columns.append(values.reshape(len(values), -1) if values.size else values.reshape(len(values), 0))
     if len(names) > MAX_PROPERTIES:
         raise ValueError(f"{len(names)} columns a vertex are more than {MAX_PROPERTIES}; save as .npz")
     header.append(f"element vertex {len(mesh.vertices)}")
@@ -69,11 +68,7 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
     header.append(f"element face {len(mesh.faces)}")
     header.append("property list uchar int vertex_indices")
     fields: list[tuple] = [("n", "u1"), ("corners", "<i4", 3)]
-    numbers = {
-        name: values
-        for name, values in (("face_splat", mesh.face_splat), ("depth_group", mesh.depth_group))
-        if values is not None
-    }
+    numbers = {field.name: values for field, values in extras if field.per == "face"}
     for name in numbers:
         header.append(f"property int {name}")
         fields.append((name, "<i4"))
@@ -91,6 +86,11 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
             for name, values in numbers.items():
                 faces[name] = values[part]
             file.write(faces.data)
+
+
+def _properties(name: str, columns: int | None) -> tuple[str, ...]:
+    """Names of the properties that hold an array of ``columns``, None for (v,)."""
+    return (name,) if columns is None else tuple(f"{name}:{i}" for i in range(columns))
 
 
 # -- reading
@@ -121,6 +121,10 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
     groups: dict[str, tuple[str, ...]] = {"vertices": ("x", "y", "z"), "colors": (*rgb, *alpha)}
     if all(n in vertex.names for n in ("nx", "ny", "nz")):
         groups["normals"] = ("nx", "ny", "nz")
+    for field in SplatMesh.EXTRAS:
+        columns = _properties(field.name, field.columns)
+        if field.per == "vertex" and all(n in vertex.names for n in columns):
+            groups[field.name] = columns
     attributes, settings = _notes(header, vertex, path)
     for name, (_, columns) in attributes.items():
         groups[f"attribute {name}"] = columns
@@ -143,7 +147,8 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
         elif types[name].kind == "i" and arrays["colors"][:, i].max(initial=0) > 1:
             # Bytes in a wider type: no program has the largest signed number for white.
             arrays["colors"][:, i] /= np.float32(255)
-    faces, numbers = read_faces(file, header, face, ("face_splat", "depth_group"), budget, path)
+    of_faces = tuple(field.name for field in SplatMesh.EXTRAS if field.per == "face")
+    faces, numbers = read_faces(file, header, face, of_faces, budget, path)
     if settings.get("filter_px2") and "face_splat" not in numbers:
         del settings["filter_px2"]
         warnings.warn(
@@ -151,8 +156,9 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
             DataWarning,
             stacklevel=3,
         )
-    return checked_mesh(
+    return checked(
         path,
+        SplatMesh,
         vertices=arrays["vertices"],
         faces=faces,
         colors=straight_colors(arrays["colors"], path),
@@ -192,9 +198,8 @@ def _notes(
                 except ValueError:
                     raise FileFormatError(f"{path}: filter_px2 must be a number: {comment[:60]}") from None
             case ["attribute", name, width]:
-                names: tuple[str, ...] = (name,)
-                if width.isascii() and width.isdecimal() and len(width) <= 4:
-                    names = tuple(f"{name}:{i}" for i in range(int(width)))
+                counted = width.isascii() and width.isdecimal() and len(width) <= 4
+                names = _properties(name, int(width) if counted else None)
                 missing = [n for n in names if n not in vertex.names]
                 if missing:
                     raise FileFormatError(f"{path}: property {missing[0][:60]!r} of an attribute is missing")

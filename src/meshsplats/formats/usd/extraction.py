@@ -9,6 +9,7 @@ goes beside the arrays.
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.ply.faces import cut_polygons
-from meshsplats.mesh import Blending
+from meshsplats.mesh import Blending, SplatMesh
 
 _LIBRARY_BYTES = 2 << 30
 _FACTOR = 256
@@ -293,14 +294,16 @@ def _restored(
 
     restored: dict[str, np.ndarray] = {}
     lost: list[str] = []
-    for name in ("face_splat", "depth_group"):
-        if note.get(name) is True:
-            values = stored(name, np.int32)
-            sorted_ = name != "face_splat" or not (values[1:] < values[:-1]).any()
-            if len(values) == len(arrays["faces"]) and sorted_:
-                restored[name] = values
+    v = len(arrays["vertices"])
+    for field in SplatMesh.EXTRAS:
+        if note.get(field.name) is True:
+            values = stored(field.name, field.dtype)
+            wanted = field.shape({"vertex": v, "face": len(arrays["faces"])})
+            sorted_ = field.name != "face_splat" or not (values[1:] < values[:-1]).any()
+            if values.size == math.prod(wanted) and sorted_:
+                restored[field.name] = values.reshape(wanted)
             else:
-                lost.append(name)
+                lost.append(field.name)
     if "filter_px2" in note:
         variance = note["filter_px2"]
         if not isinstance(variance, (int, float)):
@@ -310,7 +313,7 @@ def _restored(
         else:
             lost.append("the filter of its splats")
     for name, plain, columns in _attributes_of(note):
-        v, wide = len(arrays["vertices"]), abs(columns)
+        wide = abs(columns)
         values = stored(plain, np.float32) if wide else np.empty(0, np.float32)
         if values.size != v * wide:
             lost.append(name)

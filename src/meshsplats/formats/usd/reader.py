@@ -22,7 +22,7 @@ import numpy as np
 
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
-from meshsplats.formats._validation import Budget, checked_mesh, straight_colors
+from meshsplats.formats._validation import Budget, checked, straight_colors
 from meshsplats.mesh import SplatMesh
 
 _SECONDS = 60
@@ -62,8 +62,9 @@ def read_usd(path: Path) -> SplatMesh:
     if told["blending"] != "linear":
         colors[:, :3] = linear_to_srgb(colors[:, :3])
     attributes = {name: arrays.pop(f"attribute_{i}") for i, name in enumerate(told["attributes"])}
-    return checked_mesh(
+    return checked(
         path,
+        SplatMesh,
         vertices=arrays.pop("vertices"),
         faces=arrays.pop("faces"),
         colors=colors,

@@ -63,19 +63,24 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     opacities.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(linear[:, 3])))
     _add_material(stage, shape, lit)
     primvars = UsdGeom.PrimvarsAPI(shape)
-    for name in ("face_splat", "depth_group"):
-        values = getattr(mesh, name)
-        if values is not None:
-            new = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
-            new.Set(Vt.IntArray.FromNumpy(values))
+    types = {
+        np.int32: (Sdf.ValueTypeNames.IntArray, Vt.IntArray),
+        np.float32: (Sdf.ValueTypeNames.FloatArray, Vt.FloatArray),
+    }
+    extras = mesh.extras()
+    for field, values in extras.items():
+        kind, array = types[field.dtype]
+        per = UsdGeom.Tokens.uniform if field.per == "face" else UsdGeom.Tokens.vertex
+        new = primvars.CreatePrimvar(field.name, kind, per, field.columns or -1)
+        new.Set(array.FromNumpy(values.reshape(-1)))
     up = Gf.Vec3d(*(float(u) for u in mesh.up))
     note: dict[str, Any] = {"version": 1, "blending": mesh.blending, "up": up}
-    note |= {name: True for name in ("face_splat", "depth_group") if getattr(mesh, name) is not None}
+    note |= {field.name: True for field in extras}
     if lit and mesh.normals is None:
         note["normals"] = "computed"
     if mesh.filter_px2:
         note["filter_px2"] = mesh.filter_px2
-    taken = {"displayColor", "displayOpacity", "normals", "face_splat", "depth_group"}
+    taken = {"displayColor", "displayOpacity", "normals", *(field.name for field in mesh.EXTRAS)}
     stored: list[tuple[str, str, int]] = []
     for name, values in mesh.attributes.items():
         columns = 1 if values.ndim == 1 else values.shape[1]
