@@ -13,6 +13,7 @@ from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
 from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
+from meshsplats.formats.sniff import Content
 
 
 def load_base(
@@ -85,11 +86,10 @@ def _display(mesh) -> np.ndarray:
 
 def _textured(path: Path, laid: Texture | None) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None:
     """Coordinates (m, 3, 2), v down, texture of each face (m,) and textures; None where there are none."""
-    with open(path, "rb") as file:
-        head = file.read(4096)
-    if head[:4] == b"glTF" or head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"{":
+    content = Content(path)
+    if content.container in ("glb", "json"):
         return gltf_textures(path, read_texture, laid)
-    if b"\0" in head or head[:3] == b"ply" or head[:5] == b"#usda":
+    if content.container in ("ply", "usd") or not content.is_obj:
         return None
     found = obj_coordinates(path)
     if found is None:

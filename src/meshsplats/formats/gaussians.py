@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import BinaryIO, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -13,25 +13,16 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.splats import read_splat_gltf
-from meshsplats.formats.ply.compressed_splats import is_compressed_splat, read_compressed_ply
-from meshsplats.formats.ply.header import read_header
+from meshsplats.formats.ply.compressed_splats import read_compressed_ply
 from meshsplats.formats.ply.splats import read_float_ply, write_float_ply
-from meshsplats.formats.splats.dot_splat import is_dot_splat, read_dot_splat
+from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats
+from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
-from meshsplats.formats.splats.spz import is_spz, read_spz
+from meshsplats.formats.splats.spz import read_spz
 from meshsplats.formats.splats.streamed_sog import read_streamed_sog
 from meshsplats.gaussians import GaussianCloud
 
 Axes = Literal["auto", "y-down", "y-up"]
-SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "streamed sog", "gltf"]
-
-_CONVERT = "convert it first: npx @playcanvas/splat-transform {name} {stem}.ply"
-_SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
-_EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
-
-
-class UnreadSplats(FileFormatError):
-    """Splats, or what should be some, of a kind that is known and not read."""
 
 
 def load_gaussians(
@@ -62,14 +53,14 @@ def load_gaussians(
     if axes not in get_args(Axes):
         raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
     found = splat_file(Path(path))
+    content = Content(found)
+    kind = content.splat_format()
+    to_y_down, turn = np.eye(3), HALF_TURN_X
     with found.open("rb") as file:
-        kind = _recognised(file, found)
-        file.seek(0)
-        to_y_down, turn = np.eye(3), HALF_TURN_X
         if kind == "ply":
-            cloud = read_float_ply(file, read_header(file, found), found, strict=strict)
+            cloud = read_float_ply(file, content.ply_header, found, strict=strict)
         elif kind == "compressed.ply":
-            cloud = read_compressed_ply(file, read_header(file, found), found, strict=strict)
+            cloud = read_compressed_ply(file, content.ply_header, found, strict=strict)
         elif kind == "splat":
             cloud = read_dot_splat(file, found, strict=strict)
         elif kind == "spz":
@@ -91,11 +82,8 @@ def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
     Some containers serve meshes too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to hold one, and any
     file may be broken. Raises FileNotFoundError, and UnreadSplats for a kind that is known and not read.
     """
-    source = Path(path)
     try:
-        found = splat_file(source)
-        with found.open("rb") as file:
-            return _recognised(file, found)
+        return Content(splat_file(Path(path))).splat_format()
     except UnreadSplats:
         raise
     except FileFormatError:
@@ -119,63 +107,6 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     if not len(cloud):
         raise ValueError("no splats to write: the cloud is empty, and no reader takes such a file")
     write_float_ply(cloud, target)
-
-
-def _recognised(file: BinaryIO, path: Path) -> SplatFormat:
-    """The format of an opened file. Raises FileFormatError, saying what it is instead if that is clear."""
-    head = file.read(4096)
-    name = path.name.lower()
-    convert = _CONVERT.format(name=path.name, stem=path.stem)
-    if not head:
-        raise FileFormatError(f"{path}: the file is empty")
-    if re.match(rb"ply[ \t]*[\r\n]", head):
-        file.seek(0)
-        header = read_header(file, path)
-        # A mesh is left to the float reader, which says what is missing.
-        return "compressed.ply" if is_compressed_splat(header) else "ply"
-    if is_spz(head):
-        return "spz"
-    if head[:4] in (b"PK\x03\x04", b"PK\x05\x06"):
-        return "sog"
-    if head[:4] == b"glTF":
-        return "gltf"
-    if re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
-        return _recognised_json(file, path, convert)
-    if name.endswith(".ksplat"):
-        raise UnreadSplats(f"{path}: .ksplat files are not read here; {convert}")
-    if is_dot_splat(file):
-        return "splat"
-    if name.endswith(".splat"):
-        raise UnreadSplats(
-            f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
-            f" (it has {path.stat().st_size:,} bytes)"
-        )
-    if head[:2] == b"\x1f\x8b":
-        raise UnreadSplats(f"{path}: a gzip file, but not SPZ; unpack it first")
-    if head.startswith(b"version https://git-lfs"):
-        raise UnreadSplats(f"{path}: a Git LFS pointer, not the file itself, which 'git lfs pull' brings")
-    if re.match(rb"\s*<(!doctype html|html)", head, re.IGNORECASE):
-        raise UnreadSplats(f"{path}: a web page, not the file itself: did the download ask for a login?")
-    raise FileFormatError(
-        f"{path}: not a splat file that is known here, it begins with {head[:8]!r}; expected {_EXPECTED}"
-    )
-
-
-def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
-    """What a JSON file is, by the words in it; its reader parses it."""
-    file.seek(0)
-    text = file.read(8 << 20)
-    if all(name in text for name in _SOG_SECTIONS):  # some name their generator in an asset, as glTF does
-        return "sog"
-    if b'"lodLevels"' in text:
-        return "streamed sog"
-    if b'"asset"' in text:
-        return "gltf"
-    if path.suffix.lower() in (".lcc", ".lcc2") or (b'"splats"' in text and b'"totalLevel"' in text):
-        raise UnreadSplats(f"{path}: .lcc scenes are not read here; {convert}")
-    if b'"means"' in text:
-        return "sog"
-    raise FileFormatError(f"{path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
 
 
 def subject_name(path: Path) -> str:

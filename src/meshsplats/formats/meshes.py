@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,8 @@ from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
 from meshsplats.formats.npz import read_npz, write_npz
 from meshsplats.formats.obj.mesh import read_obj, write_obj
 from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_ply
-from meshsplats.formats.usd.reader import is_usd, read_usd
+from meshsplats.formats.sniff import Content
+from meshsplats.formats.usd.reader import read_usd
 from meshsplats.formats.usd.writer import write_usd
 from meshsplats.mesh import SplatMesh
 
@@ -55,28 +55,24 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
     without the extra ``usd``.
     """
     source = Path(path)
-    with open(source, "rb") as file:
-        head = file.read(4096)
-    if not head:
-        raise FileFormatError(f"{source}: the file is empty")
-    if head[:4] in (b"PK\x03\x04", b"PK\x05\x06"):
+    content = Content(source)
+    content.refuse_empty()
+    if content.container == "zip":
         if source.suffix.lower() == ".usdz":
             raise FileFormatError(
                 f"{source}: .usdz packages are not read; unpack it: usdcat in.usdz -o out.usdc"
             )
         return read_npz(source)
-    if re.match(rb"ply[ \t]*[\r\n]", head):
+    if content.container == "ply":
         return read_mesh_ply(source)
-    if head[:4] == b"glTF" or re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
+    if content.container in ("glb", "json"):
         return read_gltf(source)
-    if is_usd(head):
+    if content.container == "usd":
         return read_usd(source)
-    if b"\0" not in head and (
-        source.suffix.lower() == ".obj" or re.search(rb"(^|\n)v[ \t]+[-+.\d]", head) is not None
-    ):
+    if content.is_obj:
         return read_obj(source)
     raise FileFormatError(
-        f"{source}: not a mesh file that is known here, it begins with {head[:8]!r};"
+        f"{source}: not a known mesh file, it begins with {content.head[:8]!r};"
         " expected .npz, .ply, .glb, .gltf, .usdc, .usda or .obj"
     )
 

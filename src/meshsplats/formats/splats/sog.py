@@ -22,6 +22,7 @@ import numpy as np
 
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
+from meshsplats.formats.sniff import Content
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, SplatRows, fill_smallest_three
 from meshsplats.gaussians import GaussianCloud, Kernel
 
@@ -40,9 +41,7 @@ def read_sog(
     ``load_gaussians``. ``ranges``: first and end of the splats that are wanted, any number of times; None:
     all.
     """
-    with open(path, "rb") as file:
-        zipped = file.read(2) == b"PK"
-    if not zipped:
+    if Content(path).container != "zip":
         return _Reader(_Folder(path.parent, path, budget), path, budget).read(ranges, strict=strict)
     try:
         with zipfile.ZipFile(path) as archive:

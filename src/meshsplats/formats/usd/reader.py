@@ -30,11 +30,6 @@ _BYTES_A_SECOND = 1 << 20
 """A file is given up after ``_SECONDS`` and a second for each of these; it takes a fiftieth of that."""
 
 
-def is_usd(head: bytes) -> bool:
-    """Whether a file that begins with ``head`` is USD, binary or text."""
-    return head[:8] == b"PXR-USDC" or head[:5] == b"#usda"
-
-
 def read_usd(path: Path) -> SplatMesh:
     """The mesh in a `.usdc`, `.usda` or `.usd` file.
 
