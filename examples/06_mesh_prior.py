@@ -11,7 +11,7 @@ import numpy as np
 
 import meshsplats as ms
 from meshsplats.demo_scene import make_scene
-from meshsplats.images.writing import save_png, strip
+from meshsplats.images.writing import save_image, strip
 from meshsplats.prior import base_surface, bind, prior_config, train
 
 out = Path("example-output")
@@ -56,5 +56,5 @@ pictures = [
     ms.render(replace(bent, colors=warm), camera, samples=2).color,
 ]
 captions = ("splats", "mesh prior", "its base bent", "lit by a lamp")
-save_png(out / "mesh_prior.png", strip(np.clip(pictures, 0, 1), captions))
+save_image(out / "mesh_prior.png", strip(np.clip(pictures, 0, 1), captions))
 print(f"{out / 'mesh_prior.png'}: {' | '.join(captions)}")

@@ -28,7 +28,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, save_mesh
-from meshsplats.images.writing import save_animation, save_array, save_png
+from meshsplats.images.writing import save_animation, save_array, save_image
 from meshsplats.mesh import SplatMesh
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
@@ -82,7 +82,7 @@ def test_pictures_on_a_full_disk(small_disk):
     picture = np.random.default_rng(0).random((320, 320, 3))
     frames = [(picture * 255).astype(np.uint8), (picture[::-1] * 255).astype(np.uint8)] * 2
     for name, save in [
-        ("a.png", lambda path: save_png(path, picture)),
+        ("a.png", lambda path: save_image(path, picture)),
         ("a.webp", lambda path: save_animation(path, frames)),
         ("a.npy", lambda path: save_array(path, picture)),
     ]:

@@ -46,8 +46,8 @@ def test_things_that_are_no_mesh(tmp_path):
     path = tmp_path / "thing"
     for data, match in (
         (b"", "the file is empty"),
-        (b"\x89PNG\r\n\x1a\n", "not a known mesh file"),
-        (b"Dear reader,\nthis is text.\n", "not a known mesh file"),
+        (b"\x89PNG\r\n\x1a\n", "not a mesh file of a known format"),
+        (b"Dear reader,\nthis is text.\n", "not a mesh file of a known format"),
         (b"{}", "not a glTF 2 file"),
         (b'[{"name": "a"}]', "not a mesh file"),
         (b"ply\nformat ascii 1.0\nend_header\n", "no element 'vertex'"),

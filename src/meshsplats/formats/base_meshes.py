@@ -68,11 +68,12 @@ def load_base(
 
 
 def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:
-    """(h, w, 4) uint8 RGBA of a picture file, or of ``data`` inside the file ``path``."""
+    """(h, w, 4) uint8 RGBA of an image file, or of ``data`` inside the file ``path``."""
     from meshsplats.images.reading import load_image
 
-    rgb, alpha = load_image(path, data)
-    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8) if alpha is None else alpha])
+    pixels = load_image(path, data)
+    opaque = np.full((*pixels.shape[:2], 4 - pixels.shape[2]), 255, np.uint8)
+    return np.concatenate([pixels, opaque], axis=2)
 
 
 def _display(mesh) -> np.ndarray:

@@ -72,7 +72,7 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
     if content.is_obj:
         return read_obj(source)
     raise FileFormatError(
-        f"{source}: not a known mesh file, it begins with {content.head[:8]!r};"
+        f"{source}: not a mesh file of a known format, it begins with {content.head[:8]!r};"
         " expected .npz, .ply, .glb, .gltf, .usdc, .usda or .obj"
     )
 

@@ -107,7 +107,8 @@ class Content:
         if self.container in _UNREAD:
             raise UnreadSplats(f"{path}: {_UNREAD[self.container]}")
         raise FileFormatError(
-            f"{path}: not a known splat file, it begins with {self.head[:8]!r}; expected {_EXPECTED}"
+            f"{path}: not a splat file of a known format, it begins with {self.head[:8]!r};"
+            f" expected {_EXPECTED}"
         )
 
     def _json_format(self, convert: str) -> SplatFormat:
@@ -158,8 +159,7 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
         return "cameras"
     content.refuse_empty()
     raise FileFormatError(
-        f"{path}: neither splats, nor a mesh, nor cameras of a known format; it begins with"
-        f" {content.head[:8]!r}"
+        f"{path}: neither splats, a mesh nor cameras of a known format; it begins with {content.head[:8]!r}"
     )
 
 
