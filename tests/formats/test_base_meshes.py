@@ -178,7 +178,7 @@ def test_a_picture_given_by_hand(tmp_path):
         (OBJ, "newmtl painted\nmap_Kd C:\\t.png\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd /dev/zero\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd\n", "line 2: map_Kd names no picture"),
-        (OBJ, "newmtl painted\nmap_Kd m.obj\n", "not a picture"),
+        (OBJ, "newmtl painted\nmap_Kd m.obj\n", "not an image"),
         (OBJ.replace("4/4", "4/9"), "", "texture coordinate 9 of 4"),
         (OBJ.replace("4/4", "4/0"), "", "line 11 cannot be read"),
         (OBJ.replace("vt 1 1", "vt one 1"), "", "line 8 cannot be read"),
@@ -296,7 +296,7 @@ def test_gltf_without_a_texture_keeps_its_colours(tmp_path):
     [
         ({"images": [{"uri": "../t.png"}]}, "outside its folder"),
         ({"images": [{"uri": "t.png"}]}, "its file .t.png. is missing"),
-        ({"images": [{"uri": "data:image/png;base64,AAAA"}]}, "not a picture"),
+        ({"images": [{"uri": "data:image/png;base64,AAAA"}]}, "not an image"),
         ({"images": [{}]}, "neither data nor URI"),
         ({"images": []}, "refers to number 0 of 0 images"),
         ({"textures": []}, "refers to number 0 of 0 textures"),
