@@ -64,7 +64,8 @@ class SplatMesh:
         ArrayField("depth_group", np.int32, "face", optional=True),
     )
     EXTRAS: ClassVar[tuple[ArrayField, ...]] = tuple(f for f in FIELDS if f.optional and f.name != "normals")
-    """The optional arrays that formats of other programs have no place for."""
+    """The optional arrays that formats of other programs have no place for. Those of vertices are float32,
+    those of faces single integers."""
 
     def __post_init__(self) -> None:
         counts = check_fields(self)

@@ -121,10 +121,9 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
     groups: dict[str, tuple[str, ...]] = {"vertices": ("x", "y", "z"), "colors": (*rgb, *alpha)}
     if all(n in vertex.names for n in ("nx", "ny", "nz")):
         groups["normals"] = ("nx", "ny", "nz")
-    for field in SplatMesh.EXTRAS:
-        columns = _properties(field.name, field.columns)
-        if field.per == "vertex" and all(n in vertex.names for n in columns):
-            groups[field.name] = columns
+    columns_of = {f: _properties(f.name, f.columns) for f in SplatMesh.EXTRAS if f.per == "vertex"}
+    extras = [f for f, columns in columns_of.items() if all(n in vertex.names for n in columns)]
+    groups |= {f.name: columns_of[f] for f in extras}
     attributes, settings = _notes(header, vertex, path)
     for name, (_, columns) in attributes.items():
         groups[f"attribute {name}"] = columns
@@ -167,6 +166,7 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
             name: arrays[f"attribute {name}"][:, 0] if flat else arrays[f"attribute {name}"]
             for name, (flat, _) in attributes.items()
         },
+        **{f.name: arrays[f.name].reshape(f.shape({"vertex": v})) for f in extras},
         **settings,
         **numbers,
     )
