@@ -149,10 +149,10 @@ def test_obj_vertex_colours_serve_where_there_is_no_texture(tmp_path):
 
 def test_missing_pictures_are_told(tmp_path):
     path = write_obj(tmp_path, library="newmtl painted\nmap_Kd away.png\n")
-    with pytest.warns(DataWarning, match=r"not there: away\.png"):
+    with pytest.warns(DataWarning, match=r"missing: away\.png"):
         assert not load_base(path).textured
     (tmp_path / "m.mtl").unlink()
-    with pytest.warns(DataWarning, match=r"not there: m\.mtl"):
+    with pytest.warns(DataWarning, match=r"missing: m\.mtl"):
         assert not load_base(path).textured
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -177,7 +177,7 @@ def test_a_picture_given_by_hand(tmp_path):
         (OBJ, "newmtl painted\nmap_Kd ../../t.png\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd C:\\t.png\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd /dev/zero\n", "outside its folder"),
-        (OBJ, "newmtl painted\nmap_Kd\n", "line 2: map_Kd names no picture"),
+        (OBJ, "newmtl painted\nmap_Kd\n", "line 2: map_Kd names no image"),
         (OBJ, "newmtl painted\nmap_Kd m.obj\n", "not an image"),
         (OBJ.replace("4/4", "4/9"), "", "texture coordinate 9 of 4"),
         (OBJ.replace("4/4", "4/0"), "", "line 11 cannot be read"),

@@ -140,7 +140,7 @@ def test_gltf_skins_that_stand_apart(tmp_path):
             lambda d: d.update(
                 scenes=[{"nodes": [0]}], nodes=[d["nodes"][0], {"children": [2]}, {"children": [1]}]
             ),
-            "node [12] is above itself",
+            "a cycle in the node hierarchy at node [12]",
         ),
     ],
 )

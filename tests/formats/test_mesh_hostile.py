@@ -394,7 +394,7 @@ def test_glb_containers_that_lie(tmp_path):
         (4, 1, "container of version 2 expected, got version 1"),
         (8, len(good) + 1, "truncated"),
         (12, 2**32 - 1, "runs past the end"),
-        (16, 0x11111111, "without JSON chunk"),
+        (16, 0x11111111, "without a JSON chunk"),
     ):
         path.write_bytes(good[:at] + struct.pack("<I", value) + good[at + 4 :])
         refused(path, match)

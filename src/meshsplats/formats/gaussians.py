@@ -28,27 +28,33 @@ Axes = Literal["auto", "y-down", "y-up"]
 def load_gaussians(
     path: str | os.PathLike[str], *, strict: bool = False, axes: Axes = "auto"
 ) -> GaussianCloud:
-    """Splats of a file or folder, after activation. The content decides which format it is, not the name:
-    `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json),
-    streamed SOG (folder or its lod-meta.json), glTF and GLB with KHR_gaussian_splatting.
+    """Splats of a file or folder, after activation.
 
-    A folder is a model of the 3D Gaussian Splatting code, of which the
-    ``point_cloud/iteration_*/point_cloud.ply`` of the highest iteration is read, or an unpacked SOG file. A
-    streamed SOG scene is read in the finest level that each of its places has; its coarser levels are folders
-    in it that can be read by themselves.
+    The content decides the format, not the name: `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1
+    to 4, SOG (archive, folder or its meta.json), streamed SOG (folder or its lod-meta.json), glTF and GLB
+    with KHR_gaussian_splatting.
 
-    The cloud has y down and z forward, as float .ply files have it. ``axes`` says what the file has: 'auto'
-    is what its format prescribes ('y-up' for SPZ and glTF, 'y-down' for the others), so that files of one
-    model agree; but some programs write SPZ with y down, which nothing in the file tells. A 'y-up' file is
-    turned by half a turn, about z if it is glTF, about x otherwise.
+    A folder is a model of the 3D Gaussian Splatting code, read from the highest iteration of
+    ``point_cloud/iteration_*/point_cloud.ply``, or an unpacked SOG file. A streamed SOG scene is read at the
+    finest level of detail of each of its nodes; its coarser levels are folders inside it that can be read by
+    themselves.
 
-    Splats with values that are not finite after activation (an infinite opacity logit is finite: 0 or 1), or
-    with a zero quaternion, are left out with a DataWarning that counts them; with ``strict`` they are an
-    error.
+    The cloud has y down and z forward, as float .ply files have. Splats with values that are not finite after
+    activation (an infinite opacity logit gives 0 or 1, which is finite) or with a zero quaternion are left
+    out, with a DataWarning that counts them.
 
-    Raises FileNotFoundError, or FileFormatError for a file that is broken, of another kind, or without a
-    single usable splat; the message says what is wrong and where. MissingDependencyError for SPZ 4 without
-    Zstandard.
+    Args:
+        path: the file or folder.
+        strict: raise an error for unusable splats instead of the warning.
+        axes: the axes of the file. 'auto' follows its format ('y-up' for SPZ and glTF, 'y-down' for the
+            others). Some programs write SPZ with y down, which the file does not say. A 'y-up' file is
+            rotated by half a turn, about z if it is glTF, about x otherwise.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        FileFormatError: the file is broken, of another kind, or without a single usable splat; the message
+            says what is wrong and where.
+        MissingDependencyError: SPZ 4 without Zstandard.
     """
     if axes not in get_args(Axes):
         raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
@@ -77,10 +83,14 @@ def load_gaussians(
 
 
 def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
-    """The splat format that a file or folder has by its beginning, None if it has none.
+    """The splat format of a file or folder by its first bytes, None if it has none.
 
-    Some containers serve meshes too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to hold one, and any
-    file may be broken. Raises FileNotFoundError, and UnreadSplats for a kind that is known and not read.
+    Some containers hold meshes, too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to be one, and any file
+    may be broken.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UnreadSplats: the kind is known, but not read.
     """
     try:
         return Content(splat_file(Path(path))).splat_format()
@@ -91,15 +101,16 @@ def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
 
 
 def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
-    """Writes ``cloud`` as a float .ply laid out as by the 3D Gaussian Splatting code, whole or not at all.
+    """Writes ``cloud`` as a float .ply in the layout of the 3D Gaussian Splatting code, whole or not at all.
 
     Opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, are stored as
-    sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as 2DGS files
-    have it, an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both read back as what
-    they are. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three,
-    with a DataWarning, and reads back as '3dgs'.
+    sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as in 2DGS
+    files, and an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both kernels are read
+    back. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three, with
+    a DataWarning, and is read back as '3dgs'.
 
-    Raises ValueError for another suffix than .ply or for a cloud without splats.
+    Raises:
+        ValueError: the suffix is not .ply, or the cloud has no splats.
     """
     target = Path(path)
     if target.suffix.lower() != ".ply":
@@ -110,8 +121,8 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
 
 
 def subject_name(path: Path) -> str:
-    """What ``path`` holds, in a word: the name of the file without its suffix; that of the folder where the
-    file has a name that all have (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
+    """A name for the contents of ``path``: the file's without its suffix, or the folder's where all such
+    files have one name (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
     if path.name in ("point_cloud.ply", "meta.json", "lod-meta.json"):
         folder = path.absolute().parent
         if re.fullmatch(r"iteration_[0-9]+", folder.name):
@@ -129,7 +140,7 @@ def subject_name(path: Path) -> str:
 
 
 def splat_file(path: Path) -> Path:
-    """The file that ``path`` stands for: itself, or the newest one of a model folder."""
+    """The file to read for ``path``: itself, or the latest one in a model folder."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file():

@@ -41,9 +41,9 @@ _BROKEN_ZIP = (
     ValueError,
     OverflowError,
 )
-"""What the zip reader raises on broken archives; its own checks do not cover every field."""
+"""Errors of the zip reader for broken archives; its own checks do not cover every field."""
 _DEFAULTS = {"up": np.array([0, -1, 0], np.float32), "blending": np.array("display")}
-"""Stored by us alone."""
+"""For files of the published MeshSplats code, which lack them."""
 
 
 def _stored(name: str) -> str:
@@ -59,13 +59,13 @@ _NAMES = {
         *(f"binding.{f.name}" for f in Binding.FIELDS),
     )
 }
-"""Names of ``SplatMesh.arrays`` by those in the file; attributes come on top."""
+"""Names of ``SplatMesh.arrays`` by those in the file, without the attributes."""
 
 
 def write_npz(mesh: SplatMesh, path: Path) -> None:
-    """Writes every array of the mesh, uncompressed, which is 15 to 20 times as fast as compressed."""
+    """Writes every array of the mesh, uncompressed: 15 to 20 times as fast as compressed."""
     check_attribute_names(mesh)
-    # As np.savez does, which in older versions leaves the archive open where the disk is full.
+    # Like np.savez, whose older versions leave the archive open when the disk is full.
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in mesh.arrays().items():
             with archive.open(f"{_stored(name)}.npy", "w", force_zip64=True) as member:
@@ -90,13 +90,13 @@ def read_npz(path: Path) -> SplatMesh:
 
 
 class _BoundedReader(io.BufferedReader):
-    """Refuses a single read beyond 16 MiB: a zip directory of that size is an attack, and members are read in
-    blocks."""
+    """Refuses a single read beyond 16 MiB: a zip directory of that size is an attack, and members are read
+    block by block."""
 
     _limit = 1 << 24
 
     def read(self, size: int | None = -1) -> bytes:
-        # As many bytes as are asked for would be allocated, even where the file ends before.
+        # BufferedReader would allocate ``size`` bytes even where the file ends earlier.
         left = os.fstat(self.fileno()).st_size - self.tell()
         wanted = left if size is None or size < 0 else min(size, left)
         if wanted > self._limit:
@@ -106,7 +106,7 @@ class _BoundedReader(io.BufferedReader):
 
 @dataclass(frozen=True)
 class _Member:
-    """An array of the archive, known by its header only."""
+    """An array of the archive of which only the header has been read."""
 
     info: zipfile.ZipInfo
     shape: tuple[int, ...]
@@ -193,7 +193,7 @@ def _product(shape: tuple[int, ...]) -> int:
 
 
 def _check_shapes(members: dict[str, _Member], path: Path) -> None:
-    """Whether the arrays fit each other, before any is allocated."""
+    """FileFormatError unless the shapes of the arrays fit each other; before any is allocated."""
     shapes = {name: member.shape for name, member in members.items()}
 
     def rows_of(name: str) -> int:

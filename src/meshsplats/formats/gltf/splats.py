@@ -1,6 +1,6 @@
-"""glTF and GLB with splats: the extension KHR_gaussian_splatting, plain or holding SPZ.
+"""glTF and GLB with splats: the extension KHR_gaussian_splatting, plain or with SPZ inside.
 
-A primitive of points is a cloud of splats; its attributes are activated already and nodes place it. glTF
+A primitive of points is a cloud of splats; its attributes are already activated, and nodes place it. glTF
 scenes have x to the left, y up and z forward. Drafts of the extension stored log scales, recognised by
 negative values.
 """
@@ -80,8 +80,7 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
     if splatting.get("colorSpace") == "lin_rec709_display":
         warnings.warn(
             f"{document.path}: these splats were trained in linear colours, which are taken as display"
-            " colours here;"
-            " the picture will be darker than it should",
+            " colours here; images will be darker than they should",
             DataWarning,
             stacklevel=5,
         )

@@ -1,6 +1,6 @@
-"""Meshes as `.ply`: ours (binary, float RGBA, nothing lost) and those of other programs.
+"""Meshes as `.ply`: our own files (binary, float RGBA, lossless) and those of other programs.
 
-A file of ours is little endian. Element ``vertex``: float x y z, nx ny nz where the mesh has normals,
+Our own files are little endian. Element ``vertex``: float x y z, nx ny nz where the mesh has normals,
 red green blue alpha (straight, as the mesh holds them, 0 to 1), then ``attribute_NAME`` or
 ``attribute_NAME:COLUMN`` with the name in percent encoding. Element ``face``: ``list uchar int
 vertex_indices``, then int ``face_splat`` and ``depth_group`` where the mesh has them. Comments that
@@ -32,8 +32,7 @@ _COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diff
 
 
 def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
-    """Writes ``mesh`` to ``path``, every array exactly. Raises ValueError for more attribute columns
-    than a PLY reader should be asked to take."""
+    """Writes ``mesh`` to ``path`` exactly. ValueError for more than ``MAX_PROPERTIES`` columns per vertex."""
     check_attribute_names(mesh)
     up = " ".join(repr(float(u)) for u in mesh.up)
     header = [
@@ -62,7 +61,7 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
         names += _properties(stored, None if values.ndim == 1 else values.shape[1])
         columns.append(values.reshape(len(values), -1) if values.size else values.reshape(len(values), 0))
     if len(names) > MAX_PROPERTIES:
-        raise ValueError(f"{len(names)} columns a vertex are more than {MAX_PROPERTIES}; save as .npz")
+        raise ValueError(f"{len(names)} columns per vertex are more than {MAX_PROPERTIES}; save as .npz")
     header.append(f"element vertex {len(mesh.vertices)}")
     header += [f"property float {name}" for name in names]
     header.append(f"element face {len(mesh.faces)}")
@@ -144,7 +143,7 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
         if types[name].kind == "u":
             arrays["colors"][:, i] /= np.float32(np.iinfo(types[name]).max)
         elif types[name].kind == "i" and arrays["colors"][:, i].max(initial=0) > 1:
-            # Bytes in a wider type: no program has the largest signed number for white.
+            # Bytes in a wider type: no program writes white as the largest signed integer.
             arrays["colors"][:, i] /= np.float32(255)
     of_faces = tuple(field.name for field in SplatMesh.EXTRAS if field.per == "face")
     faces, numbers = read_faces(file, header, face, of_faces, budget, path)
@@ -175,7 +174,7 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
 def _notes(
     header: PlyHeader, vertex: Element, path: Path
 ) -> tuple[dict[str, tuple[bool, tuple[str, ...]]], dict[str, Any]]:
-    """What our comments say: each attribute's (whether it is (v,), its properties), and settings."""
+    """Contents of our comments: for each attribute (whether it is (v,), its properties), and settings."""
     attributes: dict[str, tuple[bool, tuple[str, ...]]] = {}
     settings: dict[str, Any] = {}
     for comment in header.comments:
@@ -205,5 +204,5 @@ def _notes(
                     raise FileFormatError(f"{path}: property {missing[0][:60]!r} of an attribute is missing")
                 attributes[unquote(name.removeprefix(_ATTRIBUTE))] = (width == "-", names)
             case _:
-                pass  # a later version's, or the version itself
+                pass  # the version, or a note of a later version
     return attributes, settings
