@@ -138,8 +138,8 @@ def save_mesh(
     if mesh.filter_px2 and suffix in _UNFILTERED:
         warnings.warn(
             f"{target.name}: the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which"
-            " other programs do not have: from afar it will look thin there. Make it part of the triangles for"
-            " the views that count: bake_filter(mesh, cameras), or meshsplats bake",
+            " other programs do not have: from afar it will look thin there. Make it part of the triangles"
+            " for the views that count: bake_filter(mesh, cameras), or meshsplats bake",
             DataWarning,
             stacklevel=2,
         )
