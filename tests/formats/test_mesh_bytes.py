@@ -129,7 +129,7 @@ def test_a_glb_with_a_cutoff_for_each_splat(tmp_path, color_type):
     np.testing.assert_allclose(
         shown.reshape(-1, 3), 0.5 + (opacity.reshape(-1, 3) - cutoffs[:, None]) / 2, atol=1e-5
     )
-    # So each corner is drawn in as many splats as its opacity says.
+    # So the share of splats that show a corner is its opacity.
     np.testing.assert_allclose((shown.reshape(-1, 3) >= 0.5).mean(axis=0), [0, 0.7, 1], atol=0.004)
 
 

@@ -62,9 +62,9 @@ def tree(file=0, offset=0, count=9):
     return {"lods": {"0": {"file": file, "offset": offset, "count": count}}}
 
 
-def bomb_picture():
-    """A picture of 4000 x 4000 equal pixels in a few kilobytes."""
-    return encode.picture(np.zeros((4000, 4000, 4), np.uint8), "PNG")
+def bomb_image():
+    """An image of 4000 x 4000 equal pixels in a few kilobytes."""
+    return encode.image(np.zeros((4000, 4000, 4), np.uint8), "PNG")
 
 
 def attributes(**changes):
@@ -148,7 +148,7 @@ FILES = {
         encode.bundle({"meta.json": b" " * 50_000_000}, "", zipfile.ZIP_DEFLATED),
         "unpacks to over",
     ),
-    "picture bomb.sog": (
+    "image bomb.sog": (
         encode.bundle(SOG | {"quats.webp": bytes(40_000_000)}, "", zipfile.ZIP_DEFLATED),
         "'quats.webp' unpacks to over",
     ),
@@ -216,11 +216,11 @@ FOLDERS = {
     "parent folder": (meta(quats={"files": ["../secret.webp"]}), "no plain file name; refused"),
     "windows path": (meta(quats={"files": ["C:\\secret.webp"]}), "no plain file name; refused"),
     "dots": (meta(quats={"files": [".."]}), "no plain file name; refused"),
-    "not a picture": (SOG | {"quats.webp": b"hello"}, "the image of quats cannot be read"),
-    "half a picture": (SOG | {"quats.webp": SOG["quats.webp"][:40]}, "the image of quats cannot be read"),
-    "large picture": (SOG | {"quats.webp": bomb_picture()}, "4000 x 4000 pixels, expected at most"),
+    "not an image": (SOG | {"quats.webp": b"hello"}, "the image of quats cannot be read"),
+    "half an image": (SOG | {"quats.webp": SOG["quats.webp"][:40]}, "the image of quats cannot be read"),
+    "large image": (SOG | {"quats.webp": bomb_image()}, "4000 x 4000 pixels, expected at most"),
     "large palette": (
-        SOG | {"shN_centroids.webp": encode.picture(np.zeros((9000, 1920, 3), np.uint8), "PNG")},
+        SOG | {"shN_centroids.webp": encode.image(np.zeros((9000, 1920, 3), np.uint8), "PNG")},
         "9000",
     ),
 }
@@ -299,8 +299,8 @@ def test_parts_that_each_unpack_far_do_not_do_so_together(tmp_path):
     """50 parts of a few kilobytes, each of which may have 260,000 equal splats."""
     side, count = 512, 50
     values = random_splats(9, degree=0)
-    part = {name: encode.picture(np.zeros((side, side, 4), np.uint8), "PNG") for name in encode.sog(values)}
-    part["quats.webp"] = encode.picture(np.full((side, side, 4), (128, 128, 128, 252), np.uint8), "PNG")
+    part = {name: encode.image(np.zeros((side, side, 4), np.uint8), "PNG") for name in encode.sog(values)}
+    part["quats.webp"] = encode.image(np.full((side, side, 4), (128, 128, 128, 252), np.uint8), "PNG")
     described = json.loads(encode.sog(values)["meta.json"]) | {"count": side * side}
     part["meta.json"] = json.dumps(described).encode()
     names = [f"p{k}" for k in range(count)]
