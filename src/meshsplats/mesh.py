@@ -123,9 +123,8 @@ class SplatMesh:
         """
         arrays = {f.name: getattr(self, f.name) for f in self.FIELDS if not f.optional}
         arrays["blending"] = np.array(self.blending)
-        for field_ in self.FIELDS:
-            if field_.optional and getattr(self, field_.name) is not None:
-                arrays[field_.name] = getattr(self, field_.name)
+        optional = {f.name: getattr(self, f.name) for f in self.FIELDS if f.optional}
+        arrays |= {name: value for name, value in optional.items() if value is not None}
         if self.filter_px2:
             arrays["filter_px2"] = np.array(self.filter_px2)
         arrays |= {f"attribute.{name}": value for name, value in self.attributes.items()}
