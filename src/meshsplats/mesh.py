@@ -116,7 +116,7 @@ class SplatMesh:
         return f"SplatMesh({', '.join(parts)})"
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All that the mesh holds, by name: its fields, ``attribute.NAME`` and ``binding.NAME``.
+        """The contents of the mesh by name: its fields, ``attribute.NAME`` and ``binding.NAME``.
 
         ``blending`` (a text) and ``filter_px2`` are arrays without dimensions. Optional arrays that are None
         and a filter of 0 are left out.
@@ -141,7 +141,7 @@ class SplatMesh:
         """The inverse of ``arrays``; unknown names are ignored.
 
         Raises:
-            KeyError: an array is missing, of the binding too where one of its arrays is there.
+            KeyError: an array is missing; a binding with some of its arrays needs all.
             ValueError, TypeError: as the constructor.
         """
         bound = any(name.startswith("binding.") for name in arrays)

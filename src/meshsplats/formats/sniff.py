@@ -1,4 +1,4 @@
-"""What a file holds, recognised by its content: the only module that looks at the first bytes of any file."""
+"""Recognises files by their content, for all readers."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ _EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with 
 
 
 class UnreadSplats(FileFormatError):
-    """Splats, or what should be some, of a kind that is known and not read."""
+    """Splats of a known kind that is not read, or a file in their place, such as a Git LFS pointer."""
 
 
 class Content:
-    """The file at ``path``, of which the first bytes have been read."""
+    """A file and the format of its first bytes."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -65,7 +65,7 @@ class Content:
 
     @property
     def is_obj(self) -> bool:
-        """Whether the file is Wavefront `.obj`, which has no signature: by its name or a vertex in it."""
+        """Whether the file is Wavefront `.obj`. The format has no signature: its name or a vertex decides."""
         named = self.path.suffix.lower() == ".obj"
         return self.is_text and (named or re.search(rb"(^|\n)v[ \t]+[-+.\d]", self.head) is not None)
 
@@ -74,10 +74,10 @@ class Content:
             raise FileFormatError(f"{self.path}: the file is empty")
 
     def splat_format(self) -> SplatFormat:
-        """The splat format that the file has by its beginning; see ``formats.gaussians.splat_format``.
+        """The splat format of the file; its reader may still refuse it, or find a mesh.
 
         Raises:
-            UnreadSplats: splats of a kind that is known and not read.
+            UnreadSplats: the kind is known, but not read.
             FileFormatError: the file is something else; the message says what, if that is clear.
         """
         path, name = self.path, self.path.name.lower()
