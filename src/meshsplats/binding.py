@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,23 @@ from meshsplats._geometry import vertex_normals
 _ROWS = 1 << 15
 SUM_TOLERANCE = 1e-6
 """Largest error of the sum of a vertex's weights, 1: a few roundings of float32."""
+
+
+class ArrayField(NamedTuple):
+    """Declares an array of ``SplatMesh`` or ``Binding``; constructors, readers and writers follow it."""
+
+    name: str
+    dtype: type[np.generic]
+    per: Literal["vertex", "face", "mesh", "base vertex", "base face"]
+    """What each row belongs to; "mesh": the array has no rows."""
+    columns: int | None = None
+    """Length of a row; None for a single number."""
+    optional: bool = False
+
+    def shape(self, counts: Mapping[str, int]) -> tuple[Any, ...]:
+        """Shape with ``counts`` rows by ``per``; None (any number) where that count is missing."""
+        rows = () if self.per == "mesh" else (counts.get(self.per),)
+        return rows if self.columns is None else (*rows, self.columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,34 +56,48 @@ class Binding:
     lift: float = 0.0
     """Scene units from one layer to the next along the normals, negative inwards; 0: all lie in the base."""
 
+    FIELDS: ClassVar[tuple[ArrayField, ...]] = (
+        ArrayField("base_vertices", np.float32, "base vertex", 3),
+        ArrayField("base_faces", np.int32, "base face", 3),
+        ArrayField("vertex_face", np.int32, "vertex"),
+        ArrayField("weights", np.float32, "vertex", 3),
+        ArrayField("layers", np.int32, "vertex"),
+    )
+
     def __post_init__(self) -> None:
-        points = checked_array("base_vertices", self.base_vertices, np.float32, (None, 3))
-        faces = checked_array("base_faces", self.base_faces, np.int32, (None, 3))
-        check_indices("base_faces", faces, len(points), "vertices of the base")
-        vertex_face = checked_array("vertex_face", self.vertex_face, np.int32, (None,))
-        check_indices("vertex_face", vertex_face, len(faces), "faces of the base")
-        v = len(vertex_face)
-        weights = checked_array("weights", self.weights, np.float32, (v, 3))
-        if v:
-            if weights.min() < 0:
-                raise ValueError(f"weights must not be negative, got {weights.min():.4g}")
-            off = float(np.abs(weights.sum(axis=1, dtype=np.float64) - 1).max())
+        check_fields(self)
+        check_indices("base_faces", self.base_faces, len(self.base_vertices), "vertices of the base")
+        check_indices("vertex_face", self.vertex_face, len(self.base_faces), "faces of the base")
+        if len(self.vertex_face):
+            if self.weights.min() < 0:
+                raise ValueError(f"weights must not be negative, got {self.weights.min():.4g}")
+            off = float(np.abs(self.weights.sum(axis=1, dtype=np.float64) - 1).max())
             if off > SUM_TOLERANCE:
                 raise ValueError(f"the weights of a vertex must have the sum 1, one misses it by {off:.3g}")
-        layers = checked_array("layers", self.layers, np.int32, (v,))
-        if v and layers.min() < 0:
-            raise ValueError(f"layers must be >= 0, got {layers.min()}")
+            if self.layers.min() < 0:
+                raise ValueError(f"layers must be >= 0, got {self.layers.min()}")
         if not np.isfinite(self.lift):
             raise ValueError(f"lift must be a finite length, got {self.lift}")
-        for name, value in [
-            ("base_vertices", points),
-            ("base_faces", faces),
-            ("vertex_face", vertex_face),
-            ("weights", weights),
-            ("layers", layers),
-            ("lift", float(self.lift)),
-        ]:
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "lift", float(self.lift))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays by name, and ``lift`` as an array without dimensions."""
+        return {f.name: getattr(self, f.name) for f in self.FIELDS} | {"lift": np.array(self.lift)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Binding:
+        """The inverse of ``arrays``.
+
+        Raises:
+            KeyError: an array is missing.
+            ValueError: the arrays do not make a binding.
+        """
+        parts = {f.name: arrays[f.name] for f in cls.FIELDS}
+        lift = float(arrays["lift"])
+        try:
+            return cls(**parts, lift=lift)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"the binding to a base: {error}") from None
 
     def positions(self) -> np.ndarray:
         """(v, 3) float32 positions of the vertices.
@@ -143,6 +175,18 @@ class Binding:
         return replace(
             self, vertex_face=self.vertex_face[rows], weights=self.weights[rows], layers=self.layers[rows]
         )
+
+
+def check_fields(owner: Any) -> dict[str, int]:
+    """Checks and converts the arrays ``FIELDS`` of a frozen data class; returns the rows by ``per``."""
+    counts: dict[str, int] = {}
+    for field in owner.FIELDS:
+        value = getattr(owner, field.name)
+        if value is not None or not field.optional:
+            array = checked_array(field.name, value, field.dtype, field.shape(counts))
+            object.__setattr__(owner, field.name, array)
+            counts.setdefault(field.per, len(array))
+    return counts
 
 
 def check_indices(name: str, indices: np.ndarray, count: int, of: str) -> None:

@@ -21,7 +21,7 @@ from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import evaluate
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.images.writing import save_png
+from meshsplats.images.writing import save_image
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.looks import draw_splats
 
@@ -37,7 +37,7 @@ def scene(tmp_path_factory):
     save_mesh(mesh, folder / "mesh.npz")
     (folder / "pictures").mkdir()
     for camera in cameras:
-        save_png(folder / "pictures" / f"{camera.name}.png", render(mesh, camera).color)
+        save_image(folder / "pictures" / f"{camera.name}.png", render(mesh, camera).color)
     return folder
 
 

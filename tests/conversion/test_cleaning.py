@@ -19,7 +19,7 @@ from meshsplats.conversion.cleaning import CleaningRules, cropped, find, take_aw
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.images.writing import load_png
+from meshsplats.images.reading import load_image
 from meshsplats.mesh import SplatMesh
 
 
@@ -200,7 +200,7 @@ def test_the_command_says_what_goes_and_draws_it(file, tmp_path, capsys):
     assert "together" in out
     assert "17 of 2,017 splats, 0.84% of the opacity" in out
     assert len(load_gaussians(tmp_path / "clean.ply")) == 2000
-    image = load_png(tmp_path / "clean.preview.png").astype(int)
+    image = load_image(tmp_path / "clean.preview.png").astype(int)
     red = (image[..., 0] > 150) & (image[..., 1:].max(axis=2) < 100)
     third = image.shape[1] // 3
     assert red[:, third : 2 * third].sum() > 50

@@ -170,11 +170,11 @@ def png_claiming(width: int, height: int) -> bytes:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "not a picture of a known kind"),
-        (b"no image", "not a picture of a known kind"),
-        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not a picture of a known kind"),
+        (b"", "not an image of a known format"),
+        (b"no picture", "not an image of a known format"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not an image of a known format"),
         (png_claiming(9_000, 8_000), "9000 x 8000 pixels; up to 67,108,864 pixels"),
-        (png_claiming(60_000, 40_000), "not a picture of a known kind|up to 67,108,864 pixels"),
+        (png_claiming(60_000, 40_000), "not an image of a known format|up to 67,108,864 pixels"),
         (png_claiming(60_000, 2), "60000 x 2 pixels; up to .* and 32768 a side"),
     ],
 )
@@ -192,7 +192,7 @@ def test_a_truncated_image_is_refused_when_it_is_read(tmp_path):
     save(path, np.random.default_rng(0).integers(0, 255, (80, 120, 3)).astype(np.uint8))
     path.write_bytes(path.read_bytes()[:5000])
     view = load_dataset(folder, test_every=0).train[0]
-    with pytest.raises(FileFormatError, match=r"p00\.png: a broken picture"):
+    with pytest.raises(FileFormatError, match=r"p00\.png: a broken image"):
         _ = view.image
 
 

@@ -191,7 +191,7 @@ def test_finetune_trains_over_it(capture, tmp_path, capsys):
 
 
 def test_compare_and_render_draw_over_it(capture, tmp_path, capsys):
-    from meshsplats.images.writing import load_png
+    from meshsplats.images.reading import load_image
 
     data = ("--data", capture / "photos")
     assert run("compare", capture / "scene.ply", *data, "--downscale", "2", "-o", tmp_path / "c") == 0
@@ -206,7 +206,7 @@ def test_compare_and_render_draw_over_it(capture, tmp_path, capsys):
         out = tmp_path / name
         arguments = ("--as-splats", "--animation", "none", *options)
         assert run("render", capture / "scene.ply", *arguments, "-o", out) == 0
-        assert load_png(out / "view_0000.png")[0, 0].tolist() == [corner] * 3
+        assert load_image(out / "view_0000.png")[0, 0].tolist() == [corner] * 3
         color = json.loads((out / "config.json").read_text())["background"]["background"]
         assert color == [corner / 255] * 3
 

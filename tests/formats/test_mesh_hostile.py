@@ -43,11 +43,11 @@ def test_truncated_at_every_length(tmp_path, suffix):
 
 
 def test_things_that_are_no_mesh(tmp_path):
-    path = tmp_path / "thing"
+    path = tmp_path / "file"
     for data, match in (
         (b"", "the file is empty"),
-        (b"\x89PNG\r\n\x1a\n", "not a mesh file that is known here"),
-        (b"Dear reader,\nthis is text.\n", "not a mesh file that is known here"),
+        (b"\x89PNG\r\n\x1a\n", "not a mesh file of a known format"),
+        (b"Dear reader,\nthis is text.\n", "not a mesh file of a known format"),
         (b"{}", "not a glTF 2 file"),
         (b'[{"name": "a"}]', "not a mesh file"),
         (b"ply\nformat ascii 1.0\nend_header\n", "no element 'vertex'"),
@@ -121,7 +121,7 @@ def test_pickled_npz_run_no_code(tmp_path):
     for name in ("vertices", "faces", "blending", "attribute_x"):
         refused(npz(tmp_path / "m.npz", **{name: np.array([Runs()], object)}), "pickled Python objects")
     npz(tmp_path / "m.npz", unrelated=np.array([Runs()], object))
-    load_mesh(tmp_path / "m.npz")  # what is not asked for is not looked at
+    load_mesh(tmp_path / "m.npz")  # other arrays are not read
     assert not Runs.traces
 
 
@@ -395,7 +395,7 @@ def test_glb_containers_that_lie(tmp_path):
         (4, 1, "container of version 2 expected, got version 1"),
         (8, len(good) + 1, "truncated"),
         (12, 2**32 - 1, "runs past the end"),
-        (16, 0x11111111, "without JSON chunk"),
+        (16, 0x11111111, "without a JSON chunk"),
     ):
         path.write_bytes(good[:at] + struct.pack("<I", value) + good[at + 4 :])
         refused(path, match)
@@ -445,7 +445,7 @@ def test_filters_that_cannot_be(tmp_path, value, match):
 
 
 def test_a_filter_without_splats_is_left_out(tmp_path):
-    """Another program has dropped what tells one splat's triangles from another's."""
+    """Another program has dropped the splat index of the triangles."""
     save_mesh(replace(MESH, face_splat=None), tmp_path / "m.glb")
     edit_glb(tmp_path / "m.glb", lambda d: d["meshes"][0]["extras"]["meshsplats"].update(filter_px2=0.3))
     save_mesh(replace(MESH, face_splat=None), tmp_path / "m.ply")

@@ -147,12 +147,12 @@ def _draw(
     scene: GaussianCloud | SplatMesh, left: GaussianCloud | SplatMesh, found: Findings, path: Path
 ) -> None:
     """The strip of three pictures; the first two from where all is seen, the third from where the rest is."""
-    from meshsplats.images.writing import save_png, strip
+    from meshsplats.images.writing import save_image, strip
 
     lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
     whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
     pictures = [_picture(scene, whole), _picture(_marked(scene, found), whole), _picture(left, rest)]
-    save_png(path, strip(pictures, ("before", "what goes", "after")))
+    save_image(path, strip(pictures, ("before", "what goes", "after")))
 
 
 def _picture(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:

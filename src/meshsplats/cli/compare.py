@@ -68,7 +68,7 @@ class Compare:
     """Overwrite existing outputs."""
 
     def run(self) -> None:
-        from meshsplats.images.writing import amplified_error, save_png, strip
+        from meshsplats.images.writing import amplified_error, save_image, strip
 
         if not self.amplify > 0:
             raise ValueError(f"--amplify must be positive, got {self.amplify}")
@@ -113,7 +113,7 @@ class Compare:
             scores.append(view.score)
             self.output.mkdir(exist_ok=True)
             error = amplified_error(view.splats, view.mesh, self.amplify)
-            save_png(self.output / name, strip([view.splats, view.mesh, error], captions))
+            save_image(self.output / name, strip([view.splats, view.mesh, error], captions))
         comparison = Comparison(tuple(scores))
         result = {
             "splats": len(cloud),

@@ -445,12 +445,12 @@ def _counts(result: dict[str, Any]) -> str:
 
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
     from meshsplats.evaluation.report import image_of
-    from meshsplats.images.writing import save_png
+    from meshsplats.images.writing import save_image
     from meshsplats.rendering import render_splats
     from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
     if isinstance(scene, SplatMesh):
-        save_png(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
+        save_image(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
     else:
-        save_png(path, render_splats(scene, camera).color)
+        save_image(path, render_splats(scene, camera).color)

@@ -343,12 +343,12 @@ def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) 
 
 
 def _save_strips(folder: Path, name: str, scored: ScoredView, amplify: float) -> None:
-    from meshsplats.images.writing import save_png
+    from meshsplats.images.writing import save_image
 
     makers: dict[str, Callable[[ScoredView, float], np.ndarray]] = {"strips": view_strip, "crops": view_crop}
     for part, make in makers.items():
         (folder / part).mkdir(exist_ok=True)
-        save_png(folder / part / name, make(scored, amplify))
+        save_image(folder / part / name, make(scored, amplify))
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -38,7 +38,7 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning import FinetuneConfig, Interrupted, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
 from meshsplats.mesh import SplatMesh
-from meshsplats.prior import MeshPrior, bind, prior_config, train
+from meshsplats.prior import MeshPrior, bind, prior_config, train_prior
 from meshsplats.prior.bind import LAYERS
 
 SUFFIXES = (".npz", ".glb")
@@ -141,7 +141,7 @@ class Prior:
         try:
             with files.claimed(inputs, resume=self.resume, force=self.force), shown() as show:
                 note_command("prior", self, files)
-                trained = train(prior, dataset, config, run=options, on_progress=show)
+                trained = train_prior(prior, dataset, config, run=options, on_progress=show)
         except Interrupted as stop:
             return stopped(stop, files)
         except OtherRunError as error:

@@ -118,9 +118,10 @@ class Render:
             _remove_older(self.output, files.every)
         self._draw(scene, cameras, files, unit, behind)
         if files.turntable:
-            from meshsplats.images.writing import load_png, save_animation
+            from meshsplats.images.reading import load_image
+            from meshsplats.images.writing import save_animation
 
-            save_animation(files.turntable, map(load_png, files.pictures), fps=self.fps)
+            save_animation(files.turntable, map(load_image, files.pictures), fps=self.fps)
         save_cameras(cameras, files.cameras)
         write_json(files.config, record)
         seconds = time.perf_counter() - start
@@ -187,7 +188,7 @@ class Render:
         background: tuple[float, ...],
     ) -> None:
         from meshsplats.colors import linear_to_srgb, srgb_to_linear
-        from meshsplats.images.writing import save_array, save_depth_png, save_png, straight_rgba
+        from meshsplats.images.writing import save_array, save_depth_png, save_image, straight_rgba
         from meshsplats.rendering import render, render_splats
         from meshsplats.rendering.samples import needed_samples
 
@@ -214,7 +215,7 @@ class Render:
             picture = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color
             if linear:
                 picture[..., :3] = linear_to_srgb(picture[..., :3])
-            save_png(files.pictures[i], picture)
+            save_image(files.pictures[i], picture)
             if drawn.depth is None:
                 continue
             mean = drawn.mean_depth(empty=0)

@@ -346,11 +346,11 @@ def _text(progress: Progress, loss: float | None) -> str:
 
 def draw_preview(mesh: SplatMesh, path: Path) -> None:
     from meshsplats.evaluation.report import image_of
-    from meshsplats.images.writing import save_png
+    from meshsplats.images.writing import save_image
     from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
-    save_png(path, image_of(mesh, camera, (1, 1, 1), samples=needed_samples(mesh, [camera]))[0])
+    save_image(path, image_of(mesh, camera, (1, 1, 1), samples=needed_samples(mesh, [camera]))[0])
 
 
 def say(text: str) -> None:

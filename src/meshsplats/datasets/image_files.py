@@ -104,7 +104,8 @@ class PhotoFile:
         return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
 
     def _read(self) -> ViewImage:
-        color, alpha = load_image(self.path)
+        pixels = load_image(self.path)
+        color, alpha = pixels[..., :3], pixels[..., 3] if pixels.shape[2] == 4 else None
         size = (self.lens.width, self.lens.height)
         if alpha is None:
             color = _resized(color, size)
@@ -132,10 +133,10 @@ class PhotoFile:
         """(h, w) bool. A pixel counts if the mask is light (128 of 255 or more), and opaque where it has
         alpha, all over it."""
         assert self.mask is not None
-        color, alpha = load_image(self.mask)
-        light = color.max(axis=2)
-        if alpha is not None:
-            light = np.minimum(light, alpha)
+        pixels = load_image(self.mask)
+        light = pixels[..., :3].max(axis=2)
+        if pixels.shape[2] == 4:
+            light = np.minimum(light, pixels[..., 3])
         return _resized((light >= 128).astype(np.float32), size) >= WHOLE
 
 

@@ -1,9 +1,9 @@
-"""Meshes as binary glTF 2.0 (`.glb`), the form that viewers, engines and Blender open directly.
+"""Writes meshes as binary glTF 2.0 (`.glb`), which viewers, engines and Blender open directly.
 
-Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one primitive, drawn
-from both sides, coloured by COLOR_0 (linear RGBA). glTF is y-up: the node carries a pure rotation from the
-mesh's own frame to a frame whose +y is the mesh's ``up``; vertices are stored untouched. What glTF has no
-place for stands in the mesh's ``extras.meshsplats``. The reader is ``gltf_reader``.
+Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one double-sided
+primitive, coloured by COLOR_0 (linear RGBA). glTF is y-up: the node has a pure rotation from the mesh's own
+frame to a frame whose +y is the mesh's ``up``; vertices are stored unchanged. All else is in the mesh's
+``extras.meshsplats``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ColorType = Literal["uint16", "float32"]
 Alpha = Literal["blend", "mask"]
 
 MASK_CUTOFF = 0.2
-"""Opacity from which ``alpha='mask'`` draws. Of 0.05 to 0.5 the best compromise over an opaque figure, a
+"""Least opacity that ``alpha='mask'`` renders: of 0.05 to 0.5 the best compromise over an opaque figure, a
 furry one and an outdoor scene in three.js (docs/viewers.md)."""
 
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
@@ -48,18 +48,23 @@ def write_glb(
 ) -> None:
     """Writes ``mesh`` to ``path``.
 
-    The material is unlit (KHR_materials_unlit): its colours are shown as they are. ``lit`` makes it a rough
-    dielectric that scene lights shade, with the mesh's normals or, where it has none, area-weighted vertex
-    normals. ``color_type`` 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
+    Colours of a mesh for display blending are converted to linear; those of a mesh for linear blending are
+    stored unchanged.
 
-    ``alpha`` is how viewers shall treat opacity. 'blend' is exact in viewers that sort, and good enough in
-    many that do not. 'mask' needs no order: what is at least ``MASK_CUTOFF`` opaque is drawn solid, with the
-    depth buffer. docs/viewers.md compares them.
+    Args:
+        mesh: the mesh.
+        path: the file.
+        lit: the material is a rough dielectric that scene lights shade, with the mesh's normals or else
+            area-weighted vertex normals; False: it is unlit (KHR_materials_unlit).
+        color_type: 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
+        alpha: how viewers treat opacity. 'blend' is exact in viewers that sort, and good enough in many that
+            do not. 'mask' needs no order: opacities of at least ``MASK_CUTOFF`` are rendered solid, with the
+            depth buffer. docs/viewers.md compares them.
+        extras: False leaves out the arrays that only this project reads.
 
-    Colours of a mesh made for display blending are converted to linear; those of one made for linear
-    blending are stored as they are. ``extras`` False leaves out the arrays that only this project reads.
-    Raises ValueError for a mesh without triangles (glTF has no empty arrays), for normals that are not
-    of unit length, and for a file beyond the 4 GiB that the format can hold.
+    Raises:
+        ValueError: the mesh has no triangles (glTF has no empty arrays), its normals are not of unit
+            length, or it needs more than the 4 GiB that the format can hold.
     """
     if alpha not in get_args(Alpha):
         raise ValueError(f"alpha must be one of {', '.join(get_args(Alpha))}, got {alpha!r}")
@@ -88,7 +93,7 @@ def write_glb(
 
 
 class _Buffer:
-    """The binary chunk under construction: arrays in order, each from a multiple of 4 bytes on."""
+    """Builder of the binary chunk: arrays in order, each aligned to 4 bytes."""
 
     def __init__(self) -> None:
         self.parts: list[np.ndarray] = []
@@ -97,7 +102,7 @@ class _Buffer:
         self.length = 0
 
     def view(self, array: np.ndarray, target: int | None = None) -> int:
-        """Appends ``array``; number of its buffer view."""
+        """Appends ``array``; returns the index of its buffer view."""
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": little.nbytes}
         if target is not None:
@@ -108,7 +113,7 @@ class _Buffer:
         return len(self.views) - 1
 
     def accessor(self, array: np.ndarray, component: int, target: int, **more: Any) -> int:
-        """Appends an array of numbers (n,) or (n, 1..4); number of its accessor."""
+        """Appends an array of numbers (n,) or (n, 1..4); returns the index of its accessor."""
         columns = 1 if array.ndim == 1 else array.shape[1]
         accessor = {
             "bufferView": self.view(array, target),
@@ -161,10 +166,8 @@ def _document(
     small = len(mesh.vertices) <= 0xFFFF
     indices = mesh.faces.reshape(-1).astype(np.uint16) if small else mesh.faces.reshape(-1).view(np.uint32)
     index_accessor = buffer.accessor(indices, _UINT16 if small else _UINT32, _ELEMENT_ARRAY_BUFFER)
-    for name in ("face_splat", "depth_group") if with_extras else ():
-        values = getattr(mesh, name)
-        if values is not None:
-            extras[name] = _raw(buffer, values)
+    if with_extras:
+        extras |= {field.name: _raw(buffer, values) for field, values in mesh.extras().items()}
     for name, values in mesh.attributes.items() if with_extras else ():
         columns = None if values.ndim == 1 else values.shape[1]
         entry: dict[str, Any] = {"name": name, "columns": columns}
@@ -209,32 +212,29 @@ def _document(
 
 
 def _raw(buffer: _Buffer, values: np.ndarray) -> dict[str, Any]:
-    """Values that no glTF attribute can hold, as a plain buffer view. The check sum tells a reader that a
-    program in between has renumbered or dropped the views."""
+    """Values that no glTF attribute can hold, as a plain buffer view. The checksum shows a reader whether
+    another program has renumbered or dropped the views."""
     view = buffer.view(values)
     return {"bufferView": view, "crc32": zlib.crc32(buffer.parts[view].data)}
 
 
 def _binding(buffer: _Buffer, binding: Binding) -> dict[str, Any]:
-    """What puts the vertices on another pose of the base, each array as it is in ``Binding``."""
+    """The entry of a binding in our note."""
     entry: dict[str, Any] = {
         "lift": binding.lift,
         "baseVertexCount": len(binding.base_vertices),
         "baseFaceCount": len(binding.base_faces),
     }
-    for key, values in [
-        ("baseVertices", binding.base_vertices),
-        ("baseFaces", binding.base_faces),
-        ("vertexFace", binding.vertex_face),
-        ("weights", binding.weights),
-        ("layers", binding.layers),
-    ]:
-        entry[key] = _raw(buffer, values)
-    return entry
+    return entry | {camel_case(f.name): _raw(buffer, getattr(binding, f.name)) for f in binding.FIELDS}
+
+
+def camel_case(name: str) -> str:
+    """``name`` as glTF writes its keys."""
+    return re.sub("_(.)", lambda match: match[1].upper(), name)
 
 
 def _semantic(name: str, taken: dict[str, int]) -> str:
-    """A free name for an application's own attribute: glTF wants a leading underscore."""
+    """An unused name of an application's own attribute: glTF requires a leading underscore."""
     plain = "_" + re.sub(r"[^A-Z0-9_]", "_", name.upper())[:60]
     candidate, number = plain, 2
     while candidate in taken:
@@ -245,8 +245,8 @@ def _semantic(name: str, taken: dict[str, int]) -> str:
 def up_quaternion(up: np.ndarray) -> list[float]:
     """Unit quaternion x, y, z, w of the shortest rotation that takes the unit vector ``up`` to +y.
 
-    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is the half turn about x,
-    which leaves x to the right and lets a camera that looked along +z look along -z, as glTF's do.
+    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is the half turn about x: x
+    stays right, and a camera that looked along +z looks along -z, as glTF's do.
     """
     x, y, z = (float(u) for u in np.asarray(up, np.float64) / np.linalg.norm(np.asarray(up, np.float64)))
     if y < -1 + 1e-9:
