@@ -21,7 +21,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", "
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""
 MAX_NAME = 1000
 MAX_STRETCH = 0.02
-"""How much width and height may be scaled differently before an image is not the one the camera took."""
+"""Largest difference between the scales of width and height at which an image still fits its camera."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Frame:
     file: str
     """Path of the image in the folder, as written there."""
     lens: Lens | None
-    """None if neither the file nor the image, which is missing, tells its size."""
+    """None if the file does not give a size and the image is missing."""
     world_to_camera: np.ndarray
     mask: str | None = None
     """Path of its mask in the folder; None: looked for in ``masks/``."""
@@ -151,7 +151,7 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 Taken = list[tuple[Camera, PhotoFile]]
-"""What was made of one photograph: one view, or the six of a panorama."""
+"""The views made from one photograph: one, or the six of a panorama."""
 
 
 @dataclass
@@ -170,9 +170,9 @@ class Album:
         result: list[Taken] = []
         masks = (self.folder / "masks").is_dir()
         for frame in frames:
-            told = f"{where}: image {frame.name[:60]!r}"
-            full = find(self.folder, frame.file, told)
-            small = self._smaller(frame.file, told)
+            label = f"{where}: image {frame.name[:60]!r}"
+            full = find(self.folder, frame.file, label)
+            small = self._smaller(frame.file, label)
             if frame.lens is None or (full is None and small is None):
                 self.missing.append(frame.file)
                 continue
@@ -183,14 +183,14 @@ class Album:
             width, height = header.width, header.height
             if small is None:
                 width, height = (max(1, round(side / self.downscale)) for side in (width, height))
-            mask = self._mask(frame, told, masks)
+            mask = self._mask(frame, label, masks)
             if mask is not None:
                 _check_shape(frame.lens, read_header(mask), mask)
             lens = frame.lens.scaled(width, height)
             taken = []
             for pinhole in pinholes(lens):
                 source = PhotoFile(frame.name, path, lens, pinhole, mask, header.has_alpha, self.store)
-                taken.append((_camera(frame, pinhole, told), source))
+                taken.append((_camera(frame, pinhole, label), source))
             result.append(taken)
         return result
 

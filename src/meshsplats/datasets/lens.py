@@ -1,8 +1,8 @@
-"""Lenses: the camera models of COLMAP, and images taken through them as a pinhole would have taken them.
+"""Lenses: the camera models of COLMAP, and undistortion of their images to those of a pinhole.
 
 A ray that leaves the camera at (u, v, 1), OpenCV axes, meets the image at ``(fx * u' + cx, fy * v' + cy)``
 pixels. The models differ in how (u', v') follows from (u, v); every one has a closed form in that direction,
-which is the one needed here: each pixel of the pinhole image looks up where its ray met the photograph.
+as needed here: each pixel of the pinhole image is looked up where its ray meets the photograph.
 Formulas: the camera models of COLMAP 4.2 (src/colmap/sensor/models.h) and the papers named there.
 """
 
@@ -37,7 +37,7 @@ class Lens:
     width: int
     height: int
     coefficients: tuple[float, ...] = ()
-    """What the model has beside focal lengths and principal point, in COLMAP's order."""
+    """Parameters of the model besides focal lengths and principal point, in COLMAP's order."""
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -69,14 +69,14 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether straight lines are straight on the image, so that it can be taken as it is."""
+        """Whether straight lines are straight in the image, so that no undistortion is needed."""
         if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
             return True
         straight_at_zero = MODELS[self.model].straight_at_zero
         return straight_at_zero and not any(self.coefficients)
 
     def scaled(self, width: int, height: int) -> Lens:
-        """The same lens before an image of another size; each axis is scaled by itself."""
+        """The same lens for an image of another size; each axis is scaled separately."""
         x, y = width / self.width, height / self.height
         fx, fy = (self.fx, self.fy) if self.model == "EQUIRECTANGULAR" else (self.fx * x, self.fy * y)
         return Lens(self.model, fx, fy, self.cx * x, self.cy * y, width, height, self.coefficients)
@@ -271,12 +271,12 @@ MODELS: dict[str, _Model] = {
 """Camera models in the order of COLMAP's numbers, 0 to 17."""
 
 
-# ---- Pinhole images from what a lens shows
+# ---- Undistortion to pinhole images
 
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """A pinhole image that can be made from an image taken through a lens."""
+    """A pinhole image that the image of a lens is undistorted to."""
 
     rotation: np.ndarray
     """(3, 3) from the lens's frame to that of the pinhole, OpenCV axes."""
@@ -287,7 +287,7 @@ class Pinhole:
     width: int
     height: int
     suffix: str = ""
-    """What tells several pinholes of one lens apart."""
+    """Distinguishes several pinholes of one lens."""
 
 
 def pinholes(lens: Lens) -> list[Pinhole]:
@@ -308,10 +308,10 @@ def pinholes(lens: Lens) -> list[Pinhole]:
 
 
 def undistort(image: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.ndarray, np.ndarray]:
-    """What the pinhole would have seen, from ``image`` (lens.height, lens.width, c), uint8 or float32.
+    """The image of the pinhole, from ``image`` (lens.height, lens.width, c), uint8 or float32.
 
     Values between pixels are bilinear. Returns (h, w, c) of the same type, 0 where the lens saw nothing, and
-    (h, w) bool that is True where all four pixels around lie on the image.
+    (h, w) bool that is True where all four pixels around lie in the image.
     """
     h, w, channels = image.shape
     result = np.zeros((pinhole.height, pinhole.width, channels), image.dtype)
