@@ -129,7 +129,7 @@ sanitized = LD_PRELOAD="$$($(SANITIZER_CXX) -print-file-name=$(1)) $$($(SANITIZE
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	TSAN_OPTIONS='halt_on_error=1 ignore_noninstrumented_modules=1' OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
 	MESHSPLATS_LIBRARY=$(CURDIR)/$(SANITIZED)/$(2).so $(BIN)/python -m pytest -k 'not ($(CORE_TESTS_LEFT_OUT))' \
-	$(foreach name,$(CORE_TESTS),$(shell find tests -name $(name).py))
+	$(foreach name,$(CORE_TESTS),$(or $(shell find tests -name $(name).py),tests/$(name).py))
 
 test-sanitizers: $(VENV)/installed-dev $(SANITIZED)/address.so $(SANITIZED)/thread.so
 	$(call sanitized,libasan.so,address)
