@@ -70,7 +70,7 @@ class Background:
         scores = {scene: dict(found) for scene, found in self.psnr.items()}
         return {
             "background": list(self.color),
-            "background_told": self.describe(),
+            "background_description": self.describe(),
             "background_psnr": scores,
         }
 
