@@ -122,12 +122,12 @@ def test_command_line_draws_meshes_and_splats(tmp_path, suffix, capsys):
     ]
     assert main(arguments) == 0
     told = json.loads(capsys.readouterr().out)
-    assert len(told["pictures"]) == len(told["picture_seconds"]) == 2
+    assert len(told["images"]) == len(told["picture_seconds"]) == 2
     assert told["blender"] == bpy.app.version_string
-    assert load_png(told["pictures"][1]).shape == (40, 72, 3)
+    assert load_png(told["images"][1]).shape == (40, 72, 3)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "cameras.json",
-        "config.json",
+        "config.toml",
         "view_0000.png",
         "view_0001.png",
     ]

@@ -14,7 +14,7 @@ from _splats import few_splats
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians, subject_name
@@ -79,10 +79,10 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
     out = capsys.readouterr().out.splitlines()
     assert out[0].startswith("scans/a.ply: 40 splats -> 320 triangles, 280 vertices: a.glb (")
     assert out[2] == "2 of 2 converted: out/"
-    wanted = {f"{n}.{s}" for n in ("a", "chair") for s in ("glb", "preview.png", "config.json")}
+    wanted = {f"{n}.{s}" for n in ("a", "chair") for s in ("glb", "glb.preview.png", "glb.config.toml")}
     assert set(os.listdir("out")) == wanted
-    options = json.loads((tmp_path / "out/chair.config.json").read_text())["options"]
-    assert (options["input"], options["output"]) == ("scans/chair", "out/chair.glb")
+    options = toml.load(tmp_path / "out/chair.glb.config.toml")["options"]
+    assert (options["input"], options["output"]) == (["../scans/chair"], "chair.glb")
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_a_mesh_in_another_format(tmp_path, monkeypatch, capsys):
     assert run("linear.npz", "-o", "linear.ply", "--up", "0,0,2") == 0
     assert load_mesh("linear.ply").blending == "linear"
     np.testing.assert_array_equal(load_mesh("linear.ply").up, (0, 0, 1))
-    assert (tmp_path / "linear.preview.png").is_file()
+    assert (tmp_path / "linear.ply.preview.png").is_file()
     for options in (["--max-splats", "3"], ["--preset", "paper"], ["--fidelity", "2"]):
         assert run("a.npz", "-o", "c.glb", *options) == 2
         assert f"a.npz is a mesh: {options[0]} would do nothing" in capsys.readouterr().err
@@ -184,7 +184,7 @@ def test_standard_input(scans, tmp_path, monkeypatch, capsys):
     assert run("-", "-o", "a.npz", "--json") == 0
     told = lines(capsys.readouterr().out)[0]
     assert (told["input"], told["splats"]) == ("-", 40)
-    assert json.loads((tmp_path / "a.config.json").read_text())["options"]["input"] == "-"
+    assert toml.load(tmp_path / "a.npz.config.toml")["options"]["input"] == ["-"]
     monkeypatch.setattr(sys, "stdin", _Piped(content[:300]))
     assert run("-", "-o", "b.npz", "--json") == 1
     out, err = capsys.readouterr()

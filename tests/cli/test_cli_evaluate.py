@@ -49,7 +49,7 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     out = tmp_path / "out"
     splats = ("--splats", scene / "scene.ply", "--cameras", scene / "cameras.json", "--sh-degree", "0")
     before = ("--before", scene / "mesh.npz")
-    pictures = ("--pictures", scene / "pictures")
+    pictures = ("--images", scene / "pictures")
     options = (*splats, *before, *pictures, "--strips", "2", "--fit-exposure", "--samples", "1", "--json")
     assert run(scene / "mesh.npz", "-o", out, *options) == 0
     printed = json.loads(capsys.readouterr().out)["scenes"][0]

@@ -82,7 +82,7 @@ class Raises:
     error: ClassVar[BaseException] = ValueError()
     json: bool = False
 
-    def run(self) -> None:
+    def execute(self) -> None:
         raise type(self).error
 
 
@@ -129,7 +129,7 @@ def test_bugs_are_not_hidden(monkeypatch):
 class Warns:
     """A command that warns."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         warnings.warn("3 splats were\nleft out", DataWarning, stacklevel=1)
         print("done")
 
@@ -193,10 +193,10 @@ def test_info_on_data_sets(tmp_path, capsys):
 
     colmap = simple_colmap(tmp_path / "colmap", count=9)
     found = told(colmap)
-    assert (found["kind"], found["layout"], found["pictures"]) == ("data set", "COLMAP", 9)
+    assert (found["kind"], found["layout"], found["images"]) == ("data set", "COLMAP", 9)
     assert (found["training_views"], found["held_out_views"], found["split"]) == (7, 2, "every 8th by name")
     assert (found["lenses"], found["undistorted_when_read"]) == (["PINHOLE"], False)
-    assert found["bytes_in_memory"] == 9 * 3 * np.prod(found["picture_sizes"][0])
+    assert found["bytes_in_memory"] == 9 * 3 * np.prod(found["image_sizes"][0])
     assert "points" not in found
     model = Path(found["read_from"])
     (model / "points3D.txt").write_text("# a comment\n1 0 0 0 9 9 9 0.5 1 2\n\n2 0 0 1 9 9 9 0.5 1 2\n")
@@ -225,7 +225,7 @@ def test_info_on_cameras(tmp_path, capsys):
     save_cameras(orbit(cloud(), 3, width=20, height=10), tmp_path / "c.json")
     assert main(["info", str(tmp_path / "c.json"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert (found["kind"], found["cameras"], found["picture_sizes"]) == ("cameras", 3, [[20, 10]])
+    assert (found["kind"], found["cameras"], found["image_sizes"]) == ("cameras", 3, [[20, 10]])
 
 
 @pytest.mark.parametrize(

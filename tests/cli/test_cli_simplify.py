@@ -10,7 +10,7 @@ from _splats import few_splats
 from conftest import shared_data
 
 from meshsplats import load_gaussians, orbit, save_cameras, save_gaussians, simplify
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 
 
 @pytest.fixture
@@ -31,8 +31,8 @@ def test_count_share_and_cameras(splats, tmp_path, capsys):
     assert run(splats, "-o", out, "--share", 0.25) == 0
     assert capsys.readouterr().out.startswith("40 splats -> 10 (25.0%) in ")
     same(load_gaussians(out), simplify(cloud, 10))
-    assert (tmp_path / "small.preview.png").is_file()
-    assert json.loads((tmp_path / "small.config.json").read_text())["options"]["share"] == 0.25
+    assert (tmp_path / "small.ply.preview.png").is_file()
+    assert toml.load(tmp_path / "small.ply.config.toml")["options"]["share"] == 0.25
     assert run(splats, "-o", out, "--count", 10, "--cameras", tmp_path / "cameras.json", "--force") == 0
     same(load_gaussians(out), simplify(cloud, 10, cameras=cameras))
 
@@ -48,7 +48,7 @@ def test_json_without_a_preview(splats, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert (told["read"], told["written"], told["preview"]) == (40, 40, None)
     assert told["bytes"] == out.stat().st_size
-    assert not (tmp_path / "small.preview.png").exists()
+    assert not (tmp_path / "small.ply.preview.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -82,6 +82,6 @@ def test_outputs_and_inputs(splats, tmp_path, capsys):
     assert "-o must end in .ply" in capsys.readouterr().err
     assert run(splats, "-o", splats, "--count", 3, "--force") == 2
     assert "is read by this command" in capsys.readouterr().err
-    (tmp_path / "small.config.json").write_text("mine")
+    (tmp_path / "small.ply.config.toml").write_text("mine")
     assert run(splats, "-o", tmp_path / "small.ply", "--count", 3) == 3
-    assert (tmp_path / "small.config.json").read_text() == "mine"
+    assert (tmp_path / "small.ply.config.toml").read_text() == "mine"

@@ -200,7 +200,7 @@ def test_the_command_says_what_goes_and_draws_it(file, tmp_path, capsys):
     assert "together" in out
     assert "17 of 2,017 splats, 0.84% of the opacity" in out
     assert len(load_gaussians(tmp_path / "clean.ply")) == 2000
-    picture = load_png(tmp_path / "clean.preview.png").astype(int)
+    picture = load_png(tmp_path / "clean.ply.preview.png").astype(int)
     red = (picture[..., 0] > 150) & (picture[..., 1:].max(axis=2) < 100)
     third = picture.shape[1] // 3
     assert red[:, third : 2 * third].sum() > 50
