@@ -149,7 +149,7 @@ def test_folders_that_are_in_the_way(splats, tmp_path, capsys):
     assert run(splats, "-o", out, *QUICK, "--force") == 3
     assert "holds no levels.json" in capsys.readouterr().err
     assert run(splats, "-o", tmp_path / "new", *QUICK, "--resume") == 1
-    assert "nothing to go on with" in capsys.readouterr().err
+    assert "nothing to resume in" in capsys.readouterr().err
     partial = tmp_path / "other.partial"
     partial.mkdir()
     assert run(splats, "-o", tmp_path / "other", *QUICK, "--force") == 3

@@ -77,7 +77,7 @@ class SplatOptions:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Cameras and image size. Give one of --orbit, --dome, --look-around, --cameras, --data."""
+    """Cameras and image size. Orbit, dome, look-around, cameras and data exclude each other."""
 
     orbit: Count = None
     """N views on a circle around the subject."""
