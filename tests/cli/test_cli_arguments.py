@@ -12,14 +12,14 @@ import pytest
 from _splats import few_splats
 
 from meshsplats.cli import COMMANDS, main, toml
-from meshsplats.cli.arguments import INVOCATION, options_of
+from meshsplats.cli.arguments import INVOCATION, Command, options_of
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.formats.gaussians import save_gaussians
 
 SMALL = ("--views", "4", "--held-out", "2", "--width", "32", "--steps", "3")
 
 
-def command(name: str) -> type:
+def command(name: str) -> type[Command]:
     module, _, attribute = COMMANDS[name][0].partition(":")
     return getattr(importlib.import_module(module), attribute)
 
@@ -50,7 +50,7 @@ def splats(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
     kind = command(name)
-    every, common = set(options_of(kind)), set(getattr(kind, "COMMON", ()))
+    every, common = set(options_of(kind)), set(kind.COMMON)
     assert common <= every
     positional = {"compare": {"splats", "mesh"}, "evaluate": {"mesh"}}.get(name, {"input"})
 
@@ -64,7 +64,7 @@ def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
     last = short.splitlines()[-1]
     hidden = len(every - common) if common else 0
     assert (f"{hidden} more options: --help-all." in last) == bool(hidden)
-    assert ("--config FILE" in last) == getattr(kind, "CONFIGURABLE", False)
+    assert ("--config FILE" in last) == kind.CONFIGURABLE
 
 
 def test_the_help_of_finetune_fits_a_screen(capsys):
@@ -171,6 +171,8 @@ HOSTILE = {
     "no such choice": '[options]\npreset = "best"',
     "too few values": "[options]\ncrop = [1.0, 2.0]",
     "a table for a value": "[options.width]\na = 1",
+    "deep keys of an option": "[options]\nwidth" + ".a" * 2000 + " = 1",
+    "lists in lists": "[options]\ncrop = [[1], [2], [3], [4], [5], [6]]",
     "a date": "[options]\nsteps = 1979-05-27",
     "a path with NUL": '[options]\noutput = "a\\u0000.npz"',
     "options that are none": 'options = "x"',
@@ -192,6 +194,15 @@ def test_hostile_configurations_end_in_one_clear_line(splats, capsys, text):
     assert len(err) < 400
     assert err[:-1].isprintable()
     assert sorted(os.listdir()) == ["in", "run.toml"]
+
+
+@pytest.mark.parametrize("option", INVOCATION)
+def test_a_configuration_neither_overwrites_nor_names_programs(splats, capsys, option):
+    with open("run.toml", "w") as file:
+        file.write(f"[options]\n{option} = true")
+    name = "blender" if option == "executable" else "finetune"
+    assert main([name, splats, "-o", "a.png", "--config", "run.toml"]) == 2
+    assert f"--{option} is for the command line only" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -231,7 +242,7 @@ def test_large_files_are_not_read(tmp_path):
         toml.load(tmp_path / "a.toml")
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if getattr(command(name), "CONFIGURABLE", False)])
+@pytest.mark.parametrize("name", [name for name in COMMANDS if command(name).CONFIGURABLE])
 def test_exclusive_groups_name_options(name):
     kind = command(name)
     known = options_of(kind)

@@ -156,7 +156,7 @@ def test_a_mesh_in_another_format(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "linear.ply.preview.png").is_file()
     for options in (["--max-splats", "3"], ["--preset", "paper"], ["--fidelity", "2"]):
         assert run("a.npz", "-o", "c.glb", *options) == 2
-        assert f"a.npz is a mesh: {options[0]} would do nothing" in capsys.readouterr().err
+        assert f"a.npz is a mesh: {options[0]} would have no effect" in capsys.readouterr().err
     assert run("a.npz", "-o", "a.npz", "--force") == 2
     assert "is read by this command" in capsys.readouterr().err
 

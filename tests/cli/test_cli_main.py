@@ -19,6 +19,7 @@ import meshsplats
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import COMMANDS, main
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import parse_color, parse_up
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
@@ -76,7 +77,7 @@ def test_version_is_quick_and_needs_nothing():
 
 
 @dataclass
-class Raises:
+class Raises(Command):
     """A command that ends in the error given."""
 
     error: ClassVar[BaseException] = ValueError()
@@ -126,7 +127,7 @@ def test_bugs_are_not_hidden(monkeypatch):
 
 
 @dataclass
-class Warns:
+class Warns(Command):
     """A command that warns."""
 
     def execute(self) -> None:
@@ -154,7 +155,7 @@ def test_info_on_splats(tmp_path, capsys):
     np.testing.assert_allclose(found["lower"], cloud().means.min(axis=0), rtol=1e-5)
     np.testing.assert_allclose(found["scale_5_50_95_percent"], [0.35 / 3] * 3, rtol=1e-4)
     assert found["bytes"] == (tmp_path / "scene.ply").stat().st_size
-    assert found["becomes_triangles_about"] > 0
+    assert found["estimated_triangles"] > 0
     assert main(["info", str(tmp_path / "scene.ply")]) == 0
     assert "sh degree" in capsys.readouterr().out
 

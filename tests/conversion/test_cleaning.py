@@ -216,7 +216,7 @@ def test_the_command_on_a_mesh_in_json(tmp_path, capsys):
     assert not (tmp_path / "clean.glb").exists()
     assert main([*arguments, "--max-distance", "1.8", "--force"]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["gone"] == told["gone"]
+    assert again["removed"] == told["removed"]
     mesh = load_mesh(tmp_path / "clean.glb")
     assert len(np.unique(mesh.face_splat)) == again["kept"] < 2017
     np.testing.assert_allclose(again["upper"], mesh.vertices.max(axis=0), atol=1e-3)

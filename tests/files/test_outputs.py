@@ -240,8 +240,9 @@ _HANGING = """
 import sys, time, meshsplats.cli
 from dataclasses import dataclass
 from meshsplats._files.atomic import atomic_path
+from meshsplats.cli.arguments import Command
 @dataclass
-class Hang:
+class Hang(Command):
     def execute(self):
         with atomic_path(sys.argv[1]) as temporary:
             temporary.write_bytes(b"half")

@@ -39,14 +39,14 @@ COMMANDS = {
     "finetune": ("meshsplats.cli.finetune:Finetune", "a mesh optimised to look like splats or photographs"),
     "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
     "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for smaller and smaller sizes"),
-    "bake": ("meshsplats.cli.bake:Bake", "the low-pass filter of a mesh made part of its triangles"),
+    "bake": ("meshsplats.cli.bake:Bake", "a mesh with its low-pass filter applied, for other programs"),
     "base": ("meshsplats.cli.base:Base", "a classical mesh of the surface that splats form"),
     "prior": ("meshsplats.cli.prior:Prior", "splats bound to a classical mesh, trained and edited with it"),
     "deform": ("meshsplats.cli.deform:Deform", "the splats of a prior moved to an edited base mesh"),
     "evaluate": ("meshsplats.cli.evaluate:Evaluate", "scores on held-out views: PSNR, SSIM, LPIPS"),
     "blender": ("meshsplats.cli.blender:Blender", "images and scenes by Blender, unlit or lit"),
     "info": ("meshsplats.cli.info:Info", "the content of a splat file, mesh, camera file or model folder"),
-    "doctor": ("meshsplats.cli.doctor:Doctor", "what is installed, and what is missing"),
+    "doctor": ("meshsplats.cli.doctor:Doctor", "installed libraries, and missing ones"),
 }
 """Name: where its dataclass is, and one line of help."""
 
@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _answer(name) if name not in COMMANDS else _run(name, _plain(arguments[1:]))
             sys.stdout.flush()
             return code
-    except SystemExit as stop:  # help, or what is wrong with the arguments, has been printed
+    except SystemExit as stop:  # help, or an error in the arguments, has been printed
         code = stop.code if isinstance(stop.code, int) else USAGE
         if code == USAGE and as_json:
             print_json_error(UsageError("the options were not understood; standard error says why"))
@@ -97,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _signals_raise() -> Iterator[None]:
-    """While the block runs, SIGTERM and SIGHUP raise ``Terminated``, so that what is under way is tidied up
+    """While the block runs, SIGTERM and SIGHUP raise ``Terminated``, so that unfinished files are removed
     as after Ctrl-C; once, as another one must not break off the tidying. Signals that are ignored (nohup)
     stay so."""
 

@@ -17,9 +17,10 @@ from meshsplats.cli import toml
 from meshsplats.cli.messages import OK, UsageError, flag, say
 
 T = TypeVar("T")
-INVOCATION = ("force", "json", "resume")
-"""Options of one call, which a configuration file does not set: they are never part of the result, and a
-stranger's file must not overwrite anything."""
+C = TypeVar("C", bound="Command")
+INVOCATION = ("executable", "force", "json", "resume")
+"""Options for the command line only: they do not change the result, and a configuration file from a stranger
+must neither overwrite files nor run programs."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """What a configuration file may hold. Only ``options`` is read."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
@@ -31,7 +32,8 @@ class Command:
     COMMON: ClassVar[tuple[str, ...]] = ()
     """Options in --help. Empty: all."""
     EXCLUSIVE: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    """Groups of which one option is given. One on the command line replaces those of a configuration file."""
+    """Groups of options that exclude each other: one on the command line replaces those of a configuration
+    file."""
     CONFIGURABLE: ClassVar[bool] = False
     """Whether the command writes a configuration, and reads one with --config."""
 
@@ -40,7 +42,7 @@ class Command:
         raise NotImplementedError
 
     def resolved(self) -> dict[str, Any]:
-        """Values behind the options, from presets."""
+        """The values that options and presets lead to."""
         return {}
 
 
@@ -59,7 +61,7 @@ class Option:
         return command
 
 
-def parse(command: type[T], prog: str, words: Sequence[str]) -> T:
+def parse(command: type[C], prog: str, words: Sequence[str]) -> C:
     """The command that ``words`` describe.
 
     Raises:
@@ -72,15 +74,15 @@ def parse(command: type[T], prog: str, words: Sequence[str]) -> T:
         raise SystemExit(OK)
     if file is None:
         return tyro.cli(command, prog=prog, args=words, config=_MARKERS)
-    if not getattr(command, "CONFIGURABLE", False):
+    if not command.CONFIGURABLE:
         raise UsageError("--config has no effect here: this command writes no configuration")
     values, resolved = _read(command, file, prog.rpartition(" ")[2])
     _warn_of_changes(command, file, values, resolved)
-    given = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in words if word[:2] == "--"}
-    for group in getattr(command, "EXCLUSIVE", ()):
-        if given & set(group):
+    on_line = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in words if word[:2] == "--"}
+    for group in command.EXCLUSIVE:
+        if on_line & set(group):
             values = {name: value for name, value in values.items() if name not in group}
-    # A flag that the file sets is taken back by --no-FLAG.
+    # --no-FLAG clears a flag that the file sets.
     return tyro.cli(command, prog=prog, args=words, default=_filled(command, values), config=_MARKERS[:1])
 
 
@@ -159,16 +161,17 @@ def _without_config(words: Sequence[str]) -> tuple[list[str], Path | None]:
     return rest, None if file is None else Path(file)
 
 
-def _print_help(command: type, prog: str, *, everything: bool) -> None:
-    common = getattr(command, "COMMON", ())
-    names = set(options_of(command))
+def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
+    names, common = set(options_of(command)), command.COMMON
     shown = command if everything or not common else _only(command, common)
     with suppress(SystemExit):
         tyro.cli(shown, prog=prog, args=["--help"], config=_MARKERS)
     hidden = len(names - set(common)) if common and not everything else 0
     notes = [f"{hidden} more options: --help-all."] if hidden else []
-    if getattr(command, "CONFIGURABLE", False):
+    if command.CONFIGURABLE:
         notes.append("--config FILE takes options from the NAME.config.toml of an earlier run.")
+        if everything:
+            notes.append("Paths in it are relative to its folder. Options on the command line win.")
     if notes:
         print(" ".join(notes))
 
@@ -196,9 +199,8 @@ def _only(command: type[T], names: Collection[str]) -> type[T]:
 # ---- Configuration files
 
 
-def _read(command: type, file: Path, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Values of the options in ``file``, by their names, and what it has recorded of the values behind
-    them."""
+def _read(command: type[Command], file: Path, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The options in ``file``, and the values that it says they lead to."""
     record = toml.load(file)
     _refuse_unknown(record, TABLES, f"{file}: no such table or key")
     if record.get("command", name) != name:
@@ -215,7 +217,7 @@ def _read(command: type, file: Path, name: str) -> tuple[dict[str, Any], dict[st
     values = {}
     for key, value in table.items():
         if key == "input" and value in ("-", ["-"]):
-            continue  # standard input is given again
+            continue  # standard input has to be named again
         try:
             values[key] = _converted(value, options[key].hint, file.parent)
         except TypeError as error:
@@ -232,12 +234,12 @@ def _refuse_unknown(table: Mapping[str, Any], known: Collection[str], problem: s
 
 
 def _warn_of_changes(
-    command: type, file: Path, values: Mapping[str, Any], recorded: Mapping[str, Any]
+    command: type[Command], file: Path, values: Mapping[str, Any], recorded: Mapping[str, Any]
 ) -> None:
-    """Warns where the options no longer lead to the recorded values: someone has changed these in place of
-    the options, or a preset has changed."""
+    """Warns if the options no longer lead to the recorded values: someone has edited these in place of the
+    options, or a preset has changed."""
     try:
-        now: dict[str, Any] = _filled(command, values).resolved()
+        now = _filled(command, values).resolved()
     except (UsageError, ValueError, TypeError):
         return  # the command itself reports it
     changed = [key for key, value in now.items() if key in recorded and _plain(value) != recorded[key]]
@@ -255,18 +257,18 @@ def _plain(value: Any) -> Any:
 
 def _filled(command: type[T], values: Mapping[str, Any]) -> T:
     """``command`` with ``values`` of its options, and defaults for the others."""
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     hints = get_type_hints(command)
     for part in fields(command):  # type: ignore[arg-type]
         hint = hints[part.name]
         if is_dataclass(hint):
             assert isinstance(hint, type)
-            given[part.name] = _filled(hint, values)
+            arguments[part.name] = _filled(hint, values)
         elif part.name in values and hint is not object:
-            given[part.name] = values[part.name]
+            arguments[part.name] = values[part.name]
         elif part.default is MISSING and part.default_factory is MISSING:
-            given[part.name] = tyro.MISSING
-    return command(**given)
+            arguments[part.name] = tyro.MISSING
+    return command(**arguments)
 
 
 def _converted(value: Any, hint: Any, folder: Path) -> Any:
@@ -322,7 +324,11 @@ def _alternatives(hint: Any) -> tuple[Any, ...]:
 
 
 def _short(value: Any) -> str:
-    """``value`` for a message, whatever a stranger has written."""
+    """``value`` for a message, in printable characters."""
+    if isinstance(value, dict):
+        return "a table"
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
     text = ascii(value) if isinstance(value, str) else str(value)
     return text if len(text) <= 60 else text[:57] + "..."
 

@@ -279,7 +279,7 @@ def _plan(ahead: dict[str, Any], options: SceneOptions, images: int) -> str:
 
 def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | None:
     """Estimated time of Cycles, from the plan of ``draw``; None for EEVEE. Measured with Blender 4.2 on
-    scenes of 4 to 16 layers a pixel (docs/blender.md): a ray that meets m layers costs 2 m + 0.17 m^2
+    scenes of 4 to 16 layers per pixel (docs/blender.md): a ray that meets m layers costs 2 m + 0.17 m^2
     microseconds lit, as each layer sends rays to the light that meet others, and 1.1 m unlit."""
     if options.engine != "cycles":
         return None

@@ -115,7 +115,7 @@ class Clean(Command):
                 "preview": str(preview),
                 "splats": total,
                 "kept": int(found.kept.sum()),
-                "gone": counts,
+                "removed": counts,
                 "lower": lower,
                 "upper": upper,
                 "seconds": round(seconds, 3),
@@ -130,7 +130,7 @@ class Clean(Command):
         for name, count in counts.items():
             share = f"{count['splats']:>9,} of {total:,} splats, {count['opacity']:.2%} of the opacity"
             print(f"{named[name]:<{width}}  {share}")
-        print(f"left: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
+        print(f"kept: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
         if not self.preview_only:
             print(f"{self.output} ({size_of(self.output)})")
         print(f"preview, before | removed, in red | after: {preview}")

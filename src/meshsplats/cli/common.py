@@ -29,7 +29,7 @@ from meshsplats.mesh import SplatMesh
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
-# Options that may be left out. Their help says what happens then, instead of "(default: None)".
+# Optional options. Their help describes the default, in place of "(default: None)".
 Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
@@ -172,7 +172,7 @@ class ViewOptions:
         return orbit(scene, count if self.orbit is None else self.orbit, azimuth=self.azimuth, **lens)
 
     def check(self) -> None:
-        """UsageError for options that exclude each other or would do nothing."""
+        """UsageError for options that exclude each other or have no effect."""
         if self.downscale != 1 and (self.data is None or self.width is not None):
             raise UsageError(
                 "--downscale has no effect without --data"
@@ -238,9 +238,7 @@ def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:
     """The splats or the mesh at ``path``."""
     kind = identify(path)
     if kind == "cameras":
-        raise FileFormatError(
-            f"{path}: a JSON file; expected splats or a mesh (cameras are given with --cameras)"
-        )
+        raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
     if kind == "splats":
         return reading.load(path)
     from meshsplats.formats.meshes import load_mesh

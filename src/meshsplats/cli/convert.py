@@ -336,7 +336,7 @@ class Convert(Command):
         idle += [name for name, value in asdict(self.conversion).items() if value is not None]
         if idle:
             flags = ", ".join(map(flag, idle))
-            raise UsageError(f"{job.shown} is a mesh: {flags} would do nothing, as they are for splats")
+            raise UsageError(f"{job.shown} is a mesh: {flags} would have no effect, as they are for splats")
         times = [time.perf_counter()]
         mesh = load_mesh(job.source)
         if self.up is not None:
@@ -400,9 +400,9 @@ class Convert(Command):
         if self.json:
             print(json.dumps(result), flush=True)
             return
-        what = f"{result['written']:,} splats" if "written" in result else _counts(result)
+        sizes = f"{result['written']:,} splats" if "written" in result else _counts(result)
         files = ", ".join(f"{path.name} ({size_of(path)})" for path in job.outputs)
-        print(f"{job.shown}: {what}: {files}", flush=True)
+        print(f"{job.shown}: {sizes}: {files}", flush=True)
 
     def _next(self, cameras: Sequence[Camera] | None) -> str:
         """The command that compares the mesh with the splats in its cameras, or one that renders it if only a

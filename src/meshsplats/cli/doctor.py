@@ -1,4 +1,4 @@
-"""``meshsplats doctor``: what is installed, and what is missing."""
+"""``meshsplats doctor``: installed libraries, and missing ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from meshsplats.cli.arguments import Command
 
 @dataclass(frozen=True)
 class Doctor(Command):
-    """Lists what is installed, the instruction set in use, and what is missing. Exit code 1 if rendering
+    """Lists installed and missing libraries, and the instruction set in use. Exit code 1 if rendering
     fails."""
 
     json: bool = False

@@ -369,7 +369,7 @@ def mesh_names(paths: Sequence[Path]) -> dict[str, Path]:
     for names in forms:
         if len(set(names)) == len(names):
             return dict(zip(names, paths, strict=True))
-    raise UsageError("a mesh was given twice")
+    raise UsageError("two meshes are the same file")
 
 
 def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) -> SplatMesh:

@@ -130,8 +130,8 @@ def _splats(cloud: GaussianCloud) -> dict[str, Any]:
         "faint_splats": int((cloud.opacities < 1 / 255).sum()),
         "scale_5_50_95_percent": _quantiles(ordered.mean(axis=1)),
         "flatness_median": float(np.float32(np.median(flatness))),
-        "becomes_triangles_about": round(len(tried.faces) * share),
-        "becomes_vertices_about": round(len(tried.vertices) * share),
+        "estimated_triangles": round(len(tried.faces) * share),
+        "estimated_vertices": round(len(tried.vertices) * share),
     }
 
 

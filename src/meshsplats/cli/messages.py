@@ -22,7 +22,7 @@ ENDINGS = {signal.SIGINT: "interrupted"} | {
 """Message for each signal that ends a command."""
 
 _standard_input: str | None = None
-"""The temporary file that holds standard input, where the command was given -."""
+"""The temporary file that holds standard input, if the input is -."""
 
 
 class UsageError(Exception):
@@ -65,7 +65,7 @@ def print_json_error(error: BaseException) -> None:
 
 
 def close_output() -> None:
-    """Keeps Python from failing once more, when it ends, on what cannot be printed."""
+    """Keeps Python from failing again, when it ends, to print the rest."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

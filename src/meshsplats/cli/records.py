@@ -24,8 +24,8 @@ def beside(output: Path, record: str) -> Path:
 def write_configuration(
     path: Path, name: str, command: Command, result: Mapping[str, Any] | None = None
 ) -> None:
-    """Writes what the command ``name`` was asked for to ``path``; --config repeats the run from it.
-    ``result``: what the run has found out."""
+    """Writes the options of the command ``name`` to ``path``, from which --config repeats the run.
+    ``result``: findings of the run."""
     from meshsplats._files.atomic import write_text
 
     write_text(path, toml.dumps(configuration(name, command, path.parent, result)))

@@ -85,7 +85,7 @@ class Render(Command):
     """No background: images with an alpha channel."""
     depth: Literal["none", "png", "npy"] = "none"
     """Also depth images of a mesh: 16-bit PNG (depth_unit in the configuration is its scale) or float arrays;
-    0: nothing there."""
+    0: empty."""
     animation: Literal["webp", "gif", "png", "none"] = "webp"
     """Format of the turntable of an orbit; png is an animated PNG."""
     fps: float = 15.0
@@ -184,7 +184,7 @@ class Render(Command):
         if isinstance(scene, SplatMesh) and self.as_splats:
             raise ValueError(f"{self.input} is a mesh: --as-splats needs a splat file")
         if self.draw.sh_degree is not None and not self.as_splats:
-            raise UsageError("--sh-degree is for splats: a mesh has one colour a vertex; add --as-splats")
+            raise UsageError("--sh-degree is for splats: a mesh has one colour per vertex; add --as-splats")
 
     def _draw(
         self,

@@ -217,11 +217,11 @@ class TrainingCommand(Command):
         self.target.check()
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
-        """Reads the input and makes ready what is optimised. ``earlier``: of a run that is resumed."""
+        """Reads the input and prepares the optimisation. ``earlier``: checkpoint of a resumed run."""
         raise NotImplementedError
 
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
-        """Lines that say what to do with the result."""
+        """Lines that name a next command."""
         raise NotImplementedError
 
     def resolved(self) -> dict[str, Any]:
@@ -265,7 +265,7 @@ class TrainingCommand(Command):
         """Further files of the run."""
 
     def explicit_settings(self) -> dict[str, Any]:
-        """The settings of the configuration that were given, the run's length included."""
+        """The settings on the command line, with the length of the run."""
         tuning = {name: value for name, value in asdict(self.tuning).items() if value is not None}
         if tuning.get("exposure") and self.target.data is None:
             raise UsageError("--exposure has no effect without --data: rendered images have one exposure")
