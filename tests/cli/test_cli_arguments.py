@@ -111,6 +111,39 @@ def test_a_run_is_repeated_from_its_configuration(splats, tmp_path, monkeypatch,
     assert before == after
 
 
+@pytest.mark.parametrize(
+    ("arguments", "results"),
+    [
+        (["render", "in/scene.ply", "--orbit", "2", "--width", "16"], ["view_0001.png", "turntable.webp"]),
+        (["compare", "in/scene.ply", "--orbit", "2", "--width", "16"], ["view_0001.png"]),
+        (["levels", "in/scene.ply", "--no-tune", "--levels", "2", "--width", "32"], ["level_1.glb"]),
+    ],
+    ids=lambda value: value[0],
+)
+def test_a_folder_of_results_is_repeated_from_its_configuration(splats, arguments, results):
+    assert main([*arguments, "-o", "first"]) == 0
+    assert main([arguments[0], "--config", "first/config.toml", "-o", "second"]) == 0
+    for name in results:
+        assert content(f"first/{name}") == content(f"second/{name}")
+    assert main([arguments[0], "--config", "second/config.toml", "--force"]) == 0
+
+
+def test_each_output_of_several_formats_is_repeated_alone(splats):
+    assert main(["convert", "in", "-o", "out", "--formats", "glb", "npz", "--lit", "--max-splats", "9"]) == 0
+    for name in ("scene.glb", "scene.npz"):
+        assert main(["convert", "--config", f"out/{name}.config.toml", "-o", f"again-{name}"]) == 0
+        assert content(f"again-{name}") == content(f"out/{name}")
+
+
+def test_an_interrupted_run_is_resumed_from_its_configuration(splats, capsys):
+    """Its folder has one from the start, with paths relative to that."""
+    assert main(["finetune", splats, "-o", "made.npz", *SMALL]) == 0
+    again = ["finetune", "--config", "made.npz.run/command.toml", "--resume", "--force"]
+    assert main([*again, "--steps", "4"]) == 0
+    assert main([*again, "--steps", "5", "--sides", "6"]) == 1
+    assert "--sides was not given and is 6" in capsys.readouterr().err
+
+
 def test_the_command_line_wins(splats):
     assert main(["convert", splats, "-o", "a.npz", "--sides", "6", "--no-preview", "--mode", "flat"]) == 0
     save_gaussians(few_splats().select(np.arange(9)), "nine.ply")

@@ -1,4 +1,4 @@
-"""From the words of a command line, and a configuration file, to a command; its help."""
+"""Parses command lines and configuration files; prints help."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from meshsplats.cli.messages import OK, UsageError, flag, say
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
 INVOCATION = ("executable", "force", "json", "resume")
-"""Options for the command line only: they do not change the result, and a configuration file from a stranger
-must neither overwrite files nor run programs."""
+"""Options for the command line only: a configuration file from a stranger must neither overwrite files nor
+run programs, and --json and --resume belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """What a configuration file may hold. Only ``options`` is read."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
@@ -53,7 +53,6 @@ class Option:
     path: tuple[str, ...]
     """Names of the groups and of the field."""
     hint: Any
-    required: bool
 
     def value(self, command: object) -> Any:
         for name in self.path:
@@ -95,10 +94,9 @@ def options_of(command: type) -> dict[str, Option]:
         if is_dataclass(hint):
             assert isinstance(hint, type)
             for name, inner in options_of(hint).items():
-                found[name] = Option((part.name, *inner.path), inner.hint, inner.required)
+                found[name] = Option((part.name, *inner.path), inner.hint)
         elif hint is not object:
-            required = part.default_factory is MISSING and part.default in (MISSING, tyro.MISSING)
-            found[part.name] = Option((part.name,), hint, required)
+            found[part.name] = Option((part.name,), hint)
     return found
 
 
