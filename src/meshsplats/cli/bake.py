@@ -31,16 +31,8 @@ class Bake(Command):
     """
 
     COMMON = (
-        "input",
-        "output",
-        "orbit",
-        "cameras",
-        "data",
-        "distance",
-        "width",
-        "filter_px2",
-        "json",
-        "force",
+        *("input", "output", "orbit", "cameras", "data"),
+        *("distance", "width", "filter_px2", "json", "force"),
     )
 
     input: tyro.conf.Positional[Path]

@@ -78,21 +78,9 @@ class Blender(Command):
     """
 
     COMMON = (
-        *(
-            "input",
-            "output",
-            "lit",
-            "lights",
-            "hdri",
-            "ground",
-            "mirror",
-            "glass",
-            "engine",
-            "samples",
-            "orbit",
-        ),
-        *("cameras", "azimuth", "elevation", "distance", "width", "background", "transparent", "executable"),
-        *("json", "force"),
+        *("input", "output", "lit", "lights", "hdri", "mirror", "glass"),
+        *("engine", "samples", "orbit", "cameras", "azimuth", "elevation", "distance"),
+        *("width", "background", "transparent", "executable", "json", "force"),
     )
     EXCLUSIVE = (
         ("orbit", "dome", "look_around", "cameras", "data"),

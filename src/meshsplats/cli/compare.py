@@ -44,8 +44,8 @@ class Compare(Command):
     error."""
 
     COMMON = (
-        *("splats", "mesh", "output", "preset", "look", "orbit", "look_around", "cameras", "data"),
-        *("downscale", "width", "background", "crop", "json", "force"),
+        *("splats", "mesh", "output", "preset", "look", "orbit", "look_around", "cameras"),
+        *("data", "downscale", "width", "background", "crop", "json", "force"),
     )
     EXCLUSIVE = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "focal_length"))
     CONFIGURABLE = True

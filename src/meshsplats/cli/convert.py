@@ -85,8 +85,8 @@ class Convert(Command):
     """
 
     COMMON = (
-        *("input", "output", "formats", "preset", "cameras", "data", "up", "lit", "alpha", "as_splats"),
-        *("mode", "max_splats", "max_triangles", "crop", "fidelity", "json", "force"),
+        *("input", "output", "formats", "preset", "cameras", "data", "up", "lit"),
+        *("alpha", "as_splats", "max_splats", "max_triangles", "crop", "json", "force"),
     )
     EXCLUSIVE = (("cameras", "data"),)
     CONFIGURABLE = True

@@ -64,8 +64,8 @@ class Evaluate(Command):
     """
 
     COMMON = (
-        *("mesh", "output", "data", "splats", "before", "cameras", "downscale", "test_every", "background"),
-        *("samples", "lpips", "fit_exposure", "threads", "json", "force"),
+        *("mesh", "output", "data", "splats", "before", "cameras", "downscale", "test_every"),
+        *("background", "samples", "lpips", "fit_exposure", "threads", "json", "force"),
     )
     EXCLUSIVE = (("data", "cameras"),)
     CONFIGURABLE = True

@@ -53,8 +53,8 @@ class Finetune(TrainingCommand):
     """
 
     COMMON = (
-        *("input", "output", "preset", "minutes", "steps", "data", "downscale", "cameras", "width"),
-        *("max_splats", "max_triangles", "crop", "threads", "resume", "json", "force"),
+        *("input", "output", "preset", "minutes", "steps", "data", "downscale", "cameras"),
+        *("width", "max_splats", "max_triangles", "crop", "threads", "resume", "json", "force"),
     )
 
     input: tyro.conf.Positional[Path]

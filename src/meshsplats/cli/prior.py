@@ -70,19 +70,8 @@ class Prior(TrainingCommand):
     """
 
     COMMON = (
-        *(
-            "input",
-            "output",
-            "data",
-            "splats",
-            "minutes",
-            "steps",
-            "triangles",
-            "layers",
-            "colors",
-            "texture",
-        ),
-        *("downscale", "width", "threads", "resume", "json", "force"),
+        *("input", "output", "data", "splats", "minutes", "steps", "triangles", "layers"),
+        *("colors", "texture", "downscale", "width", "threads", "resume", "json", "force"),
     )
     EXCLUSIVE = (("epochs", "steps", "minutes"), ("data", "splats"), ("data", "cameras"))
 

@@ -61,8 +61,9 @@ class Render(Command):
     """
 
     COMMON = (
-        *("input", "output", "as_splats", "orbit", "look_around", "cameras", "data", "elevation", "azimuth"),
-        *("distance", "up", "width", "height", "background", "transparent", "depth", "json", "force"),
+        *("input", "output", "as_splats", "orbit", "look_around", "cameras"),
+        *("data", "elevation", "azimuth", "distance", "up", "width"),
+        *("height", "background", "transparent", "depth", "json", "force"),
     )
     EXCLUSIVE = (
         ("orbit", "dome", "look_around", "cameras", "data"),
