@@ -165,7 +165,7 @@ def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, optio
     assert run(splats, "-o", "made.usdc" if not options else "made.npz", "--preset", "paper", *options) == 0
     command = shlex.split(re.search(r"next: meshsplats (.*)", capsys.readouterr().out)[1])
     assert main([*command, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     axes = options[1] if options[:1] == ["--axes"] else "auto"
     cloud, mesh = load_gaussians(splats, axes=axes), load_mesh(command[2])
     cameras = load_cameras(tmp_path / "made-compare")
@@ -175,7 +175,7 @@ def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, optio
         ]
     drawn = render(mesh, cameras[0], samples=needed_samples(mesh, cameras)).color
     wanted = psnr(drawn, draw_splats(cloud, cameras[0]).color)
-    assert told["views"][0]["psnr"] == pytest.approx(wanted, abs=0.01)
+    assert printed["views"][0]["psnr"] == pytest.approx(wanted, abs=0.01)
 
 
 def test_a_part_is_shown_not_compared_with_the_whole(splats, tmp_path, capsys):
@@ -260,7 +260,7 @@ def test_splats_as_splats(splats, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "told"),
+    ("name", "options", "printed"),
     [
         ("a.glb", [], "--as-splats writes .ply"),
         ("a.ply", ["--lit"], "--lit: for a mesh"),
@@ -269,9 +269,9 @@ def test_splats_as_splats(splats, tmp_path, capsys):
         ("a.ply", ["--preset", "paper", "--rings", "2"], "--preset, --rings: for a mesh"),
     ],
 )
-def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options, told):
+def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options, printed):
     assert run(splats, "-o", tmp_path / name, "--as-splats", *options) == 2
-    assert told in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert not (tmp_path / name).exists()
 
 

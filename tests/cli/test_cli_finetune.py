@@ -59,12 +59,12 @@ def run(*arguments) -> int:
 def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     out = tmp_path / "tuned.npz"
     assert run(splats, "-o", out, *SMALL, "--steps", "12", "--report-every", "6", "--json") == 0
-    told = capsys.readouterr()
-    result = json.loads(told.out)
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
     assert result["steps"] == 12
     assert result["held_out_psnr"]["after"] > result["held_out_psnr"]["before"]
-    assert "memory: about" in told.err
-    assert "step 6/12, loss" in told.err
+    assert "memory: about" in printed.err
+    assert "step 6/12, loss" in printed.err
     mesh = load_mesh(out)
     assert result["triangles"] == len(mesh.faces)
     names = ["tuned.npz", "tuned.npz.config.toml", "tuned.npz.preview.png", "tuned.npz.run"]
@@ -80,13 +80,13 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     assert "next: meshsplats evaluate" in capsys.readouterr().out
 
 
-def told_score(out: str, capsys) -> tuple[float, float]:
-    """Of what was held out, as ``finetune`` told it and as the command scores that it names."""
-    told = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
+def printed_score(out: str, capsys) -> tuple[float, float]:
+    """Of what was held out, as ``finetune`` printed it and as the command scores that it names."""
+    printed = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
     command = shlex.split(re.search(r"next: meshsplats (.*)", out)[1])
     assert main([*command, "--strips", "0", "--json"]) == 0
     methods = json.loads(capsys.readouterr().out)["scenes"][0]["methods"]
-    return told, methods["mesh"]["mean"]["psnr"]
+    return printed, methods["mesh"]["mean"]["psnr"]
 
 
 @pytest.mark.parametrize("options", [["--downscale", "2", "--background", "black"], ["--test-every", "3"]])
@@ -97,8 +97,8 @@ def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_pa
     data = write_photographs(tmp_path / "photos here", cameras, pictures)
     out = tmp_path / "tuned.npz"
     assert run(splats, "--data", data, "-o", out, "--steps", "4", *options) == 0
-    told, scored = told_score(capsys.readouterr().out, capsys)
-    assert told == pytest.approx(scored, abs=0.005)
+    printed, scored = printed_score(capsys.readouterr().out, capsys)
+    assert printed == pytest.approx(scored, abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys, o
     save_gaussians(replace(cloud, sh=sh), "scene.ply")
     save_cameras(orbit(cloud, 9, width=48, height=48, elevation=50), "nine.json")
     assert run("scene.ply", "-o", "tuned.npz", "--views", "4", "--steps", "2", *options) == 0
-    told, scored = told_score(capsys.readouterr().out, capsys)
-    assert told == pytest.approx(scored, abs=0.005)
+    printed, scored = printed_score(capsys.readouterr().out, capsys)
+    assert printed == pytest.approx(scored, abs=0.005)
 
 
 def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):
@@ -292,7 +292,7 @@ def test_a_mesh_needs_photographs(splats, tmp_path, capsys):
     assert "-o must end in" in capsys.readouterr().err
 
 
-def test_too_little_memory_is_told_before_the_work(splats, tmp_path, capsys, monkeypatch):
+def test_too_little_memory_is_reported_before_the_work(splats, tmp_path, capsys, monkeypatch):
     from meshsplats.finetuning import memory
 
     monkeypatch.setattr(memory, "available_memory", lambda: 1 << 20)
@@ -329,9 +329,9 @@ def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
         if "step 3/" in line:
             child.send_signal(number)
             break
-    told = child.communicate(timeout=60)[1]
+    printed = child.communicate(timeout=60)[1]
     assert child.returncode == 128 + number
-    assert "--resume" in told
+    assert "--resume" in printed
     assert not out.exists()
     assert (tmp_path / "tuned.npz.run" / "checkpoint.safetensors").is_file()
     assert run(*arguments, "--resume") == 0

@@ -111,10 +111,15 @@ def test_errors_are_one_line(monkeypatch, capsys, error, code, line):
     if code < 128:
         kinds = {1: "input", 3: "exists", 4: "space", 5: "missing"}
         assert main(["raises", "--json"]) == code
-        told = json.loads(capsys.readouterr().out)["error"]
-        assert (told["kind"], told["code"], told["type"]) == (kinds[code], code, type(error).__name__)
-        assert line.endswith(told["message"])
-        assert told["path"] == getattr(error, "filename", None)
+        printed = json.loads(capsys.readouterr().out)["error"]
+        named = (printed["kind"], printed["code"], printed["type"])
+        assert named == (kinds[code], code, type(error).__name__)
+            kinds[code],
+            code,
+            type(error).__name__,
+        )
+        assert line.endswith(printed["message"])
+        assert printed["path"] == getattr(error, "filename", None)
         with pytest.raises(type(error)):
             main(["raises", "--debug"])
 
@@ -188,12 +193,12 @@ def test_info_on_a_mesh(tmp_path, capsys, suffix):
 
 
 def test_info_on_data_sets(tmp_path, capsys):
-    def told(path) -> dict:
+    def printed(path) -> dict:
         assert main(["info", str(path), "--json"]) == 0
         return json.loads(capsys.readouterr().out)
 
     colmap = simple_colmap(tmp_path / "colmap", count=9)
-    found = told(colmap)
+    found = printed(colmap)
     assert (found["kind"], found["layout"], found["images"]) == ("data set", "COLMAP", 9)
     assert (found["training_views"], found["held_out_views"], found["split"]) == (7, 2, "every 8th by name")
     assert (found["lenses"], found["undistorted_when_read"]) == (["PINHOLE"], False)
@@ -201,23 +206,23 @@ def test_info_on_data_sets(tmp_path, capsys):
     assert "points" not in found
     model = Path(found["read_from"])
     (model / "points3D.txt").write_text("# a comment\n1 0 0 0 9 9 9 0.5 1 2\n\n2 0 0 1 9 9 9 0.5 1 2\n")
-    assert told(colmap)["points"] == 2
+    assert printed(colmap)["points"] == 2
     (model / "points3D.bin").write_bytes((3).to_bytes(8, "little") + bytes(3 * 51))
-    assert told(colmap)["points"] == 3
+    assert printed(colmap)["points"] == 3
     (model / "points3D.bin").write_bytes((1 << 60).to_bytes(8, "little"))
-    assert "points" not in told(colmap)
+    assert "points" not in printed(colmap)
     (model / "test.txt").write_text("nothing\n")
-    assert told(colmap)["split"] == "the data set's own"
+    assert printed(colmap)["split"] == "the data set's own"
 
     cameras = orbit(make_scene(200), 3, width=16, height=16)
     pictures = [np.concatenate([np.zeros((16, 16, 3)), np.full((16, 16, 1), 0.5)], axis=2)] * 3
     folder = write_photographs(tmp_path / "studio", cameras, pictures)
     for path in (folder, folder / "transforms.json"):
-        found = told(path)
+        found = printed(path)
         assert (found["layout"], found["with_alpha"], found["with_masks"]) == ("nerfstudio", 3, 0)
         assert found["split"] == "every 8th by name"
     save_cameras(cameras, tmp_path / "cameras.json")
-    assert told(tmp_path / "cameras.json")["kind"] == "cameras"
+    assert printed(tmp_path / "cameras.json")["kind"] == "cameras"
     (tmp_path / "empty").mkdir()
     assert main(["info", str(tmp_path / "empty")]) == 1
 

@@ -73,9 +73,9 @@ def test_trained_on_splats(scene, tmp_path, capsys):
     options += ["--layers", "3", "--spacing", "-0.01"]
     out = tmp_path / "prior.glb"
     assert run("prior", scene / "base.obj", "--splats", scene / "scene.ply", "-o", out, *options) == 0
-    told = capsys.readouterr()
-    assert "50 faces carry 150 triangles; 3 training views, 1 held out" in told.err
-    assert "meshsplats deform" in told.out
+    printed = capsys.readouterr()
+    assert "50 faces carry 150 triangles; 3 training views, 1 held out" in printed.err
+    assert "meshsplats deform" in printed.out
     assert load_prior(out).lift == pytest.approx(-0.01)
 
 
@@ -89,8 +89,8 @@ def test_deform_follows_the_base(scene, trained, tmp_path, capsys):
     prior = load_prior(trained)
     out = tmp_path / "edited.npz"
     assert run("deform", trained, "--base", scene / "moved1.obj", "-o", out, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["files"] == [str(out)]
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["files"] == [str(out)]
     moved = load_mesh(scene / "moved1.obj")
     with np.load(out) as file:
         corners = moved.vertices[file["binding_base_faces"][file["binding_vertex_face"]]]

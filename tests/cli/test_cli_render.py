@@ -38,7 +38,7 @@ def splats(tmp_path):
 
 @pytest.fixture
 def triangle(tmp_path):
-    """One half-opaque triangle, red, in the plane z = 0, larger than any picture."""
+    """One half-opaque triangle, red, in the plane z = 0, larger than any image."""
     corners = np.array([[-50, -50, 0], [50, -50, 0], [0, 80, 0]])
     mesh = SplatMesh(corners, np.array([[0, 1, 2]]), np.array([[1, 0, 0, 0.5]] * 3))
     save_mesh(mesh, tmp_path / "triangle.npz")
@@ -99,7 +99,7 @@ def test_transparent_and_depth(triangle, tmp_path):
 
 
 def test_orbit_of_splats(splats, tmp_path, capsys):
-    """The pictures are those of the library from the cameras written down, and the turntable has them all."""
+    """The images are those of the library from the recorded cameras, and the turntable has them all."""
     out = tmp_path / "out"
     size = ("--width", "20", "--height", "16", "--elevation", "30", "--up", "-z", "--samples", "1")
     assert run(splats, "-o", out, "--as-splats", "--orbit", "3", *size, "--sh-degree", "0", "--json") == 0

@@ -45,9 +45,9 @@ def same(a, b):
 def test_json_without_a_preview(splats, tmp_path, capsys):
     out = tmp_path / "small.ply"
     assert run(splats, "-o", out, "--count", 99, "--json", "--no-preview") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["read"], told["written"], told["preview"]) == (40, 40, None)
-    assert told["bytes"] == out.stat().st_size
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["read"], printed["written"], printed["preview"]) == (40, 40, None)
+    assert printed["bytes"] == out.stat().st_size
     assert not (tmp_path / "small.ply.preview.png").exists()
 
 
@@ -61,7 +61,7 @@ def test_every_format(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "printed"),
     [
         ([], "give --count or --share, one of them"),
         (["--count", "3", "--share", "0.5"], "give --count or --share, one of them"),
@@ -71,9 +71,9 @@ def test_every_format(tmp_path, name):
         (["--count", "3", "--cameras", "a.json", "--data", "b"], "give --cameras or --data, not both"),
     ],
 )
-def test_wrong_options(splats, tmp_path, capsys, options, told):
+def test_wrong_options(splats, tmp_path, capsys, options, printed):
     assert run(splats, "-o", tmp_path / "small.ply", *options) == 2
-    assert told in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert not (tmp_path / "small.ply").exists()
 
 

@@ -369,7 +369,7 @@ def mesh_names(paths: Sequence[Path]) -> dict[str, Path]:
     for names in forms:
         if len(set(names)) == len(names):
             return dict(zip(names, paths, strict=True))
-    raise UsageError("two meshes are the same file")
+    raise UsageError("a mesh was given twice")
 
 
 def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) -> SplatMesh:
