@@ -153,6 +153,7 @@ def test_a_mesh_in_another_format(tmp_path, monkeypatch, capsys):
     assert run("linear.npz", "-o", "linear.ply", "--up", "0,0,2") == 0
     assert load_mesh("linear.ply").blending == "linear"
     np.testing.assert_array_equal(load_mesh("linear.ply").up, (0, 0, 1))
+    assert "resolved" not in toml.load(tmp_path / "linear.ply.config.toml")
     assert (tmp_path / "linear.ply.preview.png").is_file()
     for options in (["--max-splats", "3"], ["--preset", "paper"], ["--fidelity", "2"]):
         assert run("a.npz", "-o", "c.glb", *options) == 2

@@ -114,10 +114,6 @@ def test_errors_are_one_line(monkeypatch, capsys, error, code, line):
         printed = json.loads(capsys.readouterr().out)["error"]
         named = (printed["kind"], printed["code"], printed["type"])
         assert named == (kinds[code], code, type(error).__name__)
-            kinds[code],
-            code,
-            type(error).__name__,
-        )
         assert line.endswith(printed["message"])
         assert printed["path"] == getattr(error, "filename", None)
         with pytest.raises(type(error)):

@@ -238,7 +238,7 @@ def _warn_of_changes(
     options, or a preset has changed."""
     try:
         now = _filled(command, values).resolved()
-    except (UsageError, ValueError, TypeError):
+    except (UsageError, OSError, ValueError, TypeError):
         return  # the command itself reports it
     changed = [key for key, value in now.items() if key in recorded and _plain(value) != recorded[key]]
     if changed:

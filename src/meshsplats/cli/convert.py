@@ -190,7 +190,9 @@ class Convert(Command):
         self._resolved(sources(self.input))  # checks the values before the work
 
     def resolved(self) -> dict[str, Any]:
-        return {} if self.as_splats else asdict(self._resolved(self.input))
+        if self.as_splats or all(identify(path) == "mesh" for path in self.input):
+            return {}
+        return asdict(self._resolved(self.input))
 
     def _resolved(self, inputs: Sequence[Path]) -> ConversionOptions:
         beside = any((path / "cameras.json").is_file() for path in inputs if path.is_dir())
