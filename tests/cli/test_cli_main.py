@@ -56,7 +56,8 @@ def test_every_command_has_help(name, capsys):
     out = capsys.readouterr().out
     assert f"usage: meshsplats {name}" in out
     assert "json" in out
-    assert "{None}" not in out.split("conversion options")[0]
+    assert main([name, "--help-all"]) == 0
+    assert "{None" not in out + capsys.readouterr().out
 
 
 def test_unknown_commands(capsys):

@@ -108,9 +108,15 @@ class Evaluate(Command):
     """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
     """Every n-th view is held out, if the data set has no split."""
-    protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
+    protocol: Annotated[
+        Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None,
+        tyro.conf.arg(metavar="{" + ",".join(PROTOCOLS) + "}", help_behavior_hint=""),
+    ] = None
     """Score all scenes of a benchmark as in the paper's Table 1."""
-    tune: Literal["default", "paper", "published"] | None = None
+    tune: Annotated[
+        Literal["default", "paper", "published"] | None,
+        tyro.conf.arg(metavar="{default,paper,published}", help_behavior_hint=""),
+    ] = None
     """With --protocol: first fine-tune each scene on its training views, with this preset."""
     strips: int = 8
     """Number of views, spread over all, for which strips and enlarged crops are written."""

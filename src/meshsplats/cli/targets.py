@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
@@ -49,7 +51,9 @@ class TargetOptions:
     folder, unless --placement, --distance or --up is given; else they are placed."""
     up: Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
-    look: Literal["area", "splats"] | None = None
+    look: Annotated[
+        Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
+    ] = None
     """Without --data: kind of images. area: means over each pixel's area, right at every size in programs
     that take several samples per pixel: Blender, MSAA, ray tracers. splats: those of a 3DGS viewer; the mesh
     is then rendered with the viewer's filter here, and needs 'meshsplats bake' for other programs. Default:
