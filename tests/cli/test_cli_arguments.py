@@ -192,6 +192,8 @@ HOSTILE = {
     "deep": "a = " + "[" * 4000,
     "deep keys": "a" + ".a" * 2000 + " = 1",
     "a long number": "a = " + "9" * 4900,
+    "many digits": "[options]\nminutes = 0x" + "f" * 4900,
+    "many digits of a whole number": "[options]\nsteps = 0x" + "f" * 4900,
     "no TOML": "<html>",
     "binary": "\0\1\2",
     "unknown table": "[option]\nwidth = 3",

@@ -240,17 +240,14 @@ def _warn_of_changes(
         now = _filled(command, values).resolved()
     except (UsageError, OSError, ValueError, TypeError):
         return  # the command itself reports it
-    changed = [key for key, value in now.items() if key in recorded and _plain(value) != recorded[key]]
-    if changed:
-        key = changed[0]
-        say(
-            f"warning: {file}: {key} is {_short(_plain(now[key]))} now, and was {_short(recorded[key])}:"
-            " [resolved] is a record; values are set under [options]"
-        )
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+    for key, value in now.items():
+        plain = list(value) if isinstance(value, tuple) else value
+        if key in recorded and not isinstance(value, Path) and plain != recorded[key]:
+            say(
+                f"warning: {file}: {key} is {_short(plain)} now, and was {_short(recorded[key])}:"
+                " [resolved] is a record; values are set under [options]"
+            )
+            return
 
 
 def _filled(command: type[T], values: Mapping[str, Any]) -> T:
@@ -291,9 +288,10 @@ def _as_kind(value: Any, kind: Any, folder: Path) -> Any:
         return _as_tuple(value, get_args(kind), folder)
     if kind is bool and isinstance(value, bool):
         return value
-    if kind is int and isinstance(value, int) and not isinstance(value, bool):
+    whole = isinstance(value, int) and not isinstance(value, bool) and value.bit_length() < 64
+    if kind is int and whole:
         return value
-    if kind is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+    if kind is float and (whole or isinstance(value, float)):
         return float(value)
     if kind in (str, Path) and isinstance(value, str) and "\0" not in value:
         return value if kind is str else resolve(value, folder)
@@ -327,6 +325,8 @@ def _short(value: Any) -> str:
         return "a table"
     if isinstance(value, list):
         return f"a list of {len(value)}"
+    if isinstance(value, int) and value.bit_length() > 64:
+        return "more than 64 bits"
     text = ascii(value) if isinstance(value, str) else str(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
