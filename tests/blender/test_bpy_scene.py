@@ -122,12 +122,12 @@ def test_command_line_draws_meshes_and_splats(tmp_path, suffix, capsys):
     ]
     assert main(arguments) == 0
     result = json.loads(capsys.readouterr().out)
-    assert len(result["pictures"]) == len(result["image_seconds"]) == 2
+    assert len(result["images"]) == len(result["image_seconds"]) == 2
     assert result["blender"] == bpy.app.version_string
-    assert load_image(result["pictures"][1]).shape == (40, 72, 3)
+    assert load_image(result["images"][1]).shape == (40, 72, 3)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "cameras.json",
-        "config.json",
+        "config.toml",
         "view_0000.png",
         "view_0001.png",
     ]

@@ -200,7 +200,7 @@ def test_the_command_says_what_goes_and_draws_it(file, tmp_path, capsys):
     assert "together" in out
     assert "17 of 2,017 splats, 0.84% of the opacity" in out
     assert len(load_gaussians(tmp_path / "clean.ply")) == 2000
-    image = load_image(tmp_path / "clean.preview.png").astype(int)
+    image = load_image(tmp_path / "clean.ply.preview.png").astype(int)
     red = (image[..., 0] > 150) & (image[..., 1:].max(axis=2) < 100)
     third = image.shape[1] // 3
     assert red[:, third : 2 * third].sum() > 50
@@ -216,7 +216,7 @@ def test_the_command_on_a_mesh_in_json(tmp_path, capsys):
     assert not (tmp_path / "clean.glb").exists()
     assert main([*arguments, "--max-distance", "1.8", "--force"]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["gone"] == told["gone"]
+    assert again["removed"] == told["removed"]
     mesh = load_mesh(tmp_path / "clean.glb")
     assert len(np.unique(mesh.face_splat)) == again["kept"] < 2017
     np.testing.assert_allclose(again["upper"], mesh.vertices.max(axis=0), atol=1e-3)

@@ -23,7 +23,7 @@ from _splats import few_splats
 from meshsplats._files import atomic
 from meshsplats._files.atomic import atomic_path, promises_kept, refuse_existing, temporary_beside
 from meshsplats._files.locks import locked
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
@@ -226,9 +226,9 @@ def test_two_processes_one_output(tmp_path):
     codes = [process.returncode for process in both]
     assert sorted(codes) == [0, 3], errors
     kept = ("100", "3000")[codes.index(0)]
-    recorded = json.loads((tmp_path / "mesh.config.json").read_text())["options"]["max_splats"]
+    recorded = toml.load(tmp_path / "mesh.glb.config.toml")["options"]["max_splats"]
     assert str(recorded) == kept
-    names = {"scene.ply", "mesh.glb", "mesh.config.json", "mesh.preview.png"}
+    names = {"scene.ply", "mesh.glb", "mesh.glb.config.toml", "mesh.glb.preview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
@@ -240,9 +240,10 @@ _HANGING = """
 import sys, time, meshsplats.cli
 from dataclasses import dataclass
 from meshsplats._files.atomic import atomic_path
+from meshsplats.cli.arguments import Command
 @dataclass
-class Hang:
-    def run(self):
+class Hang(Command):
+    def execute(self):
         with atomic_path(sys.argv[1]) as temporary:
             temporary.write_bytes(b"half")
             print("writing", flush=True)
