@@ -124,12 +124,14 @@ $(SANITIZED)/%.so: $(CORE_SOURCES) Makefile
 	  src/meshsplats/csrc/api.cpp -o $@
 
 # Python itself is built without sanitizers: their library has to be loaded before it, its leaks and races are its own.
-# OpenBLAS and OpenMP run without threads, which the thread sanitizer cannot follow.
+# OpenBLAS and OpenMP run without threads, which the thread sanitizer cannot follow. A report ends the process, so pytest
+# must not capture what the core prints.
 sanitized = LD_PRELOAD="$$($(SANITIZER_CXX) -print-file-name=$(1)) $$($(SANITIZER_CXX) -print-file-name=libstdc++.so.6)" \
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	TSAN_OPTIONS='halt_on_error=1 ignore_noninstrumented_modules=1' OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
-	MESHSPLATS_LIBRARY=$(CURDIR)/$(SANITIZED)/$(2).so $(BIN)/python -m pytest -k 'not ($(CORE_TESTS_LEFT_OUT))' \
-	$(foreach name,$(CORE_TESTS),$(shell find tests -name $(name).py))
+	MESHSPLATS_LIBRARY=$(CURDIR)/$(SANITIZED)/$(2).so $(BIN)/python -m pytest --capture=sys \
+	-k 'not ($(CORE_TESTS_LEFT_OUT))' \
+	$(foreach name,$(CORE_TESTS),$(or $(shell find tests -name $(name).py),tests/$(name).py))
 
 test-sanitizers: $(VENV)/installed-dev $(SANITIZED)/address.so $(SANITIZED)/thread.so
 	$(call sanitized,libasan.so,address)

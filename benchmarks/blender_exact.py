@@ -29,7 +29,7 @@ from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.inside.pictures import read_pixels
 from meshsplats.colors import linear_to_srgb
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.images.writing import load_png
+from meshsplats.images.reading import load_image
 
 SCENES = {
     "guitar": "guitar_sh0.ply",
@@ -114,7 +114,7 @@ def main() -> None:
             white = np.ones(3)
             for view, exr, png in zip(views, *files, strict=True):
                 expected = render(mesh, view, background=white, threads=asked.threads).color
-                drawn, shown = read_pixels(exr)[..., :3], load_png(png) / 255
+                drawn, shown = read_pixels(exr)[..., :3], load_image(png) / 255
                 print(
                     f"| {name} | {len(mesh.faces):,} | {results[0]['layers']} | {view.name} |"
                     f" {psnr(drawn, expected):.1f} dB | {psnr(rounded(drawn), rounded(expected)):.1f} dB |"

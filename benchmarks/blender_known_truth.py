@@ -26,7 +26,7 @@ from meshsplats.blender.inside.host import bpy
 from meshsplats.colors import linear_to_srgb
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import SH_C0
-from meshsplats.images.writing import save_png, strip
+from meshsplats.images.writing import save_image, strip
 
 UP = np.array([0.0, 1.0, 0.0], np.float32)
 SPLATS = 20_000
@@ -172,7 +172,7 @@ def main() -> None:
     print(f"\nBlender {bpy.app.version_string}, {asked.width} x {height}, {asked.samples} samples\n")
     print("\n".join(rows))
     if asked.output is not None:
-        save_png(asked.output, strip(shown, captions))
+        save_image(asked.output, strip(shown, captions))
 
 
 if __name__ == "__main__":

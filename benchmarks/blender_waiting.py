@@ -20,7 +20,7 @@ from meshsplats import convert, orbit, psnr
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.cli.blender import estimated_seconds
 from meshsplats.demo_scene import make_scene
-from meshsplats.images.writing import load_png
+from meshsplats.images.reading import load_image
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
             ahead: list[dict] = []
             camera = orbit(mesh, 1, **lens)
             result = draw(mesh, camera, images=[path], options=options, announce=ahead.append)
-            return load_png(path) / 255, result["image_processor_seconds"][0], ahead[0]
+            return load_image(path) / 255, result["image_processor_seconds"][0], ahead[0]
 
         print("| scene | light | layers, mean | samples | processor time | estimate |")
         print("|---|---|---|---|---|---|")

@@ -76,7 +76,7 @@ def forward_and_backward(mesh: SplatMesh, camera: Camera, filter_px2: float) -> 
         threads=1,
     )
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-    taped.back(np.ones_like(taped.color), None, None, vertices=points, colors=colors)
+    taped.backward(np.ones_like(taped.color), None, None, vertices=points, colors=colors)
 
 
 def main() -> None:

@@ -103,12 +103,14 @@ def run(name: str, threads: int, repeat: int) -> None:
     drawing = memory("VmHWM") - before
     before = memory("VmRSS", reset=True)
     rendering = taped()
-    rendering.back(towards, None, None, vertices=points, colors=colors)
+    rendering.backward(towards, None, None, vertices=points, colors=colors)
     both = memory("VmHWM") - before
 
     draw = clocked(lambda: render(mesh, camera, threads=threads), repeat)
     tape = clocked(taped, repeat)
-    backward = clocked(lambda: rendering.back(towards, None, None, vertices=points, colors=colors), repeat)
+    backward = clocked(
+        lambda: rendering.backward(towards, None, None, vertices=points, colors=colors), repeat
+    )
     pixels = camera.width * camera.height
     cells = (
         f"{len(mesh.faces):,}",

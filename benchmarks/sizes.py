@@ -128,7 +128,7 @@ def scores(cloud: ms.GaussianCloud, mesh: ms.SplatMesh, look: str, options: argp
 def image(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
     from PIL import Image
 
-    from meshsplats.images.writing import save_png, strip, to_bytes
+    from meshsplats.images.writing import save_image, strip, to_bytes
 
     viewers, _ = tune(cloud, options, look="splats", zooms=(1,), samples=1, footprint="cameras")
     areas, _ = tune(cloud, options, look="area")
@@ -148,7 +148,7 @@ def image(cloud: ms.GaussianCloud, options: argparse.Namespace) -> None:
             enlarged = Image.fromarray(part).resize((300, 300), Image.Resampling.NEAREST)
             parts.append(np.asarray(enlarged, np.float32) / 255)
         rows.append(strip(parts, [f"{side} px: {captions[0]}", *captions[1:]]))
-    save_png(options.image, np.concatenate(rows, axis=0))
+    save_image(options.image, np.concatenate(rows, axis=0))
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ class Step:
         assert compared.gradient is not None
         times.append(time.perf_counter())
         gradients = [np.zeros_like(values) for values in (self.vertices, self.colors)]
-        image.back(compared.gradient[0], None, None, vertices=gradients[0], colors=gradients[1])
+        image.backward(compared.gradient[0], None, None, vertices=gradients[0], colors=gradients[1])
         times.append(time.perf_counter())
         for optimizer, gradient in zip(self.optimizers, gradients, strict=True):
             optimizer.step(gradient)

@@ -8,13 +8,13 @@ BASE = "meshsplats_base"
 """Property of splats that follow a base; ``meshsplats.blender.inside.priors`` sets it."""
 
 
-def _anything_to_do(scene):
+def _has_followers(scene):
     return any(BASE in obj for obj in scene.objects)
 
 
 @persistent
 def after_update(scene, depsgraph):
-    if _anything_to_do(scene):
+    if _has_followers(scene):
         from meshsplats.blender.inside import priors
 
         priors.after_update(scene, depsgraph)
@@ -22,7 +22,7 @@ def after_update(scene, depsgraph):
 
 @persistent
 def after_frame(scene, depsgraph):
-    if _anything_to_do(scene):
+    if _has_followers(scene):
         from meshsplats.blender.inside import priors
 
         priors.after_frame(scene, depsgraph)

@@ -9,6 +9,7 @@ import numpy as np
 
 import meshsplats as ms
 from meshsplats.demo_scene import make_scene
+from meshsplats.rendering.looks import Look
 
 cloud = ms.load_gaussians(sys.argv[1]) if len(sys.argv) > 1 else make_scene()
 cameras = ms.dome(cloud, 6, width=240, height=240)
@@ -21,7 +22,8 @@ meshes = {
 
 # area: the mean over each pixel's area, as programs show it that take several samples per pixel.
 # splats: the image of a splat viewer.
-for look, samples in (("area", 2), ("splats", 1)):
+looks: list[tuple[Look, int]] = [("area", 2), ("splats", 1)]
+for look, samples in looks:
     # Degree 0 compares like with like: a mesh has one colour per vertex, whatever the view.
     splats = [ms.draw_splats(cloud, camera, look, sh_degree=0).color.clip(0, 1) for camera in cameras]
     for name, mesh in meshes.items():

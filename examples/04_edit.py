@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 import meshsplats as ms
 from meshsplats.demo_scene import BALL, make_scene
@@ -43,7 +42,7 @@ images = [
     np.repeat(1 - drawn.attributes["height"][:, :, None] / 2, 3, axis=2),
 ]
 strip = np.concatenate(images, axis=1).clip(0, 1)
-Image.fromarray(np.rint(255 * strip).astype(np.uint8)).save(out / "edit.png")
+ms.save_image(out / "edit.png", strip)
 print(f"{out / 'edit.png'}: without the ball | lifted and dyed | height")
-seen = drawn.alpha > 0.5
-print(f"nearest point: {(drawn.depth[seen] / drawn.alpha[seen]).min():.2f} scene units away")
+nearest = drawn.mean_depth(min_alpha=0.5).min()
+print(f"nearest point: {nearest:.2f} scene units away")

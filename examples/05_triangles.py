@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 import meshsplats as ms
 from meshsplats.demo_scene import make_scene
@@ -41,5 +40,5 @@ images = [
     ms.render(triangles, camera, samples=3).color,
 ]
 strip = np.concatenate(images, axis=1).clip(0, 1)
-Image.fromarray(np.rint(255 * strip).astype(np.uint8)).save(out / "triangles.png", optimize=True)
+ms.save_image(out / "triangles.png", strip)
 print(f"{out / 'triangles.png'}: {len(cloud):,} splats | {len(mesh.faces):,} triangles | the same, opaque")

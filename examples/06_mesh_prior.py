@@ -11,8 +11,8 @@ import numpy as np
 
 import meshsplats as ms
 from meshsplats.demo_scene import make_scene
-from meshsplats.images.writing import save_png, strip
-from meshsplats.prior import base_surface, bind, prior_config, train
+from meshsplats.images.writing import save_image, strip
+from meshsplats.prior import base_surface, bind, prior_config, train_prior
 
 out = Path("example-output")
 out.mkdir(exist_ok=True)
@@ -23,7 +23,7 @@ cloud = make_scene()
 base = base_surface(cloud, resolution=64, faces=10_000, cameras=32)
 data = ms.splat_dataset(cloud, train=30, test=4, width=160, sh_degree=0)
 start = bind(base, views=data.train)
-prior = train(start, data, prior_config(steps=steps))
+prior = train_prior(start, data, prior_config(steps=steps))
 before, after = (ms.evaluate(p.mesh, data).methods[0].mean("psnr") for p in (start, prior))
 ms.save_mesh(prior.mesh, out / "prior.npz")
 print(f"{out / 'prior.npz'}: {len(base.faces):,} faces, {len(prior.mesh.faces):,} triangles")
@@ -56,5 +56,5 @@ images = [
     ms.render(replace(bent, colors=warm), camera, samples=2).color,
 ]
 captions = ("splats", "mesh prior", "its base bent", "lit by a lamp")
-save_png(out / "mesh_prior.png", strip(np.clip(images, 0, 1), captions))
+save_image(out / "mesh_prior.png", strip(np.clip(images, 0, 1), captions))
 print(f"{out / 'mesh_prior.png'}: {' | '.join(captions)}")

@@ -59,13 +59,15 @@ def leaves(of: ms.SplatMesh) -> list[torch.Tensor]:
 def visible_pixels(vertices: torch.Tensor, colors: torch.Tensor) -> np.ndarray:
     """(v,) visible pixels of each vertex over all views: the gradient of the images of another attribute."""
     attribute = torch.zeros(len(vertices), 1, requires_grad=True)
+    pixels = torch.zeros(len(vertices))
     with torch.no_grad():
         now = poses().float()
     for view, pose in zip(data.train, now, strict=True):
         values = torch.cat([colors.detach(), attribute], dim=1)
         options = {"world_to_camera": pose, "face_splat": mesh.face_splat}
-        rasterize(vertices.detach(), mesh.faces, values, view.camera, **options).attributes.sum().backward()
-    return attribute.grad[:, 0].numpy()
+        drawn = rasterize(vertices.detach(), mesh.faces, values, view.camera, **options)
+        pixels += torch.autograd.grad(drawn.attributes.sum(), attribute)[0][:, 0]
+    return pixels.numpy()
 
 
 vertices, colors = leaves(mesh)
@@ -82,12 +84,11 @@ for step in range(steps):
         vertices, mesh.faces, colors, view.camera, world_to_camera=pose, face_splat=mesh.face_splat
     )
     loss = loss_of(raster, view)
-    loss.backward()
-    reached = colors.grad[:, 3] != 0
-    moving.step(vertices.grad, reached)
-    painting.step(colors.grad, reached)
+    moves, paints, twists.grad = torch.autograd.grad(loss, [vertices, colors, twists])
+    reached = paints[:, 3] != 0
+    moving.step(moves, reached)
+    painting.step(paints, reached)
     aiming.step()
-    vertices.grad = colors.grad = twists.grad = None
     if step == steps // 2:
         # Prune triangles that are hardly visible, and their vertices in the optimisers.
         mesh = replace(mesh, vertices=vertices.detach().numpy(), colors=colors.detach().numpy())

@@ -15,7 +15,7 @@ COLMAP_MODELS |= {"OPENCV_FISHEYE": (5, 8), "EQUIRECTANGULAR": (17, 2)}
 
 
 def sky(directions: np.ndarray) -> np.ndarray:
-    """(..., 3) RGB in [0, 1]: a smooth picture at infinity, for directions (..., 3) in the world."""
+    """(..., 3) RGB in [0, 1]: a smooth image at infinity, for directions (..., 3) in the world."""
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     waves = np.array([[5.0, 1, 2], [-1, 6, 3], [2, -3, 5]])
     return 0.5 + 0.45 * np.sin(unit @ waves.T)
@@ -85,7 +85,7 @@ def write_colmap(
 
 
 def simple_colmap(folder: Path, count: int = 3, size: tuple[int, int] = (12, 8), **options) -> Path:
-    """A data set of one pinhole camera with ``count`` plain pictures; picture i has the grey value 10 i."""
+    """A data set of one pinhole camera with ``count`` plain images; image i has the grey value 10 i."""
     width, height = size
     cameras = [(1, "PINHOLE", width, height, (10.0, 11.0, 6.5, 3.5))]
     names = [f"p{i:02d}.png" for i in range(count)]

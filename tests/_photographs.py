@@ -1,4 +1,4 @@
-"""A data set of photographs made from pictures that a test draws itself."""
+"""A data set of photographs made from images that a test draws itself."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from _datasets import save, write_json
 from meshsplats.camera import Camera
 
 
-def write_photographs(folder: Path, cameras: Sequence[Camera], pictures: Sequence[np.ndarray]) -> Path:
-    """A nerfstudio folder: ``pictures`` (h, w, 3) or (h, w, 4) in [0, 1], one for each camera."""
+def write_photographs(folder: Path, cameras: Sequence[Camera], images: Sequence[np.ndarray]) -> Path:
+    """A nerfstudio folder: ``images`` (h, w, 3) or (h, w, 4) in [0, 1], one for each camera."""
     frames = []
-    for i, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
-        save(folder / "images" / f"{i:04d}.png", np.asarray(picture))
+    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        save(folder / "images" / f"{i:04d}.png", np.asarray(image))
         pose = np.linalg.inv(camera.world_to_camera)
         pose[:, 1:3] *= -1  # OpenGL: y up, z backward
         frames.append(

@@ -53,7 +53,7 @@ def soup(seed: int, faces: int = 60, *, spread=(1.2, 1.2, 1.5), z: float = 2.5, 
 
 
 def layers(depths, alpha, colors=None) -> SplatMesh:
-    """Triangles of their own vertices that face ``camera`` and cover its picture, one at each depth."""
+    """Triangles of their own vertices that face ``camera`` and cover its image, one at each depth."""
     depths = np.asarray(depths, float)
     corners = np.array([(-4, -4, 1), (12, -4, 1), (-4, 12, 1)])
     colors = np.random.default_rng(1).random((len(depths), 3)) if colors is None else colors
@@ -102,14 +102,14 @@ def splats(
     )
 
 
-def outputs(picture: api.Rendering) -> dict[str, np.ndarray]:
+def outputs(image: api.Rendering) -> dict[str, np.ndarray]:
     found = {
-        "color": picture.color,
-        "alpha": picture.alpha,
-        "depth": picture.depth,
-        "normals": picture.normals,
+        "color": image.color,
+        "alpha": image.alpha,
+        "depth": image.depth,
+        "normals": image.normals,
     }
-    return {name: value for name, value in (found | dict(picture.attributes)).items() if value is not None}
+    return {name: value for name, value in (found | dict(image.attributes)).items() if value is not None}
 
 
 def assert_close(one: api.Rendering, two: api.Rendering, *, tolerance=TOLERANCE, flips=FLIPS) -> None:
@@ -138,24 +138,24 @@ def assert_same_bits(one: api.Rendering, two: api.Rendering) -> None:
 def assert_mesh_is_exact(
     mesh: SplatMesh, view: Camera, *, tolerance=TOLERANCE, flips=FLIPS, **options
 ) -> api.Rendering:
-    """The core's picture, after comparing it with the reference."""
-    picture = api.render(mesh, view, **options)
-    assert picture.color.dtype == picture.alpha.dtype == np.float32
+    """The core's image, after comparing it with the reference."""
+    image = api.render(mesh, view, **options)
+    assert image.color.dtype == image.alpha.dtype == np.float32
     options.setdefault("min_transmittance", api.MIN_TRANSMITTANCE)
     truth = reference.render(mesh, view, **options)
-    assert_close(picture, truth, tolerance=tolerance, flips=flips)
+    assert_close(image, truth, tolerance=tolerance, flips=flips)
     if not options.get("max_layers"):
         samples = view.width * view.height * options.get("samples", 1) ** 2
-        assert abs(picture.fragments - truth.fragments) <= max(1, flips * samples)
-    return picture
+        assert abs(image.fragments - truth.fragments) <= max(1, flips * samples)
+    return image
 
 
 def assert_splats_are_exact(
     cloud: GaussianCloud, view: Camera, *, tolerance=TOLERANCE, **options
 ) -> api.Rendering:
-    picture = api.render_splats(cloud, view, **options)
+    image = api.render_splats(cloud, view, **options)
     truth = reference.render_splats(cloud, view, **options)
-    assert_close(picture, truth, tolerance=tolerance)
+    assert_close(image, truth, tolerance=tolerance)
     samples = view.width * view.height * options.get("samples", 1) ** 2
-    assert abs(picture.fragments - truth.fragments) <= max(1, FLIPS * samples)
-    return picture
+    assert abs(image.fragments - truth.fragments) <= max(1, FLIPS * samples)
+    return image

@@ -173,19 +173,19 @@ def spz4(values, compress, bits=12, flags=0, extensions=b""):
 
 
 def webp(pixels):
-    """A lossless picture of pixels (m, 4), 4 pixels wide, padded with zeros."""
+    """A lossless image of pixels (m, 4), 4 pixels wide, padded with zeros."""
     height = -(-len(pixels) // 4)
     padded = np.zeros((height * 4, 4), np.uint8)
     padded[: len(pixels)] = pixels
-    return picture(padded.reshape(height, 4, 4))
+    return image(padded.reshape(height, 4, 4))
 
 
-def picture(pixels, kind="WEBP"):
+def image(pixels, kind="WEBP"):
     out = io.BytesIO()
     options = {"lossless": True, "exact": True} if kind == "WEBP" else {}
     Image.fromarray(pixels).save(out, kind, **options)
     if kind == "WEBP" and not np.array_equal(Image.open(out).convert("RGBA"), pixels):
-        return picture(pixels, "PNG")  # older Pillow drops colours where alpha is 0 from a WebP
+        return image(pixels, "PNG")  # older Pillow drops colours where alpha is 0 from a WebP
     return out.getvalue()
 
 
@@ -248,7 +248,7 @@ def sog(values, version=2, extra=None):
                 palette[entry // 64, entry % 64 * degree_rest + j, :3] = [
                     nearest(book, x) for x in table[entry, j]
                 ]
-        files["shN_centroids.webp"] = picture(palette)
+        files["shN_centroids.webp"] = image(palette)
         labels = np.arange(n)[::-1]
         files["shN_labels.webp"] = webp(
             np.stack([labels & 255, labels >> 8, 0 * labels, 255 + 0 * labels], axis=1)

@@ -76,7 +76,7 @@ def test_a_chain(splats, tmp_path, capsys):
     assert message == table | {"folder": str(out)}
     assert [row["screen_size"] for row in table["levels"]] == [64, 32]
     assert sorted(p.name for p in out.iterdir()) == [
-        "config.json",
+        "config.toml",
         "level_0.npz",
         "level_1.npz",
         "levels.json",
@@ -94,7 +94,7 @@ def test_a_chain(splats, tmp_path, capsys):
     assert run(splats, "-o", out, *QUICK, "--force", "--format", "ply", "--max-splats", 300) == 0
     shown = capsys.readouterr().out
     assert "level_1.ply" in shown
-    assert sorted(p.suffix for p in out.iterdir()) == [".json", ".json", ".ply", ".ply"]
+    assert sorted(p.suffix for p in out.iterdir()) == [".json", ".ply", ".ply", ".toml"]
     assert not list(tmp_path.glob(".chain*"))
 
 
@@ -114,13 +114,13 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(command, "make_level", stops)
     assert run(splats, "-o", out, *QUICK) == 130
-    assert "--resume goes on" in capsys.readouterr().err
+    assert "--resume continues" in capsys.readouterr().err
     assert not out.exists()
     first = (tmp_path / "chain.partial" / "level_0.glb").stat().st_mtime_ns
     assert run(splats, "-o", out, *QUICK) == 3
-    assert "--resume goes on with it, --force begins anew" in capsys.readouterr().err
+    assert "--resume continues it, --force starts again" in capsys.readouterr().err
     assert run(splats, "-o", out, "--no-tune", "--width", 80, "--levels", 2, "--resume") == 2
-    assert "was begun with --width 64, not 80" in capsys.readouterr().err
+    assert "was started with --width 64, not 80" in capsys.readouterr().err
     assert run(splats, "-o", out, *QUICK, "--resume") == 0
     assert (out / "level_0.glb").stat().st_mtime_ns == first
     assert (out / "level_1.glb").is_file()
@@ -149,7 +149,7 @@ def test_folders_that_are_in_the_way(splats, tmp_path, capsys):
     assert run(splats, "-o", out, *QUICK, "--force") == 3
     assert "holds no levels.json" in capsys.readouterr().err
     assert run(splats, "-o", tmp_path / "new", *QUICK, "--resume") == 1
-    assert "nothing to go on with" in capsys.readouterr().err
+    assert "nothing to resume in" in capsys.readouterr().err
     partial = tmp_path / "other.partial"
     partial.mkdir()
     assert run(splats, "-o", tmp_path / "other", *QUICK, "--force") == 3

@@ -85,7 +85,7 @@ def test_infinities_that_cancel_are_found():
 
 @pytest.mark.parametrize("number", [-1, 3, -(1 << 31), (1 << 31) - 1])
 def test_faces_number_vertices(number):
-    with pytest.raises(ValueError, match=r"faces must number vertices 0 to 2, got "):
+    with pytest.raises(ValueError, match=r"faces must be vertex indices from 0 to 2, got "):
         triangle(faces=np.array([[0, 1, number]]))
 
 
@@ -93,7 +93,7 @@ def test_face_splat_ascends():
     faces = np.repeat(FACES, 3, axis=0)
     assert triangle(faces=faces, face_splat=np.array([2, 2, 5])).splat_count == 2
     for wrong in ([0, 2, 1], [-1, 0, 0]):
-        with pytest.raises(ValueError, match="ascending numbers >= 0"):
+        with pytest.raises(ValueError, match="ascending indices >= 0"):
             triangle(faces=faces, face_splat=np.array(wrong))
 
 

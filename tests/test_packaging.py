@@ -18,6 +18,7 @@ import pytest
 import meshsplats
 from meshsplats import cli, demo_scene
 from meshsplats._core import library
+from meshsplats.cli import toml
 from meshsplats.errors import MissingDependencyError
 
 ROOT = Path(__file__).parents[1]
@@ -91,17 +92,18 @@ def test_package_holds_its_core_and_its_type_marker():
 
 
 def test_metadata_asks_for_little_and_caps_nothing():
-    required = [line for line in metadata.requires("meshsplats") or [] if "extra" not in line]
-    names = {re.match(r"[\w.-]+", line)[0].lower() for line in required}  # type: ignore[index]
+    required = [line.partition(";") for line in metadata.requires("meshsplats") or [] if "extra" not in line]
+    names = {re.match(r"[\w.-]+", need)[0].lower() for need, _, marker in required if not marker}  # type: ignore[index]
     assert names == {"numpy", "pillow", "tyro", "rich"}
-    assert not [line for line in required if "<" in line or "==" in line]
+    assert {need.partition(">")[0] for need, _, marker in required if marker} <= {"tomli"}
+    assert not [need for need, _, _ in required if "<" in need or "==" in need]
 
 
 def test_the_lowest_versions_are_tested():
     """The first line of a package in lowest-constraints.txt, which make test-lowest installs, is the lowest
-    version of it that the metadata allows."""
-    required = [line for line in metadata.requires("meshsplats") or [] if "extra" not in line]
-    allowed = dict(re.fullmatch(r"([\w-]+)>=([\d.]+)", line).groups() for line in required)  # type: ignore[union-attr]
+    version of it that pyproject.toml allows."""
+    required = toml.load(ROOT / "pyproject.toml")["project"]["dependencies"]
+    allowed = dict(re.match(r"([\w-]+)>=([\d.]+)(?:;.*)?$", line).groups() for line in required)  # type: ignore[union-attr]
     text = (ROOT / "lowest-constraints.txt").read_text(encoding="utf-8")
     tested = dict(reversed(re.findall(r"^([\w-]+)==([\d.]+)", text, re.MULTILINE)))
     assert tested == allowed

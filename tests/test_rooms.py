@@ -10,7 +10,10 @@ import meshsplats
 
 ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 12
-LOWEST = ("_arrays", "_cells", "_core", "_files", "colors", "errors", "spherical_harmonics")
+LOWEST = (
+    *("_arrays", "_cells", "_core", "_files", "_geometry", "_options"),
+    *("colors", "errors", "spherical_harmonics"),
+)
 """Rooms that import no other room."""
 FLOORS = (
     ("binding", "camera", "gaussians"),

@@ -26,7 +26,7 @@ WAYS = {
     "babylon": {"blend": ("blend", False)},
 }
 for _ways in WAYS.values():
-    _ways.update({"mask": ("mask", False), "hash-friendly": ("hash-friendly", False)})
+    _ways["mask"] = ("mask", False)
 
 
 def main() -> None:

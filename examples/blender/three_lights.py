@@ -16,7 +16,8 @@ import numpy as np
 import meshsplats as ms
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.demo_scene import make_scene
-from meshsplats.images.writing import load_png, save_png, strip
+from meshsplats.images.reading import load_image
+from meshsplats.images.writing import save_image, strip
 
 parser = argparse.ArgumentParser()
 parser.add_argument("scene", nargs="?")
@@ -65,7 +66,7 @@ for name, light in LIGHTS.items():
     path = out / f"{name.replace(' ', '_')}.png"
     options = SceneOptions(light=light, samples=asked.samples, denoise=True, background=(0.75, 0.8, 0.88))
     result = draw(mesh, [camera], images=[path], options=options)
-    images.append(load_png(path) / 255)
+    images.append(load_image(path) / 255)
     print(f"{path}: {result['image_seconds'][0]:.0f} s, up to {result['layers']} layers")
-save_png(out / "three_lights.png", strip(images, list(LIGHTS)))
+save_image(out / "three_lights.png", strip(images, list(LIGHTS)))
 print(f"{out / 'three_lights.png'}: all three; lit by {out / 'studio.hdr'}, too")

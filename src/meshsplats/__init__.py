@@ -38,6 +38,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.formats.gaussians import load_gaussians, save_gaussians
     from meshsplats.formats.meshes import load_mesh, save_mesh
     from meshsplats.gaussians import GaussianCloud
+    from meshsplats.images.writing import save_image
     from meshsplats.mesh import SplatMesh
     from meshsplats.prior import MeshPrior, load_prior, train_prior
     from meshsplats.prior.bind import bind
@@ -73,6 +74,7 @@ _HOME = {
     "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussians"),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh"),
     "meshsplats.gaussians": ("GaussianCloud",),
+    "meshsplats.images.writing": ("save_image",),
     "meshsplats.mesh": ("SplatMesh",),
     "meshsplats.prior": ("MeshPrior", "load_prior", "train_prior"),
     "meshsplats.prior.bind": ("bind",),
@@ -131,6 +133,7 @@ __all__ = [
     "render_splats",
     "save_cameras",
     "save_gaussians",
+    "save_image",
     "save_mesh",
     "simplify",
     "splat_dataset",

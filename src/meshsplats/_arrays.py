@@ -1,13 +1,18 @@
-"""What all parts do with arrays: checks of the data classes, a few out of many."""
+"""Checks of arrays for the data classes; samples of sequences."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def evenly(items, most: int):
+def subsample(items, most: int):
     """Every k-th of ``items``, a sequence or array, with the least k that leaves at most ``most``."""
     return items[:: max(1, -(-len(items) // most))]
+
+
+def spread_indices(count: int, most: int) -> list[int]:
+    """At most ``most`` indices below ``count``, ascending, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
 def checked_array(name: str, value, dtype, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -35,7 +40,7 @@ def checked_array(name: str, value, dtype, shape: tuple[int | None, ...]) -> np.
                 f"{name} must fit {np.dtype(dtype).name}, got values from {given.min()} to {given.max()}"
             )
     array = np.ascontiguousarray(given, dtype=dtype)
-    # A sum is not finite if any term is not. Only then, or if large values overflow it, look at each.
+    # The sum is not finite if any term is not. Each is checked only then, or where large values overflow it.
     if array.dtype.kind == "f" and array.size:
         with np.errstate(over="ignore", invalid="ignore"):
             suspicious = not np.isfinite(array.sum())

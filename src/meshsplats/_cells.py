@@ -1,26 +1,26 @@
-"""Points sorted into cells: how many lie near each other, and which parts they form."""
+"""Points sorted into cells: counts of neighbours, and connected parts."""
 
 from __future__ import annotations
 
 import numpy as np
 
 _STEPS = [(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
-"""From a cell's key to those of the 27 cells round it and its own."""
+"""From the key of a cell to those of the 26 cells around it, and its own."""
 
 
 class Cells:
-    """The points (n, 3) in cubic cells of this ``side``, > 0, in their units."""
+    """Points (n, 3) in cubic cells with a ``side`` > 0, in the units of the points."""
 
     def __init__(self, points: np.ndarray, side: float) -> None:
         low = points.min(axis=0)
-        # Strays far away must not make so many cells that their numbers overflow.
+        # Keys have 21 bits for each axis: far strays share the last cell.
         steps = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64) + 1
         keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
         self._cells, of = np.unique(keys, return_inverse=True)
         self._of = of.reshape(-1)
 
     def near(self) -> np.ndarray:
-        """(n,) int64: how many points lie in the cell of each point and the 26 round it, itself too."""
+        """(n,) int64 counts of the points in the cell of each point and the 26 around it, itself included."""
         held = np.bincount(self._of, minlength=len(self._cells))
         total = np.zeros(len(self._cells), np.int64)
         for step in _STEPS:
@@ -29,8 +29,11 @@ class Cells:
         return total[self._of]
 
     def parts(self, group: np.ndarray | None = None) -> np.ndarray:
-        """(n,) int64 numbers from 0 of the parts that the points form; points in cells that touch, by a
-        corner at least, are of one part, and so are those of one ``group`` (n,), ascending."""
+        """(n,) int64 indices, from 0, of the connected parts that the points form.
+
+        Points in cells that share at least a corner are connected; so are points of one ``group`` (n,),
+        ascending.
+        """
         label = np.arange(len(self._cells))
         pairs = [self._beside(step) for step in _STEPS if step > 0]
         if group is not None:
@@ -43,7 +46,7 @@ class Cells:
                 label = label.copy()
                 np.minimum.at(label, row, least)
                 np.minimum.at(label, found, least)
-                # Roots too, so that whole parts take the lower number at once.
+                # Roots, too, so that whole parts take the lower label at once.
                 np.minimum.at(label, before[row], least)
                 np.minimum.at(label, before[found], least)
             while True:
@@ -56,7 +59,7 @@ class Cells:
         return np.unique(label, return_inverse=True)[1].reshape(-1)[self._of]
 
     def _beside(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Cells that have another ``step`` away, and the numbers of those."""
+        """Indices of the cells that have another cell ``step`` away, and of those others."""
         keys = self._cells + step
         found = np.minimum(np.searchsorted(self._cells, keys), len(self._cells) - 1)
         row = np.flatnonzero(self._cells[found] == keys)

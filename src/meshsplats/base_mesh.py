@@ -1,4 +1,4 @@
-"""BaseMesh: the classical mesh that carries a prior's triangles, with what colours it has."""
+"""BaseMesh: the classical mesh under a mesh prior, with vertex colours and textures if it has them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from meshsplats._arrays import checked_array
-from meshsplats.binding import check_numbers
+from meshsplats.binding import check_indices
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 
 Wrap = Literal["repeat", "mirror", "clamp"]
@@ -16,24 +16,24 @@ Wrap = Literal["repeat", "mirror", "clamp"]
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture that is laid on a mesh."""
+    """An image that is mapped onto a mesh."""
 
     pixels: np.ndarray
     """(h, w, 4) uint8 display RGBA; row 0 lies at v = 0."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
-    """What lies beyond 0 and 1 along u and v."""
+    """Behaviour beyond 0 and 1 along u and v."""
     factor: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
-    """Linear RGBA that everything is multiplied with."""
+    """Linear RGBA, multiplied with the pixels."""
 
     def __post_init__(self) -> None:
         shape = np.shape(self.pixels)
         if len(shape) != 3 or shape[2] != 4 or 0 in shape or self.pixels.dtype != np.uint8:
             raise ValueError(f"pixels must be (h, w, 4) uint8, got {shape} {self.pixels.dtype}")
-        if any(way not in get_args(Wrap) for way in self.wrap):
+        if any(mode not in get_args(Wrap) for mode in self.wrap):
             raise ValueError(f"wrap must be two of {', '.join(get_args(Wrap))}, got {self.wrap}")
 
     def at(self, uv: np.ndarray) -> np.ndarray:
-        """(k, 4) float32 display RGBA at ``uv`` (k, 2), bilinear between the middles of pixels."""
+        """(k, 4) float32 display RGBA at ``uv`` (k, 2), bilinear between the centres of pixels."""
         sides = self.pixels.shape[1], self.pixels.shape[0]
         places, shares = [], []
         for axis, side in enumerate(sides):
@@ -54,13 +54,13 @@ class Texture:
         return np.clip(color, 0, 1)
 
     @staticmethod
-    def _wrapped(number: np.ndarray, side: int, way: Wrap) -> np.ndarray:
-        if way == "clamp":
-            return np.clip(number, 0, side - 1).astype(np.int64)
-        if way == "mirror":
-            inside = np.mod(number, 2 * side)
+    def _wrapped(index: np.ndarray, side: int, mode: Wrap) -> np.ndarray:
+        if mode == "clamp":
+            return np.clip(index, 0, side - 1).astype(np.int64)
+        if mode == "mirror":
+            inside = np.mod(index, 2 * side)
             return np.minimum(inside, 2 * side - 1 - inside).astype(np.int64)
-        return np.mod(number, side).astype(np.int64)
+        return np.mod(index, side).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +70,13 @@ class BaseMesh:
     vertices: np.ndarray
     """(n, 3) float32."""
     faces: np.ndarray
-    """(m, 3) int32 vertex numbers."""
+    """(m, 3) int32 vertex indices."""
     colors: np.ndarray | None = None
     """(n, 4) float32 straight display RGBA in [0, 1]; None: the mesh has no vertex colours."""
     uv: np.ndarray | None = None
     """(m, 3, 2) float32 texture coordinates at the corners of each face, u to the right, v down."""
     face_texture: np.ndarray | None = None
-    """(m,) int32 number of each face's texture; -1: none."""
+    """(m,) int32 index of each face's texture; -1: none."""
     textures: tuple[Texture, ...] = field(default=())
     up: np.ndarray = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
     """(3,) float32 direction that points up."""
@@ -90,7 +90,7 @@ class BaseMesh:
     def __post_init__(self) -> None:
         vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
         faces = checked_array("faces", self.faces, np.int32, (None, 3))
-        check_numbers("faces", faces, len(vertices), "vertices")
+        check_indices("faces", faces, len(vertices), "vertices")
         arrays = {"vertices": vertices, "faces": faces, "up": checked_array("up", self.up, np.float32, (3,))}
         m = len(faces)
         if self.colors is not None:
@@ -102,13 +102,13 @@ class BaseMesh:
             raise ValueError("uv and face_texture must be given together")
         if self.uv is not None and self.face_texture is not None:
             arrays["uv"] = checked_array("uv", self.uv, np.float32, (m, 3, 2))
-            number = checked_array("face_texture", self.face_texture, np.int32, (m,))
-            if m and not (number.min() >= -1 and number.max() < len(self.textures)):
+            index = checked_array("face_texture", self.face_texture, np.int32, (m,))
+            if m and not (index.min() >= -1 and index.max() < len(self.textures)):
                 raise ValueError(
-                    f"face_texture must number the {len(self.textures)} textures from 0, or be -1,"
-                    f" got {number.min()} to {number.max()}"
+                    f"face_texture must be indices of the {len(self.textures)} textures, from 0, or -1,"
+                    f" got {index.min()} to {index.max()}"
                 )
-            arrays["face_texture"] = number
+            arrays["face_texture"] = index
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
 
@@ -122,22 +122,28 @@ class BaseMesh:
         return np.zeros(len(self.faces), bool) if self.face_texture is None else self.face_texture >= 0
 
     def vertex_colors_at(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """(k, 4) float32 display RGBA, the vertex colours interpolated on ``face`` (k,) with barycentric
-        ``weights`` (k, 3). Only for a mesh with vertex colours."""
+        """(k, 4) float32 display RGBA of the vertex colours, interpolated at k points.
+
+        Args:
+            face: (k,) face indices.
+            weights: (k, 3) barycentric coordinates there.
+
+        Only for a mesh with vertex colours.
+        """
         assert self.colors is not None
         mixed = np.einsum("kc,kcj->kj", weights.astype(np.float64), self.colors[self.faces[face]])
         return np.clip(mixed, 0, 1).astype(np.float32)
 
     def texture_at(self, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """(k, 4) float32 display RGBA of the textures on ``face`` (k,) at barycentric ``weights`` (k, 3);
-        where a face has none, opaque mid grey."""
+        """(k, 4) float32 display RGBA of the textures at points on ``face`` (k,) with barycentric ``weights``
+        (k, 3); opaque mid grey on faces without a texture."""
         result = np.full((len(face), 4), 0.5, np.float32)
         result[:, 3] = 1
         if self.uv is None or self.face_texture is None:
             return result
         uv = np.einsum("kc,kcj->kj", weights.astype(np.float64), self.uv[face].astype(np.float64))
-        for number, texture in enumerate(self.textures):
-            here = self.face_texture[face] == number
+        for index, texture in enumerate(self.textures):
+            here = self.face_texture[face] == index
             if here.any():
                 result[here] = texture.at(uv[here])
         return result

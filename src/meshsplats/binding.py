@@ -1,18 +1,37 @@
-"""Binding: which face of a base mesh each vertex of a splat mesh lies on, and where on it."""
+"""Binding: the face of a base mesh that each vertex of a splat mesh lies on, and its place on it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats._geometry import vertex_normals
 
 _ROWS = 1 << 15
 SUM_TOLERANCE = 1e-6
-"""By how much the weights of a vertex may miss the sum 1: a few roundings of float32."""
+"""Largest error of the sum of a vertex's weights, 1: a few roundings of float32."""
+
+
+class ArrayField(NamedTuple):
+    """Declares an array of ``SplatMesh`` or ``Binding``; constructors, readers and writers follow it."""
+
+    name: str
+    dtype: type[np.generic]
+    per: Literal["vertex", "face", "mesh", "base vertex", "base face"]
+    """What each row belongs to; "mesh": the array has no rows."""
+    columns: int | None = None
+    """Length of a row; None for a single number."""
+    optional: bool = False
+
+    def shape(self, counts: Mapping[str, int]) -> tuple[Any, ...]:
+        """Shape with ``counts`` rows by ``per``; None (any number) where that count is missing."""
+        rows = () if self.per == "mesh" else (counts.get(self.per),)
+        return rows if self.columns is None else (*rows, self.columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,50 +46,63 @@ class Binding:
     base_vertices: np.ndarray
     """(n, 3) float32 positions of the base, in the frame and units of the splat mesh."""
     base_faces: np.ndarray
-    """(m, 3) int32 vertex numbers of the base."""
+    """(m, 3) int32 vertex indices of the base."""
     vertex_face: np.ndarray
-    """(v,) int32 number of the base face that each vertex lies on."""
+    """(v,) int32 index of the base face that each vertex lies on."""
     weights: np.ndarray
-    """(v, 3) float32 barycentric coordinates there: none below 0, with the sum 1."""
+    """(v, 3) float32 barycentric coordinates on that face, >= 0, with sum 1."""
     layers: np.ndarray
-    """(v,) int32 layer of each vertex, from 0, which lies on the base."""
+    """(v,) int32 layer of each vertex; layer 0 lies on the base."""
     lift: float = 0.0
-    """Scene units from one layer to the next along the normals, below 0 to the inside; 0: all lie in the
-    base."""
+    """Scene units from one layer to the next along the normals, negative inwards; 0: all lie in the base."""
+
+    FIELDS: ClassVar[tuple[ArrayField, ...]] = (
+        ArrayField("base_vertices", np.float32, "base vertex", 3),
+        ArrayField("base_faces", np.int32, "base face", 3),
+        ArrayField("vertex_face", np.int32, "vertex"),
+        ArrayField("weights", np.float32, "vertex", 3),
+        ArrayField("layers", np.int32, "vertex"),
+    )
 
     def __post_init__(self) -> None:
-        points = checked_array("base_vertices", self.base_vertices, np.float32, (None, 3))
-        faces = checked_array("base_faces", self.base_faces, np.int32, (None, 3))
-        check_numbers("base_faces", faces, len(points), "vertices of the base")
-        vertex_face = checked_array("vertex_face", self.vertex_face, np.int32, (None,))
-        check_numbers("vertex_face", vertex_face, len(faces), "faces of the base")
-        v = len(vertex_face)
-        weights = checked_array("weights", self.weights, np.float32, (v, 3))
-        if v:
-            if weights.min() < 0:
-                raise ValueError(f"weights must not be negative, got {weights.min():.4g}")
-            off = float(np.abs(weights.sum(axis=1, dtype=np.float64) - 1).max())
+        check_fields(self)
+        check_indices("base_faces", self.base_faces, len(self.base_vertices), "vertices of the base")
+        check_indices("vertex_face", self.vertex_face, len(self.base_faces), "faces of the base")
+        if len(self.vertex_face):
+            if self.weights.min() < 0:
+                raise ValueError(f"weights must not be negative, got {self.weights.min():.4g}")
+            off = float(np.abs(self.weights.sum(axis=1, dtype=np.float64) - 1).max())
             if off > SUM_TOLERANCE:
                 raise ValueError(f"the weights of a vertex must have the sum 1, one misses it by {off:.3g}")
-        layers = checked_array("layers", self.layers, np.int32, (v,))
-        if v and layers.min() < 0:
-            raise ValueError(f"layers must be numbers >= 0, got {layers.min()}")
+            if self.layers.min() < 0:
+                raise ValueError(f"layers must be >= 0, got {self.layers.min()}")
         if not np.isfinite(self.lift):
             raise ValueError(f"lift must be a finite length, got {self.lift}")
-        for name, value in [
-            ("base_vertices", points),
-            ("base_faces", faces),
-            ("vertex_face", vertex_face),
-            ("weights", weights),
-            ("layers", layers),
-            ("lift", float(self.lift)),
-        ]:
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "lift", float(self.lift))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays by name, and ``lift`` as an array without dimensions."""
+        return {f.name: getattr(self, f.name) for f in self.FIELDS} | {"lift": np.array(self.lift)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Binding:
+        """The inverse of ``arrays``.
+
+        Raises:
+            KeyError: an array is missing.
+            ValueError: the arrays do not make a binding.
+        """
+        parts = {f.name: arrays[f.name] for f in cls.FIELDS}
+        lift = float(arrays["lift"])
+        try:
+            return cls(**parts, lift=lift)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"the binding to a base: {error}") from None
 
     def positions(self) -> np.ndarray:
         """(v, 3) float32 positions of the vertices.
 
-        Summed in float64: a vertex at a corner stands there to the last bit.
+        Summed in float64: a vertex at a corner has that corner's position to the last bit.
         """
         result = np.empty((len(self.weights), 3), np.float32)
         for part in self._parts():
@@ -79,97 +111,87 @@ class Binding:
 
     def corners(self, rows: np.ndarray | slice) -> np.ndarray:
         """(r, 3, 3) float64 corners of the face of each of the chosen vertices, moved to its layer."""
-        numbers = self.base_faces[self.vertex_face[rows]]
-        result = self.base_vertices[numbers].astype(np.float64)
+        indices = self.base_faces[self.vertex_face[rows]]
+        result = self.base_vertices[indices].astype(np.float64)
         if self.lift:
-            result += (self.layers[rows] * self.lift)[:, None, None] * self.base_normals[numbers]
+            result += (self.layers[rows] * self.lift)[:, None, None] * self.base_normals[indices]
         return result
 
     def normals(self) -> np.ndarray:
         """(v, 3) float32 unit normals of the base at the vertices: those of the corners, interpolated."""
         result = np.empty((len(self.weights), 3), np.float32)
         for part in self._parts():
-            numbers = self.base_faces[self.vertex_face[part]]
-            mixed = np.einsum("ik,ikc->ic", self.weights[part].astype(np.float64), self.base_normals[numbers])
+            indices = self.base_faces[self.vertex_face[part]]
+            mixed = np.einsum("ik,ikc->ic", self.weights[part].astype(np.float64), self.base_normals[indices])
             length = np.sqrt(np.einsum("ij,ij->i", mixed, mixed))
-            # Where opposite corners cancel out, the face's own direction is what is left, or one corner's.
+            # Where normals of the corners cancel out: the face's own normal, or else one corner's.
             lost = np.flatnonzero(length < 1e-6)
             if len(lost):
-                a, b, c = (self.base_vertices[numbers[lost, k]].astype(np.float64) for k in range(3))
+                a, b, c = (self.base_vertices[indices[lost, k]].astype(np.float64) for k in range(3))
                 mixed[lost] = np.cross(b - a, c - a)
                 length[lost] = np.linalg.norm(mixed[lost], axis=1)
                 flat = np.flatnonzero(length == 0)
-                mixed[flat], length[flat] = self.base_normals[numbers[flat, 0]], 1
+                mixed[flat], length[flat] = self.base_normals[indices[flat, 0]], 1
             result[part] = mixed / length[:, None]
         return result
 
     @cached_property
     def base_normals(self) -> np.ndarray:
-        """(n, 3) float64 unit normals of the base at its vertices, which seams do not interrupt."""
-        return surface_normals(self.base_vertices, self.base_faces, self._same_place)
+        """(n, 3) float64 unit normals of the base at its vertices, continuous across seams."""
+        vertices = self.base_vertices.astype(np.float64)
+        return vertex_normals(vertices, self.base_faces, same_place=self._same_place)
 
     @property
     def area(self) -> float:
-        """Of all faces of the base, square scene units."""
+        """Area of the base, square scene units."""
         a, b, c = (self.base_vertices[self.base_faces[:, k]].astype(np.float64) for k in range(3))
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
 
     def _parts(self) -> Iterator[slice]:
-        """The vertices in portions that fit a processor's cache."""
+        """Slices of the vertices that fit the processor's cache."""
         return (slice(start, start + _ROWS) for start in range(0, len(self.weights), _ROWS))
 
     @cached_property
     def _same_place(self) -> np.ndarray:
-        """(n,) a number a place: vertices that a seam has split share one. The stored base decides, not a
-        moved one, in which a place could be shared by chance."""
+        """(n,) index of a place for each vertex of the base: vertices that a seam has split share one.
+
+        Found in the stored base, as vertices of a moved one could meet by chance.
+        """
         points = self.base_vertices + np.float32(0)  # 0 and -0 are one place
         order = np.lexsort(points.T)
         new = (points[order[1:]] != points[order[:-1]]).any(axis=1)
-        number = np.zeros(len(points), np.int64)
-        number[order[1:]] = np.cumsum(new)
-        return number
+        place = np.zeros(len(points), np.int64)
+        place[order[1:]] = np.cumsum(new)
+        return place
 
     def moved(self, base_vertices: np.ndarray, lift: float) -> Binding:
-        """The binding to the base with its vertices at (n, 3) ``base_vertices``. What was one place stays
-        one, whatever meets by chance now."""
+        """The binding to the base with its vertices at (n, 3) ``base_vertices``. Seams stay as they were."""
         made = replace(self, base_vertices=base_vertices, lift=lift)
         made.__dict__["_same_place"] = self._same_place
         return made
 
     def select(self, rows: np.ndarray) -> Binding:
-        """The binding of the vertices ``rows``, numbers or a (v,) mask; the base stays whole."""
+        """The binding of the vertices ``rows``, indices or a (v,) mask; the base stays whole."""
         return replace(
             self, vertex_face=self.vertex_face[rows], weights=self.weights[rows], layers=self.layers[rows]
         )
 
 
-def check_numbers(name: str, numbers: np.ndarray, count: int, of: str) -> None:
-    """ValueError unless all int32 ``numbers`` lie in [0, count)."""
-    if numbers.size and (numbers.min() < 0 or numbers.max() >= count):
+def check_fields(owner: Any) -> dict[str, int]:
+    """Checks and converts the arrays ``FIELDS`` of a frozen data class; returns the rows by ``per``."""
+    counts: dict[str, int] = {}
+    for field in owner.FIELDS:
+        value = getattr(owner, field.name)
+        if value is not None or not field.optional:
+            array = checked_array(field.name, value, field.dtype, field.shape(counts))
+            object.__setattr__(owner, field.name, array)
+            counts.setdefault(field.per, len(array))
+    return counts
+
+
+def check_indices(name: str, indices: np.ndarray, count: int, of: str) -> None:
+    """ValueError unless all int32 ``indices`` lie in [0, count)."""
+    if indices.size and (indices.min() < 0 or indices.max() >= count):
         raise ValueError(
-            f"{name} must number the {count:,} {of} from 0, got {numbers.min()} to {numbers.max()}"
+            f"{name} must be indices of the {count:,} {of}, from 0, got {indices.min()} to {indices.max()}"
         )
-
-
-def surface_normals(
-    vertices: np.ndarray, faces: np.ndarray, same_place: np.ndarray | None = None
-) -> np.ndarray:
-    """(n, 3) float64 unit normals of a mesh at its vertices: area-weighted means of the triangles there.
-
-    ``same_place`` (n,) has a number a place for vertices to be treated as one; without it, each is by itself.
-    A vertex without area round it gets a normal of +z.
-    """
-    number = np.arange(len(vertices)) if same_place is None else same_place
-    count = int(number.max()) + 1 if len(number) else 0
-    points = np.asarray(vertices, np.float64)
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    # Twice the area times the normal.
-    own = np.cross(b - a, c - a)
-    sums = np.zeros((count, 3))
-    for k in range(3):
-        corner = number[faces[:, k]]
-        for axis in range(3):
-            sums[:, axis] += np.bincount(corner, own[:, axis], minlength=count)
-    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))
-    sums[length == 0] = (0, 0, 1)
-    return (sums / np.where(length > 0, length, 1)[:, None])[number]

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats._arrays import checked_array, evenly
+from meshsplats._arrays import checked_array
 
 MAX_SIDE = 1 << 15
 """Largest image side in pixels."""
@@ -18,7 +17,7 @@ class Camera:
     """A pinhole camera with OpenCV axes: +x right, +y down, +z forward.
 
     Concretely, a world point p is at ``X = world_to_camera[:3, :3] @ p + world_to_camera[:3, 3]`` in the
-    camera's frame and on the picture at ``(fx * X[0] / X[2] + cx, fy * X[1] / X[2] + cy)`` pixels from the
+    camera's frame and in the image at ``(fx * X[0] / X[2] + cx, fy * X[1] / X[2] + cy)`` pixels from the
     top left corner; the centre of pixel (row, col) is at (col + 0.5, row + 0.5).
     """
 
@@ -35,7 +34,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
-    """Nothing nearer than this depth (z, scene units) is drawn."""
+    """Depth z of the near plane, scene units: nothing nearer is drawn."""
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -74,11 +73,11 @@ class Camera:
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) float64 unit direction of the picture's upper edge in the world frame."""
+        """(3,) float64 unit direction towards the image's upper edge in the world frame."""
         return -self.world_to_camera[1, :3]
 
     def scaled(self, factor: float) -> Camera:
-        """The same view on a picture ``factor`` times as large, its sides rounded to whole pixels, at least
+        """The same view with an image ``factor`` times as large, its sides rounded to whole pixels, at least
         1."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"factor must be positive, got {factor}")
@@ -89,20 +88,31 @@ class Camera:
         )
 
     def within(self, side: int) -> Camera:
-        """The same view on a picture no side of which is longer than ``side`` pixels; never a larger one."""
+        """The same view with no side of the image longer than ``side`` pixels; never a larger image."""
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
     def sees(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool: points (n, 3) in front of the camera that project into the picture."""
-        matrix = self.world_to_camera.astype(np.float32)
-        x, y, z = (points @ matrix[:3, :3].T + matrix[:3, 3]).T
-        front = z > self.near
-        depth = np.where(front, z, 1)
-        u, v = self.fx * x / depth + self.cx, self.fy * y / depth + self.cy
-        return front & (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
+        """(n,) bool: points (n, 3) beyond the near plane that project into the image."""
+        return self.in_image(self.project(points)[0])
 
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Image positions and depths of world ``points`` (n, 3).
 
-def a_few(cameras: Sequence[Camera], most: int, side: int) -> list[Camera]:
-    """Every k-th of ``cameras``, at most ``most``, with pictures of at most ``side`` pixels: enough to learn
-    what they see."""
-    return [camera.within(side) for camera in evenly(cameras, most)]
+        Returns:
+            (n, 2) x and y in pixels from the image's top left corner, NaN for points that are not beyond the
+            near plane; and (n,) depth z in the camera's frame. Both are float32 for float32 points, else
+            float64.
+        """
+        points = np.asarray(points)
+        if points.dtype != np.float32:
+            points = points.astype(np.float64, copy=False)
+        matrix = self.world_to_camera.astype(points.dtype, copy=False)
+        x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
+        beyond = np.where(z > self.near, z, points.dtype.type(np.nan))
+        return np.stack([self.fx * x / beyond + self.cx, self.fy * y / beyond + self.cy]).T, z
+
+    def in_image(self, positions: np.ndarray) -> np.ndarray:
+        """(n,) bool: which of ``positions`` (n, 2), as from ``project``, lie in the image."""
+        x, y = positions.T
+        with np.errstate(invalid="ignore"):  # NaN lies nowhere
+            return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 _CHUNK = 1 << 15
-"""Values worked on at a time, so that intermediate results stay in the processor's cache."""
+"""Values per chunk: intermediate results stay in the processor's cache."""
 
 
 def srgb_to_linear(display: np.ndarray) -> np.ndarray:
@@ -33,7 +33,7 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def _decode(v: np.ndarray) -> np.ndarray:
-    # Below the limit the power is not used; the maximum keeps it from meeting a negative base.
+    # The power is not used below the limit; the maximum avoids a negative base there.
     curve = np.power((np.maximum(v, np.float32(0)) + np.float32(0.055)) / np.float32(1.055), np.float32(2.4))
     return np.where(v <= np.float32(0.04045), v / np.float32(12.92), curve)
 

@@ -1,24 +1,24 @@
-"""The errors and warnings that users meet. Each message says what, got what, and what to do."""
+"""The errors and warnings that users meet. Messages say what was expected, what was found and what to do."""
 
 from __future__ import annotations
 
 
 class FileFormatError(ValueError):
-    """A file that cannot be read as what it was taken for: broken, truncated, hostile or of another kind."""
+    """A file that cannot be read: broken, truncated, hostile or of another format."""
 
 
 class MissingDependencyError(ImportError):
-    """An optional library is needed here; the message says how to install it."""
+    """An optional library is missing; the message says how to install it."""
 
 
 GET_TORCH = (
     "the build for processors will do: pip install torch --index-url https://download.pytorch.org/whl/cpu"
 )
-"""For messages: torch as most registries have it brings gigabytes of CUDA libraries on Linux."""
+"""For messages: on Linux, torch from most registries comes with gigabytes of CUDA libraries."""
 
 
 class DataWarning(UserWarning):
-    """Something in the data was left out or altered; the message counts it."""
+    """Some of the data was left out or altered; the message counts it."""
 
 
 class NoColorsWarning(DataWarning):
@@ -30,5 +30,4 @@ class NoTextureWarning(DataWarning):
 
 
 class DivergenceError(ValueError):
-    """Values that are not finite turned up in an optimisation; the message names the view that brought
-    them."""
+    """An optimisation met values that are not finite; the message names the view."""

@@ -1,16 +1,16 @@
-"""SplatMesh: translucent vertex-coloured triangles, the form that everything else works on."""
+"""SplatMesh: translucent vertex-coloured triangles, the representation that all steps share."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
-from meshsplats.binding import Binding
+from meshsplats.binding import ArrayField, Binding, check_fields
 
 Blending = Literal["display", "linear"]
 
@@ -29,63 +29,64 @@ class SplatMesh:
     vertices: np.ndarray
     """(v, 3) float32 positions in the world frame, scene units."""
     faces: np.ndarray
-    """(f, 3) int32 vertex numbers. Triangles are seen from both sides."""
+    """(f, 3) int32 vertex indices. Triangles are visible from both sides."""
     colors: np.ndarray
     """(v, 4) float32 straight RGBA in [0, 1]."""
     face_splat: np.ndarray | None = None
-    """(f,) int32 number of the splat each triangle was made from, ascending; None for a mesh of other
+    """(f,) int32 index of the splat that each triangle was made from, ascending; None for a mesh of other
     origin."""
     normals: np.ndarray | None = None
     """(v, 3) float32 unit shading normals, or None."""
     depth_group: np.ndarray | None = None
-    """(f,) int32: triangles with the same number >= 0 are coplanar layers that share one depth, that of their
-    common plane, and are ordered by face number; -1 keeps a triangle's own depth."""
+    """(f,) int32: triangles with the same value >= 0 are coplanar layers that share one depth, that of their
+    common plane, and are ordered by face index; -1 keeps a triangle's own depth."""
     up: np.ndarray = field(default_factory=lambda: np.array([0, -1, 0], np.float32))
-    """(3,) float32 unit direction that points up in the world frame; splats trained from COLMAP cameras have
-    y down. Another length than 1 is corrected."""
+    """(3,) float32 direction that points up in the world frame, normalised by the constructor; splats trained
+    from COLMAP cameras have y down."""
     blending: Blending = "display"
-    """Space in which the colours were made to be blended: 'display' (sRGB-encoded, as splats are) or
-    'linear'."""
+    """Colour space for blending: 'display' (sRGB-encoded, as splats are) or 'linear'."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Further float32 arrays (v,) or (v, c) by name, one row a vertex."""
+    """Further float32 arrays (v,) or (v, c) by name, one row for each vertex."""
     filter_px2: float = 0.0
-    """Variance in square pixels, 0 to 100, of the low-pass filter that the triangles of each splat want when
-    they are drawn, as splats are drawn with one; 0: none. Needs ``face_splat``."""
+    """Variance in square pixels, 0 to 100, of the low-pass filter that ``render`` applies to the triangles of
+    each splat, as splat renderers do; 0: none. Needs ``face_splat``."""
     binding: Binding | None = None
-    """Where on the faces of a base mesh the vertices lie, for a mesh prior: each triangle on one face."""
+    """For a mesh prior: where the vertices lie on the faces of its base mesh, each triangle on one face."""
+
+    FIELDS: ClassVar[tuple[ArrayField, ...]] = (
+        ArrayField("vertices", np.float32, "vertex", 3),
+        ArrayField("faces", np.int32, "face", 3),
+        ArrayField("colors", np.float32, "vertex", 4),
+        ArrayField("up", np.float32, "mesh", 3),
+        ArrayField("normals", np.float32, "vertex", 3, optional=True),
+        ArrayField("face_splat", np.int32, "face", optional=True),
+        ArrayField("depth_group", np.int32, "face", optional=True),
+    )
+    EXTRAS: ClassVar[tuple[ArrayField, ...]] = tuple(f for f in FIELDS if f.optional and f.name != "normals")
+    """The optional arrays that formats of other programs have no place for. Those of vertices are float32,
+    those of faces single integers."""
 
     def __post_init__(self) -> None:
-        vertices = checked_array("vertices", self.vertices, np.float32, (None, 3))
-        v = len(vertices)
-        faces = checked_array("faces", self.faces, np.int32, (None, 3))
-        f = len(faces)
-        if f and faces.view(np.uint32).max() >= v:  # one pass: as unsigned numbers, negative ones are large
-            raise ValueError(f"faces must number vertices 0 to {v - 1}, got {faces.min()} to {faces.max()}")
-        colors = checked_array("colors", self.colors, np.float32, (v, 4))
-        if v and (colors.min() < 0 or colors.max() > 1):
-            raise ValueError(f"colors must lie in [0, 1], got {colors.min():.4g} to {colors.max():.4g}")
+        counts = check_fields(self)
+        v, f, faces = counts["vertex"], counts["face"], self.faces
+        if f and faces.view(np.uint32).max() >= v:  # one pass: negative indices are large as unsigned ones
+            raise ValueError(
+                f"faces must be vertex indices from 0 to {v - 1}, got {faces.min()} to {faces.max()}"
+            )
+        if v and (self.colors.min() < 0 or self.colors.max() > 1):
+            low, high = self.colors.min(), self.colors.max()
+            raise ValueError(f"colors must lie in [0, 1], got {low:.4g} to {high:.4g}")
         set_ = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
-        set_("vertices", vertices)
-        set_("faces", faces)
-        set_("colors", colors)
-        if self.face_splat is not None:
-            face_splat = checked_array("face_splat", self.face_splat, np.int32, (f,))
-            if f and (face_splat[0] < 0 or (face_splat[1:] < face_splat[:-1]).any()):
-                raise ValueError("face_splat must be ascending numbers >= 0")
-            set_("face_splat", face_splat)
-        if self.depth_group is not None:
-            depth_group = checked_array("depth_group", self.depth_group, np.int32, (f,))
-            if f and depth_group.min() < -1:
-                raise ValueError(f"depth_group must be >= 0, or -1 for none, got {depth_group.min()}")
-            set_("depth_group", depth_group)
-        if self.normals is not None:
-            set_("normals", checked_array("normals", self.normals, np.float32, (v, 3)))
-        up = checked_array("up", self.up, np.float32, (3,))
-        length = float(np.linalg.norm(up))
+        splat, group = self.face_splat, self.depth_group
+        if splat is not None and f and (splat[0] < 0 or (splat[1:] < splat[:-1]).any()):
+            raise ValueError("face_splat must be ascending indices >= 0")
+        if group is not None and f and group.min() < -1:
+            raise ValueError(f"depth_group must be >= 0, or -1 for none, got {group.min()}")
+        length = float(np.linalg.norm(self.up))
         if length == 0:
             raise ValueError("up must not be the zero vector")
-        # Left as it is where rounding alone is to blame, so that a saved mesh comes back bit for bit.
-        set_("up", up if abs(length - 1) <= 1e-6 else up / np.float32(length))
+        # Kept where it differs by rounding only, so that a saved mesh is loaded bit for bit.
+        set_("up", self.up if abs(length - 1) <= 1e-6 else self.up / np.float32(length))
         if self.blending not in get_args(Blending):
             known = ", ".join(get_args(Blending))
             raise ValueError(f"blending must be one of {known}, got {self.blending!r}")
@@ -95,7 +96,7 @@ class SplatMesh:
             ndim = np.ndim(value)
             if ndim not in (1, 2):
                 raise ValueError(
-                    f"attribute {name!r} must have one row a vertex, got shape {np.shape(value)}"
+                    f"attribute {name!r} must have one row for each vertex, got shape {np.shape(value)}"
                 )
             attributes[name] = checked_array(f"attribute {name!r}", value, np.float32, (v, None)[:ndim])
         set_("attributes", MappingProxyType(attributes))
@@ -115,42 +116,85 @@ class SplatMesh:
         parts += ["bound to a base"] if self.binding is not None else []
         return f"SplatMesh({', '.join(parts)})"
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The contents of the mesh by name: its fields, ``attribute.NAME`` and ``binding.NAME``.
+
+        ``blending`` (a text) and ``filter_px2`` are arrays without dimensions. Optional arrays that are None
+        and a filter of 0 are left out.
+        """
+        arrays = {f.name: getattr(self, f.name) for f in self.FIELDS if not f.optional}
+        arrays["blending"] = np.array(self.blending)
+        optional = {f.name: getattr(self, f.name) for f in self.FIELDS if f.optional}
+        arrays |= {name: value for name, value in optional.items() if value is not None}
+        if self.filter_px2:
+            arrays["filter_px2"] = np.array(self.filter_px2)
+        arrays |= {f"attribute.{name}": value for name, value in self.attributes.items()}
+        if self.binding is not None:
+            arrays |= {f"binding.{name}": value for name, value in self.binding.arrays().items()}
+        return arrays
+
+    def extras(self) -> dict[ArrayField, np.ndarray]:
+        """Those of ``EXTRAS`` that are not None."""
+        return {f: value for f in self.EXTRAS if (value := getattr(self, f.name)) is not None}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> SplatMesh:
+        """The inverse of ``arrays``; unknown names are ignored.
+
+        Raises:
+            KeyError: an array is missing; a binding with some of its arrays needs all.
+            ValueError, TypeError: as the constructor.
+        """
+        bound = any(name.startswith("binding.") for name in arrays)
+        names = [*(f.name for f in Binding.FIELDS), "lift"] if bound else []
+        prefix = "attribute."
+        return cls(
+            **{f.name: arrays[f.name] for f in cls.FIELDS if f.name in arrays or not f.optional},
+            blending=str(arrays["blending"]),  # type: ignore[arg-type]
+            filter_px2=float(arrays.get("filter_px2", 0.0)),
+            attributes={name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)},
+            binding=Binding.from_arrays({n: arrays[f"binding.{n}"] for n in names}) if bound else None,
+        )
+
     @property
     def splat_count(self) -> int | None:
-        """How many splats own at least one triangle; None where the mesh does not know."""
+        """Count of splats with at least one triangle; None without ``face_splat``."""
         if self.face_splat is None:
             return None
         return int(len(self.face_splat) > 0) + int(np.count_nonzero(np.diff(self.face_splat)))
 
     def keep_faces(self, keep: np.ndarray) -> SplatMesh:
-        """The triangles marked in ``keep`` (f,) bool, in order, without the vertices that no kept triangle
-        uses."""
+        """The triangles of the mask ``keep`` (f,) bool, in order, without vertices that none of them uses."""
         keep = np.asarray(keep, bool)
         faces = self.faces[keep]
         used = np.zeros(len(self.vertices), bool)
         used[faces.ravel()] = True
         renumber = np.cumsum(used, dtype=np.int32) - 1
+        rows = {"vertex": used, "face": keep}
+        kept = {
+            f.name: value[rows[f.per]]
+            for f in self.FIELDS
+            if f.name != "faces" and f.per in rows and (value := getattr(self, f.name)) is not None
+        }
         return replace(
             self,
-            vertices=self.vertices[used],
+            **kept,
             faces=renumber[faces],
-            colors=self.colors[used],
-            face_splat=None if self.face_splat is None else self.face_splat[keep],
-            normals=None if self.normals is None else self.normals[used],
-            depth_group=None if self.depth_group is None else self.depth_group[keep],
             attributes={name: value[used] for name, value in self.attributes.items()},
             binding=None if self.binding is None else self.binding.select(used),
         )
 
     def prune(self, min_opacity: float) -> SplatMesh:
-        """Without the triangles all of whose corners are below ``min_opacity``, and without orphaned
-        vertices."""
+        """The mesh without triangles all of whose corners have less than ``min_opacity``, and without the
+        vertices that no triangle then uses."""
         return self.keep_faces((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
 
 
 def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
-    """``px2`` as the variance of a filter for meshes with such splat numbers. ValueError where it cannot be
-    that."""
+    """``px2`` as the filter variance of a mesh with that ``face_splat``.
+
+    Raises ValueError if it is out of range, or above 0 without ``face_splat``.
+    """
     number = isinstance(px2, (int, float, np.integer, np.floating)) and not isinstance(px2, bool)
     if not number or not 0 <= px2 <= MAX_FILTER_PX2:
         raise ValueError(
@@ -158,12 +202,12 @@ def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
         )
     if px2 > 0 and face_splat is None:
         raise ValueError(
-            f"a filter of {px2:g} px^2 widens each splat's triangles together, but the mesh does not know its"
-            " splats: give face_splat, or filter_px2=0"
+            f"a filter of {px2:g} px^2 widens the triangles of each splat together, but the mesh does not"
+            " know its splats: give face_splat, or filter_px2=0"
         )
     return float(px2)
 
 
 def splat_starts(face_splat: np.ndarray) -> np.ndarray:
-    """Numbers of the first triangles of each splat, of ``face_splat`` (f,), f > 0."""
+    """Index of the first triangle of each splat in ``face_splat`` (f,), f > 0."""
     return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))

@@ -20,7 +20,8 @@ from meshsplats.blender.inside.pictures import read_pixels
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.images.writing import load_png, to_bytes
+from meshsplats.images.reading import load_image
+from meshsplats.images.writing import to_bytes
 from meshsplats.mesh import SplatMesh
 
 
@@ -28,7 +29,7 @@ def images(mesh, views, folder: Path, options: SceneOptions | None = None, suffi
     paths = [folder / f"{i}{suffix}" for i in range(len(views))]
     draw(mesh, views, images=paths, options=options)
     assert sorted(folder.iterdir()) == sorted(paths), "nothing else is left behind"
-    return [read_pixels(path) if suffix == ".exr" else load_png(path) for path in paths]
+    return [read_pixels(path) if suffix == ".exr" else load_image(path) for path in paths]
 
 
 def test_float_images_agree_for_every_lens(tmp_path):
@@ -77,7 +78,7 @@ def test_linear_meshes_are_blended_in_linear_light_and_shown_encoded(tmp_path, s
     draw(mesh, [view, view], images=[tmp_path / "a.exr", tmp_path / "a.png"], options=options)
     assert psnr(read_pixels(tmp_path / "a.exr")[..., :3], expected) > 60
     shown = to_bytes(linear_to_srgb(expected)) / 255
-    assert psnr(load_png(tmp_path / "a.png") / 255, shown) > 60
+    assert psnr(load_image(tmp_path / "a.png") / 255, shown) > 60
 
 
 def test_many_layers_are_not_cut_off(tmp_path):

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
 
 from meshsplats import demo_scene, save_gaussians
-from meshsplats.images.writing import load_png
+from meshsplats.images.reading import load_image
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "blender"
 
@@ -29,7 +29,7 @@ def run(name, folder, *arguments):
 def test_three_lights_give_three_images(tmp_path):
     save_gaussians(demo_scene.make_scene(600), tmp_path / "scene.ply")
     _, out = run("three_lights.py", tmp_path, "scene.ply", "--width", 48, "--samples", 2)
-    images = [load_png(out / f"{name}.png") / 255 for name in ("low_sun", "overcast_sky", "studio")]
+    images = [load_image(out / f"{name}.png") / 255 for name in ("low_sun", "overcast_sky", "studio")]
     assert (out / "three_lights.png").exists()
     red, _, blue = images[0].mean(axis=(0, 1))
     assert red > blue, "the low sun is warm"
@@ -43,6 +43,6 @@ def test_the_vase_falls(tmp_path):
     assert tilt
     assert 60 < int(tilt[1]) <= 180
     assert (out / "falling.blend").stat().st_size > 10_000
-    first, last = (load_png(out / f"falling_{frame:02d}.png") for frame in (1, 50))
+    first, last = (load_image(out / f"falling_{frame:02d}.png") for frame in (1, 50))
     assert first.shape == (33, 40, 3) or first.shape == (33, 40, 4)
     assert np.abs(first[..., :3] / 255 - last[..., :3] / 255).mean() > 0.01

@@ -18,7 +18,7 @@ from meshsplats import convert, save_cameras, save_gaussians, save_mesh
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import meshes, pictures
 from meshsplats.cli import main
-from meshsplats.images.writing import load_png
+from meshsplats.images.reading import load_image
 
 
 def environment(path):
@@ -45,7 +45,7 @@ def test_unlit_file_renders_the_image_again(tmp_path):
     assert [marker.camera.name for marker in scene.timeline_markers] == ["wide", "tall"]
     assert (scene.frame_start, scene.frame_end) == (0, 1)
     pictures.render_to(scene, tmp_path / "again.png")
-    assert (load_png(tmp_path / "again.png") == load_png(targets[0])).all()
+    assert (load_image(tmp_path / "again.png") == load_image(targets[0])).all()
 
 
 def test_lit_file_has_everything_in_named_collections(tmp_path):
@@ -122,12 +122,12 @@ def test_command_line_draws_meshes_and_splats(tmp_path, suffix, capsys):
     ]
     assert main(arguments) == 0
     result = json.loads(capsys.readouterr().out)
-    assert len(result["pictures"]) == len(result["image_seconds"]) == 2
+    assert len(result["images"]) == len(result["image_seconds"]) == 2
     assert result["blender"] == bpy.app.version_string
-    assert load_png(result["pictures"][1]).shape == (40, 72, 3)
+    assert load_image(result["images"][1]).shape == (40, 72, 3)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "cameras.json",
-        "config.json",
+        "config.toml",
         "view_0000.png",
         "view_0001.png",
     ]
@@ -159,7 +159,7 @@ def test_executable_runs_the_worker_by_itself(tmp_path):
         executable=program,
     )
     assert result["blender"] == bpy.app.version_string
-    assert load_png(tmp_path / "a.png").shape == (48, 64, 3)
+    assert load_image(tmp_path / "a.png").shape == (48, 64, 3)
     assert (tmp_path / "a.blend").stat().st_size > 10_000
 
 

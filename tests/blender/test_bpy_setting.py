@@ -18,7 +18,7 @@ from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import objects, pictures, setting, versions
 from meshsplats.blender.options import LIGHTS
 from meshsplats.cameras.trajectories import look_at
-from meshsplats.images.writing import load_png
+from meshsplats.images.reading import load_image
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_white_looks_white(tmp_path, lights):
     mesh, camera = plate(0.95)
     options = SceneOptions(light=LIGHTS[lights], samples=32, denoise=True)
     draw(mesh, [camera], images=[tmp_path / "a.png"], options=options)
-    image = load_png(tmp_path / "a.png")
+    image = load_image(tmp_path / "a.png")
     middle = image[14:22, 20:28].mean()
     assert 0.88 * 255 < middle < 254, middle
 
@@ -116,7 +116,7 @@ def test_the_ground_fades_into_the_background(tmp_path, background):
     camera = look_at((0, -0.5, -3), (-0.7, -0.3, 0), width=16, height=160, fov=6.6)  # 60 degrees high
     options = SceneOptions(light=LightOptions(), samples=32, background=background, denoise=True)
     draw(small, [camera], images=[tmp_path / "a.png"], options=options)
-    column = load_png(tmp_path / "a.png").mean(axis=(1, 2))
+    column = load_image(tmp_path / "a.png").mean(axis=(1, 2))
     np.testing.assert_allclose(column[0], 255 * np.mean(background), atol=2)
     change = column[-1] - column[0]
     assert abs(change) > 20, "there is a ground"

@@ -302,7 +302,7 @@ def test_missing_system_libraries_are_named(monkeypatch, tmp_path):
         (["-o", "a.png", "--lit", "--engine", "eevee", "--no-denoise"], "--no-denoise is for --lit"),
         (["-o", "a.png", "--transparent", "--background", "black"], "exclude each other"),
         (["-o", "a.png", "--orbit", "3"], "3 views do not fit one .png"),
-        (["-o", "a.blend", "--samples", "2"], "one sample a pixel"),
+        (["-o", "a.blend", "--samples", "2"], "one sample per pixel"),
         (["-o", "a.png", "--format", "exr"], "--format is for a folder"),
         (["-o", "nowhere/a.png"], "folder for the output does not exist"),
         (["-o", "taken.png"], "taken.png: the output exists already"),

@@ -55,10 +55,10 @@ def test_environment_images_are_known_by_content(tmp_path):
 
 
 def test_named_lights_and_what_is_said_instead():
-    from meshsplats.cli.blender import Blender, _Light
+    from meshsplats.cli.blender import Blender, LightArguments
 
     def light(lights, **given):
-        return Blender(None, None, lit=True, lights=lights, light=_Light(**given)).named_light()
+        return Blender(None, None, lit=True, lights=lights, light=LightArguments(**given)).named_light()
 
     for name, named in LIGHTS.items():
         named.check()

@@ -1,4 +1,4 @@
-"""Cameras: projection, placement round a scene, and camera files."""
+"""Cameras: projection, placement around a scene, and camera files."""
 
 from __future__ import annotations
 
@@ -42,12 +42,6 @@ INRIA = {
 }
 
 
-def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions (n, 2) and depths (n,)."""
-    x, y, z = camera.world_to_camera[:3, :3] @ np.asarray(points, float).T + camera.world_to_camera[:3, 3:]
-    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1), z
-
-
 def make_cloud(means: np.ndarray, opacities: np.ndarray | None = None) -> GaussianCloud:
     n = len(means)
     return GaussianCloud(
@@ -69,7 +63,7 @@ def test_look_at_by_hand():
     """y points down: from -z, looking along +z, the world's x is to the right and its -y up."""
     camera = look_at([0, 0, -5], [0, 0, 0], width=200, height=100, fov=90)
     assert camera.fx == pytest.approx(50)  # the shorter side spans 90 degrees: 50 px at 45 degrees
-    pixels, depth = project(camera, np.array([[0, 0, 0], [1, 0, 0], [0, -1, 0], [1, -1, 5]]))
+    pixels, depth = camera.project(np.array([[0, 0, 0], [1, 0, 0], [0, -1, 0], [1, -1, 5]]))
     np.testing.assert_allclose(pixels, [[100, 50], [110, 50], [100, 40], [105, 45]], atol=1e-9)
     np.testing.assert_allclose(depth, [5, 5, 5, 10])
     np.testing.assert_allclose(camera.center, [0, 0, -5], atol=1e-12)
@@ -113,9 +107,9 @@ def test_orbit_by_hand():
 
 
 def test_orbit_frames_a_ball():
-    """A unit ball is seen whole, and fills the picture: its outline lies at 1 / sin of the half angle."""
+    """A unit ball is seen whole, and fills the image: its outline lies at 1 / sin of the half angle."""
     camera = orbit(ball(20000), 1, elevation=0, fov=60, width=400, height=300)[0]
-    pixels, depth = project(camera, ball(20000, seed=1))
+    pixels, depth = camera.project(ball(20000, seed=1))
     assert depth.min() > camera.near
     assert ((pixels > 0) & (pixels < [400, 300])).all(axis=1).mean() > 0.98
     assert np.ptp(pixels[:, 1]) > 0.85 * 300
@@ -150,14 +144,14 @@ def test_strays_and_surroundings_do_not_move_the_frame():
     assert np.linalg.norm(a.center - b.center) < 0.15 * np.linalg.norm(a.center)
 
 
-def test_the_subject_is_in_the_middle_of_the_pictures():
-    """A plate seen from above is nearer at its lower edge, which then takes more of the picture."""
+def test_the_subject_is_in_the_middle_of_the_images():
+    """A plate seen from above is nearer at its lower edge, which then takes more of the image."""
     rng = np.random.default_rng(0)
     plate = rng.uniform(-1, 1, (5000, 3)) * [1, 0.05, 1]
     around = orbit(plate, 4, elevation=25, azimuth=45, width=400, height=400)
     single = orbit(plate, 1, elevation=25, azimuth=20, width=400, height=400)
     for camera in [*around, *single]:
-        pixels = project(camera, plate)[0]
+        pixels = camera.project(plate)[0]
         middle = (pixels.min(axis=0) + pixels.max(axis=0)) / 2
         np.testing.assert_allclose(middle, [200, 200], atol=12)
 
@@ -204,7 +198,7 @@ def test_weighted_quantile_by_hand():
 @pytest.mark.parametrize("points", [np.zeros((1, 3)), np.zeros((5, 3)), np.eye(3)[:1] * 1e6])
 def test_a_single_point_is_framed(points):
     camera = orbit(points, 1)[0]
-    pixels, depth = project(camera, points)
+    pixels, depth = camera.project(points)
     np.testing.assert_allclose(pixels, [[400, 400]] * len(points), atol=1e-3)
     assert (depth > camera.near).all()
 
@@ -241,7 +235,7 @@ def test_scaled_keeps_the_view(factor, width, height):
     camera = look_at((0, 1, -5), (0, 0, 0), width=width, height=height)
     larger = camera.scaled(factor)
     points = ball(20)
-    a, b = project(camera, points)[0], project(larger, points)[0]
+    a, b = camera.project(points)[0], larger.project(points)[0]
     np.testing.assert_allclose(a / [width, height], b / [larger.width, larger.height], atol=1e-9)
     assert abs(larger.width - width * factor) <= max(0.5, 1 - width * factor)
 
@@ -262,7 +256,7 @@ def test_camera_file_of_inria(tmp_path):
     assert (camera.name, camera.cx, camera.cy) == ("b", 2.0, 1.0)
     np.testing.assert_allclose(camera.center, (1, 2, 3))
     # A point one ahead of the camera and two along its x axis, which is the world's y.
-    pixels, depth = project(camera, np.array([[1.0, 4.0, 4.0]]))
+    pixels, depth = camera.project(np.array([[1.0, 4.0, 4.0]]))
     np.testing.assert_allclose(pixels, [[2 + 2 * 3.0, 1]])
     np.testing.assert_allclose(depth, [1])
 
@@ -279,7 +273,7 @@ def test_cameras_come_back_with_every_digit(tmp_path):
 
 BROKEN = {
     "no list": ({"cameras": [OURS]}, "JSON list of cameras, this is a JSON object$"),
-    "a data set": ({"frames": []}, "JSON object with 'frames': of a data set, which load_dataset"),
+    "a data set": ({"frames": []}, "JSON object with 'frames', a data set: read it with load_dataset"),
     "empty": ([], "no camera"),
     "no object": ([OURS, 3], "camera 1"),
     "null": ([None], "camera 0"),
@@ -357,7 +351,22 @@ def test_standard_cameras():
     np.testing.assert_allclose(guess_up(None, cameras), (0, -1, 0), atol=1e-6)
 
 
-def test_sees_what_projects_into_the_picture():
+def test_projection_worked_out_by_hand():
+    """A quarter turn about the world's z axis, then a step of (0.5, 0.25, 3): (1, 2, 1) goes to (-1.5, 1.25,
+    4) in the camera's frame. Behind the camera, and in the plane through it, nothing is seen."""
+    matrix = np.array([[0, -1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, 1, 3], [0, 0, 0, 1]])
+    camera = Camera(matrix, fx=16, fy=32, cx=20, cy=8, width=40, height=30)
+    points = np.array([[1, 2, 1], [0, 0, -3], [0, 0, -5]])
+    for kind in (np.float32, np.float64):
+        positions, depth = camera.project(points.astype(kind))
+        np.testing.assert_array_equal(positions, [(14, 18), (np.nan, np.nan), (np.nan, np.nan)])
+        np.testing.assert_array_equal(depth, [4, 0, -2])
+        assert positions.dtype == depth.dtype == kind
+    assert camera.project(points)[0].dtype == np.float64
+    np.testing.assert_array_equal(camera.in_image(positions), [True, False, False])
+
+
+def test_sees_what_projects_into_the_image():
     """Focal length 10, 40 x 20 pixels, principal point (15, 10), near 1: at depth 2, x from -3 to 5 and y
     from -2 to 2."""
     camera = Camera(np.eye(4), 10, 10, 15, 10, 40, 20, near=1)

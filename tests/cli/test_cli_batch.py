@@ -14,7 +14,7 @@ from _splats import few_splats
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians, subject_name
@@ -51,15 +51,15 @@ def scans(tmp_path, monkeypatch):
 def test_a_folder_into_a_folder(scans, tmp_path, capsys):
     assert run("scans", "-o", "out", "--formats", "glb", "npz", "--json", "--no-sidecar") == 1
     out, err = capsys.readouterr()
-    told = lines(out)
-    assert [line["input"] for line in told] == [
+    printed = lines(out)
+    assert [line["input"] for line in printed] == [
         f"scans/{n}" for n in ("a.ply", "b.compressed.ply", "broken.ply", "chair")
     ]
     assert err.count("\n") == 1
     assert "broken.ply" in err
-    assert told[2]["error"]["kind"] == "input"
-    assert told[2]["error"]["message"] in err
-    whole = [line for line in told if "error" not in line]
+    assert printed[2]["error"]["kind"] == "input"
+    assert printed[2]["error"]["message"] in err
+    whole = [line for line in printed if "error" not in line]
     assert [line["splats"] for line in whole] == [40, 30, 20]
     names = {f"{name}.{suffix}" for name in ("a", "b", "chair") for suffix in ("glb", "npz")}
     assert set(os.listdir("out")) == names
@@ -79,10 +79,10 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
     out = capsys.readouterr().out.splitlines()
     assert out[0].startswith("scans/a.ply: 40 splats -> 320 triangles, 280 vertices: a.glb (")
     assert out[2] == "2 of 2 converted: out/"
-    wanted = {f"{n}.{s}" for n in ("a", "chair") for s in ("glb", "preview.png", "config.json")}
+    wanted = {f"{n}.{s}" for n in ("a", "chair") for s in ("glb", "glb.preview.png", "glb.config.toml")}
     assert set(os.listdir("out")) == wanted
-    options = json.loads((tmp_path / "out/chair.config.json").read_text())["options"]
-    assert (options["input"], options["output"]) == ("scans/chair", "out/chair.glb")
+    options = toml.load(tmp_path / "out/chair.glb.config.toml")["options"]
+    assert (options["input"], options["output"]) == (["../scans/chair"], "chair.glb")
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
         (["scans/a.ply", "-o", "a.glb", "--fidelity", "0"], 1, "--fidelity must be"),
     ],
 )
-def test_mistakes_are_told_first(scans, tmp_path, capsys, arguments, code, words):
+def test_mistakes_are_reported_first(scans, tmp_path, capsys, arguments, code, words):
     before = sorted(path.name for path in tmp_path.iterdir())
     assert run(*arguments) == code
     assert words in " ".join(capsys.readouterr().err.split())
@@ -127,11 +127,11 @@ def test_fidelity_is_that_of_compare(scans, tmp_path, capsys):
     save_cameras(cameras, "cameras.json")
     options = ["--fidelity", "2", "--json", "--no-sidecar", "--cameras", "cameras.json"]
     assert run("scans/a.ply", "-o", "a.npz", *options) == 0
-    told = lines(capsys.readouterr().out)[0]["fidelity"]
+    printed = lines(capsys.readouterr().out)[0]["fidelity"]
     wanted = compare(cloud, load_mesh("a.npz"), cameras[::2][:2])
-    assert told["views"] == 2
-    assert told["psnr"] == pytest.approx(wanted.psnr, abs=1e-6)
-    assert told["ssim"] == pytest.approx(wanted.ssim, abs=1e-6)
+    assert printed["views"] == 2
+    assert printed["psnr"] == pytest.approx(wanted.psnr, abs=1e-6)
+    assert printed["ssim"] == pytest.approx(wanted.ssim, abs=1e-6)
 
 
 def test_what_is_cut_off_does_not_count(scans, capsys):
@@ -153,10 +153,11 @@ def test_a_mesh_in_another_format(tmp_path, monkeypatch, capsys):
     assert run("linear.npz", "-o", "linear.ply", "--up", "0,0,2") == 0
     assert load_mesh("linear.ply").blending == "linear"
     np.testing.assert_array_equal(load_mesh("linear.ply").up, (0, 0, 1))
-    assert (tmp_path / "linear.preview.png").is_file()
+    assert "resolved" not in toml.load(tmp_path / "linear.ply.config.toml")
+    assert (tmp_path / "linear.ply.preview.png").is_file()
     for options in (["--max-splats", "3"], ["--preset", "paper"], ["--fidelity", "2"]):
         assert run("a.npz", "-o", "c.glb", *options) == 2
-        assert f"a.npz is a mesh: {options[0]} would do nothing" in capsys.readouterr().err
+        assert f"a.npz is a mesh: {options[0]} would have no effect" in capsys.readouterr().err
     assert run("a.npz", "-o", "a.npz", "--force") == 2
     assert "is read by this command" in capsys.readouterr().err
 
@@ -182,9 +183,9 @@ def test_standard_input(scans, tmp_path, monkeypatch, capsys):
     content = (scans / "a.ply").read_bytes()
     monkeypatch.setattr(sys, "stdin", _Piped(content))
     assert run("-", "-o", "a.npz", "--json") == 0
-    told = lines(capsys.readouterr().out)[0]
-    assert (told["input"], told["splats"]) == ("-", 40)
-    assert json.loads((tmp_path / "a.config.json").read_text())["options"]["input"] == "-"
+    printed = lines(capsys.readouterr().out)[0]
+    assert (printed["input"], printed["splats"]) == ("-", 40)
+    assert toml.load(tmp_path / "a.npz.config.toml")["options"]["input"] == ["-"]
     monkeypatch.setattr(sys, "stdin", _Piped(content[:300]))
     assert run("-", "-o", "b.npz", "--json") == 1
     out, err = capsys.readouterr()

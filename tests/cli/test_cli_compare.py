@@ -11,7 +11,7 @@ from PIL import Image
 
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
@@ -45,13 +45,13 @@ def test_scores_and_strips(splats, tmp_path, capsys):
     assert stored["mean"] == expected.to_dict()["mean"]
     assert (stored["splats"], stored["triangles"]) == (40, len(mesh.faces))
     assert stored["error_amplified"] == 2
-    names = ["cameras.json", "config.json", "results.json", "view_0000.png", "view_0001.png"]
+    names = ["cameras.json", "config.toml", "results.json", "view_0000.png", "view_0001.png"]
     assert sorted(p.name for p in out.iterdir()) == names
     with Image.open(out / "view_0000.png") as image:
         strip = np.asarray(image).astype(int)
     a, b, error = (strip[CAPTION:-GAP, GAP + i * (40 + GAP) :][:, :40] for i in range(3))
     np.testing.assert_allclose(error, np.minimum(2 * np.abs(a - b), 255), atol=3)
-    assert json.loads((out / "config.json").read_text())["options"]["preset"] == "paper"
+    assert toml.load(out / "config.toml")["options"]["preset"] == "paper"
 
 
 def test_table_and_a_given_mesh(splats, tmp_path, capsys):

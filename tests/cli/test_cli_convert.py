@@ -14,7 +14,7 @@ from PIL import Image
 import meshsplats
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.conversion import convert, simplify
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
@@ -43,14 +43,16 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
     mesh = load_mesh(out)
     np.testing.assert_array_equal(mesh.faces, expected.faces)
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
-    with Image.open(tmp_path / "mesh.preview.png") as image:
+    with Image.open(tmp_path / f"mesh.{suffix}.preview.png") as image:
         picture = np.asarray(image)
     assert picture.shape == (800, 800, 3)
     assert (picture[0] == 255).all()
     assert picture[200:600, 200:600].mean() < 240
-    assert json.loads((tmp_path / "mesh.config.json").read_text())["options"]["preset"] == "paper"
+    record = toml.load(tmp_path / f"mesh.{suffix}.config.toml")
+    assert record["options"]["preset"] == "paper"
+    assert (record["resolved"]["sides"], record["resolved"]["rim_radius"]) == (8, 2.7)
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith("mesh")) == sorted(
-        ["mesh.config.json", f"mesh.{suffix}", "mesh.preview.png"]
+        [f"mesh.{suffix}.config.toml", f"mesh.{suffix}", f"mesh.{suffix}.preview.png"]
     )
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"40 splats -> {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices"
@@ -68,8 +70,9 @@ def test_options_reach_the_conversion(splats, tmp_path):
     mesh = load_mesh(tmp_path / "mesh.npz")
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
     np.testing.assert_array_equal(mesh.colors, expected.colors)
-    stored = json.loads((tmp_path / "mesh.config.json").read_text())["options"]
-    assert (stored["sides"], stored["rim_radius"], stored["crop"]) == (6, None, [-1, -1, -1, 1, 1, 1])
+    stored = toml.load(tmp_path / "mesh.npz.config.toml")["options"]
+    assert (stored["sides"], stored["crop"]) == (6, [-1, -1, -1, 1, 1, 1])
+    assert "rim_radius" not in stored
 
 
 def test_cameras_of_a_model_folder_are_used(splats, tmp_path):
@@ -96,7 +99,7 @@ def test_json(splats, tmp_path, capsys):
     assert result["outputs"] == [{"path": str(tmp_path / "mesh.npz"), "bytes": size}]
     assert (result["input"], result["preview"]) == (str(splats), None)
     assert (result["warnings"], result["meshsplats"]) == ([], meshsplats.__version__)
-    assert not (tmp_path / "mesh.preview.png").exists()
+    assert not (tmp_path / "mesh.npz.preview.png").exists()
 
 
 def test_up(splats, tmp_path):
@@ -113,7 +116,7 @@ def test_up(splats, tmp_path):
         np.testing.assert_allclose(load_mesh(tmp_path / "mesh.npz").up, up, atol=1e-6)
 
 
-@pytest.mark.parametrize("taken", ["mesh.glb", "mesh.preview.png", "mesh.config.json"])
+@pytest.mark.parametrize("taken", ["mesh.glb", "mesh.glb.preview.png", "mesh.glb.config.toml"])
 def test_nothing_is_overwritten(splats, tmp_path, capsys, taken):
     (tmp_path / taken).write_bytes(b"mine")
     assert run(splats, "-o", tmp_path / "mesh.glb") == 3
@@ -128,13 +131,13 @@ def test_another_format_lies_beside_the_first(splats, tmp_path):
     for suffix in (".npz", ".glb"):
         assert run(splats, "-o", tmp_path / f"mesh{suffix}") == 0
     names = sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("mesh"))
-    records = ["mesh.config.json", "mesh.preview.png", "mesh.glb.config.json", "mesh.glb.preview.png"]
+    records = [f"mesh.{s}.{kind}" for s in ("npz", "glb") for kind in ("config.toml", "preview.png")]
     assert names == sorted(["mesh.npz", "mesh.glb", *records])
     assert run(splats, "-o", tmp_path / "mesh.glb") == 3  # the mesh itself is there
     assert run(splats, "-o", tmp_path / "mesh.npz") == 3
-    before = (tmp_path / "mesh.config.json").read_bytes()
+    before = (tmp_path / "mesh.npz.config.toml").read_bytes()
     assert run(splats, "-o", tmp_path / "mesh.glb", "--force") == 0
-    assert (tmp_path / "mesh.config.json").read_bytes() == before
+    assert (tmp_path / "mesh.npz.config.toml").read_bytes() == before
 
 
 def test_the_input_is_never_the_output(splats, tmp_path, capsys):
@@ -162,7 +165,7 @@ def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, optio
     assert run(splats, "-o", "made.usdc" if not options else "made.npz", "--preset", "paper", *options) == 0
     command = shlex.split(re.search(r"next: meshsplats (.*)", capsys.readouterr().out)[1])
     assert main([*command, "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
     axes = options[1] if options[:1] == ["--axes"] else "auto"
     cloud, mesh = load_gaussians(splats, axes=axes), load_mesh(command[2])
     cameras = load_cameras(tmp_path / "made-compare")
@@ -172,7 +175,7 @@ def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, optio
         ]
     drawn = render(mesh, cameras[0], samples=needed_samples(mesh, cameras)).color
     wanted = psnr(drawn, draw_splats(cloud, cameras[0]).color)
-    assert told["views"][0]["psnr"] == pytest.approx(wanted, abs=0.01)
+    assert printed["views"][0]["psnr"] == pytest.approx(wanted, abs=0.01)
 
 
 def test_a_part_is_shown_not_compared_with_the_whole(splats, tmp_path, capsys):
@@ -228,8 +231,8 @@ def test_splats_as_splats(splats, tmp_path, capsys):
     np.testing.assert_array_equal(part.means, cloud.means[kept])
     np.testing.assert_allclose(part.opacities, cloud.opacities[kept], atol=1e-6)
     assert capsys.readouterr().out.startswith(f"{kept.sum()} of 40 splats")
-    assert json.loads((tmp_path / "part.config.json").read_text())["options"]["as_splats"] is True
-    with Image.open(tmp_path / "part.preview.png") as image:
+    assert toml.load(tmp_path / "part.ply.config.toml")["options"]["as_splats"] is True
+    with Image.open(tmp_path / "part.ply.preview.png") as image:
         assert np.asarray(image)[300:500, 300:500].mean() < 250
     assert (
         run(
@@ -257,7 +260,7 @@ def test_splats_as_splats(splats, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "options", "told"),
+    ("name", "options", "printed"),
     [
         ("a.glb", [], "--as-splats writes .ply"),
         ("a.ply", ["--lit"], "--lit: for a mesh"),
@@ -266,9 +269,9 @@ def test_splats_as_splats(splats, tmp_path, capsys):
         ("a.ply", ["--preset", "paper", "--rings", "2"], "--preset, --rings: for a mesh"),
     ],
 )
-def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options, told):
+def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options, printed):
     assert run(splats, "-o", tmp_path / name, "--as-splats", *options) == 2
-    assert told in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert not (tmp_path / name).exists()
 
 
@@ -278,13 +281,12 @@ def test_no_splats_left(splats, tmp_path, capsys):
     assert not (tmp_path / "a.ply").exists()
 
 
-@pytest.mark.parametrize("alpha", ["mask", "hash-friendly"])
-def test_alpha_reaches_the_file(splats, tmp_path, capsys, alpha):
+def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     out = tmp_path / "m.glb"
-    assert run(splats, "-o", out, "--alpha", alpha, "--no-preview") == 0
+    assert run(splats, "-o", out, "--alpha", "mask", "--no-preview") == 0
     data = out.read_bytes()
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     assert document["materials"][0]["alphaMode"] == "MASK"
-    assert document["materials"][0]["alphaCutoff"] == {"mask": 0.2, "hash-friendly": 0.5}[alpha]
-    assert run(splats, "-o", tmp_path / "m.npz", "--alpha", alpha) == 2
+    assert document["materials"][0]["alphaCutoff"] == 0.2
+    assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
     assert "--alpha and --compression are for .glb" in capsys.readouterr().err

@@ -21,7 +21,7 @@ from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import evaluate
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.images.writing import save_png
+from meshsplats.images.writing import save_image
 from meshsplats.rendering import render, render_splats
 from meshsplats.rendering.looks import draw_splats
 
@@ -37,7 +37,7 @@ def scene(tmp_path_factory):
     save_mesh(mesh, folder / "mesh.npz")
     (folder / "pictures").mkdir()
     for camera in cameras:
-        save_png(folder / "pictures" / f"{camera.name}.png", render(mesh, camera).color)
+        save_image(folder / "pictures" / f"{camera.name}.png", render(mesh, camera).color)
     return folder
 
 
@@ -49,7 +49,7 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     out = tmp_path / "out"
     splats = ("--splats", scene / "scene.ply", "--cameras", scene / "cameras.json", "--sh-degree", "0")
     before = ("--before", scene / "mesh.npz")
-    pictures = ("--pictures", scene / "pictures")
+    pictures = ("--images", scene / "pictures")
     options = (*splats, *before, *pictures, "--strips", "2", "--fit-exposure", "--samples", "1", "--json")
     assert run(scene / "mesh.npz", "-o", out, *options) == 0
     printed = json.loads(capsys.readouterr().out)["scenes"][0]
@@ -85,8 +85,8 @@ def test_what_degree_0_shows_of_splats_with_more_is_scored_beside_a_mesh(scene, 
     assert set(report["methods"]) == {"mesh", "splats_sh0"}
     camera = load_cameras(scene / "cameras.json")[0]
     both = [draw_splats(replace(cloud, sh=sh), camera, sh_degree=d).color for d in (0, None)]
-    told = report["methods"]["splats_sh0"]["views"][0]["psnr"]
-    assert told == pytest.approx(psnr(*(np.clip(p, 0, 1) for p in both)), abs=0.01)
+    printed = report["methods"]["splats_sh0"]["views"][0]["psnr"]
+    assert printed == pytest.approx(psnr(*(np.clip(p, 0, 1) for p in both)), abs=0.01)
     assert report["held_out"] is None  # given cameras may have been trained on
 
 
@@ -98,9 +98,9 @@ def test_several_meshes_in_one_table(scene, tmp_path, capsys):
     meshes = (scene / "mesh.npz", tmp_path / "first.npz")
     assert run(*meshes, *options, "-o", tmp_path / "a") == 0
     assert set(json.loads((tmp_path / "a" / "results.json").read_text())) == {"mesh", "first", "splats_sh0"}
-    told = capsys.readouterr().out
-    assert "LPIPS" not in told
-    assert "fitted" not in told
+    printed = capsys.readouterr().out
+    assert "LPIPS" not in printed
+    assert "fitted" not in printed
     meshes = (tmp_path / "first.npz", tmp_path / "other" / "first.npz")
     assert run(*meshes, *options, "-o", tmp_path / "b") == 0
     names = {f"{tmp_path.name}/first.npz", "other/first.npz"}
@@ -131,8 +131,8 @@ def test_a_protocol_scores_every_scene_that_is_there(scene, tmp_path, capsys):
     (models / "train.npz").write_bytes((scene / "mesh.npz").read_bytes())
     out = tmp_path / "out"
     assert run(models, "--data", data, "--protocol", "tanks-and-temples", "-o", out) == 0
-    told = capsys.readouterr()
-    assert "scene truck is left out" in told.err
+    printed = capsys.readouterr()
+    assert "scene truck is left out" in printed.err
     report = json.loads((out / "report.json").read_text())
     assert (report["scenes"], report["missing"]) == (["train"], ["truck"])
     assert report["reports"][0]["views"] == 2  # views 0 and 8 of 9

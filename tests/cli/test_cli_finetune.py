@@ -19,7 +19,7 @@ from _photographs import write_photographs
 from meshsplats._files.locks import locked
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.cli.finetune import Finetune
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
@@ -48,6 +48,10 @@ def splats(tmp_path_factory):
     return path
 
 
+def without_none(values: dict) -> dict:
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def run(*arguments) -> int:
     return main(["finetune", *map(str, arguments)])
 
@@ -55,34 +59,34 @@ def run(*arguments) -> int:
 def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     out = tmp_path / "tuned.npz"
     assert run(splats, "-o", out, *SMALL, "--steps", "12", "--report-every", "6", "--json") == 0
-    told = capsys.readouterr()
-    result = json.loads(told.out)
+    printed = capsys.readouterr()
+    result = json.loads(printed.out)
     assert result["steps"] == 12
     assert result["held_out_psnr"]["after"] > result["held_out_psnr"]["before"]
-    assert "memory: about" in told.err
-    assert "step 6/12, loss" in told.err
+    assert "memory: about" in printed.err
+    assert "step 6/12, loss" in printed.err
     mesh = load_mesh(out)
     assert result["triangles"] == len(mesh.faces)
-    names = ["tuned.config.json", "tuned.npz", "tuned.preview.png", "tuned.run"]
+    names = ["tuned.npz", "tuned.npz.config.toml", "tuned.npz.preview.png", "tuned.npz.run"]
     assert sorted(p.name for p in tmp_path.iterdir()) == names
-    config = json.loads((tmp_path / "tuned.config.json").read_text())
-    assert config["tuning"] == make_config(steps=12).to_dict()
+    config = toml.load(tmp_path / "tuned.npz.config.toml")
+    assert config["resolved"] == without_none(make_config(steps=12).to_dict())
     assert config["options"]["width"] == 32
     # Nothing is overwritten, and an older run is not lost.
     assert run(splats, "-o", out, *SMALL, "--steps", "12") == 3
-    assert "--resume goes on with it, --force begins anew" in capsys.readouterr().err
+    assert "--resume continues it, --force starts again" in capsys.readouterr().err
     assert run(splats, "-o", out, *SMALL, "--steps", "12", "--force") == 0
     assert np.array_equal(load_mesh(out).vertices, mesh.vertices)
     assert "next: meshsplats evaluate" in capsys.readouterr().out
 
 
-def told_score(out: str, capsys) -> tuple[float, float]:
-    """Of what was held out, as ``finetune`` told it and as the command scores that it names."""
-    told = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
+def printed_score(out: str, capsys) -> tuple[float, float]:
+    """Of what was held out, as ``finetune`` printed it and as the command scores that it names."""
+    printed = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
     command = shlex.split(re.search(r"next: meshsplats (.*)", out)[1])
     assert main([*command, "--strips", "0", "--json"]) == 0
     methods = json.loads(capsys.readouterr().out)["scenes"][0]["methods"]
-    return told, methods["mesh"]["mean"]["psnr"]
+    return printed, methods["mesh"]["mean"]["psnr"]
 
 
 @pytest.mark.parametrize("options", [["--downscale", "2", "--background", "black"], ["--test-every", "3"]])
@@ -93,8 +97,8 @@ def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_pa
     data = write_photographs(tmp_path / "photos here", cameras, pictures)
     out = tmp_path / "tuned.npz"
     assert run(splats, "--data", data, "-o", out, "--steps", "4", *options) == 0
-    told, scored = told_score(capsys.readouterr().out, capsys)
-    assert told == pytest.approx(scored, abs=0.005)
+    printed, scored = printed_score(capsys.readouterr().out, capsys)
+    assert printed == pytest.approx(scored, abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -114,8 +118,8 @@ def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys, o
     save_gaussians(replace(cloud, sh=sh), "scene.ply")
     save_cameras(orbit(cloud, 9, width=48, height=48, elevation=50), "nine.json")
     assert run("scene.ply", "-o", "tuned.npz", "--views", "4", "--steps", "2", *options) == 0
-    told, scored = told_score(capsys.readouterr().out, capsys)
-    assert told == pytest.approx(scored, abs=0.005)
+    printed, scored = printed_score(capsys.readouterr().out, capsys)
+    assert printed == pytest.approx(scored, abs=0.005)
 
 
 def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):
@@ -131,13 +135,13 @@ def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):
     data = write_photographs(tmp_path / "photos", [camera], [render_splats(cloud, camera).color])
     arguments = ("--data", data, "--test-every", "0", "--steps", "1")
     assert run(splats, "-o", tmp_path / "b.npz", *arguments, *box) == 0
-    assert "will be painted on the rest" in capsys.readouterr().err
+    assert "will be baked into the rest" in capsys.readouterr().err
 
 
 def test_a_record_of_everything_given(splats, tmp_path):
     given = ("--preset", "paper", "--steps", "2")
     assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, *given) == 0
-    options = json.loads((tmp_path / "tuned.config.json").read_text())["options"]
+    options = toml.load(tmp_path / "tuned.npz.config.toml")["options"]
     assert (options["preset"], options["steps"], options["width"]) == ("paper", 2, 32)
 
 
@@ -175,7 +179,7 @@ def test_cameras_of_a_model_folder_give_way_to_a_placement(tmp_path):
     for name, options in (("own", []), ("placed", ["--distance", "0.5", "0.5"])):
         out = tmp_path / f"{name}.npz"
         assert run(folder, "-o", out, "--views", "4", "--width", "32", "--steps", "1", *options) == 0
-    held = [load_cameras(tmp_path / f"{name}.run/held_out.cameras.json") for name in ("own", "placed")]
+    held = [load_cameras(tmp_path / f"{name}.npz.run/held_out.cameras.json") for name in ("own", "placed")]
     assert [len(cameras) for cameras in held] == [2, 8]
     assert held[0][0].center == pytest.approx(load_cameras(folder)[int(2 * 0.25 * 9 / 2)].center)
 
@@ -191,14 +195,14 @@ def test_a_run_that_has_ended_is_not_resumed(splats, tmp_path, capsys):
     out = tmp_path / "tuned.npz"
     assert run(splats, "-o", out, *SMALL, "--steps", "2") == 0
     assert run(splats, "-o", out, *SMALL, "--steps", "2", "--resume") == 3
-    assert "the run has come to its end, or there was one before" in capsys.readouterr().err
+    assert "the run has ended, or there was one before" in capsys.readouterr().err
 
 
 def test_without_views_held_out_the_next_command_shows_the_mesh(splats, tmp_path, capsys):
     out = tmp_path / "tuned.npz"
     assert run(splats, "-o", out, "--views", "3", "--held-out", "0", "--width", "32", "--steps", "1") == 0
     assert "next: meshsplats render" in capsys.readouterr().out
-    assert not (tmp_path / "tuned.run/held_out.cameras.json").exists()
+    assert not (tmp_path / "tuned.npz.run/held_out.cameras.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -224,13 +228,13 @@ def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
 def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
     """Its views stay, though so long a run would have more; its time counts, too."""
     arguments = [splats, "-o", tmp_path / "t.npz", "--held-out", "2", "--width", "8", "--json"]
-    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: 4)
+    monkeypatch.setattr("meshsplats.cli.training.worthwhile_views", lambda config: 4)
     assert run(*arguments, "--steps", "3") == 0
     first = json.loads(capsys.readouterr().out)
     assert first["seconds_since_resumed"] is None
-    begun = load_checkpoint(tmp_path / "t.run" / "checkpoint.safetensors", only_header=True).seconds
+    begun = load_checkpoint(tmp_path / "t.npz.run" / "checkpoint.safetensors", only_header=True).seconds
     assert 0 < begun <= first["seconds"]
-    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: 5)
+    monkeypatch.setattr("meshsplats.cli.training.worthwhile_views", lambda config: 5)
     assert run(*arguments, "--steps", "6", "--resume", "--force") == 0
     second = json.loads(capsys.readouterr().out)
     assert second["steps"] == 6
@@ -245,8 +249,8 @@ def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):
     options = ("--preset", "paper", "--epochs", "2", "--exposure", "True", "--seed", "3", "--sides", "4")
     assert run(splats, "-o", out, "--data", data, *options) == 0
     assert "7 training views, 2 held out" in capsys.readouterr().err
-    config = json.loads((tmp_path / "tuned.config.json").read_text())["tuning"]
-    assert config == make_config("paper", epochs=2, exposure=True, seed=3).to_dict()
+    config = toml.load(tmp_path / "tuned.ply.config.toml")["resolved"]
+    assert config == without_none(make_config("paper", epochs=2, exposure=True, seed=3).to_dict())
     mesh = load_mesh(out)
     assert len(mesh.faces) == 300 * 4  # --sides went to the conversion
     again = tmp_path / "again.npz"
@@ -288,7 +292,7 @@ def test_a_mesh_needs_photographs(splats, tmp_path, capsys):
     assert "-o must end in" in capsys.readouterr().err
 
 
-def test_too_little_memory_is_told_before_the_work(splats, tmp_path, capsys, monkeypatch):
+def test_too_little_memory_is_reported_before_the_work(splats, tmp_path, capsys, monkeypatch):
     from meshsplats.finetuning import memory
 
     monkeypatch.setattr(memory, "available_memory", lambda: 1 << 20)
@@ -310,7 +314,7 @@ def test_neither_torch_nor_safetensors_is_needed(splats, tmp_path):
         f"sys.exit(main([*arguments, *{SMALL}]))"
     )
     subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
-    assert (tmp_path / "t.run" / "checkpoint.safetensors").is_file()
+    assert (tmp_path / "t.npz.run" / "checkpoint.safetensors").is_file()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -325,11 +329,11 @@ def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
         if "step 3/" in line:
             child.send_signal(number)
             break
-    told = child.communicate(timeout=60)[1]
+    printed = child.communicate(timeout=60)[1]
     assert child.returncode == 128 + number
-    assert "--resume" in told
+    assert "--resume" in printed
     assert not out.exists()
-    assert (tmp_path / "tuned.run" / "checkpoint.safetensors").is_file()
+    assert (tmp_path / "tuned.npz.run" / "checkpoint.safetensors").is_file()
     assert run(*arguments, "--resume") == 0
     whole = tmp_path / "whole.npz"
     assert run(*[str(whole) if a == str(out) else a for a in arguments]) == 0
@@ -338,12 +342,12 @@ def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
 
 
 def test_two_runs_of_one_name(splats, tmp_path, capsys):
-    folder = tmp_path / "tuned.run"
+    folder = tmp_path / "tuned.npz.run"
     folder.mkdir()
     with locked(folder / ".lock") as ours:
         assert ours
         assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "1") == 3
-        assert "tuned.run: another process is writing this run" in capsys.readouterr().err
+        assert "tuned.npz.run: another process is writing this run" in capsys.readouterr().err
         assert [path.name for path in folder.iterdir()] == [".lock"]
     assert run(splats, "-o", tmp_path / "tuned.npz", *SMALL, "--steps", "1") == 0
     assert not (folder / ".lock").exists()

@@ -10,7 +10,7 @@ from _photographs import write_photographs
 from _priors import bumpy
 
 from meshsplats import SplatMesh, load_mesh, orbit, render, save_mesh
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.prior import load_prior, prior_config
@@ -51,16 +51,17 @@ def test_trained_on_photographs(scene, trained, capsys):
     assert len(prior.mesh.faces) <= 50 * 8
     assert len(prior.base_faces) == 50
     names = {p.name for p in scene.iterdir()}
-    assert {"prior.config.json", "prior.preview.png", "prior.run"} <= names
-    config = json.loads((scene / "prior.config.json").read_text())
-    assert config["tuning"] == prior_config(steps=30).to_dict()
+    assert {"prior.npz.config.toml", "prior.npz.preview.png", "prior.npz.run"} <= names
+    config = toml.load(scene / "prior.npz.config.toml")
+    wanted = prior_config(steps=30).to_dict()
+    assert config["resolved"] == {name: value for name, value in wanted.items() if value is not None}
     assert config["options"]["layers"] == 2
-    lines = (scene / "prior.run" / "metrics.jsonl").read_text().splitlines()
+    lines = (scene / "prior.npz.run" / "metrics.jsonl").read_text().splitlines()
     scores = [json.loads(line)["psnr"] for line in lines]
     assert scores[-1] > scores[0] + 3
     # Nothing is overwritten.
     assert run("prior", scene / "base.obj", "--data", scene / "photos", "-o", trained) == 3
-    assert "--resume goes on with it, --force begins anew" in capsys.readouterr().err
+    assert "--resume continues it, --force starts again" in capsys.readouterr().err
     # It is a mesh like any other.
     capsys.readouterr()
     assert run("info", trained) == 0
@@ -72,9 +73,9 @@ def test_trained_on_splats(scene, tmp_path, capsys):
     options += ["--layers", "3", "--spacing", "-0.01"]
     out = tmp_path / "prior.glb"
     assert run("prior", scene / "base.obj", "--splats", scene / "scene.ply", "-o", out, *options) == 0
-    told = capsys.readouterr()
-    assert "50 faces carry 150 triangles; 3 training views, 1 held out" in told.err
-    assert "meshsplats deform" in told.out
+    printed = capsys.readouterr()
+    assert "50 faces carry 150 triangles; 3 training views, 1 held out" in printed.err
+    assert "meshsplats deform" in printed.out
     assert load_prior(out).lift == pytest.approx(-0.01)
 
 
@@ -88,8 +89,8 @@ def test_deform_follows_the_base(scene, trained, tmp_path, capsys):
     prior = load_prior(trained)
     out = tmp_path / "edited.npz"
     assert run("deform", trained, "--base", scene / "moved1.obj", "-o", out, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["files"] == [str(out)]
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["files"] == [str(out)]
     moved = load_mesh(scene / "moved1.obj")
     with np.load(out) as file:
         corners = moved.vertices[file["binding_base_faces"][file["binding_vertex_face"]]]

@@ -11,7 +11,7 @@ from PIL import Image
 
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import look_at, orbit
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.gaussians import GaussianCloud
@@ -38,7 +38,7 @@ def splats(tmp_path):
 
 @pytest.fixture
 def triangle(tmp_path):
-    """One half-opaque triangle, red, in the plane z = 0, larger than any picture."""
+    """One half-opaque triangle, red, in the plane z = 0, larger than any image."""
     corners = np.array([[-50, -50, 0], [50, -50, 0], [0, 80, 0]])
     mesh = SplatMesh(corners, np.array([[0, 1, 2]]), np.array([[1, 0, 0, 0.5]] * 3))
     save_mesh(mesh, tmp_path / "triangle.npz")
@@ -59,8 +59,8 @@ def test_one_picture_of_a_mesh(triangle, tmp_path, capsys):
     out = tmp_path / "a.png"
     assert run(triangle, "-o", out, "--cameras", tmp_path / "one.json", "--background", "0,0,1") == 0
     np.testing.assert_array_equal(picture(out), np.full((8, 12, 3), (128, 0, 128)))
-    assert "1 picture of 12 x 8" in capsys.readouterr().out
-    config = json.loads((tmp_path / "a.png.config.json").read_text())
+    assert "1 image of 12 x 8" in capsys.readouterr().out
+    config = toml.load(tmp_path / "a.png.config.toml")
     assert config["command"] == "render"
     assert config["options"]["background"] == "0,0,1"
     assert len(load_cameras(tmp_path / "a.png.cameras.json")) == 1
@@ -68,10 +68,10 @@ def test_one_picture_of_a_mesh(triangle, tmp_path, capsys):
 
 def test_a_picture_beside_the_files_of_its_mesh(triangle, tmp_path):
     """A mesh has its own configuration beside it, which is neither in the way nor lost."""
-    ours = tmp_path / "triangle.config.json"
-    ours.write_text("{}")
+    ours = tmp_path / "triangle.npz.config.toml"
+    ours.write_text("")
     assert run(triangle, "-o", tmp_path / "triangle.png", "--cameras", tmp_path / "one.json") == 0
-    assert ours.read_text() == "{}"
+    assert ours.read_text() == ""
 
 
 def test_linear_meshes_are_blended_in_linear_light_and_encoded(triangle, tmp_path):
@@ -94,12 +94,12 @@ def test_transparent_and_depth(triangle, tmp_path):
     depth = np.load(tmp_path / "a.depth.npy", allow_pickle=False)
     np.testing.assert_allclose(depth, np.full((16, 24), 4.0), rtol=1e-5)
     assert run(triangle, "-o", out, *cameras, "--transparent", "--depth", "png", "--force") == 0
-    unit = json.loads((tmp_path / "a.png.config.json").read_text())["depth_unit"]
+    unit = toml.load(tmp_path / "a.png.config.toml")["result"]["depth_unit"]
     np.testing.assert_allclose(picture(tmp_path / "a.depth.png") * unit, np.full((16, 24), 4.0), atol=unit)
 
 
 def test_orbit_of_splats(splats, tmp_path, capsys):
-    """The pictures are those of the library from the cameras written down, and the turntable has them all."""
+    """The images are those of the library from the recorded cameras, and the turntable has them all."""
     out = tmp_path / "out"
     size = ("--width", "20", "--height", "16", "--elevation", "30", "--up", "-z", "--samples", "1")
     assert run(splats, "-o", out, "--as-splats", "--orbit", "3", *size, "--sh-degree", "0", "--json") == 0
@@ -107,11 +107,11 @@ def test_orbit_of_splats(splats, tmp_path, capsys):
     pictures = [f"view_000{i}.png" for i in range(3)]
     assert sorted(p.name for p in out.iterdir()) == [
         "cameras.json",
-        "config.json",
+        "config.toml",
         "turntable.webp",
         *pictures,
     ]
-    assert result["pictures"] == [str(out / name) for name in pictures]
+    assert result["images"] == [str(out / name) for name in pictures]
     cloud = load_gaussians(splats)
     expected = orbit(cloud, 3, elevation=30, up=(0, 0, -1), width=20, height=16)
     for name, camera, wanted in zip(pictures, load_cameras(out / "cameras.json"), expected, strict=True):

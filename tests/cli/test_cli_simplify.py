@@ -10,7 +10,7 @@ from _splats import few_splats
 from conftest import shared_data
 
 from meshsplats import load_gaussians, orbit, save_cameras, save_gaussians, simplify
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 
 
 @pytest.fixture
@@ -31,8 +31,8 @@ def test_count_share_and_cameras(splats, tmp_path, capsys):
     assert run(splats, "-o", out, "--share", 0.25) == 0
     assert capsys.readouterr().out.startswith("40 splats -> 10 (25.0%) in ")
     same(load_gaussians(out), simplify(cloud, 10))
-    assert (tmp_path / "small.preview.png").is_file()
-    assert json.loads((tmp_path / "small.config.json").read_text())["options"]["share"] == 0.25
+    assert (tmp_path / "small.ply.preview.png").is_file()
+    assert toml.load(tmp_path / "small.ply.config.toml")["options"]["share"] == 0.25
     assert run(splats, "-o", out, "--count", 10, "--cameras", tmp_path / "cameras.json", "--force") == 0
     same(load_gaussians(out), simplify(cloud, 10, cameras=cameras))
 
@@ -45,10 +45,10 @@ def same(a, b):
 def test_json_without_a_preview(splats, tmp_path, capsys):
     out = tmp_path / "small.ply"
     assert run(splats, "-o", out, "--count", 99, "--json", "--no-preview") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["read"], told["written"], told["preview"]) == (40, 40, None)
-    assert told["bytes"] == out.stat().st_size
-    assert not (tmp_path / "small.preview.png").exists()
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["read"], printed["written"], printed["preview"]) == (40, 40, None)
+    assert printed["bytes"] == out.stat().st_size
+    assert not (tmp_path / "small.ply.preview.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_every_format(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "printed"),
     [
         ([], "give --count or --share, one of them"),
         (["--count", "3", "--share", "0.5"], "give --count or --share, one of them"),
@@ -71,9 +71,9 @@ def test_every_format(tmp_path, name):
         (["--count", "3", "--cameras", "a.json", "--data", "b"], "give --cameras or --data, not both"),
     ],
 )
-def test_wrong_options(splats, tmp_path, capsys, options, told):
+def test_wrong_options(splats, tmp_path, capsys, options, printed):
     assert run(splats, "-o", tmp_path / "small.ply", *options) == 2
-    assert told in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert not (tmp_path / "small.ply").exists()
 
 
@@ -82,6 +82,6 @@ def test_outputs_and_inputs(splats, tmp_path, capsys):
     assert "-o must end in .ply" in capsys.readouterr().err
     assert run(splats, "-o", splats, "--count", 3, "--force") == 2
     assert "is read by this command" in capsys.readouterr().err
-    (tmp_path / "small.config.json").write_text("mine")
+    (tmp_path / "small.ply.config.toml").write_text("mine")
     assert run(splats, "-o", tmp_path / "small.ply", "--count", 3) == 3
-    assert (tmp_path / "small.config.json").read_text() == "mine"
+    assert (tmp_path / "small.ply.config.toml").read_text() == "mine"

@@ -27,7 +27,7 @@ def one_splat(mode: str, quaternion=(1, 0, 0, 0), **options) -> SplatMesh:
 @pytest.mark.parametrize("mode", ["flat", "crossed", "3d"])
 @pytest.mark.parametrize("turn", [(1, 0, 0, 0), (1, 1, 0, 0)])
 def test_each_axis_grows_by_the_pixel(mode, turn):
-    """Seen along an axis, from where it was baked for: the variances on the picture grow by the filter's."""
+    """Seen along an axis, from where it was baked for: the variances on the image grow by the filter's."""
     if mode == "flat" and turn[1]:
         turn = (1, 0, 0, 1)  # not edge on
     view = camera(160, 160, fx=600.0, fy=600.0)
@@ -47,7 +47,7 @@ def test_as_the_renderer_filters():
     baked = bake_filter(mesh, [view])
     assert baked.filter_px2 == 0
     drawn, plain = render(mesh, view), render(mesh, view, filter_px2=0)
-    far, near = (np.abs(picture.color - drawn.color).mean() for picture in (plain, render(baked, view)))
+    far, near = (np.abs(image.color - drawn.color).mean() for image in (plain, render(baked, view)))
     assert near < 0.3 * far
     assert_close(render(baked, view), render(baked, view, filter_px2=0), flips=0)
 
@@ -61,7 +61,7 @@ def test_flat_splats_stay_flat():
     assert np.ptp(baked.vertices, axis=0).max() > 3 * np.ptp(mesh.vertices, axis=0).max()
 
 
-def test_by_default_for_pictures_of_the_whole():
+def test_by_default_for_images_of_the_whole():
     mesh = fans(4, 300, sizes=(0.001, 0.01))
     views = orbit(mesh, 6, width=1000, height=1000)
     assert bake_filter(mesh).vertices.tobytes() == bake_filter(mesh, views).vertices.tobytes()
@@ -118,7 +118,7 @@ def test_command(tmp_path, capsys):
 
 
 def test_blender_gets_it_baked(tmp_path, monkeypatch):
-    """For the cameras of its pictures; the programs that draw triangles as they are get warned otherwise."""
+    """For the cameras of its images; the programs that draw triangles as they are get warned otherwise."""
     from meshsplats import blender
     from meshsplats.blender import launch
 
@@ -126,7 +126,7 @@ def test_blender_gets_it_baked(tmp_path, monkeypatch):
     jobs = []
     monkeypatch.setattr(launch, "command", lambda executable: [])
     monkeypatch.setattr(launch, "run_job", lambda arrays, *_, **__: jobs.append(arrays) or {})
-    blender.draw(mesh, [view], pictures=[tmp_path / "p.png"])
-    np.testing.assert_array_equal(jobs[0]["vertices"], bake_filter(mesh, [view]).vertices)
+    blender.draw(mesh, [view], images=[tmp_path / "p.png"])
+    np.testing.assert_array_equal(jobs[0][0]["vertices"], bake_filter(mesh, [view]).vertices)
     with pytest.warns(DataWarning, match="bake_filter"):
         save_mesh(mesh, tmp_path / "m.glb")

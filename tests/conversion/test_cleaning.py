@@ -19,7 +19,7 @@ from meshsplats.conversion.cleaning import CleaningRules, cropped, find, take_aw
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.images.writing import load_png
+from meshsplats.images.reading import load_image
 from meshsplats.mesh import SplatMesh
 
 
@@ -175,7 +175,7 @@ def test_framing_ignores_floaters():
     rng = np.random.default_rng(2)
     ball = rng.normal(size=(3000, 3))
     ball /= np.linalg.norm(ball, axis=1)[:, None]
-    # 3 % of single points round it, near enough to count as part of the subject.
+    # 3 % of single points around it, near enough to count as part of the subject.
     around = rng.normal(size=(90, 3))
     around *= (rng.uniform(1.8, 3.8, 90) / np.linalg.norm(around, axis=1))[:, None]
     plain, with_floaters = orbit(ball, 1)[0], orbit(np.concatenate([ball, around]), 1)[0]
@@ -200,9 +200,9 @@ def test_the_command_says_what_goes_and_draws_it(file, tmp_path, capsys):
     assert "together" in out
     assert "17 of 2,017 splats, 0.84% of the opacity" in out
     assert len(load_gaussians(tmp_path / "clean.ply")) == 2000
-    picture = load_png(tmp_path / "clean.preview.png").astype(int)
-    red = (picture[..., 0] > 150) & (picture[..., 1:].max(axis=2) < 100)
-    third = picture.shape[1] // 3
+    image = load_image(tmp_path / "clean.ply.preview.png").astype(int)
+    red = (image[..., 0] > 150) & (image[..., 1:].max(axis=2) < 100)
+    third = image.shape[1] // 3
     assert red[:, third : 2 * third].sum() > 50
     assert red[:, :third].sum() == red[:, 2 * third :].sum() == 0
 
@@ -216,7 +216,7 @@ def test_the_command_on_a_mesh_in_json(tmp_path, capsys):
     assert not (tmp_path / "clean.glb").exists()
     assert main([*arguments, "--max-distance", "1.8", "--force"]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["gone"] == told["gone"]
+    assert again["removed"] == told["removed"]
     mesh = load_mesh(tmp_path / "clean.glb")
     assert len(np.unique(mesh.face_splat)) == again["kept"] < 2017
     np.testing.assert_allclose(again["upper"], mesh.vertices.max(axis=0), atol=1e-3)

@@ -141,7 +141,7 @@ class TestPaper:
 
     @pytest.mark.parametrize("mode", ["flat", "3d"])
     def test_cameras_change_nothing_but_up(self, mode):
-        # Looks along -x from (5, 0, 0); the picture's y axis, which points down, is the world's -z.
+        # Looks along -x from (5, 0, 0); the image's y axis, which points down, is the world's -z.
         camera = Camera([[0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 5], [0, 0, 0, 1]], 64, 64, 32, 32, 64, 64)
         plain = convert(many(9), preset="paper", mode=mode)
         with_cameras = convert(many(9), preset="paper", mode=mode, cameras=[camera])

@@ -15,7 +15,7 @@ from meshsplats.conversion.detail import (
     HIDDEN,
     LEAST,
     LEVELS,
-    LOOKED_AT,
+    MIN_VIEWS,
     TRIANGLES,
     choose_levels,
     visibility,
@@ -75,15 +75,15 @@ def test_levels_of_a_hand_worked_case():
 
 
 @pytest.mark.parametrize("look", ["area", "splats"])
-def test_shown_pixels_are_the_opacity_of_the_picture(look):
-    """What all splats show adds up to the opacity of the pictures; one before the other hides it."""
+def test_shown_pixels_are_the_opacity_of_the_image(look):
+    """What all splats show adds up to the opacity of the images; one before the other hides it."""
     cloud = scene(0)
     mesh = convert(cloud, mode="flat", footprint="none")
     views = cameras()
     shown = visibility(mesh, cloud.means, cloud, views, look).pixels
     samples = {"area": 2, "splats": 1}[look]
     drawn = [render(mesh, view, background=(0, 0, 0), samples=samples) for view in views]
-    alpha = np.mean([picture.alpha.sum(dtype=np.float64) for picture in drawn])
+    alpha = np.mean([image.alpha.sum(dtype=np.float64) for image in drawn])
     np.testing.assert_allclose(shown.sum(), alpha, rtol=1e-4)
     one = mesh.keep_faces(mesh.face_splat == 7)
     alone = render(one, views[0], background=(0, 0, 0), samples=samples).alpha.sum(dtype=np.float64)
@@ -93,7 +93,7 @@ def test_shown_pixels_are_the_opacity_of_the_picture(look):
 
 
 @pytest.mark.parametrize("look", ["area", "splats"])
-def test_error_is_that_of_the_picture(look):
+def test_error_is_that_of_the_image(look):
     """Of a mesh that fills every pixel, the squared differences of colour and opacity add up."""
     cloud = scene(5, 1)
     sheet = SplatMesh(
@@ -112,7 +112,7 @@ def test_error_is_that_of_the_picture(look):
 
 
 def test_pixels_are_those_of_the_camera():
-    """Cameras of twelve times the size: their pictures are looked at smaller, and show 144 times as many
+    """Cameras of twelve times the size: their images are looked at smaller, and show 144 times as many
     pixels."""
     cloud = scene(1)
     mesh = convert(cloud, mode="flat", footprint="none")
@@ -123,7 +123,7 @@ def test_pixels_are_those_of_the_camera():
 
 
 def test_what_is_hidden_gets_no_triangles():
-    """Behind an opaque wall, out of all pictures, and before too few cameras to tell."""
+    """Behind an opaque wall, out of all images, and before too few cameras to tell."""
     wall = GaussianCloud(
         np.array([[0, 0, 0], [0, 0, 3.0], [0, 40, 0], [0.3, 0, -1]]),
         np.array([[1.0, 0, 0, 0]] * 4),
@@ -133,7 +133,7 @@ def test_what_is_hidden_gets_no_triangles():
     )
     views = [
         look_at((x, 0, -6), (x, 0, 0), up=(0, -1, 0), width=40, height=40, fov=40)
-        for x in np.linspace(-0.5, 0.5, LOOKED_AT)
+        for x in np.linspace(-0.5, 0.5, MIN_VIEWS)
     ]
     mesh = convert(wall, cameras=views, detail="cameras", footprint="none")
     assert np.unique(mesh.face_splat).tolist() == [0, 2, 3]

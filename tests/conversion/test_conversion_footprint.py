@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from meshsplats._geometry import spacing
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import look_at, orbit
 from meshsplats.conversion import convert
 from meshsplats.conversion import footprint as module
-from meshsplats.conversion.footprint import Views, spacing
+from meshsplats.conversion.footprint import CameraCoverage
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -52,17 +53,21 @@ FLAT = dict(mode="flat", rim_radius=1.0, center_opacity=1.0, compensation=0.0, s
 
 class TestPixelSize:
     def test_one_camera(self):
-        sizes = Views(np.float32([[0, 0, 10], [3, 0, 4], [0, 0, 5]]), [ahead(size=200)]).pixel_sizes()
+        sizes = CameraCoverage(
+            np.float32([[0, 0, 10], [3, 0, 4], [0, 0, 5]]), [ahead(size=200)]
+        ).pixel_sizes()
         np.testing.assert_allclose(sizes, [0.1, 0.05, 0.05], rtol=1e-6)
 
     def test_unequal_focal_lengths(self):
         camera = Camera(np.eye(4), 50, 200, 32, 32, 64, 64)
-        np.testing.assert_allclose(Views(np.float32([[0, 0, 10]]), [camera]).pixel_sizes(), [0.1], rtol=1e-6)
+        np.testing.assert_allclose(
+            CameraCoverage(np.float32([[0, 0, 10]]), [camera]).pixel_sizes(), [0.1], rtol=1e-6
+        )
 
     def test_near_views_count_for_more(self):
         # Distances 1 and 2: the mean of 1 and 1/4 is 5/8.
         cameras = [ahead(z=4), ahead(z=3)]
-        sizes = Views(np.float32([[0, 0, 5]]), cameras).pixel_sizes()
+        sizes = CameraCoverage(np.float32([[0, 0, 5]]), cameras).pixel_sizes()
         np.testing.assert_allclose(sizes, [(8 / 5) ** 0.5 / 100], rtol=1e-6)
 
     @pytest.mark.parametrize(
@@ -79,11 +84,13 @@ class TestPixelSize:
         ],
     )
     def test_what_a_camera_sees(self, position, seen):
-        assert (Views(np.float32([position]), [ahead()]).pixel_sizes()[0] > 0) == seen
+        assert (CameraCoverage(np.float32([position]), [ahead()]).pixel_sizes()[0] > 0) == seen
 
     def test_principal_point(self):
         camera = Camera(np.eye(4), 100, 100, 0, 64, 64, 64)  # sees what is right of and above its axis
-        sizes = Views(np.float32([[0.5, -0.5, 1], [-0.1, -0.1, 1], [0.1, 0.1, 1]]), [camera]).pixel_sizes()
+        sizes = CameraCoverage(
+            np.float32([[0.5, -0.5, 1], [-0.1, -0.1, 1], [0.1, 0.1, 1]]), [camera]
+        ).pixel_sizes()
         assert (sizes > 0).tolist() == [True, False, False]
 
     def test_unseen_splats_take_the_median(self):
@@ -101,21 +108,23 @@ class TestPixelSize:
         matrix = np.eye(4)
         matrix[:3, 3] = -far
         camera = Camera(matrix, 100, 100, 32, 32, 64, 64)
-        there = Views((near + far).astype(np.float32), [camera]).pixel_sizes()
-        np.testing.assert_allclose(there, Views(near, [ahead()]).pixel_sizes(), rtol=1e-3)
+        there = CameraCoverage((near + far).astype(np.float32), [camera]).pixel_sizes()
+        np.testing.assert_allclose(there, CameraCoverage(near, [ahead()]).pixel_sizes(), rtol=1e-3)
 
     def test_many_cameras_are_thinned(self):
         cameras = [ahead(z=-i) for i in range(module.MAX_CAMERAS + 1)] * 3
-        views = Views(np.float32([[0, 0, 9]]), cameras)
+        views = CameraCoverage(np.float32([[0, 0, 9]]), cameras)
         assert len(views.cameras) == module.MAX_CAMERAS
         assert views.cameras[0] is cameras[0]
         assert views.cameras[-1] is cameras[-1]
 
     def test_chunks_do_not_show(self, monkeypatch):
         means = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32) + np.float32([0, 0, 5])
-        whole = Views(means, [ahead(), ahead(z=1)]).pixel_sizes()
+        whole = CameraCoverage(means, [ahead(), ahead(z=1)]).pixel_sizes()
         monkeypatch.setattr(module, "_CHUNK", 7)
-        np.testing.assert_allclose(Views(means, [ahead(), ahead(z=1)]).pixel_sizes(), whole, rtol=1e-6)
+        np.testing.assert_allclose(
+            CameraCoverage(means, [ahead(), ahead(z=1)]).pixel_sizes(), whole, rtol=1e-6
+        )
 
     def test_no_splat_seen(self):
         with pytest.raises(ValueError, match="none of the 1 cameras sees any of the 2 splats"):
@@ -205,8 +214,8 @@ class TestSpacing:
 
 
 class TestFraming:
-    def test_pixel_of_a_picture_that_holds_the_subject(self):
-        """Sparse splats: as if given the cameras of such pictures."""
+    def test_pixel_of_an_image_that_holds_the_subject(self):
+        """Sparse splats: as if given the cameras of such images."""
         cloud = grid(16)
         cameras = orbit(
             cloud, module.FRAMING_VIEWS, width=module.FRAMING_PIXELS, height=module.FRAMING_PIXELS

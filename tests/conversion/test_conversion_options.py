@@ -74,7 +74,7 @@ class TestSelection:
     def test_ties_keep_the_first(self):
         assert kept(convert(row_of([0.5] * 9), max_splats=4, footprint="none", budget="drop")) == [0, 1, 2, 3]
 
-    def test_visible_area_is_that_on_the_picture(self):
+    def test_visible_area_is_that_on_the_image(self):
         cloud = row_of([0.5, 0.5], [0.1, 0.11], positions=[0, 0])
         cloud = replace(cloud, means=[[0, 0, 5], [0, 0, 10]])
         assert kept(convert(cloud, cameras=[CAMERA], max_splats=1, budget="drop")) == [0]

@@ -1,4 +1,4 @@
-"""The pictures decide: meshes against the splats they were made from."""
+"""The images decide: meshes against the splats they were made from."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_each_ingredient_helps(scene):
 
 @pytest.mark.parametrize("count", [300, 8000])
 def test_without_cameras(count):
-    """Better than paper on coarse and fine clouds, at the distance of pictures of the whole and nearer."""
+    """Better than paper on coarse and fine clouds, at the distance of images of the whole and nearer."""
     cloud = one_color_each(make_scene(count))
     paper, default = convert(cloud, preset="paper"), convert(cloud)
     assert len(default.faces) <= 8 * len(cloud)
@@ -95,7 +95,7 @@ def test_limits_leave_out_what_shows_least(scene):
 
 
 def test_kernels():
-    """Each kernel's own picture, with meshes made for it and for the plain kernel."""
+    """Each kernel's own image, with meshes made for it and for the plain kernel."""
     cloud = one_color_each(make_scene(8000))
     cameras = orbit(cloud, 2, azimuth=20, width=240, height=240, distance=1.2)
     options = dict(cameras=cameras, look="splats")

@@ -1,4 +1,4 @@
-"""Views, pictures and their memory; hostile picture files; splats as a data set; real photographs."""
+"""Views, images and their memory; hostile image files; splats as a data set; real photographs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def cloud_at(points: np.ndarray, scale: float = 0.02) -> GaussianCloud:
     return GaussianCloud(points, turns, np.full((n, 3), scale), np.full(n, 0.9), rng.normal(size=(n, 4, 3)))
 
 
-# ---- Pictures
+# ---- Images
 
 
 def test_bytes_and_floats_over_a_background():
@@ -63,23 +63,23 @@ def test_bytes_and_floats_over_a_background():
         ((np.zeros((2, 3, 3), np.uint8), None, np.zeros((2, 3), np.uint8)), "mask must have .* bool"),
     ],
 )
-def test_pictures_check_themselves(arrays, message):
+def test_images_check_themselves(arrays, message):
     with pytest.raises(ValueError, match=message):
         ViewImage(*arrays)
 
 
-def test_a_view_checks_that_its_picture_has_the_cameras_size():
+def test_a_view_checks_that_its_image_has_the_cameras_size():
     camera = look_at((0, 0, -1), (0, 0, 0), width=3, height=2, name="a")
     view = View(camera, ViewImage(np.zeros((2, 3, 3), np.uint8)))
     assert (view.name, view.image.shape, view.alpha, view.mask) == ("a", (2, 3, 3), None, None)
-    with pytest.raises(ValueError, match="view 'a': its picture has shape"):
+    with pytest.raises(ValueError, match="view 'a': its image has shape"):
         _ = View(camera, ViewImage(np.zeros((3, 2, 3), np.uint8))).image
 
 
 # ---- Memory
 
 
-def test_pictures_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, monkeypatch):
+def test_images_are_read_when_asked_for_and_kept_within_the_limit(tmp_path, monkeypatch):
     from meshsplats.datasets import image_files as photographs
 
     reads = []
@@ -100,7 +100,7 @@ def test_memory_is_known_before_and_right(tmp_path):
     folder = simple_colmap(tmp_path, 3)
     save(folder / "images/p01.png", np.zeros((8, 12, 4), np.uint8))
     save(folder / "masks/p02.png.png", np.zeros((8, 12), np.uint8))
-    with pytest.warns(ms.DataWarning, match="2 pictures have no mask"):
+    with pytest.warns(ms.DataWarning, match="2 images have no mask"):
         dataset = load_dataset(folder)
     assert [view.source.nbytes for view in sorted(dataset.views, key=lambda v: v.name)] == [288, 768, 384]
     for view in dataset.views:
@@ -170,15 +170,15 @@ def png_claiming(width: int, height: int) -> bytes:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "not a picture of a known kind"),
-        (b"no picture", "not a picture of a known kind"),
-        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not a picture of a known kind"),
+        (b"", "not an image of a known format"),
+        (b"no picture", "not an image of a known format"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not an image of a known format"),
         (png_claiming(9_000, 8_000), "9000 x 8000 pixels; up to 67,108,864 pixels"),
-        (png_claiming(60_000, 40_000), "not a picture of a known kind|up to 67,108,864 pixels"),
+        (png_claiming(60_000, 40_000), "not an image of a known format|up to 67,108,864 pixels"),
         (png_claiming(60_000, 2), "60000 x 2 pixels; up to .* and 32768 a side"),
     ],
 )
-def test_what_is_no_picture_is_refused_by_its_header(tmp_path, content, message):
+def test_what_is_no_image_is_refused_by_its_header(tmp_path, content, message):
     folder = simple_colmap(tmp_path, 2)
     (folder / "images/p01.png").write_bytes(content)
     with pytest.raises(FileFormatError, match=message) as caught:
@@ -186,13 +186,13 @@ def test_what_is_no_picture_is_refused_by_its_header(tmp_path, content, message)
     assert "p01.png" in str(caught.value)
 
 
-def test_a_truncated_picture_is_refused_when_it_is_read(tmp_path):
+def test_a_truncated_image_is_refused_when_it_is_read(tmp_path):
     folder = simple_colmap(tmp_path, 1, size=(120, 80))
     path = folder / "images/p00.png"
     save(path, np.random.default_rng(0).integers(0, 255, (80, 120, 3)).astype(np.uint8))
     path.write_bytes(path.read_bytes()[:5000])
     view = load_dataset(folder, test_every=0).train[0]
-    with pytest.raises(FileFormatError, match=r"p00\.png: a broken picture"):
+    with pytest.raises(FileFormatError, match=r"p00\.png: a broken image"):
         _ = view.image
 
 
@@ -272,7 +272,7 @@ def test_windows_are_parts_of_larger_images(cloud):
 
 
 def angles_of(cameras, cloud) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation in degrees of cameras round the middle of their optical axes, y down."""
+    """Azimuth and elevation in degrees of cameras around the middle of their optical axes, y down."""
     center = scene_bounds(cloud).center
     away = np.array([c.center for c in cameras]) - center
     return np.degrees(np.arctan2(away[:, 0], away[:, 2])), np.degrees(
@@ -350,7 +350,7 @@ def test_surroundings_are_noticed_and_keep_cameras_above_the_ground():
 
 
 def test_inside_cameras_stand_in_free_space_and_look_all_round():
-    """A closed room of 8 x 3 x 6 with a block in the middle: from inside every picture is full of wall."""
+    """A closed room of 8 x 3 x 6 with a block in the middle: from inside every image is full of wall."""
     rng = np.random.default_rng(0)
     half = np.array([4.0, 1.5, 3.0])
     walls = rng.uniform(-1, 1, (30_000, 3)) * half
@@ -490,9 +490,9 @@ def test_trained_splats_look_like_the_photographs(photos, splats, downscale, bac
         assert median(**shift) < score - 0.3, shift
 
 
-def smaller(picture: np.ndarray) -> np.ndarray:
-    h, w = picture.shape[0] // 2, picture.shape[1] // 2
-    return np.clip(picture, 0, 1).reshape(h, 2, w, 2, 3).mean(axis=(1, 3))
+def smaller(image: np.ndarray) -> np.ndarray:
+    h, w = image.shape[0] // 2, image.shape[1] // 2
+    return np.clip(image, 0, 1).reshape(h, 2, w, 2, 3).mean(axis=(1, 3))
 
 
 def test_results_of_the_loader_can_be_saved_as_cameras(tmp_path):

@@ -19,7 +19,7 @@ def by_name(dataset) -> dict:
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
-def test_poses_intrinsics_and_pictures(tmp_path, text):
+def test_poses_intrinsics_and_images(tmp_path, text):
     views = by_name(load_dataset(simple_colmap(tmp_path, 4, text=text)))
     assert len(views) == 4
     for i in range(4):
@@ -49,7 +49,7 @@ def test_every_eighth_by_name_is_held_out(tmp_path):
     assert load_dataset(folder, test_every=0).test == ()
 
 
-def test_a_list_of_test_pictures_is_followed(tmp_path):
+def test_a_list_of_test_images_is_followed(tmp_path):
     folder = simple_colmap(tmp_path, 5)
     (folder / "sparse/0/test.txt").write_text("p03.png\n\np01\n")
     dataset = load_dataset(folder)
@@ -57,8 +57,8 @@ def test_a_list_of_test_pictures_is_followed(tmp_path):
     assert [view.name for view in dataset.train] == ["p00.png", "p02.png", "p04.png"]
 
 
-def test_intrinsics_follow_the_pictures_real_size(tmp_path):
-    """The model was made of pictures twice as large, the folder of smaller ones a pixel short."""
+def test_intrinsics_follow_the_images_real_size(tmp_path):
+    """The model was made of images twice as large, the folder of smaller ones a pixel short."""
     folder = simple_colmap(tmp_path, 2)
     for i in range(2):
         save(folder / f"images/p{i:02d}.png", np.zeros((4, 6, 3), np.uint8))
@@ -158,7 +158,7 @@ def test_models_written_by_colmap(tmp_path, text):
         camera = model.cameras[image.camera_id]
         rigid = image.cam_from_world()
         np.testing.assert_allclose(view.camera.world_to_camera[:3], rigid.matrix(), atol=1e-12)
-        # The lens, through the picture's size: an eighth of the model's.
+        # The lens, through the image's size: an eighth of the model's.
         seen = points @ view.camera.world_to_camera[:3, :3].T + view.camera.world_to_camera[:3, 3]
         want = camera.img_from_cam(seen) * [
             view.camera.width / camera.width,
@@ -226,8 +226,8 @@ def camera(**change) -> bytes:
     [
         ({"model": 99}, "camera 0 has model number 99; known are 0 to 17"),
         ({"model": -1}, "model number -1"),
-        ({"width": 0}, "a picture of 0 x 4 pixels"),
-        ({"height": 2**40}, "a picture of 4 x 1099511627776 pixels"),
+        ({"width": 0}, "an image of 0 x 4 pixels"),
+        ({"height": 2**40}, "an image of 4 x 1099511627776 pixels"),
         ({"parameters": (float("nan"), 1, 2, 2)}, "must be finite"),
         ({"parameters": (1, -1, 2, 2)}, "focal lengths must be positive"),
     ],
@@ -244,12 +244,12 @@ def test_impossible_cameras_are_refused(tmp_path, change, message):
         (("a.png", (1, 0, 0, 0), (0, 0, 0), 5), "refers to camera 5"),
         (("x" * 1001, (1, 0, 0, 0), (0, 0, 0), 1), "does not end within 1000 bytes"),
         (("../secret.png", (1, 0, 0, 0), (0, 0, 0), 1), "only files inside"),
-        (("/etc/passwd", (1, 0, 0, 0), (0, 0, 0), 1), "none of its pictures is there"),
+        (("/etc/passwd", (1, 0, 0, 0), (0, 0, 0), 1), "none of its images is there"),
         (("a/../../../b.png", (1, 0, 0, 0), (0, 0, 0), 1), "only files inside"),
         (("..\\b.png", (1, 0, 0, 0), (0, 0, 0), 1), "only files inside"),
     ],
 )
-def test_impossible_pictures_are_refused(tmp_path, image, message):
+def test_impossible_images_are_refused(tmp_path, image, message):
     refused(broken(tmp_path, images=colmap_bytes([], [image])[1]), message)
 
 
@@ -257,7 +257,7 @@ def test_names_that_are_not_text_and_names_twice_are_refused(tmp_path):
     _, images = colmap_bytes(*GOOD)
     refused(broken(tmp_path, images=images.replace(b"a.png", b"\xff.png")), "not UTF-8 text")
     twice = colmap_bytes([], GOOD[1] * 2)[1]
-    refused(broken(tmp_path, images=twice), "two pictures have the name 'a.png'")
+    refused(broken(tmp_path, images=twice), "two images have the name 'a.png'")
 
 
 @pytest.mark.parametrize(
@@ -268,13 +268,13 @@ def test_names_that_are_not_text_and_names_twice_are_refused(tmp_path):
         ("cameras", "1 GLASS 4 4 1 1 2 2\n", "unknown camera model 'GLASS'"),
         ("cameras", "1 PINHOLE 4 x 1 1 2 2\n", "expected a whole number, got b'x'"),
         ("cameras", "# only a comment\n", "refers to camera 1, which the model does not have"),
-        ("images", "1 1 0 0 0 0 0 0 1\n\n", "line 1: a picture is"),
+        ("images", "1 1 0 0 0 0 0 0 1\n\n", "line 1: an image is"),
         ("images", "# x\n1 1 0 0 0 0 0 y 1 a.png\n\n", "line 2: expected numbers"),
-        ("images", "\n", "names no pictures"),
+        ("images", "\n", "names no images"),
         (
             "images",
             "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b 7.png\n",
-            "line 2: a picture, where the points of the one before it are expected",
+            "line 2: an image, where the points of the one before it are expected",
         ),
     ],
 )
@@ -298,30 +298,30 @@ def test_an_endless_line_of_points_is_skipped_without_memory(tmp_path):
     tracemalloc.stop()
 
 
-def test_missing_pictures_are_counted_and_left_out(tmp_path):
+def test_missing_images_are_counted_and_left_out(tmp_path):
     folder = simple_colmap(tmp_path, 5)
     (folder / "images/p01.png").unlink()
     (folder / "images/p03.png").unlink()
-    with pytest.warns(DataWarning, match=r"2 pictures are missing.*images/p01\.png, images/p03\.png"):
+    with pytest.warns(DataWarning, match=r"2 images are missing.*images/p01\.png, images/p03\.png"):
         dataset = load_dataset(folder, test_every=2)
     # Held out is every second of those that are there.
     assert [view.name for view in dataset.test] == ["p00.png", "p04.png"]
 
 
-def test_no_pictures_at_all_says_where_they_were_expected(tmp_path):
+def test_no_images_at_all_says_where_they_were_expected(tmp_path):
     folder = simple_colmap(tmp_path, 2)
     (folder / "images").rename(folder / "images_2")
-    refused(folder, r"none of its pictures is there.*images/p00\.png.*give a downscale of 2")
+    refused(folder, r"none of its images is there.*images/p00\.png.*give a downscale of 2")
     assert len(load_dataset(folder, downscale=2).views) == 2
 
 
 def test_an_incomplete_smaller_folder_is_refused(tmp_path):
     folder = simple_colmap(tmp_path, 2)
     save(folder / "images_2/p00.png", np.zeros((4, 6, 3), np.uint8))
-    refused(folder, "'images_2' has no such picture", downscale=2)
+    refused(folder, "'images_2' has no such image", downscale=2)
 
 
-def test_pictures_of_another_shape_are_refused(tmp_path):
+def test_images_of_another_shape_are_refused(tmp_path):
     folder = simple_colmap(tmp_path, 2)
     save(folder / "images/p01.png", np.zeros((8, 16, 3), np.uint8))
     refused(folder, "16 x 8 pixels do not fit its camera, which took 12 x 8")
@@ -329,8 +329,8 @@ def test_pictures_of_another_shape_are_refused(tmp_path):
     refused(folder, "8 x 12 pixels do not fit.*It is turned")
 
 
-def test_a_model_beside_its_pictures_is_no_numbered_one(tmp_path):
-    """Nor does an empty sparse/ hide it, nor is a test.txt beside the pictures a list of them."""
+def test_a_model_beside_its_images_is_no_numbered_one(tmp_path):
+    """Nor does an empty sparse/ hide it, nor is a test.txt beside the images a list of them."""
     folder = simple_colmap(tmp_path / "0", 3, place=".")
     simple_colmap(tmp_path / "1", 9, place=".")
     (folder / "sparse").mkdir()

@@ -1,4 +1,4 @@
-"""Camera models against COLMAP's own values, and pictures undistorted to what a pinhole sees."""
+"""Camera models against COLMAP's own values, and images undistorted to what a pinhole sees."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from _datasets import pinhole_rays, sky
 
 from meshsplats.datasets.lens import MODELS, Lens, pinholes, undistort
 
-# Where pycolmap 4.2.1 puts the point (0.6, -0.4, 1.6) on a picture of 640 x 480.
+# Where pycolmap 4.2.1 puts the point (0.6, -0.4, 1.6) on an image of 640 x 480.
 TRUTH = [
     ("SIMPLE_PINHOLE", (500, 321, 238), (508.5, 113.0)),
     ("PINHOLE", (500, 510, 321, 238), (508.5, 110.5)),
@@ -131,7 +131,7 @@ def test_impossible_lenses_are_refused(change, message):
         Lens(**(fine | change))
 
 
-# ---- Pictures
+# ---- Images
 
 
 def fisheye_directions(width: int, height: int, f: float, cx: float, cy: float) -> np.ndarray:
@@ -165,15 +165,15 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_undistorted_picture_is_what_a_pinhole_sees(case):
+def test_undistorted_image_is_what_a_pinhole_sees(case):
     lens, directions = CASES[case]
     (pinhole,) = pinholes(lens)
-    picture, seen = undistort(sky(directions).astype(np.float32), lens, pinhole)
+    image, seen = undistort(sky(directions).astype(np.float32), lens, pinhole)
     want = sky(pinhole_rays(160, 120, lens.fx, lens.fy, lens.cx, lens.cy))
     assert seen[30:-30, 30:-30].all()
     # Bilinear values of these waves are within 0.002; half a pixel beside them is 0.03 off.
-    assert np.abs(picture - want)[seen].max() < 2.5e-3
-    assert (picture[~seen] == 0).all()
+    assert np.abs(image - want)[seen].max() < 2.5e-3
+    assert (image[~seen] == 0).all()
     # A pincushion photograph has its corners drawn out, a pinhole of the same focal length sees less than it.
     assert seen.all() == (case != "pincushion")
 
@@ -201,11 +201,11 @@ def test_six_sides_of_a_panorama():
     ahead = {}
     for side in pinholes(lens):
         assert (side.width, side.height, side.fx, side.cx) == (65, 65, 32.5, 32.5)
-        picture, seen = undistort(panorama, lens, side)
+        image, seen = undistort(panorama, lens, side)
         rays = pinhole_rays(65, 65, side.fx, side.fy, side.cx, side.cy) @ side.rotation
         assert seen.all()
         # Rows at the poles have no neighbour beyond, where half a row is lost.
-        assert np.abs(picture - sky(rays)).max() < (8e-3 if side.suffix not in ("/up", "/down") else 0.05)
+        assert np.abs(image - sky(rays)).max() < (8e-3 if side.suffix not in ("/up", "/down") else 0.05)
         ahead[side.suffix] = side.rotation[2].round(9).tolist()
     # OpenCV axes: right is +x, down is +y.
     assert ahead == {

@@ -88,7 +88,7 @@ def test_alpha_goes_over_any_background(tmp_path):
     assert views[0].mask is None
 
 
-def test_smaller_pictures_mix_colours_by_their_opacity(tmp_path):
+def test_smaller_images_mix_colours_by_their_opacity(tmp_path):
     nerf(tmp_path)
     pixels = np.zeros((8, 12, 4), np.uint8)
     pixels[:, ::2] = (200, 0, 0, 255)
@@ -135,7 +135,7 @@ def test_frames_have_intrinsics_of_their_own(tmp_path):
     ]
     views = load_dataset(studio(tmp_path, frames=frames), test_every=0).train
     assert (views[0].camera.fx, views[0].camera.fy, views[0].camera.cx) == (5, 11, 1)
-    assert (views[1].camera.fx, views[1].camera.cy) == (5, 1.75)  # meant for pictures twice as large
+    assert (views[1].camera.fx, views[1].camera.cy) == (5, 1.75)  # meant for images twice as large
     assert views[0].mask is None
     assert views[1].mask is not None
     np.testing.assert_array_equal(views[2].camera.world_to_camera, np.diag([1.0, -1, -1, 1]))
@@ -155,7 +155,7 @@ def test_the_files_own_split(tmp_path):
     assert [view.name for view in dataset.test] == names[3:4]
     refused(
         studio(tmp_path, 5, **split | {"train_filenames": ["other.png"]}),
-        "none of its pictures is in 'train_",
+        "none of its images is in 'train_",
     )
     refused(studio(tmp_path, 5, test_filenames="all"), "'test_filenames' must be a list")
 
@@ -216,7 +216,7 @@ def test_masks_by_name_and_by_folder(tmp_path):
     save(tmp_path / "m/x.png", mask)
     save(tmp_path / "masks/f1.png.png", 255 - mask)
     folder = studio(tmp_path, frames=frames)
-    with pytest.warns(DataWarning, match=r"1 pictures have no mask and count wholly \(masks/f2\.png\)"):
+    with pytest.warns(DataWarning, match=r"1 images have no mask and count wholly \(masks/f2\.png\)"):
         views = load_dataset(folder, test_every=0).train
     np.testing.assert_array_equal(views[0].mask, mask > 0)
     np.testing.assert_array_equal(views[1].mask, mask == 0)
@@ -229,13 +229,13 @@ def test_masks_by_name_and_by_folder(tmp_path):
     refused(folder, "8 x 12 pixels do not fit its camera")
 
 
-def test_missing_pictures_are_counted(tmp_path):
+def test_missing_images_are_counted(tmp_path):
     folder = studio(tmp_path, 4)
     (tmp_path / "images/f2.png").unlink()
-    with pytest.warns(DataWarning, match=r"1 pictures are missing.*\(images/f2\.png\)"):
+    with pytest.warns(DataWarning, match=r"1 images are missing.*\(images/f2\.png\)"):
         assert len(load_dataset(folder).views) == 3
     # The same where their size would have been asked of them.
-    with pytest.warns(DataWarning, match="1 pictures are missing"):
+    with pytest.warns(DataWarning, match="1 images are missing"):
         assert (
             len(load_dataset(studio(tmp_path, 3, [*map(frame, ("images/f0.png", "no.png"))], w=None)).views)
             == 1

@@ -11,7 +11,7 @@ import pytest
 from _photographs import write_photographs
 
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
@@ -182,7 +182,7 @@ def test_finetune_trains_over_it(capture, tmp_path, capsys):
     output = capsys.readouterr()
     assert "background: black, which fits the splats best" in output.err
     assert "--background black" in output.out  # of the command that scores it
-    assert json.loads((tmp_path / "found.config.json").read_text())["background"] == [0, 0, 0]
+    assert toml.load(tmp_path / "found.npz.config.toml")["result"]["background"] == [0, 0, 0]
     for name in ("black", "white"):
         assert run(*arguments, "-o", tmp_path / f"{name}.npz", "--background", name) == 0
     found, black, white = (load_mesh(tmp_path / f"{name}.npz").colors for name in ("found", "black", "white"))
@@ -191,7 +191,7 @@ def test_finetune_trains_over_it(capture, tmp_path, capsys):
 
 
 def test_compare_and_render_draw_over_it(capture, tmp_path, capsys):
-    from meshsplats.images.writing import load_png
+    from meshsplats.images.reading import load_image
 
     data = ("--data", capture / "photos")
     assert run("compare", capture / "scene.ply", *data, "--downscale", "2", "-o", tmp_path / "c") == 0
@@ -206,8 +206,8 @@ def test_compare_and_render_draw_over_it(capture, tmp_path, capsys):
         out = tmp_path / name
         arguments = ("--as-splats", "--animation", "none", *options)
         assert run("render", capture / "scene.ply", *arguments, "-o", out) == 0
-        assert load_png(out / "view_0000.png")[0, 0].tolist() == [corner] * 3
-        color = json.loads((out / "config.json").read_text())["background"]["background"]
+        assert load_image(out / "view_0000.png")[0, 0].tolist() == [corner] * 3
+        color = toml.load(out / "config.toml")["result"]["background"]
         assert color == [corner / 255] * 3
 
 

@@ -30,7 +30,7 @@ from meshsplats.evaluation.report import (
 )
 from meshsplats.evaluation.strips import image_folder, markdown_table, worst_window
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.images.writing import save_png
+from meshsplats.images.writing import save_image
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
 
@@ -196,7 +196,7 @@ def test_views_are_all_scored_where_none_is_held_out():
 def test_images_by_name_and_by_order(tmp_path):
     cameras = [replace(CAMERA, name=f"set/r_{i}.png") for i in (2, 10)]
     for i, name in enumerate(("r_2", "r_10")):
-        save_png(tmp_path / f"{name}.png", np.full((16, 24, 3), (51 + 51 * i) / 255, np.float32))
+        save_image(tmp_path / f"{name}.png", np.full((16, 24, 3), (51 + 51 * i) / 255, np.float32))
     at = image_folder(tmp_path, cameras)
     assert at(cameras[0], (1, 1, 1))[0][0, 0] == pytest.approx([0.2] * 3)
     assert at(cameras[1], (1, 1, 1))[0][0, 0] == pytest.approx([0.4] * 3)
@@ -210,7 +210,7 @@ def test_images_by_name_and_by_order(tmp_path):
 
 
 def test_images_with_alpha_go_over_the_background_and_sizes_are_checked(tmp_path):
-    save_png(tmp_path / "one.png", np.tile(np.float32([1, 0, 0, 0.6]), (16, 24, 1)))
+    save_image(tmp_path / "one.png", np.tile(np.float32([1, 0, 0, 0.6]), (16, 24, 1)))
     color, alpha = image_folder(tmp_path, [CAMERA])(CAMERA, (0, 0, 1))
     assert np.allclose(color, [0.6, 0, 0.4], atol=1e-6)
     assert np.allclose(alpha, 0.6)

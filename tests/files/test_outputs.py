@@ -23,12 +23,12 @@ from _splats import few_splats
 from meshsplats._files import atomic
 from meshsplats._files.atomic import atomic_path, promises_kept, refuse_existing, temporary_beside
 from meshsplats._files.locks import locked
-from meshsplats.cli import main
+from meshsplats.cli import main, toml
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, save_mesh
-from meshsplats.images.writing import save_animation, save_array, save_png
+from meshsplats.images.writing import save_animation, save_array, save_image
 from meshsplats.mesh import SplatMesh
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and limits of POSIX")
@@ -55,7 +55,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", folder], check=True)
 
 
-def told(error: OSError, path: Path) -> str:
+def message_of(error: OSError, path: Path) -> str:
     assert error.filename == str(path)
     assert error.errno == errno.ENOSPC
     return str(error.strerror)
@@ -72,23 +72,23 @@ def test_a_full_disk_is_one_line_with_path_and_bytes(small_disk, suffix):
     with pytest.raises(OSError) as caught:
         save_mesh(mesh, target)
     needed = atomic.in_words(expected_bytes(mesh, suffix))
-    assert told(caught.value, target) == (
+    assert message_of(caught.value, target) == (
         f"no space left on the disk: the file needs about {needed}, 262.1 kB are free"
     )
     assert list(small_disk.iterdir()) == []
 
 
-def test_pictures_on_a_full_disk(small_disk):
-    picture = np.random.default_rng(0).random((320, 320, 3))
-    frames = [(picture * 255).astype(np.uint8), (picture[::-1] * 255).astype(np.uint8)] * 2
+def test_images_on_a_full_disk(small_disk):
+    image = np.random.default_rng(0).random((320, 320, 3))
+    frames = [(image * 255).astype(np.uint8), (image[::-1] * 255).astype(np.uint8)] * 2
     for name, save in [
-        ("a.png", lambda path: save_png(path, picture)),
+        ("a.png", lambda path: save_image(path, image)),
         ("a.webp", lambda path: save_animation(path, frames)),
-        ("a.npy", lambda path: save_array(path, picture)),
+        ("a.npy", lambda path: save_array(path, image)),
     ]:
         with pytest.raises(OSError) as caught:
             save(small_disk / name)
-        assert "needs about" in told(caught.value, small_disk / name)
+        assert "needs about" in message_of(caught.value, small_disk / name)
     assert list(small_disk.iterdir()) == []
 
 
@@ -99,8 +99,8 @@ def test_the_command_on_a_full_disk(small_disk, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert err.startswith(f"meshsplats: error: {small_disk / 'mesh.glb'}: no space left on the disk")
     assert err.count("\n") == 1
-    told = json.loads(out)["error"]
-    assert (told["kind"], told["code"], told["path"]) == ("space", 4, str(small_disk / "mesh.glb"))
+    error = json.loads(out)["error"]
+    assert (error["kind"], error["code"], error["path"]) == ("space", 4, str(small_disk / "mesh.glb"))
 
 
 @posix
@@ -158,7 +158,7 @@ def test_of_two_writers_exactly_one_wins(tmp_path):
         with pytest.raises(FileExistsError, match="another process has written"):
             both(target)
         with pytest.raises(FileExistsError, match="another process has written"):
-            both(target)  # told before the work now
+            both(target)  # now before the work
     assert target.read_bytes() == b"theirs"
     assert os.listdir(tmp_path) == ["mesh.glb"]
 
@@ -226,9 +226,9 @@ def test_two_processes_one_output(tmp_path):
     codes = [process.returncode for process in both]
     assert sorted(codes) == [0, 3], errors
     kept = ("100", "3000")[codes.index(0)]
-    recorded = json.loads((tmp_path / "mesh.config.json").read_text())["options"]["max_splats"]
+    recorded = toml.load(tmp_path / "mesh.glb.config.toml")["options"]["max_splats"]
     assert str(recorded) == kept
-    names = {"scene.ply", "mesh.glb", "mesh.config.json", "mesh.preview.png"}
+    names = {"scene.ply", "mesh.glb", "mesh.glb.config.toml", "mesh.glb.preview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
@@ -240,9 +240,10 @@ _HANGING = """
 import sys, time, meshsplats.cli
 from dataclasses import dataclass
 from meshsplats._files.atomic import atomic_path
+from meshsplats.cli.arguments import Command
 @dataclass
-class Hang:
-    def run(self):
+class Hang(Command):
+    def execute(self):
         with atomic_path(sys.argv[1]) as temporary:
             temporary.write_bytes(b"half")
             print("writing", flush=True)

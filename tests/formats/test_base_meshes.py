@@ -34,14 +34,14 @@ f 1/1 2/2 3/3 4/4
 """
 
 
-def write_picture(path, pixels=PIXELS) -> None:
+def write_image(path, pixels=PIXELS) -> None:
     Image.fromarray(pixels).save(path)
 
 
 def write_obj(folder, text=OBJ, library="newmtl painted\nmap_Kd t.png\n"):
     (folder / "m.obj").write_text(text)
     (folder / "m.mtl").write_text(library)
-    write_picture(folder / "t.png")
+    write_image(folder / "t.png")
     return folder / "m.obj"
 
 
@@ -96,13 +96,13 @@ def test_a_texture_checks_itself(arguments, message):
 
 def test_a_base_checks_itself():
     vertices, faces = np.eye(3), [[0, 1, 2]]
-    with pytest.raises(ValueError, match="faces must number"):
+    with pytest.raises(ValueError, match="faces must be indices"):
         BaseMesh(vertices, [[0, 1, 3]])
     with pytest.raises(ValueError, match="colors must lie"):
         BaseMesh(vertices, faces, np.full((3, 4), 2.0))
     with pytest.raises(ValueError, match="given together"):
         BaseMesh(vertices, faces, uv=np.zeros((1, 3, 2)))
-    with pytest.raises(ValueError, match="face_texture must number the 0 textures"):
+    with pytest.raises(ValueError, match="face_texture must be indices of the 0 textures"):
         BaseMesh(vertices, faces, uv=np.zeros((1, 3, 2)), face_texture=[0])
 
 
@@ -110,7 +110,7 @@ def test_a_base_checks_itself():
 
 
 def test_obj_with_a_material_library(tmp_path):
-    """A square of one polygon: the picture's first row lies at v = 1, as these files have it."""
+    """A square of one polygon: the image's first row lies at v = 1, as these files have it."""
     base = load_base(write_obj(tmp_path))
     assert base.colors is None
     assert base.textured
@@ -121,8 +121,8 @@ def test_obj_with_a_material_library(tmp_path):
         np.testing.assert_array_equal(np.rint(found), wanted)
     mesh = bind(base, triangles=16).mesh
     camera = orbit(mesh, 1, width=64, height=64, up=(0, 1, 0), elevation=0)[0]
-    picture = render(mesh, camera).color
-    quarter = picture[20, 20], picture[20, 44], picture[44, 20], picture[44, 44]
+    image = render(mesh, camera).color
+    quarter = image[20, 20], image[20, 44], image[44, 20], image[44, 44]
     np.testing.assert_array_equal(np.rint(quarter), (red, green, blue, white))
 
 
@@ -147,19 +147,19 @@ def test_obj_vertex_colours_serve_where_there_is_no_texture(tmp_path):
     assert (bind(base, layers=1, colors="texture").mesh.colors[:6, 2] > 0).any()
 
 
-def test_missing_pictures_are_told(tmp_path):
+def test_missing_images_are_reported(tmp_path):
     path = write_obj(tmp_path, library="newmtl painted\nmap_Kd away.png\n")
-    with pytest.warns(DataWarning, match=r"not there: away\.png"):
+    with pytest.warns(DataWarning, match=r"missing: away\.png"):
         assert not load_base(path).textured
     (tmp_path / "m.mtl").unlink()
-    with pytest.warns(DataWarning, match=r"not there: m\.mtl"):
+    with pytest.warns(DataWarning, match=r"missing: m\.mtl"):
         assert not load_base(path).textured
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_base(path, textures=False).uv is None
 
 
-def test_a_picture_given_by_hand(tmp_path):
+def test_an_image_given_by_hand(tmp_path):
     path = write_obj(tmp_path, OBJ.replace("mtllib m.mtl\n", ""))
     assert not load_base(path).textured
     base = load_base(path, texture=tmp_path / "t.png")
@@ -177,8 +177,8 @@ def test_a_picture_given_by_hand(tmp_path):
         (OBJ, "newmtl painted\nmap_Kd ../../t.png\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd C:\\t.png\n", "outside its folder"),
         (OBJ, "newmtl painted\nmap_Kd /dev/zero\n", "outside its folder"),
-        (OBJ, "newmtl painted\nmap_Kd\n", "line 2: map_Kd names no picture"),
-        (OBJ, "newmtl painted\nmap_Kd m.obj\n", "not a picture"),
+        (OBJ, "newmtl painted\nmap_Kd\n", "line 2: map_Kd names no image"),
+        (OBJ, "newmtl painted\nmap_Kd m.obj\n", "not an image"),
         (OBJ.replace("4/4", "4/9"), "", "texture coordinate 9 of 4"),
         (OBJ.replace("4/4", "4/0"), "", "line 11 cannot be read"),
         (OBJ.replace("vt 1 1", "vt one 1"), "", "line 8 cannot be read"),
@@ -192,7 +192,7 @@ def test_obj_that_lie(tmp_path, text, library, message):
 
 def test_a_link_out_of_the_folder_is_refused(tmp_path):
     (tmp_path / "in").mkdir()
-    write_picture(tmp_path / "t.png")
+    write_image(tmp_path / "t.png")
     path = write_obj(tmp_path / "in")
     (tmp_path / "in" / "t.png").unlink()
     (tmp_path / "in" / "t.png").symlink_to(tmp_path / "t.png")
@@ -208,9 +208,9 @@ def gltf(tmp_path, **changes):
     points = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")
     index = np.array([0, 1, 2, 0, 2, 3], "<u2")
-    picture = io.BytesIO()
-    Image.fromarray(PIXELS).save(picture, "PNG")
-    parts = [points.tobytes(), uv.tobytes(), index.tobytes() + b"\0" * 4, picture.getvalue()]
+    png = io.BytesIO()
+    Image.fromarray(PIXELS).save(png, "PNG")
+    parts = [points.tobytes(), uv.tobytes(), index.tobytes() + b"\0" * 4, png.getvalue()]
     starts = np.cumsum([0, *(len(p) for p in parts)])
     document = {
         "asset": {"version": "2.0"},
@@ -296,7 +296,7 @@ def test_gltf_without_a_texture_keeps_its_colours(tmp_path):
     [
         ({"images": [{"uri": "../t.png"}]}, "outside its folder"),
         ({"images": [{"uri": "t.png"}]}, "its file .t.png. is missing"),
-        ({"images": [{"uri": "data:image/png;base64,AAAA"}]}, "not a picture"),
+        ({"images": [{"uri": "data:image/png;base64,AAAA"}]}, "not an image"),
         ({"images": [{}]}, "neither data nor URI"),
         ({"images": []}, "refers to number 0 of 0 images"),
         ({"textures": []}, "refers to number 0 of 0 textures"),

@@ -15,7 +15,7 @@ import pytest
 from _meshes import assert_same, random_mesh
 
 from meshsplats import SplatMesh, load_mesh, save_mesh
-from meshsplats.formats.gltf.writer import up_quaternion, vertex_normals
+from meshsplats.formats.gltf.writer import computed_normals, up_quaternion
 
 SQUARE = SplatMesh(
     vertices=[[0, 0, 2], [1, 0, 2], [1, 1, 2], [0, 1, 2]],
@@ -110,42 +110,16 @@ def test_a_glb_for_viewers_that_mask(tmp_path):
     assert [c[3] for c in color] == [0, 65535, 32768, 16384]  # the truth
 
 
-@pytest.mark.parametrize("color_type", ["uint16", "float32"])
-def test_a_glb_with_a_cutoff_for_each_splat(tmp_path, color_type):
-    """Where a viewer cuts at 0.5, splat s is drawn where its opacity reaches frac(0.618 s)."""
-    corners = np.tile(np.eye(3), (500, 1))
-    opacity = np.tile([0.0, 0.7, 1.0], 500)
-    colors = np.column_stack([np.ones((1500, 3)), opacity])
-    faces = np.arange(1500).reshape(-1, 3)
-    mesh = SplatMesh(corners, faces, colors, face_splat=np.arange(500))
-    save_mesh(mesh, tmp_path / "m.glb", alpha="hash-friendly", color_type=color_type)
-    document, binary = chunks(tmp_path / "m.glb")
-    (material,) = document["materials"]
-    assert (material["alphaMode"], material["alphaCutoff"]) == ("MASK", 0.5)
-    attributes = document["meshes"][0]["primitives"][0]["attributes"]
-    shown = np.array(values(document, binary, attributes["COLOR_0"]))[:, 3]
-    shown = shown / (65535 if color_type == "uint16" else 1)
-    cutoffs = np.arange(500) * 0.6180339887498949 % 1
-    np.testing.assert_allclose(
-        shown.reshape(-1, 3), 0.5 + (opacity.reshape(-1, 3) - cutoffs[:, None]) / 2, atol=1e-5
-    )
-    # So each corner is drawn in as many splats as its opacity says.
-    np.testing.assert_allclose((shown.reshape(-1, 3) >= 0.5).mean(axis=0), [0, 0.7, 1], atol=0.004)
-
-
-@pytest.mark.parametrize("alpha", ["mask", "hash-friendly"])
-def test_true_opacities_come_back_from_masked_files(tmp_path, alpha):
+def test_true_opacities_come_back_from_masked_files(tmp_path):
     mesh = random_mesh(np.random.default_rng(3))
     mesh = replace(mesh, attributes={**mesh.attributes, "alpha": np.arange(9)})
-    save_mesh(mesh, tmp_path / "m.glb", alpha=alpha)
+    save_mesh(mesh, tmp_path / "m.glb", alpha="mask")
     assert_same(load_mesh(tmp_path / "m.glb"), mesh, 1e-4)
 
 
 def test_what_alpha_refuses(tmp_path):
-    with pytest.raises(ValueError, match="alpha must be one of blend, mask, hash-friendly, got 'add'"):
+    with pytest.raises(ValueError, match="alpha must be one of blend, mask, got 'add'"):
         save_mesh(SQUARE, tmp_path / "m.glb", alpha="add")
-    with pytest.raises(ValueError, match="needs a mesh that knows its splats"):
-        save_mesh(replace(SQUARE, face_splat=None), tmp_path / "m.glb", alpha="hash-friendly")
     with pytest.raises(ValueError, match=r"alpha applies to \.glb only"):
         save_mesh(SQUARE, tmp_path / "m.ply", alpha="mask")
 
@@ -182,7 +156,7 @@ def test_vertex_normals_weigh_by_area_and_never_vanish():
     # A triangle of area 2 facing +z and one of area 1 facing +x meet in vertex 0; vertex 5 has a sliver only.
     vertices = [[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 1, 0], [0, 0, 2], [9, 9, 9]]
     faces = [[0, 1, 2], [0, 3, 4], [5, 5, 5]]
-    normals = vertex_normals(SplatMesh(vertices, faces, np.ones((6, 4)), up=(0, 0, 1)))
+    normals = computed_normals(SplatMesh(vertices, faces, np.ones((6, 4)), up=(0, 0, 1)))
     np.testing.assert_allclose(normals[0], np.array([1, 0, 2]) / 5**0.5, rtol=1e-6)
     np.testing.assert_allclose(normals[1:], [[0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 0], [0, 0, 1]])
 
@@ -304,7 +278,7 @@ def test_the_khronos_validator_is_content(tmp_path):
             for color_type in ("uint16", "float32"):
                 files.append(tmp_path / f"{extras}-{lit}-{color_type}.glb")
                 save_mesh(mesh, files[-1], lit=lit, color_type=color_type)
-    for alpha in ("blend", "mask", "hash-friendly"):
+    for alpha in ("blend", "mask"):
         files.append(tmp_path / f"{alpha}.glb")
         save_mesh(SQUARE, files[-1], alpha=alpha)
     for file, issues in zip(files, validator_reports(tmp_path, files), strict=True):

@@ -134,13 +134,13 @@ def test_gltf_skins_that_stand_apart(tmp_path):
         (lambda d: d["nodes"][0].update(skin=1), "refers to number 1 of 1 skins"),
         (
             lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(JOINTS_0=3),
-            "must be 3 times 4 whole numbers",
+            "must be 3 times 4 integers",
         ),
         (
             lambda d: d.update(
                 scenes=[{"nodes": [0]}], nodes=[d["nodes"][0], {"children": [2]}, {"children": [1]}]
             ),
-            "node [12] is above itself",
+            "a cycle in the node hierarchy at node [12]",
         ),
     ],
 )
@@ -176,8 +176,8 @@ def test_gltf_instances_are_all_there(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ({}, "as many of each attribute"),
-        ({"TRANSLATION": [[0, 0, 0]], "SCALE": [[1, 1, 1]] * 2}, "as many of each attribute"),
+        ({}, "equal counts of all attributes"),
+        ({"TRANSLATION": [[0, 0, 0]], "SCALE": [[1, 1, 1]] * 2}, "equal counts of all attributes"),
         ({"ROTATION": [[0, 0, np.nan, 1]]}, "finite"),
     ],
 )

@@ -43,11 +43,11 @@ def test_truncated_at_every_length(tmp_path, suffix):
 
 
 def test_things_that_are_no_mesh(tmp_path):
-    path = tmp_path / "thing"
+    path = tmp_path / "file"
     for data, match in (
         (b"", "the file is empty"),
-        (b"\x89PNG\r\n\x1a\n", "not a mesh file that is known here"),
-        (b"Dear reader,\nthis is text.\n", "not a mesh file that is known here"),
+        (b"\x89PNG\r\n\x1a\n", "not a mesh file of a known format"),
+        (b"Dear reader,\nthis is text.\n", "not a mesh file of a known format"),
         (b"{}", "not a glTF 2 file"),
         (b'[{"name": "a"}]', "not a mesh file"),
         (b"ply\nformat ascii 1.0\nend_header\n", "no element 'vertex'"),
@@ -95,8 +95,8 @@ def test_npz_that_do_not_hold_a_mesh(tmp_path):
         ({"vertices": f4(1)}, r"'vertices' has shape \(\)"),
         ({"vertex_colors": np.ones((2, 4), f4)}, r"'vertex_colors' has shape \(2, 4\), expected \(3, 4\) or"),
         ({"faces": np.array([[0.0, 1, 2]])}, "faces must hold integers"),
-        ({"faces": np.array([[0, 1, 3]])}, "faces must number vertices 0 to 2, got 0 to 3"),
-        ({"faces": np.array([[0, 1, -1]])}, "faces must number vertices"),
+        ({"faces": np.array([[0, 1, 3]])}, "faces must be vertex indices from 0 to 2, got 0 to 3"),
+        ({"faces": np.array([[0, 1, -1]])}, "faces must be vertex indices"),
         ({"vertices": TRIANGLE + np.nan}, "vertices must be finite"),
         ({"vertices": TRIANGLE.astype(float) + 1e300}, "vertices must be finite"),
         ({"vertex_colors": np.full((3, 4), np.inf)}, "colors must be finite"),
@@ -104,7 +104,7 @@ def test_npz_that_do_not_hold_a_mesh(tmp_path):
         ({"vertices": TRIANGLE.astype(complex)}, "'vertices' must hold numbers"),
         ({"vertices": np.zeros(3, [("x", "f4")])}, "'vertices' must hold numbers"),
         ({"face_splat": np.array([1, 2])}, r"'face_splat' has shape \(2,\), expected \(1,\)"),
-        ({"face_splat": np.array([-1])}, "face_splat must be ascending numbers >= 0"),
+        ({"face_splat": np.array([-1])}, "face_splat must be ascending indices >= 0"),
         ({"up": np.zeros(3)}, "up must not be the zero vector"),
         ({"blending": np.array("additive")}, "blending must be one of display, linear"),
         ({"filter_px2": np.array(0.3)}, "does not know its splats"),
@@ -121,7 +121,7 @@ def test_pickled_npz_run_no_code(tmp_path):
     for name in ("vertices", "faces", "blending", "attribute_x"):
         refused(npz(tmp_path / "m.npz", **{name: np.array([Runs()], object)}), "pickled Python objects")
     npz(tmp_path / "m.npz", unrelated=np.array([Runs()], object))
-    load_mesh(tmp_path / "m.npz")  # what is not asked for is not looked at
+    load_mesh(tmp_path / "m.npz")  # other arrays are not read
     assert not Runs.traces
 
 
@@ -218,9 +218,10 @@ def test_ply_that_lie(tmp_path):
     refused(ply(path, body + struct.pack("<b3i", -1, 0, 1, 2), count="char"), "list of length -1|truncated")
     refused(ply(path, body + struct.pack("<I3i", 2**32 - 1, 0, 1, 2), count="uint"), "past the end")
     refused(
-        ply(path, body + struct.pack("<B3i", 3, 0, 1, 3)), "faces must number vertices 0 to 2, got 0 to 3"
+        ply(path, body + struct.pack("<B3i", 3, 0, 1, 3)),
+        "faces must be vertex indices from 0 to 2, got 0 to 3",
     )
-    refused(ply(path, body + struct.pack("<B3i", 3, 0, 1, -7)), "faces must number vertices")
+    refused(ply(path, body + struct.pack("<B3i", 3, 0, 1, -7)), "faces must be vertex indices")
     refused(ply(path, (TRIANGLE + np.inf).tobytes() + face), "vertices must be finite")
     text = b"0 0 0\n1 0 0\n0 1 0\n"
     for line in (
@@ -394,7 +395,7 @@ def test_glb_containers_that_lie(tmp_path):
         (4, 1, "container of version 2 expected, got version 1"),
         (8, len(good) + 1, "truncated"),
         (12, 2**32 - 1, "runs past the end"),
-        (16, 0x11111111, "without JSON chunk"),
+        (16, 0x11111111, "without a JSON chunk"),
     ):
         path.write_bytes(good[:at] + struct.pack("<I", value) + good[at + 4 :])
         refused(path, match)
@@ -444,7 +445,7 @@ def test_filters_that_cannot_be(tmp_path, value, match):
 
 
 def test_a_filter_without_splats_is_left_out(tmp_path):
-    """Another program has dropped what tells one splat's triangles from another's."""
+    """Another program has dropped the splat index of the triangles."""
     save_mesh(replace(MESH, face_splat=None), tmp_path / "m.glb")
     edit_glb(tmp_path / "m.glb", lambda d: d["meshes"][0]["extras"]["meshsplats"].update(filter_px2=0.3))
     save_mesh(replace(MESH, face_splat=None), tmp_path / "m.ply")

@@ -6,12 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _meshes import assert_same, random_mesh
+from _splats import few_splats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats import DataWarning, SplatMesh, load_mesh, save_mesh
+from meshsplats import DataWarning, SplatMesh, load_gaussians, load_mesh, save_gaussians, save_mesh
+from meshsplats.binding import Binding
 from meshsplats.formats import meshes
 from meshsplats.formats.gltf import writer as glb
+from meshsplats.formats.ply import header
+from meshsplats.formats.sniff import identify
 
 SUFFIXES = (".npz", ".ply", ".glb")
 
@@ -82,7 +86,7 @@ def test_normals_made_for_a_lit_glb_are_not_taken_for_the_meshs_own(tmp_path):
 
 
 def test_saving_twice_changes_nothing(tmp_path):
-    """What 16 bits have rounded once is not rounded again."""
+    """Values rounded to 16 bits once are not rounded again."""
     mesh = random_mesh(np.random.default_rng(3), 2000, 3000)
     for name in ("a", "b"):
         save_mesh(mesh, tmp_path / f"{name}.glb")
@@ -146,5 +150,39 @@ def test_files_are_recognised_by_content(tmp_path):
     mesh = random_mesh(np.random.default_rng(4))
     for suffix in SUFFIXES:
         save_mesh(mesh, tmp_path / f"m{suffix}")
-        (tmp_path / f"m{suffix}").rename(tmp_path / "thing.dat")
-        assert_same(load_mesh(tmp_path / "thing.dat"), mesh, 1e-4)
+        (tmp_path / f"m{suffix}").rename(tmp_path / "mesh.dat")
+        assert_same(load_mesh(tmp_path / "mesh.dat"), mesh, 1e-4)
+
+
+@pytest.mark.parametrize("extras", [True, False])
+def test_a_mesh_comes_back_from_its_arrays(extras):
+    mesh = random_mesh(np.random.default_rng(5), 9, 3, extras=extras)
+    mesh = replace(mesh, filter_px2=0.5 if extras else 0)
+    if extras:
+        corners = np.tile(np.eye(3), (3, 1))
+        of_face = np.repeat([1, 0, 1], 3)
+        bound = Binding(mesh.vertices, [[0, 1, 2], [2, 3, 4]], of_face, corners, np.arange(9), 0.25)
+        mesh = replace(mesh, faces=np.arange(9).reshape(3, 3), binding=bound)
+    again = SplatMesh.from_arrays(mesh.arrays())
+    assert_same(again, mesh)
+    assert list(again.arrays()) == list(mesh.arrays())
+    for name, values in mesh.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values)
+    for name in mesh.arrays():
+        if name in ("vertices", "faces", "colors", "up", "blending") or name.startswith("binding."):
+            with pytest.raises(KeyError, match=name):
+                SplatMesh.from_arrays({n: a for n, a in mesh.arrays().items() if n != name})
+
+
+def test_a_ply_header_is_parsed_once(tmp_path, monkeypatch):
+    save_mesh(random_mesh(np.random.default_rng(6)), tmp_path / "mesh.ply")
+    save_gaussians(few_splats(), tmp_path / "splats.ply")
+    parsed = []
+    parse = header.parse_header
+    monkeypatch.setattr(header, "parse_header", lambda *args: parsed.append(args[1]) or parse(*args))
+    readers = {"mesh.ply": (load_mesh, identify), "splats.ply": (load_gaussians, identify)}
+    for name, functions in readers.items():
+        for read in functions:
+            parsed.clear()
+            read(tmp_path / name)
+            assert parsed == [tmp_path / name]

@@ -194,7 +194,7 @@ def test_spz_4_names_its_axes_where_it_says_so(tmp_path):
 # -- real files
 
 
-def pictures_agree(a, b, *, means, covariance, color):
+def images_agree(a, b, *, means, covariance, color):
     """Splats in the same order: means in units of the median size, covariances relative, colours absolute."""
     size = np.median(a.scales)
     assert np.abs(a.means - b.means).max() < means * size
@@ -214,7 +214,7 @@ def pictures_agree(a, b, *, means, covariance, color):
 )
 def test_real_models_in_two_formats(one, other):
     a, b = load_gaussians(shared_data(f"splats/{one}")), load_gaussians(shared_data(f"splats/{other}"))
-    pictures_agree(a, b, means=1e-3, covariance=1e-4, color=1e-5)
+    images_agree(a, b, means=1e-3, covariance=1e-4, color=1e-5)
 
 
 def test_real_bundle():

@@ -317,14 +317,14 @@ def test_sog_codebooks_may_lack_their_first_entry(tmp_path):
     np.testing.assert_allclose(cloud.sh[:, 0], np.tile([0.8, 1, 52], (9, 1)), rtol=1e-6)
 
 
-def test_sog_pictures_may_be_png(tmp_path):
+def test_sog_images_may_be_png(tmp_path):
     values = some_splats(9, degree=0)
     files = encode.sog(values)
     from io import BytesIO
 
     from PIL import Image
 
-    files["quats.webp"] = encode.picture(
+    files["quats.webp"] = encode.image(
         np.asarray(Image.open(BytesIO(files["quats.webp"])).convert("RGBA")), "PNG"
     )
     assert len(load_gaussians(put(tmp_path / "s", files), strict=True)) == 9

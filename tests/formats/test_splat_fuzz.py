@@ -1,4 +1,4 @@
-"""Sixty mutated files of each format; tests/fuzz/fuzz_readers.py runs as many as wanted."""
+"""Sixty mutated files of each format; tests/fuzz/fuzz_readers.py runs any number."""
 
 from __future__ import annotations
 

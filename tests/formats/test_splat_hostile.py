@@ -62,9 +62,9 @@ def tree(file=0, offset=0, count=9):
     return {"lods": {"0": {"file": file, "offset": offset, "count": count}}}
 
 
-def bomb_picture():
-    """A picture of 4000 x 4000 equal pixels in a few kilobytes."""
-    return encode.picture(np.zeros((4000, 4000, 4), np.uint8), "PNG")
+def bomb_image():
+    """An image of 4000 x 4000 equal pixels in a few kilobytes."""
+    return encode.image(np.zeros((4000, 4000, 4), np.uint8), "PNG")
 
 
 def attributes(**changes):
@@ -148,7 +148,7 @@ FILES = {
         encode.bundle({"meta.json": b" " * 50_000_000}, "", zipfile.ZIP_DEFLATED),
         "unpacks to over",
     ),
-    "picture bomb.sog": (
+    "image bomb.sog": (
         encode.bundle(SOG | {"quats.webp": bytes(40_000_000)}, "", zipfile.ZIP_DEFLATED),
         "'quats.webp' unpacks to over",
     ),
@@ -210,17 +210,17 @@ FOLDERS = {
     "NaN": (meta(means__mins=[float("nan"), 0, 0]), "means.mins in meta.json must be 3 numbers"),
     "bands do not fit": (meta(shN__bands=2), "does not fit 2 bands"),
     "bands of list": (meta(shN__bands=[1]), "does not fit"),
-    "palette too long": (meta(shN__count=65), "a palette of 65 harmonics in a picture of 64"),
+    "palette too long": (meta(shN__count=65), "a palette of 65 harmonics in an image of 64"),
     "missing": (meta(quats={"files": ["other.webp"]}), "'other.webp' that it names is missing"),
     "absolute path": (meta(quats={"files": ["/etc/passwd"]}), "no plain file name; refused"),
     "parent folder": (meta(quats={"files": ["../secret.webp"]}), "no plain file name; refused"),
     "windows path": (meta(quats={"files": ["C:\\secret.webp"]}), "no plain file name; refused"),
     "dots": (meta(quats={"files": [".."]}), "no plain file name; refused"),
-    "not a picture": (SOG | {"quats.webp": b"hello"}, "the picture of quats cannot be read"),
-    "half a picture": (SOG | {"quats.webp": SOG["quats.webp"][:40]}, "the picture of quats cannot be read"),
-    "large picture": (SOG | {"quats.webp": bomb_picture()}, "4000 x 4000 pixels, expected at most"),
+    "not an image": (SOG | {"quats.webp": b"hello"}, "the image of quats cannot be read"),
+    "half an image": (SOG | {"quats.webp": SOG["quats.webp"][:40]}, "the image of quats cannot be read"),
+    "large image": (SOG | {"quats.webp": bomb_image()}, "4000 x 4000 pixels, expected at most"),
     "large palette": (
-        SOG | {"shN_centroids.webp": encode.picture(np.zeros((9000, 1920, 3), np.uint8), "PNG")},
+        SOG | {"shN_centroids.webp": encode.image(np.zeros((9000, 1920, 3), np.uint8), "PNG")},
         "9000",
     ),
 }
@@ -246,7 +246,7 @@ STREAMED = {
         "'count' of a level must be a whole number, got True",
     ),
     "huge count": (streamed(tree=tree(count=10**30)), "'count' of a level must be a whole number"),
-    "beyond its part": (streamed(tree=tree(offset=1)), "splats 1 to 10 are asked for, but it has 9"),
+    "beyond its part": (streamed(tree=tree(offset=1)), "splats 1 to 10 are requested, but it has 9"),
     "missing part": (streamed(filenames=["b/meta.json"]), "the part 'b/meta.json' that it names is missing"),
     "missing environment": (streamed(environment="env/meta.json"), "the part 'env/meta.json' that"),
     "parent folder": (streamed(filenames=["../secret/meta.json"]), "no path below its folder; refused"),
@@ -299,8 +299,8 @@ def test_parts_that_each_unpack_far_do_not_do_so_together(tmp_path):
     """50 parts of a few kilobytes, each of which may have 260,000 equal splats."""
     side, count = 512, 50
     values = random_splats(9, degree=0)
-    part = {name: encode.picture(np.zeros((side, side, 4), np.uint8), "PNG") for name in encode.sog(values)}
-    part["quats.webp"] = encode.picture(np.full((side, side, 4), (128, 128, 128, 252), np.uint8), "PNG")
+    part = {name: encode.image(np.zeros((side, side, 4), np.uint8), "PNG") for name in encode.sog(values)}
+    part["quats.webp"] = encode.image(np.full((side, side, 4), (128, 128, 128, 252), np.uint8), "PNG")
     described = json.loads(encode.sog(values)["meta.json"]) | {"count": side * side}
     part["meta.json"] = json.dumps(described).encode()
     names = [f"p{k}" for k in range(count)]

@@ -1,4 +1,4 @@
-"""Picture files, read back by Pillow."""
+"""Image files, read back by Pillow."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFont
 
+from meshsplats.images.reading import load_image
 from meshsplats.images.writing import (
     CAPTION,
     GAP,
     amplified_error,
-    load_png,
     save_animation,
     save_array,
     save_depth_png,
-    save_png,
+    save_image,
     straight_rgba,
     strip,
     to_bytes,
@@ -30,25 +30,46 @@ def test_bytes_are_rounded():
         to_bytes(np.array([np.nan]))
 
 
+@pytest.mark.parametrize("suffix", [".png", ".WEBP"])
 @pytest.mark.parametrize("channels", [3, 4])
-def test_png_comes_back(tmp_path, channels):
+def test_an_image_comes_back(tmp_path, suffix, channels):
     stored = RNG.integers(0, 256, (5, 7, channels))
-    save_png(tmp_path / "a.png", stored / 255)
-    with Image.open(tmp_path / "a.png") as image:
+    path = tmp_path / f"a{suffix}"
+    save_image(path, stored / 255)
+    with Image.open(path) as image:
+        assert image.format == suffix[1:].upper()
         assert image.mode == ("RGB", "RGBA")[channels - 3]
         np.testing.assert_array_equal(np.asarray(image), stored)
-    np.testing.assert_array_equal(load_png(tmp_path / "a.png"), stored)
-    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+    np.testing.assert_array_equal(load_image(path), stored)
+    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_png_of_another_shape_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="shape"):
-        save_png(tmp_path / "a.png", np.zeros((5, 7)))
+@pytest.mark.parametrize("suffix", [".jpg", ".jpeg"])
+def test_jpeg_is_close(tmp_path, suffix):
+    stored = np.tile(np.linspace(0, 1, 64)[:, None, None], (1, 48, 3)) * [1, 0.5, 0.2]
+    save_image(tmp_path / f"a{suffix}", stored)
+    shown = load_image(tmp_path / f"a{suffix}")
+    assert shown.shape == (64, 48, 3)
+    assert np.abs(shown / 255 - stored).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "words"),
+    [
+        ("a.png", (5, 7), r"shape \(h, w, 3\) or \(h, w, 4\), got \(5, 7\)"),
+        ("a.jpg", (5, 7, 4), r"JPEG images must have shape \(h, w, 3\), got"),
+        ("a.bmp", (5, 7, 3), "written as .png, .jpg, .jpeg, .webp, got 'a.bmp'"),
+        ("a", (5, 7, 3), "written as"),
+    ],
+)
+def test_images_of_other_shapes_and_names_are_refused(tmp_path, name, shape, words):
+    with pytest.raises(ValueError, match=words):
+        save_image(tmp_path / name, np.zeros(shape))
     assert not list(tmp_path.iterdir())
 
 
-def test_straight_alpha_composes_to_the_same_picture():
-    """Over any background: straight * alpha + background * (1 - alpha) is the picture drawn on it."""
+def test_straight_alpha_composes_to_the_same_image():
+    """Over any background: straight * alpha + background * (1 - alpha) is the image rendered on it."""
     alpha = RNG.uniform(0, 1, (6, 5)).astype(np.float32)
     alpha[0] = 0
     color = RNG.uniform(0, 1, (6, 5, 3)).astype(np.float32)
@@ -96,7 +117,7 @@ def test_animation(tmp_path, suffix):
 
 
 def test_gif_keeps_the_background(tmp_path):
-    """256 colours for thousands: those of the picture may shift a little, the plain background must not."""
+    """256 colours for thousands: those of the image may shift a little, the plain background must not."""
     frame = np.full((64, 64, 3), (250, 253, 251), np.uint8)
     frame[:16] -= RNG.integers(0, 6, (16, 64, 3), np.uint8)  # shades that are nearly the background's
     frame[16:32] -= RNG.integers(0, 200, (16, 64, 3), np.uint8)
@@ -142,7 +163,7 @@ def test_strip():
     assert plain[:GAP].min() == plain[:, :GAP].min() == 1
     titled = strip([a, b], ["one", "two"])
     np.testing.assert_array_equal(titled[CAPTION:-GAP, GAP : GAP + 90], a)
-    assert titled[:CAPTION, :90].min() < 0.5  # there is text over each picture
+    assert titled[:CAPTION, :90].min() < 0.5  # there is text over each image
     assert titled[:CAPTION, 100:].min() < 0.5
     with pytest.raises(ValueError, match="one shape"):
         strip([a, b[:3]])

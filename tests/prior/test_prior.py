@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
-from meshsplats.binding import Binding, surface_normals
+from meshsplats._geometry import vertex_normals
+from meshsplats.binding import Binding
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.prior import BaseMesh, MeshPrior, bind
@@ -397,7 +398,7 @@ def test_exported_layers_are_lifted_along_the_normal():
     lifted = prior.pose(lift=lift)
     binding = lifted.binding
     # The corners of the base are moved, here of a cube, along its area-weighted normals.
-    out = prior.base_vertices + surface_normals(CUBE, CUBE_FACES) * lift
+    out = prior.base_vertices + vertex_normals(CUBE.astype(np.float64), CUBE_FACES) * lift
     for layer in range(3):
         rows = binding.layers == layer
         moved = CUBE + layer * (out - CUBE)
@@ -463,9 +464,9 @@ def test_dropping_faces_keeps_the_binding_of_the_others():
         ({"weights": [[0.5, 0.6, -0.1]] * 3}, "weights must not be negative"),
         ({"weights": [[0.5, 0.4, 0.0999]] * 3}, "sum 1"),
         ({"weights": [[0.5, 0.5]] * 3}, "shape"),
-        ({"vertex_face": [0, 0, 1]}, "vertex_face must number the 1 faces"),
-        ({"vertex_face": [0, 0, -1]}, "vertex_face must number"),
-        ({"base_faces": [[0, 1, 3]]}, "base_faces must number the 3 vertices"),
+        ({"vertex_face": [0, 0, 1]}, "vertex_face must be indices of the 1 faces"),
+        ({"vertex_face": [0, 0, -1]}, "vertex_face must be indices"),
+        ({"base_faces": [[0, 1, 3]]}, "base_faces must be indices of the 3 vertices"),
         ({"layers": [0, 0, -1]}, "layers must be"),
         ({"lift": float("nan")}, "lift must be"),
         ({"base_vertices": [[np.inf, 0, 0]] * 3}, "finite"),

@@ -19,7 +19,7 @@ from meshsplats.finetuning.bound import BoundPositions, project_to_simplex, weig
 from meshsplats.finetuning.checkpoint import load_checkpoint, mesh_arrays, stored_mesh
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
-from meshsplats.prior import MeshPrior, bind, train
+from meshsplats.prior import MeshPrior, bind, train_prior
 
 triples = st.tuples(*[st.floats(-10, 10, width=32)] * 3)
 
@@ -170,7 +170,9 @@ def test_training_brings_the_images_closer_and_moves_with_the_base(task, tmp_pat
     base, data = task
     prior = bind(base, triangles=4, layers=2, spacing=0)
     config = make_config(steps=60, position_rate=0.005, color_rate=0.05, prune_epochs=0)
-    trained = train(prior, data, config, run=RunOptions(folder=tmp_path / "run", threads=1, report_every=20))
+    trained = train_prior(
+        prior, data, config, run=RunOptions(folder=tmp_path / "run", threads=1, report_every=20)
+    )
     before, after = (evaluate(p.mesh, data, threads=1).methods[0].mean("psnr") for p in (prior, trained))
     assert after > before + 6
     check_constraint(trained.mesh.binding)
@@ -188,7 +190,7 @@ def test_training_brings_the_images_closer_and_moves_with_the_base(task, tmp_pat
         View(replace(v.camera, world_to_camera=v.camera.world_to_camera @ np.linalg.inv(motion)), v.source)
         for v in data.train
     ]
-    elsewhere = train(
+    elsewhere = train_prior(
         bind(away, triangles=4, layers=2, spacing=0), Dataset(views), config, run=RunOptions(threads=1)
     )
     moved = elsewhere.pose(base.vertices)
@@ -202,7 +204,7 @@ def test_stopped_and_resumed_to_the_same_bits(task, tmp_path):
     prior = bind(base, triangles=4, layers=2, spacing=-0.02)
     config = make_config(steps=24, prune_epochs=1, prune_opacity=0.27)
     folder = tmp_path / "run"
-    whole = train(prior, data, config, run=RunOptions(folder=tmp_path / "whole", threads=1))
+    whole = train_prior(prior, data, config, run=RunOptions(folder=tmp_path / "whole", threads=1))
     assert len(whole.mesh.faces) < len(prior.mesh.faces), "something was pruned"
 
     class Enough(Exception):
@@ -214,25 +216,27 @@ def test_stopped_and_resumed_to_the_same_bits(task, tmp_path):
 
     run = RunOptions(folder=folder, threads=1, checkpoint_seconds=1e-9)
     with pytest.raises(Enough):
-        train(prior, data, config, run=run, on_progress=stop)
-    again = train(prior, data, config, run=replace(run, resume=True))
+        train_prior(prior, data, config, run=run, on_progress=stop)
+    again = train_prior(prior, data, config, run=replace(run, resume=True))
     for name in ("vertices", "faces", "colors", "depth_group", "normals"):
         np.testing.assert_array_equal(getattr(again.mesh, name), getattr(whole.mesh, name))
     np.testing.assert_array_equal(again.mesh.binding.weights, whole.mesh.binding.weights)
     # A checkpoint of another binding is not taken for this one's.
     turned = replace(prior.mesh.binding, weights=np.roll(prior.mesh.binding.weights, 1, axis=0))
     with pytest.raises(ValueError, match="began with another mesh"):
-        train(MeshPrior(replace(prior.mesh, binding=turned)), data, config, run=replace(run, resume=True))
+        train_prior(
+            MeshPrior(replace(prior.mesh, binding=turned)), data, config, run=replace(run, resume=True)
+        )
 
 
 def test_a_checkpoint_with_a_broken_binding_is_refused(task, tmp_path):
     base, data = task
-    train(bind(base), data, make_config(steps=1), run=RunOptions(folder=tmp_path / "run", threads=1))
+    train_prior(bind(base), data, make_config(steps=1), run=RunOptions(folder=tmp_path / "run", threads=1))
     arrays = dict(load_checkpoint(tmp_path / "run" / "checkpoint.safetensors").arrays)
     assert set(mesh_arrays(stored_mesh(arrays, "display"))) <= set(arrays)
     lacking = {k: v for k, v in arrays.items() if k != "mesh.binding.weights"}
     with pytest.raises(FileFormatError, match=r"lacks 'mesh.binding.weights'"):
         stored_mesh(lacking, "display")
     arrays["mesh.binding.vertex_face"] = arrays["mesh.binding.vertex_face"] + 10**6
-    with pytest.raises(FileFormatError, match="vertex_face must number"):
+    with pytest.raises(FileFormatError, match="vertex_face must be indices"):
         stored_mesh(arrays, "display")

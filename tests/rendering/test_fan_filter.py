@@ -1,4 +1,4 @@
-"""The filter for the triangles of a splat: by hand, by what it does to the opacity on the picture, by what
+"""The filter for the triangles of a splat: by hand, by what it does to the opacity on the image, by what
 must not change it, and against float64."""
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from _rendering import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_rendering_variants import VIEWS, assert_picture, in_another_process, scaled
+from test_rendering_variants import VIEWS, assert_image, in_another_process, scaled
 
 from meshsplats import SplatMesh, convert
 from meshsplats._core import library
@@ -89,7 +89,7 @@ def test_a_splat_that_is_nearly_edge_on_gets_the_width_of_the_filter():
     assert thin.alpha[18, 17] > 0.5
 
 
-# What it does to the opacity on the picture
+# What it does to the opacity on the image
 
 
 def covariance(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +102,7 @@ def covariance(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("mode", "options"), SHAPES)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_covariance_on_the_picture_grows_by_the_filter(mode, options, seed):
+def test_the_covariance_on_the_image_grows_by_the_filter(mode, options, seed):
     """For all patterns, in all positions: what is drawn of one splat has its mean and its covariance + s.
     Faint, for opacities of layers to add up; far, for perspective to be small."""
     cloud = splats(seed, 1, degree=0, sizes=(0.4, 1.2), opacity=0.01)
@@ -142,14 +142,14 @@ def test_scale_of_the_scene(seed, power):
 def test_renumbered_vertices_and_other_splats():
     """A splat is widened by itself, whatever the numbers of its vertices and wherever its triangles are."""
     mesh, view = fans(3, 40, "crossed"), camera()
-    picture = render(mesh, view)
+    image = render(mesh, view)
     rng = np.random.default_rng(0)
     order = rng.permutation(len(mesh.vertices))
     place = np.argsort(order)
     renumbered = replace(
         mesh, vertices=mesh.vertices[order], colors=mesh.colors[order], faces=place[mesh.faces]
     )
-    assert_same_bits(picture, render(renumbered, view))
+    assert_same_bits(image, render(renumbered, view))
     alone = mesh.keep_faces(mesh.face_splat == 7)
     assert alone.filter_px2 == mesh.filter_px2
     without = replace(
@@ -193,10 +193,10 @@ def test_an_invisible_splat_has_a_shape():
     """Its gradient tells what it would add, where its filter would have it."""
     mesh, view = diamond((20, 18), (2.0, 2.0), alpha=0.0), plain_camera()
     options = {"face_splat": mesh.face_splat, "filter_px2": 8.0, "samples": 8}
-    picture = TapedRendering(mesh.vertices, mesh.faces, mesh.colors, None, view, **options)
+    image = TapedRendering(mesh.vertices, mesh.faces, mesh.colors, None, view, **options)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-    nothing, all_pixels = np.zeros_like(picture.color), np.ones_like(picture.alpha)
-    picture.back(nothing, all_pixels, None, vertices=points, colors=colors)
+    nothing, all_pixels = np.zeros_like(image.color), np.ones_like(image.alpha)
+    image.backward(nothing, all_pixels, None, vertices=points, colors=colors)
     # Of uniform density, the square has a variance of r^2 / 6: its area grows by 1 + 48 / 4.
     np.testing.assert_allclose(colors[:, 3].sum(), 2 * 4 * 13, rtol=0.01)
     np.testing.assert_array_equal(points, 0)
@@ -215,17 +215,17 @@ def test_hostile(view):
     rng = np.random.default_rng(5)
     options = {"depth": True, "normals": True}
     for size in (1e-42, 1e-30, 1e-6, 1, 1e6, 1e18, 1e30, 3e38):
-        assert_picture(
+        assert_image(
             render(replace(own, vertices=scaled(own.vertices, size)), view, filter_px2=0.3, **options)
         )
         mixed = replace(own, vertices=scaled(own.vertices, 10 ** rng.uniform(-40, 38, (180, 1))))
-        assert_picture(render(mixed, view, filter_px2=100, samples=3, **options))
-        picture = TapedRendering(
+        assert_image(render(mixed, view, filter_px2=100, samples=3, **options))
+        image = TapedRendering(
             mixed.vertices, mixed.faces, mixed.colors, None, view, face_splat=own.face_splat, filter_px2=0.3
         )
         points, colors = np.zeros_like(mixed.vertices), np.zeros_like(mixed.colors)
         with np.errstate(all="ignore"):
-            picture.back(np.ones_like(picture.color), None, None, vertices=points, colors=colors)
+            image.backward(np.ones_like(image.color), None, None, vertices=points, colors=colors)
 
 
 # Against float64
@@ -309,7 +309,7 @@ def many() -> SplatMesh:
 
 def back(mesh: SplatMesh, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     view = camera(70, 50)
-    picture = TapedRendering(
+    image = TapedRendering(
         mesh.vertices,
         mesh.faces,
         mesh.colors,
@@ -320,14 +320,14 @@ def back(mesh: SplatMesh, threads: int | None = None) -> tuple[np.ndarray, np.nd
         threads=threads,
     )
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-    towards = np.random.default_rng(0).normal(size=picture.color.shape).astype(np.float32)
-    picture.back(towards, None, None, vertices=points, colors=colors)
+    towards = np.random.default_rng(0).normal(size=image.color.shape).astype(np.float32)
+    image.backward(towards, None, None, vertices=points, colors=colors)
     return points, colors
 
 
 def digest() -> str:
-    picture = render(many(), camera(70, 50), samples=2)
-    return hashlib.sha256(picture.color.tobytes() + picture.alpha.tobytes()).hexdigest()
+    image = render(many(), camera(70, 50), samples=2)
+    return hashlib.sha256(image.color.tobytes() + image.alpha.tobytes()).hexdigest()
 
 
 def test_threads_and_variants_do_not_change_a_bit():
@@ -384,7 +384,7 @@ def test_conversion_for_a_filter():
 
 
 def test_splats_of_any_size_look_as_their_viewer_shows_them():
-    """One splat of 0.1 to 2.5 pixels: against the splat's own picture, the filter is right where the plain
+    """One splat of 0.1 to 2.5 pixels: against the splat's own image, the filter is right where the plain
     conversion is not."""
     from meshsplats import render_splats
 

@@ -61,7 +61,7 @@ def test_the_low_pass_of_2dgs_follows_the_dilation(cloud, dilation):
 
 
 def fan_of(side: float) -> SplatMesh:
-    """A square of four triangles round the origin, ``side`` wide, across the z axis."""
+    """A square of four triangles around the origin, ``side`` wide, across the z axis."""
     half = side / 2
     rim = [(-half, -half, 0), (half, -half, 0), (half, half, 0), (-half, half, 0)]
     faces = [(0, i + 1, (i + 1) % 4 + 1) for i in range(4)]

@@ -27,7 +27,7 @@ TOLERANCE = 1e-5
 
 
 def stack(depths, alpha) -> SplatMesh:
-    """Layers that cover the picture, with vertices of many colours and opacities of about ``alpha``."""
+    """Layers that cover the image, with vertices of many colours and opacities of about ``alpha``."""
     mesh = layers(depths, alpha)
     rng = np.random.default_rng(2)
     return replace(mesh, colors=rng.random(mesh.colors.shape) * [1, 1, 1, 2 * alpha])
@@ -68,7 +68,7 @@ SCENES = [
 
 
 def gradients(function, dtype, mesh: SplatMesh, cameras, seed: int = 0, extra: int = 2, **options):
-    """For random gradients of a picture those of vertices, attributes, background and poses."""
+    """For random gradients of an image those of vertices, attributes, background and poses."""
     generator = torch.Generator().manual_seed(seed)
     more = torch.randn(len(mesh.vertices), extra, generator=generator)
     view = cameras[0]
@@ -80,7 +80,7 @@ def gradients(function, dtype, mesh: SplatMesh, cameras, seed: int = 0, extra: i
     ]
     inputs = [part.to(dtype).clone().requires_grad_() for part in inputs]
     vertices, attributes, background, poses = inputs
-    pictures = function(
+    images = function(
         vertices,
         mesh.faces,
         attributes,
@@ -90,8 +90,8 @@ def gradients(function, dtype, mesh: SplatMesh, cameras, seed: int = 0, extra: i
         depth_group=mesh.depth_group,
         **options,
     )
-    towards = [torch.randn(part.shape, generator=generator).to(dtype) for part in pictures]
-    torch.autograd.backward(pictures, towards)
+    towards = [torch.randn(part.shape, generator=generator).to(dtype) for part in images]
+    torch.autograd.backward(images, towards)
     return [part.grad for part in inputs]
 
 
@@ -125,18 +125,18 @@ def test_reference_by_finite_differences():
     ).requires_grad_()
     pose = torch.from_numpy(view.world_to_camera).requires_grad_()
 
-    def pictures(vertices, attributes, background, pose):
+    def images(vertices, attributes, background, pose):
         return tuple(
             reference_autograd.rasterize(
                 vertices, mesh.faces, attributes, view, background=background, world_to_camera=pose
             )
         )
 
-    assert torch.autograd.gradcheck(pictures, (vertices, attributes, background, pose), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(images, (vertices, attributes, background, pose), eps=1e-7, atol=1e-5)
 
 
-def test_picture_moves_as_its_gradient_says():
-    """Where no edge is in the picture, the reference renderer itself shows what a small move does."""
+def test_image_moves_as_its_gradient_says():
+    """Where no edge is in the image, the reference renderer itself shows what a small move does."""
     mesh, view = layers([1.2, 1.5, 2.0, 2.2], [0.3, 0.6, 0.2, 0.9]), camera(20, 16)
     rng = np.random.default_rng(0)
     mesh = replace(mesh, colors=rng.random(mesh.colors.shape))
@@ -209,14 +209,14 @@ def test_face_without_opacity_can_appear():
 def test_background_and_alpha():
     mesh, view = soup(9), camera()
     background = torch.rand(3, requires_grad=True, generator=torch.Generator().manual_seed(0))
-    picture = rasterize(
+    image = rasterize(
         torch.from_numpy(mesh.vertices),
         mesh.faces,
         torch.from_numpy(mesh.colors),
         [view, view],
         background=background,
     )
-    picture.color.sum().backward()
+    image.color.sum().backward()
     expected = 2 * (1 - render(mesh, view).alpha).sum()
     np.testing.assert_allclose(background.grad.numpy(), [expected] * 3, rtol=1e-5)
 
@@ -279,7 +279,7 @@ def test_calls_at_the_same_time_do_not_disturb_each_other():
 
 @pytest.mark.parametrize("variant", library.VARIANTS)
 def test_same_gradients_on_every_instruction_set(variant, tmp_path):
-    """But for rounding: fused multiply-adds are used where there are some. (Pictures: the same bits.)"""
+    """But for rounding: fused multiply-adds are used where there are some. (Images: the same bits.)"""
     if variant not in library.available_variants():
         pytest.skip(f"this processor or build has no variant {variant}")
     code = (
@@ -315,10 +315,10 @@ def test_without_gradients_it_is_render():
     slow = rasterize(points, mesh.faces, colors, view, background=(0.1, 0.2, 0.3), samples=2)
     assert slow.color.requires_grad
     assert not fast.color.requires_grad
-    for picture in (fast, slow):
-        np.testing.assert_array_equal(picture.color.detach().numpy(), expected.color)
-        np.testing.assert_array_equal(picture.alpha.detach().numpy(), expected.alpha)
-        assert picture.attributes.shape == (view.height, view.width, 0)
+    for image in (fast, slow):
+        np.testing.assert_array_equal(image.color.detach().numpy(), expected.color)
+        np.testing.assert_array_equal(image.alpha.detach().numpy(), expected.alpha)
+        assert image.attributes.shape == (view.height, view.width, 0)
 
 
 def test_only_what_is_asked_for():
@@ -356,9 +356,9 @@ def test_vertices_changed_in_place():
 
 def test_empty_mesh():
     points, colors = torch.zeros(0, 3, requires_grad=True), torch.zeros(0, 4, requires_grad=True)
-    picture = rasterize(points, np.zeros((0, 3), np.int32), colors, camera(), background=(0.5, 0.25, 0))
-    picture.color.sum().backward()
-    assert (picture.color == torch.tensor([0.5, 0.25, 0])).all()
+    image = rasterize(points, np.zeros((0, 3), np.int32), colors, camera(), background=(0.5, 0.25, 0))
+    image.color.sum().backward()
+    assert (image.color == torch.tensor([0.5, 0.25, 0])).all()
     assert points.grad.shape == (0, 3)
 
 
@@ -369,8 +369,8 @@ def test_empty_mesh():
         ({"vertices": torch.zeros(5, 2)}, r"vertices must be \(v, 3\)"),
         ({"attributes": torch.zeros(5, 3)}, r"attributes must be \(5, 4 \+ k\)"),
         ({"attributes": torch.zeros(4, 4)}, r"attributes must be \(5, 4 \+ k\)"),
-        ({"faces": np.array([[0, 1, 5]])}, "faces must name vertices 0 to 4, got 0 to 5"),
-        ({"faces": np.array([[0, -1, 2]])}, "faces must name vertices 0 to 4, got -1 to 2"),
+        ({"faces": np.array([[0, 1, 5]])}, "faces must be vertex indices from 0 to 4, got 0 to 5"),
+        ({"faces": np.array([[0, -1, 2]])}, "faces must be vertex indices from 0 to 4, got -1 to 2"),
         ({"faces": np.zeros((1, 3))}, "faces must be"),
         ({"face_splat": np.zeros(2, np.int32)}, r"face_splat must be \(1,\)"),
         ({"depth_group": np.zeros(1)}, r"depth_group must be \(1,\)"),

@@ -1,4 +1,4 @@
-"""The float64 reference for meshes against pictures worked out by hand and the laws of blending."""
+"""The float64 reference for meshes against images worked out by hand and the laws of blending."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def triangles(*corners, colors=None) -> SplatMesh:
 
 
 def layer(z: float, size: float = 100.0) -> list[tuple[float, float, float]]:
-    """A triangle that faces ``flat_camera`` and covers its picture."""
+    """A triangle that faces ``flat_camera`` and covers its image."""
     return [(-size * z, -size * z, z), (3 * size * z, -size * z, z), (-size * z, 3 * size * z, z)]
 
 
@@ -152,7 +152,7 @@ def test_a_triangle_across_the_near_plane_is_the_clipped_one():
     assert result.fragments == render(clipped, camera).fragments > 30
     same(result, render(clipped, camera))
     np.testing.assert_allclose(result.depth, render(clipped, camera, depth=True).depth, atol=1e-12)
-    # Without a plane in the way it would reach further up the picture.
+    # Without a plane in the way it would reach further up the image.
     assert render(whole, replace(camera, near=0.1)).fragments > result.fragments
 
 
@@ -178,7 +178,7 @@ def test_triangles_without_area_are_not_drawn():
 
 
 def test_interpolation_is_perspective_correct():
-    # The middle of the picture of an edge from z = 1 to z = 3 lies a quarter of the way along it:
+    # The middle of the image of an edge from z = 1 to z = 3 lies a quarter of the way along it:
     # x / z of (1 - t) (0, 1) + t (12, 3) is 2 where 12 t = 2 (1 + 2 t), t = 1 / 4.
     mesh = SplatMesh(
         [(0, 0, 1), (12, 0, 3), (0, 8, 1)],
@@ -293,7 +293,7 @@ def test_a_depth_group_lies_where_its_largest_triangle_lies():
 
 
 def test_a_depth_group_stays_within_its_vertices():
-    # Blue, outside the picture, is the largest. Its plane z = 1 + x / 2 is 1 / z = 1 - u / 2 at u = x / z:
+    # Blue, outside the image, is the largest. Its plane z = 1 + x / 2 is 1 / z = 1 - u / 2 at u = x / z:
     # z is 4 / 3 at u = 0.5, 4 at 1.5, and behind the camera from 2 on. The farthest vertex limits it to 2.
     slope = [(0, -800, 1), (2, -800, 2), (0, -100, 1)]
     red, green = (1, 0, 0, 1), (0, 1, 0, 1)
@@ -317,10 +317,10 @@ def test_a_depth_group_seen_edge_on_stands_at_its_nearest_vertex():
 def test_backgrounds():
     camera = random_camera()
     rng = np.random.default_rng(0)
-    picture = rng.random((11, 13, 3))
+    image = rng.random((11, 13, 3))
     empty = SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 4)))
-    result = render(empty, camera, background=picture, samples=2, depth=True, normals=True)
-    np.testing.assert_allclose(result.color, picture)
+    result = render(empty, camera, background=image, samples=2, depth=True, normals=True)
+    np.testing.assert_allclose(result.color, image)
     assert result.fragments == 0
     assert (result.alpha == 0).all()
     assert (result.depth == 0).all()
@@ -396,13 +396,13 @@ def test_a_triangle_of_alpha_0_is_no_triangle(seed, layers):
 
 @FEW
 @given(seed=seeds)
-def test_the_picture_is_affine_in_the_background(seed):
+def test_the_image_is_affine_in_the_background(seed):
     mesh, camera = random_mesh(seed), random_camera()
-    picture = np.random.default_rng(seed).random((11, 13, 3))
+    image = np.random.default_rng(seed).random((11, 13, 3))
     on_black = render(mesh, camera, background=BLACK)
-    on_picture = render(mesh, camera, background=picture)
+    on_picture = render(mesh, camera, background=image)
     np.testing.assert_allclose(
-        on_picture.color, on_black.color + (1 - on_black.alpha)[..., None] * picture, atol=1e-12
+        on_picture.color, on_black.color + (1 - on_black.alpha)[..., None] * image, atol=1e-12
     )
 
 
@@ -422,19 +422,19 @@ def test_attributes_are_blended_as_colours_are(seed):
 @given(seed=seeds)
 def test_layers_add_up(seed):
     mesh, camera = random_mesh(seed), random_camera()
-    pictures = [render(mesh, camera, max_layers=k) for k in (1, 2, 4, 14)]
-    for fewer, more in pairwise(pictures):
+    images = [render(mesh, camera, max_layers=k) for k in (1, 2, 4, 14)]
+    for fewer, more in pairwise(images):
         assert fewer.fragments <= more.fragments
         assert (fewer.alpha <= more.alpha + 1e-12).all()
-    same(pictures[-1], render(mesh, camera))
+    same(images[-1], render(mesh, camera))
     limit = 0.05
     stopped = render(mesh, camera, min_transmittance=limit)
-    assert np.abs(stopped.color - pictures[-1].color).max() <= limit
+    assert np.abs(stopped.color - images[-1].color).max() <= limit
 
 
 @FEW
 @given(seed=seeds, samples=st.sampled_from([2, 3, 4]))
-def test_samples_are_the_pixels_of_a_larger_picture(seed, samples):
+def test_samples_are_the_pixels_of_a_larger_image(seed, samples):
     camera = random_camera()
     names = ("fx", "fy", "cx", "cy", "width", "height")
     large = replace(camera, **{name: samples * getattr(camera, name) for name in names})

@@ -79,7 +79,7 @@ def test_a_splat_off_the_axis_by_hand():
 
 
 def test_the_jacobian_of_a_splat_far_outside_is_limited():
-    # tan x of the picture: -0.2 to 0.8, half field of view 0.5, so limits -0.35 and 0.95.
+    # tan x of the image: -0.2 to 0.8, half field of view 0.5, so limits -0.35 and 0.95.
     camera = Camera(np.eye(4), 10, 10, 2, 5, 10, 10)
     for tan, limit, pixel in ((2.0, 0.95, 9), (-1.5, -0.35, 0)):
         splat = one_splat(mean=(2 * tan, 0, 2), scales=(0.01, 0.01, 3))
@@ -99,7 +99,7 @@ def test_the_jacobian_of_a_splat_far_outside_is_limited():
 @FEW
 @given(seed=seeds)
 def test_projected_covariance_follows_from_the_projection(seed):
-    # The falloff read back from the picture, against a Jacobian by differences and a rotation by quaternions.
+    # The falloff read back from the image, against a Jacobian by differences and a rotation by quaternions.
     rng = np.random.default_rng(seed)
     q = rng.normal(size=4)
     q = np.float32(q / np.linalg.norm(q)).astype(float)
@@ -303,12 +303,12 @@ def test_splat_laws(kernel, seed):
 
 @FEW
 @given(seed=seeds, samples=st.sampled_from([2, 3, 4]))
-def test_samples_are_the_pixels_of_a_larger_picture(seed, samples):
+def test_samples_are_the_pixels_of_a_larger_image(seed, samples):
     cloud, camera = random_splats(seed), random_camera()
     names = ("fx", "fy", "cx", "cy", "width", "height")
     large = replace(camera, **{name: samples * getattr(camera, name) for name in names})
     result = render_splats(cloud, camera, samples=samples)
-    # The dilation is in pixels of the picture, whatever the samples.
+    # The dilation is in pixels of the image, whatever the samples.
     expected = render_splats(cloud, large, dilation=0.3 * samples**2)
     fine = expected.color.reshape(11, samples, 13, samples, 3)
     np.testing.assert_allclose(result.color, fine.mean(axis=(1, 3)), atol=1e-12)
@@ -329,8 +329,8 @@ def test_bad_options_are_refused():
 
 def test_no_splats():
     empty = one_splat().select(np.zeros(1, bool))
-    picture = np.random.default_rng(0).random((11, 13, 3))
-    result = render_splats(empty, random_camera(), background=picture, samples=2)
-    np.testing.assert_allclose(result.color, picture, atol=1e-15)
+    image = np.random.default_rng(0).random((11, 13, 3))
+    result = render_splats(empty, random_camera(), background=image, samples=2)
+    np.testing.assert_allclose(result.color, image, atol=1e-15)
     assert (result.alpha == 0).all()
     assert result.fragments == 0

@@ -43,7 +43,7 @@ def test_random_triangles(seed):
 @FEW
 @given(seed=seeds, near=st.sampled_from([1.0, 0.05, 1e-4]))
 def test_triangles_across_and_behind_the_near_plane(seed, near):
-    # About half of all vertices are behind; what is just in front is huge on the picture.
+    # About half of all vertices are behind; what is just in front is huge on the image.
     mesh = soup(seed, spread=(2, 2, 3), z=0.5)
     assert (mesh.vertices[:, 2] < near).sum() > 10
     assert_mesh_is_exact(mesh, camera(near=near), tolerance=5e-5, **EXTRAS)
@@ -51,7 +51,7 @@ def test_triangles_across_and_behind_the_near_plane(seed, near):
 
 @pytest.mark.parametrize("samples", [1, 2, 3, 5, 16])
 @pytest.mark.parametrize("size", [(13, 11), (1, 1), (1, 20), (17, 2)])
-def test_samples_and_odd_pictures(samples, size):
+def test_samples_and_odd_images(samples, size):
     mesh = soup(5, 20, spread=(0.5, 0.5, 1.5))
     assert_mesh_is_exact(mesh, camera(*size), samples=samples, **(EXTRAS if samples < 16 else {}))
 
@@ -82,7 +82,7 @@ def test_triangles_seen_edge_on():
     rng = np.random.default_rng(0)
     middle = np.column_stack([np.zeros((200, 2)), rng.uniform(1, 5, 200)])
     across = rng.normal(size=(200, 2, 1)) * [0.1, 0.1, 0.0] + [0, 0, 1]
-    # All planes contain the ray through the picture's centre or miss it by 1e-9.
+    # All planes contain the ray through the image's centre or miss it by 1e-9.
     side = np.concatenate([middle[:, None], middle[:, None] + across * [1, 1, 0.1]], 1)
     side[:, :, 0] += rng.choice([0, 1e-9, -1e-9], (200, 1))
     view = camera(33, 33, cx=16.5, cy=16.5)
@@ -106,11 +106,11 @@ def test_coplanar_layers(grouped):
         rng.random((3 * planes * copies, 4)),
         depth_group=10**9 + np.repeat(np.arange(planes), copies)[order] if grouped else None,
     )
-    picture = assert_mesh_is_exact(mesh, camera(near=2.5), depth=True, normals=True)
+    image = assert_mesh_is_exact(mesh, camera(near=2.5), depth=True, normals=True)
     # Group numbers are names only.
     if grouped:
         renamed = replace(mesh, depth_group=mesh.depth_group - 10**9)
-        assert_same_bits(picture, render(renamed, camera(near=2.5), depth=True, normals=True))
+        assert_same_bits(image, render(renamed, camera(near=2.5), depth=True, normals=True))
 
 
 @FEW
@@ -139,23 +139,23 @@ def test_vertices_on_pixel_centres():
         rng.random((360, 4)),
     )
     for mesh in (tilted, upright):
-        picture = assert_mesh_is_exact(mesh, view, flips=0)
+        image = assert_mesh_is_exact(mesh, view, flips=0)
         truth = reference.render(mesh, view, min_transmittance=api.MIN_TRANSMITTANCE)
-        assert picture.fragments == truth.fragments > 2000
+        assert image.fragments == truth.fragments > 2000
         # Triangles of one origin are taken together, those of the nearest first.
         origins = np.sort(rng.integers(0, 20, 120))
-        assert_same_bits(picture, render(replace(mesh, face_splat=origins), view))
+        assert_same_bits(image, render(replace(mesh, face_splat=origins), view))
 
 
 def test_ties_go_by_face_number():
     mesh = layers([2.0] * 40, 0.3)
-    picture = assert_mesh_is_exact(mesh, camera(20, 18), flips=0)
+    image = assert_mesh_is_exact(mesh, camera(20, 18), flips=0)
     one = layers([2.0, 2.0], [1, 0.5], [(1, 0, 0), (0, 1, 0)])
     assert (render(one, camera(4, 4)).color == (1, 0, 0)).all()
     other = layers([2.0, 2.0], [0.5, 1], [(0, 1, 0), (1, 0, 0)])
     assert (render(other, camera(4, 4)).color == (0.5, 0.5, 0)).all()
     swapped = replace(mesh, faces=mesh.faces[::-1])
-    assert np.abs(render(swapped, camera(20, 18)).color - picture.color).max() > 0.01
+    assert np.abs(render(swapped, camera(20, 18)).color - image.color).max() > 0.01
 
 
 @pytest.mark.parametrize("count", [3, 5, 7, 11, 15, 30, 200, 600])
@@ -170,9 +170,9 @@ def test_ties_where_planes_cross(count):
     mesh = SplatMesh(
         points.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), np.clip(np.repeat(rgba, 3, axis=0), 0, 1)
     )
-    picture = assert_mesh_is_exact(mesh, view, flips=0)
+    image = assert_mesh_is_exact(mesh, view, flips=0)
     backwards = render(replace(mesh, faces=mesh.faces[::-1]), view)
-    differs = np.abs(backwards.color - picture.color).max(axis=(0, 2)) > 1e-4
+    differs = np.abs(backwards.color - image.color).max(axis=(0, 2)) > 1e-4
     assert differs[8]
 
 
@@ -182,15 +182,15 @@ def test_five_thousand_layers(depths):
     # Depths that float32 tells apart as 1 / z.
     close = 2 - 2.0**-21 * rng.permutation(5000)
     z = {"apart": rng.uniform(1, 20, 5000), "the same": np.full(5000, 2.0), "nearly the same": close}[depths]
-    picture = assert_mesh_is_exact(layers(z, 0.001), camera(7, 5), tolerance=1e-5)
-    assert picture.alpha == pytest.approx(1 - 0.999**5000, abs=1e-5)
+    image = assert_mesh_is_exact(layers(z, 0.001), camera(7, 5), tolerance=1e-5)
+    assert image.alpha == pytest.approx(1 - 0.999**5000, abs=1e-5)
 
 
 @pytest.mark.parametrize("alpha", [0, 1e-30, 1])
 def test_invisible_and_opaque_layers(alpha):
-    picture = assert_mesh_is_exact(layers(np.linspace(5, 1, 30), alpha), camera(9, 9), flips=0, depth=True)
-    assert (picture.alpha == (alpha == 1)).all()
-    assert picture.fragments == (81 if alpha == 1 else 0 if alpha == 0 else 81 * 30)
+    image = assert_mesh_is_exact(layers(np.linspace(5, 1, 30), alpha), camera(9, 9), flips=0, depth=True)
+    assert (image.alpha == (alpha == 1)).all()
+    assert image.fragments == (81 if alpha == 1 else 0 if alpha == 0 else 81 * 30)
 
 
 def test_nothing_to_draw():
@@ -207,11 +207,11 @@ def test_nothing_to_draw():
         replace(soup(1), faces=np.zeros((0, 3), int)),
         replace(soup(1), vertices=soup(1).vertices * -1),
     ):
-        picture = render(mesh, camera(near=9), background=(0.2, 0.4, 0.6), **EXTRAS)
-        assert (picture.color == np.float32([0.2, 0.4, 0.6])).all()
-        assert picture.fragments == 0
-        assert picture.attributes["flow"].shape == (29, 37, 2)
-        assert not any(value.any() for value in (picture.alpha, picture.depth, picture.normals))
+        image = render(mesh, camera(near=9), background=(0.2, 0.4, 0.6), **EXTRAS)
+        assert (image.color == np.float32([0.2, 0.4, 0.6])).all()
+        assert image.fragments == 0
+        assert image.attributes["flow"].shape == (29, 37, 2)
+        assert not any(value.any() for value in (image.alpha, image.depth, image.normals))
 
 
 @pytest.mark.parametrize(
@@ -221,8 +221,8 @@ def test_real_meshes(splats, cameras, factor):
     cloud = load_gaussians(shared_data(f"splats/{splats}"))
     view = load_cameras(shared_data(f"cameras/{cameras}"))[1].scaled(factor)
     mesh = convert(cloud)
-    picture = assert_mesh_is_exact(mesh, view, depth=True, normals=True)
-    assert picture.alpha.max() > 0.9
+    image = assert_mesh_is_exact(mesh, view, depth=True, normals=True)
+    assert image.alpha.max() > 0.9
 
 
 # Laws
@@ -233,13 +233,13 @@ def test_real_meshes(splats, cameras, factor):
 def test_order_of_faces_and_vertices_and_origins_do_not_matter(seed):
     rng = np.random.default_rng(seed)
     mesh, view = soup(seed, 300, spread=(1.5, 1.5, 2)), camera(60, 50)
-    picture = render(mesh, view, **EXTRAS)
+    image = render(mesh, view, **EXTRAS)
     # Where two depths are the same float32, the face number decides.
     permuted = render(replace(mesh, faces=mesh.faces[rng.permutation(300)]), view, **EXTRAS)
-    assert_close(picture, permuted, tolerance=0)
-    assert picture.fragments == permuted.fragments
+    assert_close(image, permuted, tolerance=0)
+    assert image.fragments == permuted.fragments
     for origin in (np.arange(300), np.zeros(300, int), np.sort(rng.integers(0, 40, 300))):
-        assert_same_bits(picture, render(replace(mesh, face_splat=origin), view, **EXTRAS))
+        assert_same_bits(image, render(replace(mesh, face_splat=origin), view, **EXTRAS))
     order = rng.permutation(300)
     renumbered = SplatMesh(
         mesh.vertices[order],
@@ -247,7 +247,7 @@ def test_order_of_faces_and_vertices_and_origins_do_not_matter(seed):
         mesh.colors[order],
         attributes={name: value[order] for name, value in mesh.attributes.items()},
     )
-    assert_same_bits(picture, render(renumbered, view, **EXTRAS))
+    assert_same_bits(image, render(renumbered, view, **EXTRAS))
 
 
 @FEW
@@ -269,25 +269,25 @@ def test_everything_moved_far_away(seed):
 @pytest.mark.parametrize("factor", [2.0**-20, 2.0**20, 1e-6, 1e6])
 def test_size_of_the_scene_does_not_matter(factor):
     mesh = soup(8, spread=(2, 2, 3), z=2)
-    picture = render(mesh, camera(), normals=True)
+    image = render(mesh, camera(), normals=True)
     scaled = replace(mesh, vertices=mesh.vertices * np.float32(factor))
     other = render(scaled, camera(near=0.5 * factor), normals=True)
     if np.log2(factor) == round(np.log2(factor)):
-        assert_same_bits(picture, other)
+        assert_same_bits(image, other)
     else:
-        assert_close(picture, other)
+        assert_close(image, other)
 
 
 @FEW
 @given(seed=seeds, triangles=st.integers(3, 40), alpha=st.sampled_from([0.5, 0.1, 1.0, 1 / 255]))
 @example(seed=0, triangles=8, alpha=0.3)
 def test_a_fan_shows_no_seam(seed, triangles, alpha):
-    picture = render(fan(seed, triangles, alpha), camera(200, 160, fx=150, fy=160))
-    covered = picture.alpha > 0
-    assert len(np.unique(picture.alpha[covered])) <= 1
-    assert np.abs(picture.alpha[covered] - np.float32(alpha)).max(initial=0) <= 6e-8
+    image = render(fan(seed, triangles, alpha), camera(200, 160, fx=150, fy=160))
+    covered = image.alpha > 0
+    assert len(np.unique(image.alpha[covered])) <= 1
+    assert np.abs(image.alpha[covered] - np.float32(alpha)).max(initial=0) <= 6e-8
     # A sample on an edge is drawn once; and in no row of a convex fan is a hole.
-    assert picture.fragments == covered.sum()
+    assert image.fragments == covered.sum()
     assert (np.abs(np.diff(covered.astype(int), axis=1)).sum(axis=1) <= 2).all()
 
 
@@ -303,9 +303,9 @@ def test_a_surface_covers_every_sample_once(seed, samples):
     z = np.exp(rng.uniform(-3, 5, x.shape))
     points = np.stack([x * z, y * z, z], axis=-1).reshape(-1, 3)
     mesh = SplatMesh(points, grid_faces(*x.shape), np.tile([1, 0, 0, 0.25], (x.size, 1)))
-    picture = render(mesh, Camera(np.eye(4), 1, 1, 0, 0, 37, 29, near=0.01), samples=samples)
-    assert picture.fragments == 37 * 29 * samples**2
-    assert (picture.alpha == 0.25).all()
+    image = render(mesh, Camera(np.eye(4), 1, 1, 0, 0, 37, 29, near=0.01), samples=samples)
+    assert image.fragments == 37 * 29 * samples**2
+    assert (image.alpha == 0.25).all()
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
@@ -321,23 +321,23 @@ def test_the_ground_below_the_camera_covers_every_sample_once(tilt):
     # The ray (u, v, 1) meets the plane at z = 1 / (v - tilt).
     v = (np.arange(29) + 0.5 - view.cy) / view.fy
     below = (v > tilt + 1e-4).sum()
-    picture = render(mesh, view)
-    assert picture.fragments == 37 * below
-    assert set(np.unique(picture.alpha)) == {0, np.float32(0.5)}
+    image = render(mesh, view)
+    assert image.fragments == 37 * below
+    assert set(np.unique(image.alpha)) == {0, np.float32(0.5)}
 
 
 def test_background():
     rng = np.random.default_rng(0)
     mesh, view = soup(2), camera()
     one, two = rng.random((2, 29, 37, 3)).astype(np.float32)
-    picture = assert_mesh_is_exact(mesh, view, background=one)
+    image = assert_mesh_is_exact(mesh, view, background=one)
     assert_mesh_is_exact(mesh, view, background=(3.0, -1.0, 0.25))
     black = render(mesh, view, background=BLACK)
     expected = black.color + (1 - black.alpha[..., None]) * one
-    np.testing.assert_allclose(picture.color, expected, atol=1e-6)
+    np.testing.assert_allclose(image.color, expected, atol=1e-6)
     mixed = render(mesh, view, background=0.25 * one + 0.75 * two).color
     np.testing.assert_allclose(
-        mixed, 0.25 * picture.color + 0.75 * render(mesh, view, background=two).color, atol=1e-6
+        mixed, 0.25 * image.color + 0.75 * render(mesh, view, background=two).color, atol=1e-6
     )
 
 
@@ -347,10 +347,10 @@ def test_attributes_are_blended_as_colours_are(samples):
     mesh = replace(
         mesh, attributes={"rgb": mesh.colors[:, :3], "red": mesh.colors[:, 0], "none": np.zeros((60, 0))}
     )
-    picture = render(mesh, camera(), background=BLACK, samples=samples, attributes=("red", "rgb", "none"))
-    np.testing.assert_allclose(picture.attributes["rgb"], picture.color, atol=2e-6)
-    assert (picture.attributes["red"] == picture.attributes["rgb"][..., 0]).all()
-    assert picture.attributes["none"].shape == (29, 37, 0)
+    image = render(mesh, camera(), background=BLACK, samples=samples, attributes=("red", "rgb", "none"))
+    np.testing.assert_allclose(image.attributes["rgb"], image.color, atol=2e-6)
+    assert (image.attributes["red"] == image.attributes["rgb"][..., 0]).all()
+    assert image.attributes["none"].shape == (29, 37, 0)
 
 
 def test_depth_and_normals_of_an_opaque_plane():
@@ -365,10 +365,24 @@ def test_depth_and_normals_of_an_opaque_plane():
     flat = SplatMesh(seen_by(view, corners), [(0, 1, 2)], np.ones((3, 4)))
     smooth = replace(flat, normals=np.tile(-3 * world, (3, 1)))
     for mesh in (flat, smooth, replace(flat, faces=[(1, 0, 2)])):
-        picture = render(mesh, view, depth=True, normals=True)
-        np.testing.assert_allclose(picture.depth, expected, rtol=2e-6)
+        image = render(mesh, view, depth=True, normals=True)
+        np.testing.assert_allclose(image.depth, expected, rtol=2e-6)
         facing = world if (normal @ corners[0]) < 0 else -world
-        np.testing.assert_allclose(picture.normals, np.broadcast_to(facing, (29, 37, 3)), atol=1e-6)
+        np.testing.assert_allclose(image.normals, np.broadcast_to(facing, (29, 37, 3)), atol=1e-6)
+
+
+def test_mean_depth_is_that_of_what_is_seen():
+    """Half opaque at depth 2 before opaque at 6: 4 in the mean; alone, its own."""
+    view = camera()
+    both = render(layers([2.0, 6.0], [0.5, 1.0]), view, depth=True)
+    np.testing.assert_allclose(both.mean_depth(), 4, rtol=1e-6)
+    alone = render(layers([2.0], 0.5), view, depth=True)
+    np.testing.assert_allclose(alone.mean_depth(), 2, rtol=1e-6)
+    assert np.isinf(alone.mean_depth(min_alpha=0.5)).all()
+    assert (alone.mean_depth(min_alpha=0.5, empty=0) == 0).all()
+    assert alone.mean_depth().dtype == np.float32
+    with pytest.raises(ValueError, match="render with depth=True"):
+        render(layers([2.0], 0.5), view).mean_depth()
 
 
 def test_vertex_normals():

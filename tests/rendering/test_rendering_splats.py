@@ -40,7 +40,7 @@ def test_random_splats(seed, kernel, dilation):
 
 @FEW
 @given(seed=seeds, kernel=kernels)
-def test_splats_near_behind_and_beside_the_picture(seed, kernel):
+def test_splats_near_behind_and_beside_the_image(seed, kernel):
     view = camera(near=0.05)
     assert_splats_are_exact(splats(seed, 60, kernel=kernel, spread=0.4, z=0.2), view)
     assert_splats_are_exact(splats(seed, 60, kernel=kernel, spread=6, sizes=(0.1, 3)), view)
@@ -53,16 +53,16 @@ def test_spherical_harmonics(kernel, degree, limit):
     view = turned(camera(), degree)
     cloud = splats(degree, 20, kernel=kernel, degree=degree)
     cloud = replace(cloud, means=seen_by(view, cloud.means), sh=cloud.sh * 3)
-    picture = assert_splats_are_exact(cloud, view, sh_degree=limit)
+    image = assert_splats_are_exact(cloud, view, sh_degree=limit)
     if limit is not None and limit < degree:
         cut = replace(cloud, sh=cloud.sh[:, : (limit + 1) ** 2])
-        assert_same_bits(picture, render_splats(cut, view))
-        assert np.abs(picture.color - render_splats(cloud, view).color).max() > 0.01
+        assert_same_bits(image, render_splats(cut, view))
+        assert np.abs(image.color - render_splats(cloud, view).color).max() > 0.01
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("samples", [1, 2, 3, 5, 16])
-def test_samples_and_odd_pictures(kernel, samples):
+def test_samples_and_odd_images(kernel, samples):
     for size in [(13, 11), (1, 1), (17, 2)]:
         assert_splats_are_exact(splats(6, 15, kernel=kernel), camera(*size), samples=samples)
 
@@ -70,8 +70,8 @@ def test_samples_and_odd_pictures(kernel, samples):
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("opacity", [0, 0.0039, 0.00393, 0.5, 0.99, 1])
 def test_opacities(kernel, opacity):
-    picture = assert_splats_are_exact(splats(7, 60, kernel=kernel, opacity=opacity), camera())
-    assert opacity >= 1 / 255 or picture.fragments == 0
+    image = assert_splats_are_exact(splats(7, 60, kernel=kernel, opacity=opacity), camera())
+    assert opacity >= 1 / 255 or image.fragments == 0
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -82,9 +82,9 @@ def test_scales_of_zero(kernel, dilation, flat):
     scales = cloud.scales.copy()
     scales[:, flat] = 0
     view = camera()
-    picture = render_splats(replace(cloud, scales=scales), view, dilation=dilation)
+    image = render_splats(replace(cloud, scales=scales), view, dilation=dilation)
     if kernel != "2dgs" and dilation == 0 and len(flat) > 1:
-        assert picture.fragments == 0  # lines and points cover nothing
+        assert image.fragments == 0  # lines and points cover nothing
     else:
         assert_splats_are_exact(replace(cloud, scales=scales), view, dilation=dilation, tolerance=2e-4)
 
@@ -93,7 +93,7 @@ def test_scales_of_zero(kernel, dilation, flat):
 @pytest.mark.parametrize("thickness", [1e-2, 1e-3, 1e-4])
 @pytest.mark.parametrize("angle", [0.3, np.pi / 4, 1.2])
 def test_needles(angle, thickness, dilation):
-    # In front of the picture, and across it with the centre far outside; up to 3e5 times as long as thick.
+    # In front of the image, and across it with the centre far outside; up to 3e5 times as long as thick.
     view = Camera(np.eye(4), 200, 200, 32.5, 32.5, 65, 65, 0.1)
     quaternion = [[np.cos(angle / 2), 0, 0, np.sin(angle / 2)]]
     for kernel in KERNELS:
@@ -108,8 +108,8 @@ def test_needles(angle, thickness, dilation):
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_one_splat_that_covers_all(kernel):
     cloud = GaussianCloud([(0, 0, 5)], [(1, 0, 0, 0)], [(1e4, 1e4, 0)], [0.7], np.ones((1, 1, 3)), kernel)
-    picture = assert_splats_are_exact(cloud, camera(100, 70))
-    np.testing.assert_allclose(picture.alpha, 0.7, atol=1e-6)
+    image = assert_splats_are_exact(cloud, camera(100, 70))
+    np.testing.assert_allclose(image.alpha, 0.7, atol=1e-6)
     for distance in (1e3, 1e6, 1e20):
         away = replace(cloud, means=[(distance, -distance, 5)], scales=[(100 * distance, 100 * distance, 0)])
         assert assert_splats_are_exact(away, camera()).alpha.min() > 0.69
@@ -124,10 +124,10 @@ def test_nothing_to_draw(kernel):
         replace(cloud, means=cloud.means * -1),
         replace(cloud, opacities=np.zeros(30)),
     ):
-        picture = render_splats(nothing, camera(near=8), background=background)
-        assert (picture.color == background).all()
-        assert not picture.alpha.any()
-        assert picture.fragments == 0
+        image = render_splats(nothing, camera(near=8), background=background)
+        assert (image.color == background).all()
+        assert not image.alpha.any()
+        assert image.fragments == 0
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -136,9 +136,9 @@ def test_centres_nearer_than_the_near_plane_are_left_out(kernel):
         splats(2, 2, kernel=kernel, opacity=0.9), means=[(0, 0, 1), (0, 0, 2)], scales=np.full((2, 3), 0.2)
     )
     for near, drawn in [(0.999, [0, 1]), (1.0, [0, 1]), (1.001, [1]), (2.001, [])]:
-        picture = assert_splats_are_exact(cloud, camera(near=near))
-        assert (picture.fragments > 0) == (len(drawn) > 0)
-        assert_same_bits(picture, render_splats(cloud.select(np.array(drawn, int)), camera(near=near)))
+        image = assert_splats_are_exact(cloud, camera(near=near))
+        assert (image.fragments > 0) == (len(drawn) > 0)
+        assert_same_bits(image, render_splats(cloud.select(np.array(drawn, int)), camera(near=near)))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -157,7 +157,7 @@ def test_real_splats(kernel):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_part_of_a_real_picture(kernel):
+def test_a_part_of_a_real_image(kernel):
     cloud = load_gaussians(shared_data("splats/guitar_sh0.ply"))
     cloud = replace(cloud.select(np.arange(0, len(cloud), 23)), kernel=kernel)
     view = load_cameras(shared_data("cameras/guitar_close.json"))[0]
@@ -177,8 +177,8 @@ def test_order_does_not_matter(seed, kernel):
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_part_of_a_picture_is_the_picture_of_the_part(kernel):
-    # Alpha does not depend on the grid of tiles; EWA's limits outside the picture do depend on its sides.
+def test_a_part_of_an_image_is_the_image_of_the_part(kernel):
+    # Alpha does not depend on the grid of tiles; EWA's limits outside the image do depend on its sides.
     cloud = splats(4, 80, kernel=kernel, spread=0.4)
     whole = render_splats(cloud, camera(64, 48, cx=32.0, cy=24.0))
     part = render_splats(cloud, camera(41, 31, cx=32.0 - 9, cy=24.0 - 7))

@@ -18,7 +18,7 @@ KERNELS = ("3dgs", "antialiased", "2dgs")
 
 
 def scenes():
-    """Pictures that go through every path: short and long lists, ties, groups, crossing triangles, extras."""
+    """Images that go through every path: short and long lists, ties, groups, crossing triangles, extras."""
     many = soup(1, 500, spread=(2, 2, 2))
     groups = np.random.default_rng(0).integers(-1, 50, 500)
     view = camera(70, 50, near=0.3)
@@ -48,10 +48,10 @@ def digest() -> str:
 
     total = hashlib.sha256()
     for scene in scenes():
-        picture = scene()
-        for value in outputs(picture).values():
+        image = scene()
+        for value in outputs(image).values():
             total.update(value.tobytes())
-        total.update(str(picture.fragments).encode())
+        total.update(str(image.fragments).encode())
     return total.hexdigest()
 
 
@@ -94,7 +94,7 @@ def test_an_unknown_variant_is_refused():
         library.load_core("v9")
 
 
-# Hostile scenes: finite pictures, no crash
+# Hostile scenes: finite images, no crash
 
 VIEWS = {
     "common": camera(),
@@ -113,11 +113,11 @@ def scaled(values: np.ndarray, factor) -> np.ndarray:
     return np.clip(values.astype(np.float64) * factor, -3e38, 3e38)
 
 
-def assert_picture(picture) -> None:
-    for name, value in outputs(picture).items():
+def assert_image(image) -> None:
+    for name, value in outputs(image).items():
         assert np.isfinite(value).all(), name
-    assert picture.alpha.min() >= 0
-    assert picture.alpha.max() <= 1
+    assert image.alpha.min() >= 0
+    assert image.alpha.max() <= 1
 
 
 @pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
@@ -127,10 +127,10 @@ def test_hostile_meshes(view):
     groups = rng.integers(-1, 9, 60)
     for size in (1e-42, 1e-30, 1e-6, 1, 1e6, 1e18, 1e30, 3e38):
         vertices = scaled(mesh.vertices, size)
-        assert_picture(render(replace(mesh, vertices=vertices, depth_group=groups), view, **EXTRAS))
+        assert_image(render(replace(mesh, vertices=vertices, depth_group=groups), view, **EXTRAS))
         mixed = scaled(mesh.vertices, 10 ** rng.uniform(-40, 38, (60, 1)))
         hostile = replace(mesh, vertices=mixed, normals=np.zeros((60, 3)), face_splat=np.sort(groups + 1))
-        assert_picture(render(hostile, view, samples=3, max_layers=3, **EXTRAS))
+        assert_image(render(hostile, view, samples=3, max_layers=3, **EXTRAS))
 
 
 def test_degenerate_faces():
@@ -142,7 +142,7 @@ def test_degenerate_faces():
     line = replace(mesh, vertices=np.outer(np.arange(60), [1, 2, 4]))
     assert render(line, camera(), **EXTRAS).fragments == 0
     big = replace(mesh, attributes={"heat": np.full(60, 3e38), "flow": np.full((60, 2), -3e38)})
-    assert_picture(render(big, camera(), **EXTRAS))
+    assert_image(render(big, camera(), **EXTRAS))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -158,13 +158,13 @@ def test_hostile_splats(view, kernel):
                 scales=scaled(cloud.scales, scale),
             )
             for dilation in (0, 0.3, 1e30, 1e300):
-                assert_picture(render_splats(hostile, view, dilation=dilation))
+                assert_image(render_splats(hostile, view, dilation=dilation))
         mixed = replace(
             cloud,
             means=scaled(cloud.means, 10 ** rng.uniform(-40, 38, (60, 1))),
             scales=scaled(cloud.scales, 10 ** rng.uniform(-40, 38, (60, 3))),
         )
-        assert_picture(render_splats(mixed, view, dilation=0))
+        assert_image(render_splats(mixed, view, dilation=0))
 
 
 # Wrong options
@@ -240,9 +240,9 @@ corners = np.array([(-100, -100, 1), (300, -100, 1), (-100, 300, 1)])
 colors = np.full((3 * n, 4), {alpha})
 mesh = SplatMesh((z[:, :, None] * corners).reshape(-1, 3), np.arange(3 * n).reshape(-1, 3), colors)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-picture = render(mesh, Camera(np.eye(4), side, side, side / 2, side / 2, side, side, 0.05), threads=2)
+image = render(mesh, Camera(np.eye(4), side, side, side / 2, side / 2, side, side, 0.05), threads=2)
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-print((after - before) / 1024, picture.alpha.min())
+print((after - before) / 1024, image.alpha.min())
 """
 
 
@@ -250,7 +250,7 @@ print((after - before) / 1024, picture.alpha.min())
 @pytest.mark.parametrize(
     ("scene", "most"),
     [
-        # Large triangles over the whole picture: the lists of 256 tiles would be 600 MiB.
+        # Large triangles over the whole image: the lists of 256 tiles would be 600 MiB.
         (
             {
                 "n": 200_000,

@@ -16,14 +16,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a disk, a quota or a limit on files that is used up."""
+"""Error numbers of a full disk, an exhausted quota or a limit on file sizes."""
 
 _LEFTOVER = re.compile(r"\..*\.([0-9a-f]+)-([0-9a-f]{8})\.[0-9a-f]{16}(\..*)?")
-"""Names of temporary files: process and machine stand before the random part."""
+"""Names of temporary files: process and machine, then a random part."""
 _swept: set[Path] = set()
-"""Folders in which this process has looked for leftovers."""
+"""Folders that this process has searched for leftovers."""
 _promised: set[Path] | None = None
-"""Outputs that are new by a command's word, while it runs; see ``promises_kept``."""
+"""Outputs that must still be free when they are written; see ``promises_kept``."""
 
 
 @contextmanager
@@ -34,24 +34,27 @@ def atomic_path(
     temporary: Path | None = None,
     new: bool = False,
 ) -> Iterator[Path]:
-    """A temporary path in the folder of ``path``; what is written there becomes ``path`` if all goes well.
+    """A temporary path in the folder of ``path``; its file becomes ``path`` at the end of the block.
 
-    The temporary file exists (empty) from the start, is hidden, keeps the suffix of ``path`` and is
-    removed if the block raises, Ctrl-C included; an older file at ``path`` then stays as it was. A new
-    file gets the usual permissions (the umask decides), one that replaces another gets the permissions of
-    the other. Where ``path`` is a symbolic link, the file it points to is replaced and the link stays.
-    Temporary files that killed processes of this machine have left in the folder are removed.
+    The temporary file exists (empty) from the start, is hidden and keeps the suffix of ``path``. If the block
+    raises, Ctrl-C included, it is removed, and an older file at ``path`` stays as it was. A new file gets the
+    permissions of the umask; a file that replaces another gets the permissions of the other. If ``path`` is a
+    symbolic link, its target is replaced and the link stays. Temporary files that killed processes of this
+    machine left in the folder are removed.
 
     Args:
-        path: the file to be.
-        needs: about how many bytes it will have, for the message of a full disk.
-        temporary: the temporary path, as ``temporary_beside`` names it, where someone else has to know it.
+        path: the file.
+        needs: its estimated size in bytes, for the message about a full disk.
+        temporary: the temporary path, as ``temporary_beside`` names it, if others have to know it.
         new: ``path`` must not exist. Of several processes that write it at a time, exactly one succeeds.
 
-    Raises FileNotFoundError or NotADirectoryError for a missing folder, IsADirectoryError where ``path``
-    is a folder, PermissionError where the folder or an existing file may not be written, OSError for a
-    device or pipe: all before the block is entered. FileExistsError, with ``new``, before the block or after
-    it. OSError with errno ENOSPC, EDQUOT or EFBIG, which says how much room is missing, for a full disk.
+    Raises:
+        FileNotFoundError, NotADirectoryError: the folder is missing. Like the next three, before the block.
+        IsADirectoryError: ``path`` is a folder.
+        PermissionError: the folder or an existing file is not writable.
+        OSError: ``path`` is a device or pipe; or, with errno ENOSPC, EDQUOT or EFBIG and the space that is
+            missing, the disk is full.
+        FileExistsError: ``path`` exists, with ``new``; before the block or after it.
     """
     shown, target = os.fspath(path), Path(os.path.realpath(path))
     if not target.name:
@@ -65,7 +68,7 @@ def atomic_path(
         if stat.S_ISDIR(mode):
             raise IsADirectoryError(errno.EISDIR, "cannot write a file here, this is a folder", shown)
         if not stat.S_ISREG(mode):
-            # Renaming over a device such as /dev/null would take it away from everyone.
+            # Renaming over a device such as /dev/null would remove it for all programs.
             raise OSError(errno.EINVAL, "cannot write here, this is not a regular file", shown)
         if new or promised:
             raise _written_meanwhile(shown)
@@ -96,7 +99,7 @@ def atomic_path(
         if new or promised:
             _place_new(temporary, target, shown)
             if _promised is not None:
-                _promised.discard(target)  # from now on it is ours
+                _promised.discard(target)  # ours: it may be replaced from now on
         else:
             os.replace(temporary, target)
     except BaseException as error:
@@ -112,7 +115,7 @@ def atomic_path(
 
 
 def temporary_beside(path: str | os.PathLike[str]) -> Path:
-    """A new name for the temporary file of ``path``: hidden, with its suffix, and with this process in it."""
+    """A new temporary path for ``path``: hidden, with its suffix and the id of this process."""
     target = Path(os.path.realpath(path))
     owner = f"{os.getpid():x}-{_machine():08x}"
     return target.parent / f".{target.stem[:32]}.{owner}.{secrets.token_hex(8)}{target.suffix[:16]}"
@@ -132,7 +135,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def refuse_existing(paths: Iterable[str | os.PathLike[str]], force: bool) -> None:
     """Raises FileExistsError if one of the outputs ``paths`` exists already, unless ``force``.
 
-    A command calls this before its work, so that an hour of it is not lost to a name that is taken; within
+    A command calls this before its work, so that no work is lost to a name that is taken. Within
     ``promises_kept`` the paths must still be free when they are written.
     """
     paths = [os.fspath(path) for path in paths]
@@ -158,8 +161,8 @@ def is_promised(path: str | os.PathLike[str]) -> bool:
 
 @contextmanager
 def promises_kept() -> Iterator[None]:
-    """While the block runs, what ``refuse_existing`` has found free is written only if it is free then:
-    another process that has written it meanwhile wins, and ours gets a FileExistsError."""
+    """Within the block, paths that ``refuse_existing`` found free are written only if they are still free: if
+    another process has written one meanwhile, ours gets a FileExistsError."""
     global _promised
     before, _promised = _promised, set()
     try:
@@ -169,17 +172,17 @@ def promises_kept() -> Iterator[None]:
 
 
 def _place_new(temporary: Path, target: Path, shown: str) -> None:
-    """Moves ``temporary`` to ``target``. FileExistsError if there is something by then."""
+    """Moves ``temporary`` to ``target``. FileExistsError if ``target`` exists by then."""
     try:
         if sys.platform == "win32":
-            os.rename(temporary, target)  # which replaces nothing there
+            os.rename(temporary, target)  # never replaces a file on Windows
             return
         try:
             os.link(temporary, target)
         except FileExistsError:
             raise
         except OSError:
-            # A file system without hard links: an empty file takes the name first.
+            # A file system without hard links: reserve the name with an empty file.
             os.close(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
             os.replace(temporary, target)
             return
@@ -197,7 +200,7 @@ def _written_meanwhile(shown: str) -> FileExistsError:
 
 
 def _full(error: BaseException) -> int | None:
-    """The error number if ``error`` tells of a full disk, also in the words of another library."""
+    """The error number if ``error`` means a full disk, also by the message of another library."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno if error.errno in FULL else None
     if not isinstance(error, Exception):
@@ -228,7 +231,7 @@ def in_words(count: float) -> str:
 
 
 def _machine() -> int:
-    """A number for the machine, or the container on it, whose process numbers are ours."""
+    """Identifies the machine, or the container on it, that our process ids belong to."""
     name = socket.gethostname()
     with suppress(OSError):
         name += os.readlink("/proc/self/ns/pid")
@@ -236,8 +239,8 @@ def _machine() -> int:
 
 
 def _sweep(folder: Path) -> None:
-    """Removes the temporary files that killed processes have left in ``folder``; once for each folder."""
-    if folder in _swept or sys.platform == "win32":  # os.kill(.., 0) ends processes there
+    """Removes the temporary files of killed processes from ``folder``, once for each folder."""
+    if folder in _swept or sys.platform == "win32":  # os.kill(.., 0) ends processes on Windows
         return
     _swept.add(folder)
     with suppress(OSError), os.scandir(folder) as entries:

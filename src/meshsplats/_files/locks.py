@@ -1,4 +1,4 @@
-"""Locks that end with the process that holds them, however it ends."""
+"""Locks that end with the process that holds them, even if it is killed."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 
 
 def try_lock(path: Path) -> int | None:
-    """An open file descriptor that holds the lock of the file ``path``, which is made; None if another
-    process holds it. The lock ends when the descriptor, and every copy that a child has of it, is closed."""
+    """An open file descriptor that holds the lock of the file ``path``, created if missing; None if another
+    process holds it. The lock ends when the descriptor, and every copy in child processes, is closed."""
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
             if not _lock(descriptor):
                 os.close(descriptor)
                 return None
-            # Whoever held it may have removed the file between our two calls.
+            # The previous holder may have removed the file between our two calls.
             if sys.platform == "win32" or os.path.samestat(os.fstat(descriptor), os.stat(path)):
                 return descriptor
         except FileNotFoundError:
@@ -31,13 +31,13 @@ def try_lock(path: Path) -> int | None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[bool]:
-    """Whether this process holds the lock of the file ``path`` while the block runs; the file goes after."""
+    """Whether this process holds the lock of ``path`` within the block; the file is removed afterwards."""
     descriptor = try_lock(path)
     try:
         yield descriptor is not None
     finally:
         if descriptor is not None:
-            if sys.platform == "win32":  # open files are not removed there
+            if sys.platform == "win32":  # cannot remove open files
                 os.close(descriptor)
             with suppress(OSError):
                 path.unlink()
@@ -60,6 +60,6 @@ def _lock(descriptor: int) -> bool:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # a file system that knows no locks: nobody can hold one
+    except OSError:  # a file system without locks: no process can hold one
         return True
     return True

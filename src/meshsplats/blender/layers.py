@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.camera import Camera, a_few
+from meshsplats._arrays import subsample
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import front_axes, scene_bounds
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.mesh import SplatMesh
@@ -46,7 +47,7 @@ def most_layers(
     """
     if len(mesh.faces) == 0:
         return 0
-    probes = a_few(cameras or (), 8, PROBE_SIDE)
+    probes = [camera.within(PROBE_SIDE) for camera in subsample(cameras or (), 8)]
     bounds = scene_bounds(mesh)
     reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max()) or bounds.radius
     axes = front_axes(mesh.up.astype(np.float64))

@@ -12,10 +12,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats.camera import Camera, a_few
+from meshsplats._arrays import subsample
+from meshsplats._geometry import spacing
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome
-from meshsplats.conversion.footprint import spacing
 from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.rendering import render
 
@@ -169,21 +170,14 @@ def _seen_from(
 ) -> np.ndarray:
     """(n, 3) sum of the unit directions from each centre to the cameras that see it; zero where none does."""
     views = dome(mesh, VIEWS, whole=True, up=guess_up(mesh), width=_SIDE, height=_SIDE)
-    views += a_few(cameras or (), 16, _SIDE)
+    views += [camera.within(_SIDE) for camera in subsample(cameras or (), 16)]
     seen = np.zeros_like(centers)
     for camera in views:
-        rendering = render(mesh, camera, depth=True, threads=threads)
-        assert rendering.depth is not None
-        solid = rendering.alpha > _SOLID
-        surface = np.where(solid, rendering.depth / np.where(solid, rendering.alpha, 1), np.inf)
-        x, y, z = camera.world_to_camera[:3, :3] @ centers.T + camera.world_to_camera[:3, 3:]
-        front = z > camera.near
-        z = np.where(front, z, 1)
-        column = camera.fx * x / z + camera.cx
-        row = camera.fy * y / z + camera.cy
-        inside = front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        pixel = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
-        visible = inside & (z < surface[pixel] + tolerance)
+        surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)
+        positions, z = camera.project(centers)
+        rows = np.flatnonzero(camera.in_image(positions))
+        column, row = positions[rows].T.astype(np.intp)
+        visible = rows[z[rows] < surface[row, column] + tolerance]
         away = camera.center - centers[visible]
         seen[visible] += away / np.linalg.norm(away, axis=1, keepdims=True)
     return seen

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import subsample
+from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
-from meshsplats.camera import Camera, a_few
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.colors import srgb_to_linear
 from meshsplats.mesh import SplatMesh
@@ -33,9 +35,9 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
     axes = front_axes(mesh.up.astype(np.float64))
     directions = []
     if options.light is not None:
-        directions.append(_world_direction(axes, *options.light.sun))
+        directions.append(direction(axes, *options.light.sun))
         if options.light.fill > 0:
-            directions.append(_world_direction(axes, *options.light.fill_direction))
+            directions.append(direction(axes, *options.light.fill_direction))
     layers = most_layers(mesh, cameras, directions, threads=options.threads)
     # Unlit images must be exact, and a high limit costs nothing where there are no layers.
     return layers, MAX_LAYERS if options.light is None else bounce_limit(layers, MAX_LAYERS)
@@ -43,7 +45,7 @@ def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> 
 
 def mean_layers(mesh: SplatMesh, cameras: Sequence[Camera], threads: int | None = None) -> float:
     """Mean number of triangles behind each other in a pixel, over the images."""
-    some = a_few(cameras, 4, PROBE_SIDE)
+    some = [camera.within(PROBE_SIDE) for camera in subsample(cameras, 4)]
     return float(np.mean([count_layers(mesh, camera, threads=threads).mean() for camera in some] or [0.0]))
 
 
@@ -115,10 +117,3 @@ def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:
     own = np.cross(mesh.vertices[b] - mesh.vertices[a], mesh.vertices[c] - mesh.vertices[a])
     back = np.einsum("ij,ij->i", own, normals[a] + normals[b] + normals[c]) < 0
     return np.where(back[:, None], mesh.faces[:, [0, 2, 1]], mesh.faces)
-
-
-def _world_direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
-    """(3,) unit vector in the splats' world from degrees; ``axes`` as from ``front_axes``."""
-    a, e = np.radians(azimuth), np.radians(elevation)
-    right, up, forward = axes
-    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up

@@ -1,1 +1,1 @@
-"""Where cameras stand: the subject of a scene, orbits and domes around it, and camera files."""
+"""Camera placement: the subject of a scene, orbits and domes around it; camera files."""

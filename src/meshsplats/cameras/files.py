@@ -14,7 +14,7 @@ from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
 
 MAX_FILE_BYTES = 16 << 20
-"""A larger file of cameras is refused."""
+"""Larger camera files are refused."""
 MAX_CAMERAS = 20_000
 
 
@@ -22,13 +22,13 @@ def load_cameras(path: str | Path) -> list[Camera]:
     """Cameras of a JSON file, in file order.
 
     Two forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
-    4x4 matrix and OpenCV axes; ``name``, ``near``, and cx and cy (then the picture's centre) may be missing.
+    4x4 matrix and OpenCV axes; ``name``, ``near``, and cx and cy (then the image's centre) may be missing.
     The other is the ``cameras.json`` that INRIA's 3DGS trainer writes: ``{img_name, width, height, position,
-    rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and the principal point at the picture's
-    centre. A folder stands for the ``cameras.json`` in it.
+    rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and the principal point at the image's
+    centre. For a folder, the ``cameras.json`` in it is read.
 
     Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
-    kind, and OSError if it cannot be opened.
+    format, and OSError if it cannot be opened.
     """
     path = Path(path)
     if path.is_dir():
@@ -36,7 +36,7 @@ def load_cameras(path: str | Path) -> list[Camera]:
     entries = read_json(path)
     if not isinstance(entries, list):
         other = isinstance(entries, dict) and "frames" in entries
-        what = " with 'frames': of a data set, which load_dataset and --data read" if other else ""
+        what = " with 'frames', a data set: read it with load_dataset or --data" if other else ""
         raise FileFormatError(
             f"{path}: a camera file is a JSON list of cameras, this is a JSON {_kind(entries)}{what}"
         )
@@ -50,11 +50,11 @@ def load_cameras(path: str | Path) -> list[Camera]:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a file of cameras. FileFormatError if it is no JSON, or larger than any such file is."""
+    """The content of a camera file. FileFormatError if it is not JSON or too large."""
     with open(path, "rb") as file:
         text = file.read(MAX_FILE_BYTES + 1)
     if len(text) > MAX_FILE_BYTES:
-        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, which no file of cameras is")
+        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, the limit for camera files")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -62,7 +62,7 @@ def read_json(path: Path) -> Any:
 
 
 def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
-    """Writes the JSON list that ``load_cameras`` reads; a file of that name is replaced. No digit is lost."""
+    """Writes the JSON list that ``load_cameras`` reads, to the last digit; replaces a file of that name."""
     entries = [
         {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
         | {"world_to_camera": camera.world_to_camera.tolist()}

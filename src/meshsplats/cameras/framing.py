@@ -1,5 +1,4 @@
-"""Where the subject of a scene is and which way is up: what an orbit needs to know, robust against stray
-splats."""
+"""Where the subject of a scene is and which way is up, robust against stray splats."""
 
 from __future__ import annotations
 
@@ -8,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
@@ -17,38 +16,38 @@ from meshsplats.mesh import SplatMesh
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Splats trained from COLMAP cameras have the y axis pointing down."""
 SAMPLE = 20_000
-"""Points looked at: more do not move the quantiles visibly."""
+"""Largest number of points to measure: more do not change the quantiles visibly."""
 SURROUNDINGS = 4.0
 """Points farther from the centre than this many median distances are surroundings, not the subject. Splats of
-an object on its own reach about 2 (a ball's surface: 1; a filled ball: 1.26; the longest object measured:
-3.9)."""
+a single object reach about 2 (surface of a ball: 1; filled ball: 1.26; longest object measured: 3.9)."""
 
 APART = 0.15
-"""Parts of the subject that are farther than this many radii from the rest stand apart..."""
+"""Parts of the subject that are farther than this many radii from the rest are separate..."""
 FLOATER = 0.01
-"""... and are floaters if they have less than this share of its opacity,"""
+"""... and are floaters if they have less than this share of its opacity..."""
 FLOATERS = 0.1
-"""and all such together less than this."""
+"""... and all of them together have less than this share."""
 COVERED = 0.995
-"""Share of the subject's opacity that must be on the picture."""
+"""Share of the subject's opacity that must be in the image."""
 MARGIN = 1.08
-"""Room left round the subject."""
+"""Distance of the cameras as a multiple of the one at which the subject just fits."""
 
-Scene = GaussianCloud | SplatMesh | np.ndarray
+Framable = GaussianCloud | SplatMesh | np.ndarray
+"""Whatever cameras can be placed around: splats, a mesh, or points (n, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Size of a scene without its strays; frame and units of the scene."""
+    """Extent of a scene without its strays, in the frame and units of the scene."""
 
     center: np.ndarray
     """(3,) float64 weighted median of the points along each axis."""
     radius: float
     """Distance from ``center`` within which 90 % of the weight lies, > 0."""
     points: np.ndarray
-    """(k, 3) float64 points of the subject: a sample, without the surroundings and without floaters."""
+    """(k, 3) float64 sample of the subject's points, without surroundings and floaters."""
     weights: np.ndarray
-    """(k,) float64 their weights, >= 0: opacity."""
+    """(k,) float64 weights of the points, >= 0: their opacity."""
     sizes: np.ndarray
     """(k,) float64 reach of each point: two standard deviations of a splat's middle axis, else 0."""
 
@@ -60,8 +59,8 @@ def weighted_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> floa
     return float(values[order[min(np.searchsorted(total, q * total[-1]), len(order) - 1)]])
 
 
-def scene_bounds(scene: Scene) -> Bounds:
-    """Robust bounds of a cloud, a mesh or points (n, 3); opacity is the weight of a splat or vertex.
+def scene_bounds(scene: Framable) -> Bounds:
+    """Robust bounds of a cloud, a mesh or points (n, 3); splats and vertices are weighted by opacity.
 
     Raises ValueError for a scene without points, or if points (n, 3) have another shape or are not finite.
     """
@@ -75,7 +74,7 @@ def scene_bounds(scene: Scene) -> Bounds:
             raise ValueError(f"points must be finite and of shape (n, 3), got {points.shape}")
         weights = np.ones(len(points))
     if len(points) == 0:
-        raise ValueError("the scene is empty: there is nothing to place cameras round")
+        raise ValueError("the scene is empty: there is nothing to place cameras around")
     step = -(-len(points) // SAMPLE)
     points = np.asarray(points[::step], np.float64)
     weights = np.asarray(weights[::step], np.float64)
@@ -88,7 +87,7 @@ def scene_bounds(scene: Scene) -> Bounds:
     distance = np.linalg.norm(points - center, axis=1)
     radius = weighted_quantile(distance, weights, 0.9)
     if radius == 0:
-        # Nearly everything in one spot: use what spread there is, or else the splats' own size.
+        # Nearly all points are in one spot: use the largest distance, or else the size of the splats.
         radius = float(distance.max())
     if radius == 0:
         radius = float(sizes.max()) or 1.0
@@ -99,25 +98,28 @@ def scene_bounds(scene: Scene) -> Bounds:
 
 
 def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np.ndarray:
-    """(k,) bool: the points but those of parts that stand apart and weigh little. All, where the parts that
-    weigh something are not nearly everything: then the scene is a scatter of small things."""
+    """(k,) bool: points that are not in floaters, separate parts of little weight.
+
+    Where the other parts are not nearly all of the weight, the scene is a scatter of small parts, and all
+    points stay.
+    """
     part = Cells(points, gap).parts()
     held = np.bincount(part, weights)
     keep = (held >= FLOATER * held.sum())[part]
     return keep if weights[keep].sum() >= (1 - FLOATERS) * weights.sum() else np.ones(len(points), bool)
 
 
-def guess_up(scene: Scene | None = None, cameras: Sequence[Camera] | None = None) -> np.ndarray:
+def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = None) -> np.ndarray:
     """(3,) float64 unit direction that points up in the world frame.
 
-    The mean up direction of ``cameras`` where they are known and agree (people hold cameras upright); else
-    what a mesh says of itself; else ``DEFAULT_UP``, as in files trained from COLMAP cameras. The points
-    themselves are not asked: nothing in a cloud of splats tells an upright vase from a hanging lamp.
+    The mean up direction of ``cameras`` if there are any and they agree (people hold cameras upright); else
+    the ``up`` of a mesh; else ``DEFAULT_UP``, as in scenes trained from COLMAP cameras. The points themselves
+    do not count: they cannot distinguish an upright vase from a hanging lamp.
     """
     if cameras:
         mean = np.mean([-camera.world_to_camera[1, :3] for camera in cameras], axis=0)
         length = float(np.linalg.norm(mean))
-        if length > 0.2:  # cameras on a whole sphere cancel out and say nothing
+        if length > 0.2:  # up directions all around a sphere cancel out
             return mean / length
     if isinstance(scene, SplatMesh):
         return scene.up.astype(np.float64)
@@ -136,7 +138,7 @@ def unit_up(up: Sequence[float] | np.ndarray) -> np.ndarray:
 def front_axes(up: np.ndarray) -> np.ndarray:
     """(3, 3) float64 rows right, up, forward of someone who stands before the scene, for a unit ``up``.
 
-    Right is the world's +x (+z if ``up`` is close to the x axis), made square to ``up``; forward = up x
+    Right is the world's +x (+z if ``up`` is close to the x axis), made orthogonal to ``up``; forward = up x
     right. So COLMAP's y-down scenes are seen along +z, y-up scenes along -z and z-up scenes along +y.
     """
     right = np.array([1.0, 0, 0]) if abs(up[0]) < 0.9 else np.array([0, 0, 1.0])
@@ -146,23 +148,25 @@ def front_axes(up: np.ndarray) -> np.ndarray:
 
 
 def middle(bounds: Bounds, axes: np.ndarray) -> np.ndarray:
-    """(3,) middle of the box along ``axes`` that the subject fills: half-way along a guitar, not in its
-    body."""
+    """(3,) centre of the subject's bounding box along ``axes``: half-way along a guitar, not in its body."""
     along = bounds.points @ axes.T
     return np.array([_middle_of(along[:, k], bounds.weights) for k in range(3)]) @ axes
 
 
-def fit_pictures(
+def fit_images(
     bounds: Bounds, target: np.ndarray, rotations: Sequence[np.ndarray], slopes: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """Point to look at, near ``target``, and the least distance from it at which every view shows it all.
+    """The point to look at, and the least distance from it at which every view shows the whole subject.
 
-    ``rotations`` (3, 3) turn the world's axes into the views' (OpenCV axes);
-    ``slopes`` are x / z and y / z at the right and the lower edge of the picture.
+    Args:
+        bounds: of the subject.
+        target: (3,) first guess of the point.
+        rotations: (3, 3) from the world's to each view's axes (OpenCV).
+        slopes: x / z and y / z at the right and the lower edge of the image.
     """
-    # What is near looks larger: the middle of the box is not the middle of a picture. Two steps of least
-    # squares over the views bring it there within a few pixels; a dozen of the views are enough to know.
-    some = evenly(rotations, 12)
+    # Near parts look larger, so the centre of the box is not in the centre of an image. Two steps of least
+    # squares over a dozen of the views bring it there within a few pixels.
+    some = subsample(rotations, 12)
     across = np.concatenate([rotation[:2] for rotation in some])
     for _ in range(2):
         away = max(_fitting_distance(bounds, target, rotation, slopes) for rotation in some)
@@ -174,15 +178,18 @@ def fit_pictures(
 def _fitting_distance(
     bounds: Bounds, target: np.ndarray, rotation: np.ndarray, slopes: tuple[float, float]
 ) -> float:
-    """A point at (x, y, z) from the target, in the view's axes, is on the picture if |x| <= slope (d + z):
-    each asks for d = |x| / slope - z, and the covered share of them decides."""
+    """Distance d at which one view shows the covered share of the points.
+
+    A point at (x, y, z) from the target, in the view's axes, is in the image if |x| <= slope (d + z): it
+    needs d >= |x| / slope - z.
+    """
     x, y, z = rotation @ (bounds.points - target).T
     needed = np.maximum((np.abs(x) + bounds.sizes) / slopes[0], (np.abs(y) + bounds.sizes) / slopes[1]) - z
     return max(weighted_quantile(needed, bounds.weights, COVERED) * MARGIN, 0.1 * bounds.radius)
 
 
 def _seen_aside(bounds: Bounds, target: np.ndarray, rotation: np.ndarray, away: float) -> np.ndarray:
-    """(2,) how far right of and below the picture's centre the subject's middle is seen, as lengths at the
+    """(2,) offset of the subject's middle from the image's centre, right and down, in lengths at the
     target."""
     x, y, z = rotation @ (bounds.points - target).T
     seen = z > -0.9 * away

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._geometry import direction
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import (
     DEFAULT_UP,
-    Scene,
-    fit_pictures,
+    Framable,
+    fit_images,
     front_axes,
     guess_up,
     middle,
@@ -20,7 +21,7 @@ from meshsplats.cameras.framing import (
 )
 
 NEAR_SHARE = 0.01
-"""Near plane of the cameras made here, as a share of their distance to the subject's middle."""
+"""Near plane of these cameras as a share of their distance from the subject's middle."""
 
 
 def look_at(
@@ -34,16 +35,20 @@ def look_at(
     near: float = 0.01,
     name: str = "",
 ) -> Camera:
-    """Camera at ``center`` (3,) that looks at ``target`` (3,) with ``up`` (3,) towards the picture's upper
-    edge.
+    """A camera that looks at a point.
 
-    Parameters
-    ----------
-    fov: angle in degrees, 1 to 170, that the shorter side of the picture spans.
-    near: as in Camera.
+    Straight along ``up``, the front of the scene is at the lower edge of the image.
 
-    Raises ValueError if the two points coincide. Looking straight along ``up``, the scene's front is at the
-    lower edge.
+    Args:
+        center: (3,) position of the camera, world frame.
+        target: (3,) point in the centre of the image.
+        up: (3,) direction towards the image's upper edge.
+        width, height: of the image, pixels.
+        fov: angle in degrees, 1 to 170, that the shorter side of the image spans.
+        near: depth of the near plane, scene units.
+        name: of the camera.
+
+    Raises ValueError if the two points coincide or are not finite, and for a value out of range.
     """
     if not 1 <= fov <= 170:
         raise ValueError(f"fov must lie between 1 and 170 degrees, got {fov}")
@@ -68,7 +73,7 @@ def look_at(
 
 
 def orbit(
-    scene: Scene,
+    scene: Framable,
     count: int = 60,
     *,
     elevation: float = 15.0,
@@ -80,29 +85,29 @@ def orbit(
     distance: float = 1.0,
     target: Sequence[float] | np.ndarray | None = None,
 ) -> list[Camera]:
-    """``count`` cameras evenly spaced on a circle round the subject of ``scene``, all looking at its middle.
+    """``count`` cameras evenly spaced on a circle around the subject of ``scene``, looking at its middle.
 
-    Parameters
-    ----------
-    scene: GaussianCloud, SplatMesh or points (n, 3); see ``framing.scene_bounds`` for what counts as the
-        subject.
-    elevation: degrees above the subject's horizon, -90 to 90.
-    azimuth: degrees of the first camera, 0 in front (``framing.front_axes``), 90 at the right-hand side.
-    up: (3,) direction; None: ``framing.guess_up``.
-    fov: angle in degrees, 1 to 170, that the shorter side of the picture spans.
-    distance: multiple of the distance at which the subject just fits the picture in every view.
-    target: (3,) point to look at and to go round, from as far away; None: the subject's middle.
+    Args:
+        scene: splats, a mesh or points (n, 3); ``framing.scene_bounds`` decides what counts as the subject.
+        count: number of cameras, at least 1.
+        elevation: degrees above the subject's horizon, -90 to 90.
+        azimuth: degrees of the first camera, 0 in front (``framing.front_axes``), 90 at the right-hand side.
+        up: (3,) direction; None: ``framing.guess_up``.
+        width, height: of the images, pixels.
+        fov: angle in degrees, 1 to 170, that the shorter side of the image spans.
+        distance: multiple of the distance at which the subject just fits into the image of every view.
+        target: (3,) point to look at and to circle, at the same distance; None: the subject's middle.
 
     Raises ValueError for an empty scene or a value out of range.
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
-    return round_subject(scene, angles, up, width, height, fov, distance, target)
+    return around_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def dome(
-    scene: Scene,
+    scene: Framable,
     count: int = 32,
     *,
     whole: bool = False,
@@ -113,10 +118,15 @@ def dome(
     distance: float = 1.0,
     target: Sequence[float] | np.ndarray | None = None,
 ) -> list[Camera]:
-    """``count`` cameras spread evenly over the upper half of a sphere round the subject, or all of it.
+    """``count`` cameras evenly spread over a dome around the subject, the upper half of a sphere.
 
-    The points are those of a Fibonacci spiral: equal steps in height, the golden angle in azimuth, so that
-    each camera has the same share of the surface. Parameters are those of ``orbit``.
+    They stand on a Fibonacci spiral: equal steps in height, the golden angle in azimuth, so that each camera
+    has the same share of the surface.
+
+    Args:
+        whole: use the whole sphere.
+
+    The other arguments are those of ``orbit``.
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
@@ -124,11 +134,11 @@ def dome(
     lowest = -1.0 if whole else 0.0
     heights = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     angles = [(i * golden % 360, float(np.degrees(np.arcsin(h)))) for i, h in enumerate(heights)]
-    return round_subject(scene, angles, up, width, height, fov, distance, target)
+    return around_subject(scene, angles, up, width, height, fov, distance, target)
 
 
 def look_around(
-    scene: Scene,
+    scene: Framable,
     count: int = 60,
     *,
     elevation: float = 0.0,
@@ -138,10 +148,12 @@ def look_around(
     height: int = 800,
     fov: float = 75.0,
 ) -> list[Camera]:
-    """``count`` cameras that stand in the middle of ``scene``, a room say, and turn once round to the right.
+    """``count`` cameras in the middle of ``scene``, say a room, that make one full turn to the right.
 
-    ``elevation`` is the direction they look in, above the horizon; the other parameters are those of
-    ``orbit``.
+    Args:
+        elevation: degrees above the horizon in which they look.
+
+    The other arguments are those of ``orbit``.
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
@@ -150,22 +162,15 @@ def look_around(
     lens: dict[str, Any] = {"width": width, "height": height, "fov": fov, "near": bounds.radius * NEAR_SHARE}
     cameras = []
     for i in range(count):
-        # Azimuth 0 looks forward, and a turn to the right is a growing angle.
-        direction = _direction(axes, 180 - azimuth - 360 * i / count, elevation)
-        target = bounds.center + bounds.radius * direction
+        # At azimuth 0 they look forward; angles grow to the right.
+        gaze = direction(axes, 180 - azimuth - 360 * i / count, elevation)
+        target = bounds.center + bounds.radius * gaze
         cameras.append(look_at(bounds.center, target, up=axes[1], name=f"view_{i:04d}", **lens))
     return cameras
 
 
-def _direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
-    """Unit vector from the subject to a camera; ``axes`` as from ``front_axes``."""
-    a, e = np.radians(azimuth), np.radians(elevation)
-    right, up, forward = axes
-    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
-
-
-def round_subject(
-    scene: Scene,
+def around_subject(
+    scene: Framable,
     angles: Sequence[tuple[float, float]],
     up: Sequence[float] | np.ndarray | None,
     width: int,
@@ -174,24 +179,27 @@ def round_subject(
     distance: float,
     aim: Sequence[float] | np.ndarray | None = None,
 ) -> list[Camera]:
-    """Cameras at (azimuth, elevation) degrees, at the distance from which every picture shows the subject."""
+    """Cameras at ``angles``, (azimuth, elevation) in degrees, around the subject, all of which they show.
+
+    The other arguments are those of ``orbit``; ``aim`` is its ``target``.
+    """
     if not (np.isfinite(distance) and distance > 0):
         raise ValueError(f"distance must be positive, got {distance}")
     if not all(np.isfinite(a) and -90 <= e <= 90 for a, e in angles):
         raise ValueError("azimuth must be finite and elevation between -90 and 90 degrees")
     bounds = scene_bounds(scene)
     axes = front_axes(guess_up(scene) if up is None else unit_up(up))
-    directions = [_direction(axes, azimuth, elevation) for azimuth, elevation in angles]
+    directions = [direction(axes, azimuth, elevation) for azimuth, elevation in angles]
     lens: dict[str, Any] = {"up": axes[1], "width": width, "height": height, "fov": fov}
     target = middle(bounds, axes)
-    around = [look_at(target + direction, target, **lens) for direction in directions]
+    around = [look_at(target + d, target, **lens) for d in directions]
     rotations = [camera.world_to_camera[:3, :3] for camera in around]
     slopes = (width / 2 / around[0].fx, height / 2 / around[0].fy)
-    target, fit = fit_pictures(bounds, target, rotations, slopes)
+    target, fit = fit_images(bounds, target, rotations, slopes)
     if aim is not None:
         target = np.asarray(aim, np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
-            raise ValueError(f"the target must be three finite numbers, got {aim!r}")
+            raise ValueError(f"target must be three finite numbers, got {aim!r}")
     away = distance * fit
     return [
         look_at(target + away * d, target, near=away * NEAR_SHARE, name=f"view_{i:04d}", **lens)

@@ -6,9 +6,7 @@ A module is imported only when its command runs, so that ``meshsplats --version`
 
 from __future__ import annotations
 
-import errno
 import importlib
-import json
 import os
 import signal
 import sys
@@ -16,51 +14,43 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+
+from meshsplats.cli.messages import (
+    DISK_FULL,
+    ENDINGS,
+    FAILED,
+    OK,
+    USAGE,
+    Terminated,
+    UsageError,
+    close_output,
+    exit_code,
+    one_line,
+    print_json_error,
+    read_from_standard_input,
+    say,
+)
 
 COMMANDS = {
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
     "clean": ("meshsplats.cli.clean:Clean", "splats or a mesh without its floaters"),
-    "render": ("meshsplats.cli.render:Render", "pictures of splats or a mesh, and a turntable"),
-    "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, pictures side by side"),
-    "finetune": ("meshsplats.cli.finetune:Finetune", "the mesh brought closer to splats or photographs"),
+    "render": ("meshsplats.cli.render:Render", "images of splats or a mesh, and a turntable"),
+    "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, images side by side"),
+    "finetune": ("meshsplats.cli.finetune:Finetune", "a mesh optimised to look like splats or photographs"),
     "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
-    "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for ever smaller sizes"),
-    "bake": ("meshsplats.cli.bake:Bake", "the filter of a mesh made part of its triangles"),
+    "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for smaller and smaller sizes"),
+    "bake": ("meshsplats.cli.bake:Bake", "a mesh with its low-pass filter applied, for other programs"),
     "base": ("meshsplats.cli.base:Base", "a classical mesh of the surface that splats form"),
-    "prior": ("meshsplats.cli.prior:Prior", "splats on a classical mesh, trained and edited with it"),
+    "prior": ("meshsplats.cli.prior:Prior", "splats bound to a classical mesh, trained and edited with it"),
     "deform": ("meshsplats.cli.deform:Deform", "the splats of a prior moved to an edited base mesh"),
-    "evaluate": ("meshsplats.cli.evaluate:Evaluate", "scores against photographs: PSNR, SSIM, LPIPS"),
-    "blender": ("meshsplats.cli.blender:Blender", "pictures and scenes by Blender: exact ones, and lit ones"),
-    "info": ("meshsplats.cli.info:Info", "what is in a splat file, mesh, camera file or model folder"),
-    "doctor": ("meshsplats.cli.doctor:Doctor", "what is installed here, and what is missing"),
+    "evaluate": ("meshsplats.cli.evaluate:Evaluate", "scores on held-out views: PSNR, SSIM, LPIPS"),
+    "blender": ("meshsplats.cli.blender:Blender", "images and scenes by Blender, unlit or lit"),
+    "info": ("meshsplats.cli.info:Info", "the content of a splat file, mesh, camera file or model folder"),
+    "doctor": ("meshsplats.cli.doctor:Doctor", "installed libraries, and missing ones"),
 }
 """Name: where its dataclass is, and one line of help."""
 
 _TAKES_SIGN = ("--up", "--azimuth", "--elevation")
-_standard_input: str | None = None
-"""The file that holds what standard input had, where the command was given -."""
-
-
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a full disk, as in ``_files.atomic``."""
-OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
-"""Exit codes. FAILED: the input, or a place that was named, is wrong. LACKING: a library, a program or memory
-is not there. Ended by signal n: 128 + n."""
-KINDS = {FAILED: "input", USAGE: "usage", EXISTS: "exists", NO_SPACE: "space", LACKING: "missing"}
-"""What the errors in JSON call them."""
-
-
-class UsageError(Exception):
-    """Options that contradict each other: exit code 2."""
-
-
-class Terminated(BaseException):
-    """A signal asks the process to end; ``number`` is the signal's."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -79,72 +69,35 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _answer(name) if name not in COMMANDS else _run(name, _plain(arguments[1:]))
             sys.stdout.flush()
             return code
-    except SystemExit as stop:  # tyro has shown help, or what is wrong with the arguments
+    except SystemExit as stop:  # help, or an error in the arguments, has been printed
         code = stop.code if isinstance(stop.code, int) else USAGE
         if code == USAGE and as_json:
-            _tell_json(USAGE, UsageError("the options were not understood; standard error says why"))
+            print_json_error(UsageError("the options were not understood; standard error says why"))
         return code
     except (KeyboardInterrupt, Terminated) as stop:
         number = getattr(stop, "number", signal.SIGINT)
-        say(f"{_ENDINGS.get(number, 'ended')}; no file was left half-written")
+        say(f"{ENDINGS.get(number, 'ended')}; no file was left half-written")
         return 128 + number
     except BrokenPipeError:
-        _close_output()  # its reader has gone, `| head` say
+        close_output()  # its reader has gone, `| head` say
         return FAILED
     except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
         if debug:
             raise
-        if isinstance(error, OSError) and error.errno in FULL and error.filename is None:
+        if isinstance(error, OSError) and error.errno in DISK_FULL and error.filename is None:
             # All files have names in their errors.
             error = OSError(error.errno, error.strerror, "standard output")
-            _close_output()
+            close_output()
         hint = f" (see meshsplats {name} --help)" if isinstance(error, UsageError) else ""
         say(f"error: {one_line(error)}{hint}")
-        code = exit_code(error)
         if as_json:
-            _tell_json(code, error)
-        return code
-
-
-def exit_code(error: BaseException) -> int:
-    """The exit code that tells of ``error``."""
-    if isinstance(error, UsageError):
-        return USAGE
-    if isinstance(error, FileExistsError):
-        return EXISTS
-    if isinstance(error, OSError) and error.errno in FULL:
-        return NO_SPACE
-    return LACKING if isinstance(error, (ImportError, MemoryError)) else FAILED
-
-
-def error_record(error: BaseException) -> dict[str, Any]:
-    """``error`` for JSON."""
-    path = os.fsdecode(error.filename) if isinstance(error, OSError) and error.filename else None
-    code = exit_code(error)
-    named = {"kind": KINDS[code], "code": code, "message": one_line(error), "path": path}
-    return named | {"type": type(error).__name__}
-
-
-def _tell_json(code: int, error: BaseException) -> None:
-    try:
-        print(json.dumps({"error": error_record(error)}), flush=True)
-    except OSError:  # the message stands on standard error
-        _close_output()
-
-
-def _close_output() -> None:
-    """Python must not find out again, when it ends, that nothing more can be printed."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-_ENDINGS = {signal.SIGINT: "interrupted"} | {
-    getattr(signal, name): f"ended by {name}" for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
-}
+            print_json_error(error)
+        return exit_code(error)
 
 
 @contextmanager
 def _signals_raise() -> Iterator[None]:
-    """While the block runs, SIGTERM and SIGHUP raise ``Terminated``, so that what is under way is tidied up
+    """While the block runs, SIGTERM and SIGHUP raise ``Terminated``, so that unfinished files are removed
     as after Ctrl-C; once, as another one must not break off the tidying. Signals that are ignored (nohup)
     stay so."""
 
@@ -155,7 +108,7 @@ def _signals_raise() -> Iterator[None]:
 
     ours = []
     if threading.current_thread() is threading.main_thread():
-        ours = [n for n in _ENDINGS if n != signal.SIGINT and signal.getsignal(n) == signal.SIG_DFL]
+        ours = [n for n in ENDINGS if n != signal.SIGINT and signal.getsignal(n) == signal.SIG_DFL]
     for number in ours:
         signal.signal(number, end)
     try:
@@ -171,42 +124,29 @@ def _run(name: str, arguments: list[str]) -> int:
     warnings.simplefilter("always", DataWarning)
     warnings.showwarning = lambda message, *_, **__: say(f"warning: {one_line(message)}")
 
-    with _input_read(_joined(arguments)) as given:
-        return _command(name, given)
+    with _standard_input_as_file(_joined(arguments)) as words:
+        return _execute(name, words)
 
 
-def _command(name: str, arguments: list[str]) -> int:
-    import tyro
-
+def _execute(name: str, words: list[str]) -> int:
     from meshsplats._files.atomic import promises_kept
+    from meshsplats.cli.arguments import parse
 
     module, _, attribute = COMMANDS[name][0].partition(":")
-    command = getattr(importlib.import_module(module), attribute)
-    options = tyro.cli(
-        command,
-        args=arguments,
-        prog=f"meshsplats {name}",
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
+    command = parse(getattr(importlib.import_module(module), attribute), f"meshsplats {name}", words)
     with promises_kept():
-        return options.run() or OK
-
-
-def shown_path(path: str | os.PathLike[str]) -> str:
-    """``path`` as it was given: - for standard input."""
-    return "-" if _standard_input is not None and os.fspath(path) == _standard_input else os.fspath(path)
+        return command.execute() or OK
 
 
 @contextmanager
-def _input_read(arguments: list[str]) -> Iterator[list[str]]:
-    """``arguments`` with the name of a file in place of -, which holds what standard input has: readers look
-    at their files several times."""
-    global _standard_input
-    _standard_input = None
+def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
+    """``arguments`` with the path of a file in place of -, which holds standard input: readers open their
+    files several times."""
+    read_from_standard_input(None)
     places = [
         i
         for i, argument in enumerate(arguments)
-        if argument == "-" and (i == 0 or arguments[i - 1] not in ("-o", "--output"))
+        if argument == "-" and (i == 0 or arguments[i - 1] not in ("-o", "--output", "--config"))
     ]
     if not places:
         yield arguments
@@ -214,7 +154,7 @@ def _input_read(arguments: list[str]) -> Iterator[list[str]]:
     if len(places) > 1:
         raise UsageError("- stands for standard input, which can be read once")
     if sys.stdin is None or sys.stdin.isatty():
-        raise UsageError("- reads standard input: lead a file there, < scene.ply say")
+        raise UsageError("- reads standard input: redirect a file there, < scene.ply say")
     import shutil
     import tempfile
 
@@ -225,12 +165,12 @@ def _input_read(arguments: list[str]) -> Iterator[list[str]]:
                 shutil.copyfileobj(sys.stdin.buffer, file, 1 << 20)
         except OSError as error:
             raise OSError(error.errno, f"standard input does not fit here: {error.strerror}", path) from None
-        _standard_input = path  # until the next command: errors are told when this one has ended
+        read_from_standard_input(path)  # until the next command: errors are printed after this one
         yield [*arguments[: places[0]], path, *arguments[places[0] + 1 :]]
 
 
 def _answer(name: str) -> int:
-    """What is said where no command was named."""
+    """Answers --help and --version; an error for an unknown command."""
     if name in ("", "-h", "--help", "help"):
         print(_overview())
         return OK
@@ -269,11 +209,11 @@ def _overview() -> str:
         "usage: meshsplats COMMAND ...\n\n"
         "Gaussian splats as ordinary triangle meshes: convert, render exactly, compare, save.\n\n"
         f"commands:\n{commands}\n\n"
-        "  meshsplats COMMAND --help   options of a command\n"
+        "  meshsplats COMMAND --help   the most used options of a command; --help-all: all of them\n"
         "  meshsplats --version\n"
         "  --debug                     with any command: the full traceback of an error\n\n"
         "exit codes: 0 done, 1 wrong input, 2 wrong usage, 3 the output exists, 4 no space, 5 something is\n"
-        "missing here (a library, a program, memory)\n\n"
+        "missing (a library, a program, memory)\n\n"
         "start with:\n"
         "  meshsplats convert scene.ply -o scene.glb"
     )
@@ -286,19 +226,3 @@ def _unknown(name: str) -> int:
     hint = f"did you mean {close[0]!r}?" if close else f"commands: {', '.join(COMMANDS)}"
     say(f"error: there is no command {name!r}; {hint}")
     return USAGE
-
-
-def one_line(error: object) -> str:
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        text = f"{os.fsdecode(error.filename)}: {error.strerror}"
-    else:
-        text = str(error)
-    if isinstance(error, MemoryError) and not text:
-        text = "out of memory"
-    if _standard_input is not None:
-        text = text.replace(_standard_input, "standard input")
-    return " ".join(text.split()) or type(error).__name__
-
-
-def say(text: str) -> None:
-    print(f"meshsplats: {text}", file=sys.stderr)

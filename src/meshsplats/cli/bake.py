@@ -1,4 +1,4 @@
-"""``meshsplats bake``: a mesh that is to be drawn with a filter, for programs without one."""
+"""``meshsplats bake``: the low-pass filter of a mesh, for programs that have none."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Number,
     Output,
@@ -21,13 +22,18 @@ from meshsplats.cli.common import (
 
 
 @dataclass(frozen=True)
-class Bake:
-    """Makes the filter that a mesh wants part of its triangles, for viewers, engines and Blender, which draw
-    triangles as they are.
+class Bake(Command):
+    """Applies the low-pass filter of a mesh to its triangles, for viewers, engines and Blender, which have no
+    such filter.
 
-    Convert with --footprint filter makes such meshes. The result is right for the views asked for and their
-    size; nearer it is soft, farther away it is thin.
+    'convert --footprint filter' makes such meshes. The result is right for these views and this image size;
+    nearer it is soft, farther away thin.
     """
+
+    COMMON = (
+        *("input", "output", "orbit", "cameras", "data"),
+        *("distance", "width", "filter_px2", "json", "force"),
+    )
 
     input: tyro.conf.Positional[Path]
     """The mesh: .npz, .ply, .glb, .usdc."""
@@ -41,7 +47,7 @@ class Bake:
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         from meshsplats.conversion import bake_filter
         from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS
         from meshsplats.formats.meshes import load_mesh, save_mesh
@@ -54,7 +60,7 @@ class Bake:
         px2 = mesh.filter_px2 if self.filter_px2 is None else self.filter_px2
         if px2 == 0:
             raise ValueError(
-                f"{self.input}: the mesh wants no filter, there is nothing to bake; --filter-px2 gives it one"
+                f"{self.input}: the mesh has no filter, there is nothing to bake; --filter-px2 gives it one"
             )
         cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS)
         baked = bake_filter(mesh, cameras, filter_px2=px2)
@@ -70,6 +76,6 @@ class Bake:
             }
             print(json.dumps(result, indent=1))
             return
-        seen = f"{plural(len(cameras), 'view')} of {cameras[0].width} x {cameras[0].height}"
+        views = f"{plural(len(cameras), 'view')} of {cameras[0].width} x {cameras[0].height}"
         print(f"{self.output} ({plural(len(baked.faces), 'triangle')}, {size_of(self.output)}): a filter of")
-        print(f"{px2:g} px^2 for {seen}, in {seconds:.1f} s")
+        print(f"{px2:g} px^2 for {views}, in {seconds:.1f} s")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tyro
 
-from meshsplats.cli import UsageError
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
     File,
@@ -21,37 +21,38 @@ from meshsplats.cli.common import (
     load_scene,
     size_of,
 )
+from meshsplats.cli.messages import UsageError
 from meshsplats.mesh import SplatMesh
 
 
 @dataclass(frozen=True)
-class Base:
+class Base(Command):
     """Makes a closed mesh of the surface that splats form, to be edited and to carry a mesh prior.
 
-    For objects that can be seen from all round; what no picture sees becomes inside.
+    For objects that can be seen from all sides; space that no image sees becomes interior.
     """
 
     input: tyro.conf.Positional[Path]
-    """Splats, a model folder, or a mesh of them, fine-tuned say."""
+    """Splats, a model folder, or a mesh of splats."""
     output: Output
     """The mesh, coloured and opaque: .ply, .obj, .glb, .npz, .usdc."""
     resolution: int = 96
-    """Voxels along the longest side, 8 to 512: the more, the finer."""
+    """Voxels along the longest side, 8 to 512."""
     faces: int = 20_000
-    """About so many triangles, where the voxels give more; 0: all of them."""
+    """Approximate number of triangles, if the voxels give more; 0: all."""
     views: int = 48
-    """Number of places round the object from which it is looked at."""
+    """Number of cameras around the object."""
     cameras: File = None
-    """Camera file to look from instead."""
+    """Camera file, in place of --views."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
-    """At most N threads. Default: all processors."""
+    """Maximum number of threads. Default: all processors."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         from meshsplats.cameras.files import load_cameras
         from meshsplats.formats.meshes import save_mesh
         from meshsplats.prior.surface import base_surface

@@ -1,4 +1,4 @@
-"""What a conversion reads and writes: one file, several, or all of a folder."""
+"""Inputs and outputs of a conversion: one file, several, or all of a folder."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from meshsplats.cli import UsageError, shown_path
-from meshsplats.cli.common import check_mesh_suffix, check_outputs, recorded_options
+from meshsplats.cli.common import check_mesh_suffix, check_outputs
+from meshsplats.cli.messages import UsageError, shown_path
+from meshsplats.cli.records import CONFIGURATION, PREVIEW, beside
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import splat_file, subject_name
 from meshsplats.formats.meshes import MESH_SUFFIXES
 
 INPUT_SUFFIXES = (*MESH_SUFFIXES, ".splat", ".spz", ".sog", ".gltf")
-"""Names that are looked at in a folder of inputs."""
+"""Names of inputs in a folder."""
 
 
 @dataclass(frozen=True)
@@ -24,22 +25,23 @@ class Job:
     outputs: tuple[Path, ...]
     """The same mesh in several formats."""
     preview: Path | None
-    config: Path | None
+    configs: tuple[Path, ...]
+    """One for each output, or none."""
 
     @property
     def shown(self) -> str:
-        """The input as it was given."""
+        """The input as the user named it."""
         return shown_path(self.source)
 
     def check(self, force: bool) -> None:
-        """Before the work: what ``check_outputs`` raises."""
-        records = [path for path in (self.preview, self.config) if path is not None]
+        """Before the work: the errors of ``check_outputs``."""
+        records = [*self.configs, *([self.preview] if self.preview else [])]
         check_outputs([*self.outputs, *records], force, inputs=[self.source])
 
 
 def sources(paths: Sequence[Path]) -> list[Path]:
-    """``paths``, with the splats and meshes of folders that are no splats themselves in place of them, by
-    name. Raises FileNotFoundError, and FileFormatError for a folder without any."""
+    """``paths``, with the splats and meshes inside in place of a folder that is no model, by name. Raises
+    FileNotFoundError, and FileFormatError for a folder without any."""
     found: list[Path] = []
     for path in paths:
         found += _inside(path) if path.is_dir() else [path]
@@ -54,8 +56,8 @@ def is_batch(paths: Sequence[Path]) -> bool:
 def jobs(
     inputs: Sequence[Path], output: Path, formats: Sequence[str], *, preview: bool, sidecars: bool
 ) -> list[Job]:
-    """What each of ``inputs`` becomes. ``formats``: suffixes without a dot, for a folder ``output``; none:
-    ``output`` is the one file. UsageError if two would have one name."""
+    """A job for each of ``inputs``. ``formats``: suffixes without a dot, for a folder ``output``; none:
+    ``output`` is the one file. UsageError if two outputs have one name."""
     made: dict[Path, Path] = {}
     result = []
     for source in inputs:
@@ -63,16 +65,16 @@ def jobs(
             base = output / subject_name(source)
             outputs = tuple(base.with_name(f"{base.name}.{kind}") for kind in dict.fromkeys(formats))
         else:
-            base, outputs = output.with_suffix(""), (output,)
+            outputs = (output,)
         for path in outputs:
             if path in made:
                 raise UsageError(
                     f"{made[path]} and {source} would both become {path}: convert them into different folders"
                 )
             made[path] = source
-        shown, config = _records(base, outputs)
-        kept = sidecars and (shown if preview else None)
-        result.append(Job(source, outputs, kept or None, config if sidecars else None))
+        image = beside(outputs[0], PREVIEW) if sidecars and preview else None
+        configs = tuple(beside(path, CONFIGURATION) for path in outputs) if sidecars else ()
+        result.append(Job(source, outputs, image, configs))
     return result
 
 
@@ -110,18 +112,3 @@ def _inside(folder: Path) -> list[Path]:
     if not found:
         splat_file(folder)  # says what is wrong
     return found
-
-
-def _records(base: Path, outputs: Sequence[Path]) -> tuple[Path, Path]:
-    """Names of the preview and the configuration. Where the usual ones are those of another mesh, the same in
-    another format say, names with all of the output's own."""
-    preview, config = record_names(base)
-    other = (recorded_options(config) or {}).get("output")
-    if isinstance(other, str) and Path(other).name not in [path.name for path in outputs]:
-        preview, config = record_names(outputs[0])
-    return preview, config
-
-
-def record_names(name: Path) -> tuple[Path, Path]:
-    """Those of the preview and the configuration of the output ``name``, which has no suffix."""
-    return name.with_name(f"{name.name}.preview.png"), name.with_name(f"{name.name}.config.json")

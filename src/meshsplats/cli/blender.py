@@ -1,4 +1,4 @@
-"""``meshsplats blender``: pictures and scenes by Blender."""
+"""``meshsplats blender``: images and scenes by Blender."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -17,7 +17,7 @@ from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
 from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
-from meshsplats.cli import UsageError, say
+from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
     Count,
     File,
@@ -26,15 +26,14 @@ from meshsplats.cli.common import (
     SplatOptions,
     ViewOptions,
     check_outputs,
-    configuration,
     load_scene,
     parse_color,
     plural,
-    record_beside,
     size_of,
     view_names,
-    write_json,
 )
+from meshsplats.cli.messages import UsageError, say
+from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, write_configuration
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -42,82 +41,84 @@ if TYPE_CHECKING:
     from meshsplats.blender import Progress
 
 LIT_SAMPLES = 16
-"""Samples a pixel of lit pictures where nothing is said."""
+"""Default number of samples per pixel of lit images."""
 _EVERY = 10.0
-"""Seconds from one line of progress to the next, where standard error is no terminal."""
+"""Seconds between lines of progress, if standard error is no terminal."""
 _FORMATS = (".png", ".exr", ".blend")
-
-
-def _described(options: type[LightOptions]) -> type[LightOptions]:
-    """The options of light as ones that may be left out, so that a named light can say them."""
-    metavars = {"sun": "AZIMUTH ELEVATION", "sun_color": "R G B", "sky_color": "R G B", "hdri": "FILE"}
-    typed: dict[str, Any] = {}
-    for name, hint in get_type_hints(options).items():
-        if hint is bool:
-            typed[name] = bool
-            continue
-        choices = "{" + ",".join(map(str, get_args(hint))) + "}"
-        metavar = metavars.get(name) or {int: "N", float: "X"}.get(hint, choices)
-        told = "" if name == "hdri" else f"(default: {_listed(getattr(options, name))})"
-        typed[name] = Annotated[hint | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=told)]
-    about = (
-        "Light and surroundings of lit pictures. Lengths follow the subject's size. Defaults: --lights sun."
-    )
-    values = {name: False if kind is bool else None for name, kind in typed.items()}
-    made = type("LightOptions", (options,), {"__annotations__": typed, "__doc__": about, **values})
-    return dataclass(frozen=True)(made)
 
 
 def _listed(value: Any) -> str:
     return " ".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
 
 
+def _default_light(name: str) -> str:
+    return "" if name == "hdri" else f"(default: {_listed(getattr(LightOptions, name))})"
+
+
 if TYPE_CHECKING:
-    _Light = LightOptions
+    LightArguments = LightOptions
 else:
-    _Light = _described(LightOptions)
+    LightArguments = as_cli_options(
+        LightOptions,
+        "Light and surroundings of lit images. Lengths are relative to the subject. Defaults: --lights sun.",
+        metavars={"sun": "AZIMUTH ELEVATION", "sun_color": "R G B", "sky_color": "R G B", "hdri": "FILE"},
+        defaults=_default_light,
+        flags=True,
+    )
 
 
 @dataclass(frozen=True)
-class Blender:
-    """Draws a mesh in Blender: a picture (-o picture.png or .exr), a folder of them, or the scene (-o
+class Blender(Command):
+    """Renders a mesh in Blender: an image (-o image.png or .exr), a folder of images, or the scene (-o
     scene.blend).
 
-    Without --lit, the picture is that of `meshsplats render`. With it, sun and sky light the splats, which
+    Without --lit, the image is that of `meshsplats render`. With --lit, sun and sky light the splats, which
     cast shadows and are seen in mirrors and through glass. Splats are converted to a mesh first, with
-    default settings; with --lit, to one flat ellipse a splat (convert --mode flat), which takes light best.
+    default settings; with --lit, to one flat ellipse per splat (convert --mode flat), which takes light best.
     Needs Blender's module bpy in an environment of its own, or an installed Blender (--executable).
     """
+
+    COMMON = (
+        *("input", "output", "lit", "lights", "hdri", "mirror", "glass"),
+        *("engine", "samples", "orbit", "cameras", "azimuth", "elevation", "distance"),
+        *("width", "background", "transparent", "executable", "json", "force"),
+    )
+    EXCLUSIVE = (
+        ("orbit", "dome", "look_around", "cameras", "data"),
+        ("fov", "focal_length"),
+        ("background", "transparent"),
+    )
+    CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, a mesh, or a chain of levels of detail (levels.json; for a .blend)."""
     output: Output
     """A .png or .exr for one view, a folder for several, or a .blend with a camera for each view."""
     lit: bool = False
-    """Light the splats; the options under "light" say how."""
+    """Light the splats, with the options under "light"."""
     engine: Literal["cycles", "eevee"] = "cycles"
-    """cycles: exact. eevee: quicker on a graphics card; triangles are sorted for each view, which is nearly
+    """cycles: exact. eevee: faster on a graphics card, with triangles sorted per view, which is nearly
     exact."""
     views: ViewOptions = field(default_factory=ViewOptions)
     lights: Literal["sun", "noon", "overcast", "studio"] = "sun"
-    """With --lit: an afternoon's sun, the sun high in a clear sky, clouds, or two large lamps. The options
-    under "light" change what they say."""
-    light: _Light = field(default_factory=_Light)
+    """With --lit: afternoon sun, high sun in a clear sky, clouds, or two large lamps. The options under
+    "light" change them."""
+    light: LightArguments = field(default_factory=LightArguments)
     background: str = "white"
-    """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
+    """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1."""
     transparent: bool = False
-    """No background: pictures with an alpha channel."""
+    """No background: images with an alpha channel."""
     samples: Count = None
-    """Unlit: side of the grid of samples in each pixel, as in render. Default: 2 (a .blend: 1). With --lit:
-    samples a pixel. Default: 16 and denoised, which a person waits for; 64 or more for a last picture."""
+    """Unlit: side of the sample grid in each pixel, as in render. Default: 2 (a .blend: 1). With --lit:
+    samples per pixel. Default: 16 and denoised, for previews; 64 or more for final images."""
     no_denoise: bool = False
-    """With --lit, cycles: leave the noise of few samples in."""
+    """With --lit, cycles: do not denoise."""
     format: Literal["png", "exr"] = "png"
-    """Kind of the pictures in a folder."""
+    """Format of the images in a folder."""
     executable: File = None
     """An installed Blender, 4.2 or newer, to use instead of the module bpy."""
     threads: Count = None
-    """At most N threads. Default: all processors."""
+    """Maximum number of threads. Default: all processors."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
     json: bool = False
@@ -125,7 +126,7 @@ class Blender:
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         from meshsplats.blender import draw
         from meshsplats.blender.launch import command
 
@@ -139,14 +140,14 @@ class Blender:
         cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800)
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
-        pictures = self._pictures(suffix, len(cameras))
+        images = self._images(suffix, len(cameras))
         blend = self.output if suffix == ".blend" else None
         records = [
-            record_beside(self.output, kind) if suffix else self.output / f"{kind}.json"
-            for kind in ("cameras", "config")
+            beside(self.output, record) if suffix else self.output / record
+            for record in (CAMERAS, CONFIGURATION)
         ]
         check_outputs(
-            [*pictures, *([blend] if blend else []), *records], self.force, None if suffix else self.output
+            [*images, *([blend] if blend else []), *records], self.force, None if suffix else self.output
         )
         mesh = _converted(scene, self.lit)
         subject: SplatMesh | LevelMeshes = mesh
@@ -155,20 +156,20 @@ class Blender:
             subject = LevelMeshes(chain.name, levels, [level.screen_size for level in chain.levels])
         if not suffix:
             self.output.mkdir(exist_ok=True)
-        with _shown(len(pictures)) as show:
+        with _progress_display(len(images)) as show:
             result = draw(
                 subject,
                 cameras,
-                images=pictures,
+                images=images,
                 blend=blend,
                 options=options,
                 executable=self.executable,
-                announce=lambda ahead: say(_announcement(ahead, options, len(pictures))),
+                announce=lambda ahead: say(_plan(ahead, options, len(images))),
                 progress=show,
             )
         save_cameras(cameras, records[0])
-        write_json(records[1], configuration("blender", self))
-        self._report(result, cameras, pictures, len(mesh.faces), time.perf_counter() - start)
+        write_configuration(records[1], "blender", self)
+        self._print_result(result, cameras, images, len(mesh.faces), time.perf_counter() - start)
 
     def _chain(self, suffix: str) -> Chain | None:
         """The chain of levels of detail that the input names, or None."""
@@ -181,8 +182,7 @@ class Blender:
         return read_chain(self.input)
 
     def _options(self, suffix: str) -> SceneOptions:
-        """What Blender is asked for, or UsageError for options that contradict each other or would do
-        nothing."""
+        """The scene for Blender; UsageError for options that contradict each other or have no effect."""
         self.views.check()
         if suffix and suffix not in _FORMATS:
             raise UsageError(
@@ -190,19 +190,19 @@ class Blender:
             )
         if self.transparent and self.background != "white":
             raise UsageError("--transparent and --background exclude each other")
-        if not self.lit and (self.light != _Light() or self.lights != "sun"):
+        if not self.lit and (self.light != LightArguments() or self.lights != "sun"):
             raise UsageError("the options of light need --lit")
         if self.no_denoise and (not self.lit or self.engine != "cycles"):
-            raise UsageError("--no-denoise is for --lit with Cycles: other pictures are not denoised")
+            raise UsageError("--no-denoise is for --lit with Cycles: other images are not denoised")
         if suffix and self.format != "png":
-            raise UsageError("--format is for a folder of pictures: the name given with -o decides")
+            raise UsageError("--format is for a folder of images: the name given with -o decides")
         if self.light.hdri is not None and self.background != "white":
-            raise UsageError("--background has no effect with --hdri, which is what is seen behind the scene")
+            raise UsageError("--background has no effect with --hdri, which is the background")
         samples = self.samples
         if samples is None:
             samples = LIT_SAMPLES if self.lit else 1 if suffix == ".blend" else 2
         elif suffix == ".blend" and not self.lit and samples > 1:
-            raise UsageError("--samples: an unlit .blend takes one sample a pixel; render it larger instead")
+            raise UsageError("--samples: an unlit .blend takes one sample per pixel; render it larger")
         options = SceneOptions(
             light=self.named_light() if self.lit else None,
             engine=self.engine,
@@ -214,12 +214,16 @@ class Blender:
         options.check()
         return options
 
+    def resolved(self) -> dict[str, Any]:
+        return asdict(self.named_light()) if self.lit else {}
+
     def named_light(self) -> LightOptions:
-        """The named light, with what was given instead."""
-        given = {f.name: getattr(self.light, f.name) for f in fields(LightOptions)}
-        return replace(
-            LIGHTS[self.lights], **{k: v for k, v in given.items() if v is not None and v is not False}
-        )
+        """The light of --lights, changed by the options."""
+        options = {f.name: getattr(self.light, f.name) for f in fields(LightOptions)}
+        explicit = {
+            name: value for name, value in options.items() if value is not None and value is not False
+        }
+        return replace(LIGHTS[self.lights], **explicit)
 
     def _views(self) -> ViewOptions:
         """Mirror and ball need room beside the subject."""
@@ -228,38 +232,34 @@ class Blender:
             return replace(self.views, distance=1.7)
         return self.views
 
-    def _pictures(self, suffix: str, count: int) -> list[Path]:
+    def _images(self, suffix: str, count: int) -> list[Path]:
         if suffix:
             return [] if suffix == ".blend" else [self.output]
         return [self.output / name for name in view_names(count, suffix=f".{self.format}")]
 
-    def _report(
+    def _print_result(
         self,
         result: dict,
         cameras: Sequence[Camera],
-        pictures: Sequence[Path],
+        images: Sequence[Path],
         triangles: int,
         seconds: float,
     ) -> None:
         if self.json:
-            output = (
-                {"blend": str(self.output)}
-                if not pictures
-                else {"pictures": [str(path) for path in pictures]}
-            )
+            output = {"images": [str(p) for p in images]} if images else {"blend": str(self.output)}
             print(
                 json.dumps(output | result | {"triangles": triangles, "seconds": round(seconds, 3)}, indent=1)
             )
             return
-        told = f"Blender {result['blender']}, {triangles:,} triangles, up to {result['layers']} layers"
-        if not pictures:
+        summary = f"Blender {result['blender']}, {triangles:,} triangles, up to {result['layers']} layers"
+        if not images:
             named = f"{self.output} ({size_of(self.output)}), {plural(len(cameras), 'camera')}"
-            print(f"{named}, in {seconds:.1f} s: {told}")
+            print(f"{named}, in {seconds:.1f} s: {summary}")
             return
         where = f"{self.output} ({size_of(self.output)})" if self.output.is_file() else f"{self.output}/"
         size = f"{cameras[0].width} x {cameras[0].height}"
-        print(f"{plural(len(pictures), 'picture')} of {size} in {seconds:.1f} s: {where}")
-        print(told)
+        print(f"{plural(len(images), 'image')} of {size} in {seconds:.1f} s: {where}")
+        print(summary)
 
 
 def _converted(scene: GaussianCloud | SplatMesh, lit: bool) -> SplatMesh:
@@ -271,20 +271,20 @@ def _converted(scene: GaussianCloud | SplatMesh, lit: bool) -> SplatMesh:
     return convert(scene, mode="flat") if lit else convert(scene)
 
 
-def _announcement(ahead: dict[str, Any], options: SceneOptions, pictures: int) -> str:
-    """What Blender is about to do, and about how long it will take."""
-    told = f"{ahead['triangles']:,} triangles, up to {ahead['layers']:,} layers behind each other"
-    if not pictures:
-        return told
-    told += f" ({ahead['mean_layers']:.0f} on average), {plural(ahead['samples'], 'sample')} a pixel"
-    told += ", denoised" if options.denoise else ""
+def _plan(ahead: dict[str, Any], options: SceneOptions, images: int) -> str:
+    """The work ahead of Blender, with an estimate of the time."""
+    text = f"{ahead['triangles']:,} triangles, up to {ahead['layers']:,} layers behind each other"
+    if not images:
+        return text
+    text += f" ({ahead['mean_layers']:.0f} on average), {plural(ahead['samples'], 'sample')} per pixel"
+    text += ", denoised" if options.denoise else ""
     seconds = estimated_seconds(ahead, options)
-    return told + ("" if seconds is None else f"; about {_duration(seconds)} on {_processors(options)}")
+    return text + ("" if seconds is None else f"; about {_duration(seconds)} on {_processors(options)}")
 
 
 def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | None:
-    """About how long Cycles takes, from what ``draw`` announces; None for EEVEE. Measured with Blender 4.2 on
-    scenes of 4 to 16 layers a pixel (docs/blender.md): a ray that meets m layers costs 2 m + 0.17 m^2
+    """Estimated time of Cycles, from the plan of ``draw``; None for EEVEE. Measured with Blender 4.2 on
+    scenes of 4 to 16 layers per pixel (docs/blender.md): a ray that meets m layers costs 2 m + 0.17 m^2
     microseconds lit, as each layer sends rays to the light that meet others, and 1.1 m unlit."""
     if options.engine != "cycles":
         return None
@@ -304,7 +304,7 @@ def _processors(options: SceneOptions) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """For people, no more exact than an estimate is."""
+    """In words, no more exact than an estimate."""
     if seconds < 90:
         return f"{max(5, 5 * round(seconds / 5))} s"
     minutes = round(seconds / 60)
@@ -312,9 +312,9 @@ def _duration(seconds: float) -> str:
 
 
 @contextmanager
-def _shown(total: int) -> Iterator[Callable[[Progress], object]]:
-    """A function that shows how far Blender is: as a bar where stderr is a terminal, else a line now and
-    then."""
+def _progress_display(total: int) -> Iterator[Callable[[Progress], object]]:
+    """A function that shows the progress of Blender: as a bar where stderr is a terminal, else in a line now
+    and then."""
     if not sys.stderr.isatty():
         yield _Lines()
         return
@@ -339,6 +339,6 @@ class _Lines:
 
 
 def _words(at: Progress) -> str:
-    which = f"picture {min(at.done + 1, at.images)} of {at.images}" if at.images > 1 else ""
+    which = f"image {min(at.done + 1, at.images)} of {at.images}" if at.images > 1 else ""
     left = f"{at.left} left" if at.left else ""
     return ", ".join(filter(None, [which, at.stage, left]))

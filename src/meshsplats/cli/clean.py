@@ -1,4 +1,4 @@
-"""``meshsplats clean``: splats or a mesh without its floaters."""
+"""``meshsplats clean``: splats or a mesh without floaters."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import UsageError, shown_path
+from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
     Output,
     SplatOptions,
@@ -23,6 +23,8 @@ from meshsplats.cli.common import (
     load_scene,
     size_of,
 )
+from meshsplats.cli.messages import UsageError, shown_path
+from meshsplats.cli.records import PREVIEW, beside
 from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, take_away
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -34,61 +36,52 @@ _RULES = {
     "sparse": "fewer than {:.1%} of the usual neighbours",
     "min_part": "in parts below {:.1%} of all opacity",
 }
-"""What a rule is called in the table."""
+"""Names of the rules in the table."""
 _SIDE = 480
 
 
-def _described(rules: type[CleaningRules]) -> type[CleaningRules]:
-    """The rules as options that may be left out; their docstrings are the help."""
-    metavars = {"crop": "X0 Y0 Z0 X1 Y1 Z1"}
-    typed = {
-        name: Annotated[hint, tyro.conf.arg(metavar=metavars.get(name, "X"), help_behavior_hint="")]  # type: ignore[valid-type]
-        for name, hint in get_type_hints(rules).items()
-    }
-    about = f"What goes. Without any of these: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}."
-    return dataclass(frozen=True)(
-        type(rules.__name__, (rules,), {"__annotations__": typed, "__doc__": about, **dict.fromkeys(typed)})
+if TYPE_CHECKING:
+    RuleOptions = CleaningRules
+else:
+    RuleOptions = as_cli_options(
+        CleaningRules,
+        f"Rules. Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
+        metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
 
 
-if TYPE_CHECKING:
-    _Rules = CleaningRules
-else:
-    _Rules = _described(CleaningRules)
-
-
 @dataclass(frozen=True)
-class Clean:
-    """Takes floaters away: what is faint, far off, alone, or in the air, by the rules given.
+class Clean(Command):
+    """Removes floaters: splats that are faint, far away, alone, or in small separate parts.
 
-    Says what each rule takes, and draws before | what goes, in red | after in NAME.preview.png beside the
-    result.
+    Prints what each rule removes. NAME.preview.png beside the result NAME shows before | removed, in red |
+    after.
     """
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh."""
     output: Output
-    """What is left: splats as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
-    rules: _Rules = field(default_factory=_Rules)
+    """The rest: splats as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
+    rules: RuleOptions = field(default_factory=RuleOptions)
     preview_only: bool = False
-    """Say what would go and draw the picture, but write no result."""
+    """Print and draw what would be removed, but write no result."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         from meshsplats.formats.gaussians import save_gaussians
         from meshsplats.formats.meshes import save_mesh
 
         start = time.perf_counter()
-        preview = self.output.with_suffix(".preview.png")
+        preview = beside(self.output, PREVIEW)
         check_mesh_suffix(self.output)
         outputs = [preview] if self.preview_only else [self.output, preview]
         check_outputs(outputs, self.force, inputs=[self.input])
-        given = any(value is not None for value in vars(self.rules).values())
-        rules = self.rules if given else FLOATERS
+        explicit = any(value is not None for value in vars(self.rules).values())
+        rules = self.rules if explicit else FLOATERS
         scene = load_scene(self.input, self.reading)
         if isinstance(scene, GaussianCloud) and self.output.suffix.lower() != ".ply":
             raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
@@ -100,9 +93,9 @@ class Clean:
             else:
                 save_gaussians(left, self.output)
         _draw(scene, left, found, preview)
-        self._tell(rules, found, left, preview, time.perf_counter() - start)
+        self._print_result(rules, found, left, preview, time.perf_counter() - start)
 
-    def _tell(
+    def _print_result(
         self,
         rules: CleaningRules,
         found: Findings,
@@ -122,7 +115,7 @@ class Clean:
                 "preview": str(preview),
                 "splats": total,
                 "kept": int(found.kept.sum()),
-                "gone": counts,
+                "removed": counts,
                 "lower": lower,
                 "upper": upper,
                 "seconds": round(seconds, 3),
@@ -135,27 +128,27 @@ class Clean:
             del counts["all"]
         width = max(len(named[name]) for name in counts)
         for name, count in counts.items():
-            told = f"{count['splats']:>9,} of {total:,} splats, {count['opacity']:.2%} of the opacity"
-            print(f"{named[name]:<{width}}  {told}")
-        print(f"left: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
+            share = f"{count['splats']:>9,} of {total:,} splats, {count['opacity']:.2%} of the opacity"
+            print(f"{named[name]:<{width}}  {share}")
+        print(f"kept: {int(found.kept.sum()):,} splats, from {lower} to {upper}")
         if not self.preview_only:
             print(f"{self.output} ({size_of(self.output)})")
-        print(f"preview, before | what goes, in red | after: {preview}")
+        print(f"preview, before | removed, in red | after: {preview}")
 
 
 def _draw(
     scene: GaussianCloud | SplatMesh, left: GaussianCloud | SplatMesh, found: Findings, path: Path
 ) -> None:
-    """The strip of three pictures; the first two from where all is seen, the third from where the rest is."""
-    from meshsplats.images.writing import save_png, strip
+    """Saves the strip of three images: two that show the whole, one that shows the rest."""
+    from meshsplats.images.writing import save_image, strip
 
     lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
     whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
-    pictures = [_picture(scene, whole), _picture(_marked(scene, found), whole), _picture(left, rest)]
-    save_png(path, strip(pictures, ("before", "what goes", "after")))
+    images = [_image(scene, whole), _image(_marked(scene, found), whole), _image(left, rest)]
+    save_image(path, strip(images, ("before", "removed", "after")))
 
 
-def _picture(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
+def _image(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
     from meshsplats.evaluation.report import image_of
     from meshsplats.rendering import render_splats
 
@@ -166,7 +159,7 @@ def _picture(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
 
 
 def _marked(scene: GaussianCloud | SplatMesh, found: Findings) -> GaussianCloud | SplatMesh:
-    """What goes in red, the rest in dull colours."""
+    """The scene with the removed splats in red, the rest in dull colours."""
     red = np.array([0.95, 0.05, 0.05], np.float32)
     if isinstance(scene, GaussianCloud):
         plain = scene.sh[:, :1] * np.float32(0.4)

@@ -1,15 +1,14 @@
-"""What the commands share: input by content, output that is not overwritten, cameras and drawing options."""
+"""Shared by the commands: input by content, output that is not overwritten, cameras and rendering options."""
 
 from __future__ import annotations
 
 import errno
-import json
 import os
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -20,7 +19,7 @@ from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome, look_around, orbit
-from meshsplats.cli import UsageError, one_line, shown_path
+from meshsplats.cli.messages import UsageError, flag, one_line
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.backgrounds import Background
@@ -30,7 +29,7 @@ from meshsplats.mesh import SplatMesh
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
-# Options that may be left out. Their help says what happens then, instead of "(default: None)".
+# Optional options. Their help describes the default, in place of "(default: None)".
 Count = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Number = Annotated[float | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
 Text = Annotated[str | None, tyro.conf.arg(metavar="TEXT", help_behavior_hint="")]
@@ -56,10 +55,10 @@ class SplatOptions:
     """How splat files are read."""
 
     axes: Literal["auto", "y-down", "y-up"] = "auto"
-    """What points up in the file; auto: as its format prescribes. The scene has y down after reading. Some
-    programs write SPZ as if its y pointed down: if the picture is upside down, give y-down."""
+    """Direction of the y axis in the file; auto: as its format prescribes. After reading, y points down. Some
+    programs write SPZ with y down: if the image is upside down, give y-down."""
     strict: bool = False
-    """Splats with values that are not finite are an error, not left out with a warning."""
+    """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
     def load(self, path: Path) -> GaussianCloud:
         from meshsplats.formats.gaussians import load_gaussians
@@ -72,48 +71,47 @@ class SplatOptions:
             raise
 
     def again(self) -> list[str]:
-        """What another command needs to read the file with the same axes."""
+        """The words with which another command reads the file with the same axes."""
         return ["--axes", self.axes] if self.axes != "auto" else []
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """From where, and how large. Give one of --orbit, --dome, --look-around, --cameras,
-    --data."""
+    """Cameras and image size. Orbit, dome, look-around, cameras and data exclude each other."""
 
     orbit: Count = None
-    """N views on a circle round the subject."""
+    """N views on a circle around the subject."""
     dome: Count = None
-    """N views spread evenly over the upper half of a sphere round the subject."""
+    """N views spread evenly over the upper half of a sphere around the subject."""
     look_around: Count = None
-    """N views from the middle of the scene, a room say, turning once round."""
+    """N views from the middle of the scene, a room say, in one full turn."""
     cameras: File = None
     """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder that has
     one."""
     data: Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio): the cameras of its test views."""
     downscale: int = 1
-    """With --data: pictures this many times smaller than the photographs."""
+    """With --data: factor by which images are smaller than the photographs."""
     elevation: Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0
     """Degrees of the first view: 0 from the front, 90 from the subject's right-hand side in that view."""
     distance: float = 1.0
-    """Multiple of the distance from which the subject just fits the picture."""
+    """Multiple of the distance from which the subject just fits the image."""
     look_at: Point = None
-    """Point to look at and to go round, in the coordinates of the file. Default: the subject's middle."""
+    """Point to look at and to circle, in the coordinates of the file. Default: the middle of the subject."""
     fov: Number = None
-    """Degrees that the picture's shorter side spans. Default: 45; 75 with --look-around."""
+    """Field of view across the shorter side of the image, degrees. Default: 45; 75 with --look-around."""
     focal_length: Number = None
-    """Millimetres of a lens on 35 mm film, whose 36 mm span the picture's width: 50 is normal, 85 for
-    portraits, 24 wide. In place of --fov."""
+    """Focal length in mm on 35 mm film, whose 36 mm span the image width: 50 is normal, 85 for portraits, 24
+    wide. In place of --fov."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
-    folder, of the mesh, else -y, as COLMAP's scenes have it."""
+    folder, of the mesh, else -y, as in COLMAP's scenes."""
     width: Count = None
-    """Image width in pixels. With --cameras or --data, pictures are scaled to this width."""
+    """Image width in pixels. With --cameras or --data, images are scaled to this width."""
     height: Count = None
-    """Image height in pixels. Default: the width. Not with --cameras or --data, where it follows."""
+    """Image height in pixels. Default: the width. Not with --cameras or --data."""
 
     @property
     def moving(self) -> bool:
@@ -121,7 +119,7 @@ class ViewOptions:
         return self.cameras is None and self.data is None and self.dome is None
 
     def photographs(self) -> Dataset | None:
-        """The data set, where one was named."""
+        """The data set of --data, or None."""
         if self.data is None:
             return None
         from meshsplats.datasets.folder import load_dataset
@@ -137,8 +135,8 @@ class ViewOptions:
         side: int,
         photographs: Dataset | None = None,
     ) -> list[Camera]:
-        """The cameras; ``count`` views of an orbit, ``side`` pixels wide, where nothing else is asked for.
-        ``photographs`` are those of ``photographs()``, if they are there already."""
+        """The cameras; by default ``count`` views of an orbit, ``side`` pixels wide. ``photographs``: the
+        result of ``photographs()``, if it is at hand."""
         self.check()
         for name in ("width", "height"):
             value = getattr(self, name)
@@ -174,7 +172,7 @@ class ViewOptions:
         return orbit(scene, count if self.orbit is None else self.orbit, azimuth=self.azimuth, **lens)
 
     def check(self) -> None:
-        """UsageError for options that exclude each other or would do nothing."""
+        """UsageError for options that exclude each other or have no effect."""
         if self.downscale != 1 and (self.data is None or self.width is not None):
             raise UsageError(
                 "--downscale has no effect without --data"
@@ -187,7 +185,7 @@ class ViewOptions:
             if getattr(self, name) is not None
         ]
         if len(modes) > 1:
-            raise UsageError(f"give one of {', '.join(map(_flag, modes))}, not several")
+            raise UsageError(f"give one of {', '.join(map(flag, modes))}, not several")
         if self.fov is not None and self.focal_length is not None:
             raise UsageError("give --fov or --focal-length, not both")
         placing = ("elevation", "azimuth", "distance", "look_at", "fov", "focal_length", "up", "height")
@@ -200,34 +198,34 @@ class ViewOptions:
         for mode in modes:
             for name in without_effect.get(mode, ()):
                 if getattr(self, name) != next(f.default for f in fields(self) if f.name == name):
-                    raise UsageError(f"{_flag(name)} has no effect with {_flag(mode)}")
+                    raise UsageError(f"{flag(name)} has no effect with {flag(mode)}")
 
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """How pictures are drawn."""
+    """How images are rendered."""
 
     background: Text = None
-    """Colour behind the scene: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; with --data
-    what the model folder says, or the photographs."""
+    """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; with --data that of the
+    model folder or of the photographs."""
     samples: Count = None
-    """Side of the grid of samples in each pixel. Default: as many as the mesh needs at this size, 2 (which
-    means 2 x 2) to 8; 1 for splats, whose filter is as wide as a pixel. compare: of the mesh."""
+    """Side of the sample grid in each pixel: 2 means 2 x 2. Default: what the mesh needs at this size, 2 to
+    8; 1 for splats, whose filter is as wide as a pixel. compare: of the mesh."""
     sh_degree: Count = None
-    """Draw splats with spherical harmonics up to this degree, 0 to 3. Default: all that are stored."""
+    """Render splats with spherical harmonics up to this degree, 0 to 3. Default: all that are stored."""
     max_layers: Count = None
-    """Blend only the nearest N triangles of a mesh at each sample, as N passes of depth peeling do. Default:
+    """Blend only the nearest N triangles of a mesh at each sample, like N passes of depth peeling. Default:
     all."""
     threads: Count = None
-    """At most N threads. Default: all processors."""
+    """Maximum number of threads. Default: all processors."""
 
 
 @dataclass(frozen=True)
 class PartOptions:
-    """What is shown."""
+    """Part of the scene."""
 
     crop: Box = None
-    """Only splats whose centre is in this box, in the coordinates of the file; 'info' tells its extent."""
+    """Only splats with their centre in this box, in the coordinates of the file; 'info' prints its extent."""
 
     def of(self, scene: Scene) -> Scene:
         """That part of ``scene``."""
@@ -240,9 +238,7 @@ def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:
     """The splats or the mesh at ``path``."""
     kind = identify(path)
     if kind == "cameras":
-        raise FileFormatError(
-            f"{path}: a JSON file; expected splats or a mesh (cameras are given with --cameras)"
-        )
+        raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
     if kind == "splats":
         return reading.load(path)
     from meshsplats.formats.meshes import load_mesh
@@ -262,7 +258,7 @@ def cameras_beside(source: Path) -> list[Camera] | None:
 
 
 def chosen_background(
-    given: str | None,
+    color: str | None,
     photographs: Dataset | None,
     scenes: Mapping[str, GaussianCloud | SplatMesh],
     source: Path | None,
@@ -270,16 +266,16 @@ def chosen_background(
     *,
     whole: bool = True,
 ) -> Background:
-    """What pictures of ``scenes`` are drawn over: what was ``given``; else white, or beside ``photographs``
-    what the model folder ``source`` names or fits the scenes best. Warns where scenes and photographs do not
-    agree; unless they cannot, as scenes that are not ``whole``."""
+    """The background of images of ``scenes``: ``color``; else white, or beside ``photographs`` the one that
+    the model folder ``source`` names or that fits the scenes best. Warns where scenes and photographs
+    disagree, as they must for scenes that are not ``whole``."""
     from meshsplats.evaluation.backgrounds import find_background, model_background, warn_of_other_worlds
 
-    color = None if given is None else parse_color(given)
+    rgb = None if color is None else parse_color(color)
     if photographs is None:
-        return Background(color or WHITE, "usual" if color is None else "given")
+        return Background(rgb or WHITE, "usual" if rgb is None else "given")
     named = None if source is None else model_background(source)
-    found = find_background(photographs, scenes, given=color, named=named, threads=threads)
+    found = find_background(photographs, scenes, given=rgb, named=named, threads=threads)
     if whole:
         warn_of_other_worlds(found)
     return found
@@ -332,11 +328,12 @@ def check_mesh_suffix(path: Path) -> None:
 def check_outputs(
     paths: Sequence[Path], force: bool, folder: Path | None = None, *, inputs: Sequence[Path] = ()
 ) -> None:
-    """Before the work: raises OSError if an output exists already (unless ``force``) or cannot be made, and
-    UsageError, ``force`` or not, if it is one of ``inputs``.
+    """Checks outputs before the work. ``folder`` holds all of them and is made later, but not the one above
+    it: a misspelt path must not make a tree of folders.
 
-    ``folder`` holds all of them and is made later, but not the one above it: a misspelt path must not make a
-    tree of folders.
+    Raises:
+        OSError: an output exists already (unless ``force``) or cannot be written.
+        UsageError: an output is one of ``inputs``, with ``force``, too.
     """
     from meshsplats._files.atomic import refuse_existing
 
@@ -366,45 +363,9 @@ def _file_of(source: Path) -> Path:
         return source
 
 
-def record_beside(output: Path, kind: str) -> Path:
-    """Name of the record ``kind`` of a single picture or scene: with all of its own name, so that
-    ``mesh.png`` and ``mesh.glb`` can lie side by side."""
-    return output.with_name(f"{output.name}.{kind}.json")
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Writes ``content`` whole or not at all; infinities and NaN, which JSON lacks, are a ValueError."""
-    from meshsplats._files.atomic import write_text
-
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
-
-
-def configuration(command: str, options: Any) -> dict:
-    """What was asked for, for the file beside the results: enough to run the command again."""
-    import meshsplats
-
-    flat: dict[str, Any] = {}
-    for key, value in asdict(options).items():
-        parts = value if isinstance(value, dict) else {key: value}
-        # A group may hide an option that the command has by itself: what was given counts.
-        flat |= {k: v for k, v in parts.items() if v is not None or k not in flat}
-    return {
-        "command": command,
-        "meshsplats": meshsplats.__version__,
-        "options": {k: _plain(v) for k, v in flat.items()},
-    }
-
-
-def _plain(value: Any) -> Any:
-    """An option's value for JSON, which knows no paths."""
-    if isinstance(value, (tuple, list)):
-        return [_plain(part) for part in value]
-    return shown_path(value) if isinstance(value, Path) else value
-
-
 @contextmanager
 def warnings_kept() -> Iterator[list[str]]:
-    """The warnings given while the block runs, for JSON; they are shown as well."""
+    """The warnings of the block, for JSON; they are printed as well."""
     kept: list[str] = []
     show = warnings.showwarning
 
@@ -419,16 +380,6 @@ def warnings_kept() -> Iterator[list[str]]:
         warnings.showwarning = show
 
 
-def recorded_options(path: Path, command: str | None = None) -> dict[str, Any] | None:
-    """The options in the file at ``path`` that ``configuration`` made for ``command``, or for any; None if it
-    is no such file."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        return dict(record["options"]) if command in (None, record["command"]) else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
 def track(items: Iterable[T], label: str, total: int) -> Iterable[T]:
     """``items`` with a progress bar on stderr, where that is a terminal."""
     if not sys.stderr.isatty():
@@ -440,12 +391,26 @@ def track(items: Iterable[T], label: str, total: int) -> Iterable[T]:
     yield from progress(items, label, total, console=Console(stderr=True), transient=True)
 
 
-def plural(count: int, thing: str) -> str:
-    return f"{count:,} {thing}" + ("" if count == 1 else "s")
+def plural(count: int, noun: str) -> str:
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
+    """Saves an image of ``scene``."""
+    from meshsplats.evaluation.report import image_of
+    from meshsplats.images.writing import save_image
+    from meshsplats.rendering import render_splats
+    from meshsplats.rendering.samples import needed_samples
+
+    camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
+    if isinstance(scene, SplatMesh):
+        save_image(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
+    else:
+        save_image(path, render_splats(scene, camera).color)
 
 
 def size_of(path: Path) -> str:
-    """Size of a file for people: 3.2 MB."""
+    """Size of a file in words: 3.2 MB."""
     from meshsplats._files.atomic import in_words
 
     return in_words(path.stat().st_size)
@@ -454,7 +419,3 @@ def size_of(path: Path) -> str:
 def view_names(count: int, prefix: str = "view", suffix: str = ".png") -> Sequence[str]:
     """File names of ``count`` views, numbered for video tools; names from camera files never become paths."""
     return [f"{prefix}_{i:04d}{suffix}" for i in range(count)]
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")

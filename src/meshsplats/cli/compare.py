@@ -1,4 +1,4 @@
-"""``meshsplats compare``: how close the mesh comes to the splats."""
+"""``meshsplats compare``: scores of a mesh against its splats."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Literal
 import tyro
 
 from meshsplats.cameras.files import save_cameras
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     DrawOptions,
     File,
@@ -20,55 +21,61 @@ from meshsplats.cli.common import (
     ViewOptions,
     check_outputs,
     chosen_background,
-    configuration,
     identify,
     parse_color,
     track,
     view_names,
-    write_json,
 )
+from meshsplats.cli.records import CAMERAS, CONFIGURATION, write_configuration, write_json
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.comparison import Comparison, compare_views
 from meshsplats.rendering.looks import mesh_samples
 
 LOOKS = {
     "area": "splats as means over each pixel's area; the mesh with",
-    "splats": "splats as a 3DGS viewer draws them at this size; the mesh with",
+    "splats": "splats as a 3DGS viewer renders them at this size; the mesh with",
 }
-CONFIGURATION, RESULTS, CAMERAS = "config.json", "results.json", "cameras.json"
+RESULTS = "results.json"
 
 
 @dataclass(frozen=True)
-class Compare:
-    """Draws splats and mesh from the same cameras: PSNR and SSIM per view, and strips splats | mesh |
+class Compare(Command):
+    """Renders splats and mesh from the same cameras: PSNR and SSIM per view, and strips splats | mesh |
     error."""
+
+    COMMON = (
+        *("splats", "mesh", "output", "preset", "look", "orbit", "look_around", "cameras"),
+        *("data", "downscale", "width", "background", "crop", "json", "force"),
+    )
+    EXCLUSIVE = (("orbit", "dome", "look_around", "cameras", "data"), ("fov", "focal_length"))
+    CONFIGURABLE = True
 
     splats: tyro.conf.Positional[Path]
     """Splat file or model folder."""
     mesh: tyro.conf.Positional[File] = None
-    """The mesh. Default: the splats converted with --preset for these cameras."""
+    """The mesh. Default: the splats, converted with --preset for these cameras."""
     output: Output = tyro.MISSING
-    """Folder for strips, results.json, cameras.json and config.json."""
+    """Folder for strips, results.json, cameras.json and config.toml."""
     preset: Literal["default", "paper"] = "default"
-    """Preset of the conversion where no mesh is given."""
+    """Preset of the conversion, without a mesh."""
     look: Literal["area", "splats"] = "area"
-    """What the mesh is compared with. area: the mean over each pixel's area, as photographs, Blender, MSAA
-    and ray tracers show it. splats: the image of a 3DGS viewer at this size."""
+    """Ground truth. area: the mean over each pixel's area, as in photographs, Blender, MSAA and ray tracers.
+    splats: the image of a 3DGS viewer at this size."""
     views: ViewOptions = field(default_factory=ViewOptions)
-    """8 views of an orbit, 400 pixels wide, where nothing else is asked for."""
+    """Default: 8 views of an orbit, 400 pixels wide."""
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
     """Of the splats and of the mesh."""
     amplify: float = 4.0
-    """Factor that makes the error visible in the strips."""
+    """Factor of the error in the strips."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
-        from meshsplats.images.writing import amplified_error, save_png, strip
+    def execute(self) -> None:
+        from meshsplats.images.writing import amplified_error, save_image, strip
 
         if not self.amplify > 0:
             raise ValueError(f"--amplify must be positive, got {self.amplify}")
@@ -113,7 +120,7 @@ class Compare:
             scores.append(view.score)
             self.output.mkdir(exist_ok=True)
             error = amplified_error(view.splats, view.mesh, self.amplify)
-            save_png(self.output / name, strip([view.splats, view.mesh, error], captions))
+            save_image(self.output / name, strip([view.splats, view.mesh, error], captions))
         comparison = Comparison(tuple(scores))
         result = {
             "splats": len(cloud),
@@ -128,12 +135,12 @@ class Compare:
         }
         write_json(self.output / RESULTS, result)
         save_cameras(cameras, self.output / CAMERAS)
-        write_json(self.output / CONFIGURATION, configuration("compare", self))
+        write_configuration(self.output / CONFIGURATION, "compare", self)
         if self.json:
             print(json.dumps(result, indent=1, allow_nan=False))
             return
         _print_table(comparison)
-        print(f"look {self.look}: {LOOKS[self.look]} {samples} x {samples} samples a pixel")
+        print(f"look {self.look}: {LOOKS[self.look]} {samples} x {samples} samples per pixel")
         print(f"{len(cloud):,} splats against {len(mesh.faces):,} triangles, {result['seconds']:.1f} s")
         print(f"background: {background.describe()}")
         print(f"strips splats | mesh | error x {self.amplify:g}: {self.output}/")

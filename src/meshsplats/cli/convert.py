@@ -9,26 +9,17 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera, a_few
+from meshsplats._arrays import subsample
+from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import (
-    FAILED,
-    NO_SPACE,
-    OK,
-    UsageError,
-    error_record,
-    exit_code,
-    one_line,
-    say,
-    shown_path,
-)
+from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.batch import Job, check_file, check_folder, is_batch, jobs, sources
 from meshsplats.cli.common import (
     Count,
@@ -38,15 +29,27 @@ from meshsplats.cli.common import (
     SplatOptions,
     Text,
     cameras_beside,
-    configuration,
+    draw_preview,
     identify,
     parse_up,
     plural,
     size_of,
     track,
     warnings_kept,
-    write_json,
 )
+from meshsplats.cli.messages import (
+    FAILED,
+    NO_SPACE,
+    OK,
+    UsageError,
+    error_record,
+    exit_code,
+    flag,
+    one_line,
+    say,
+    shown_path,
+)
+from meshsplats.cli.records import write_configuration
 from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
@@ -54,101 +57,84 @@ from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-_CHOOSING = ("crop", "min_opacity", "max_splats", "budget")
-"""Options of the conversion that choose splats, and so serve --as-splats too."""
-_OF_SPLATS = (
+_SELECTION = ("crop", "min_opacity", "max_splats", "budget")
+"""Options of the conversion that select splats: they have an effect with --as-splats."""
+_FOR_SPLATS = (
     *("input", "output", "cameras", "data", "formats", "as_splats", "no_preview", "no_sidecar"),
     *("conversion", "reading", "json", "force"),
 )
-"""Options of the command that do."""
-
-
-def _with_placeholders(
-    options: type[ConversionOptions], without: tuple[str, ...] = ()
-) -> type[ConversionOptions]:
-    """The same options but those named in ``without``, described to tyro: ``--rings N`` where it would say
-    ``--rings {None}|INT (default: None)``. Their docstrings are the help and say what happens without
-    them."""
-    typed: dict[str, Any] = {}
-    named = {}
-    for name, hint in get_type_hints(options).items():
-        if name in without:
-            typed[name] = tyro.conf.Suppress[object]  # type: ignore[misc]
-            continue
-        kind = next(part for part in get_args(hint) if part is not type(None))
-        choices = "{" + ",".join(map(str, get_args(kind))) + "}"
-        placeholders = {int: "N", float: "X", bool: "{True,False}"}
-        metavar = "X0 Y0 Z0 X1 Y1 Z1" if name == "crop" else placeholders.get(kind, choices)
-        typed[name] = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint="")]  # type: ignore[valid-type]
-    for option in fields(options):
-        named[option.name] = option.default
-    about = "What is not given is left to the preset."
-    described = type(options.__name__, (options,), {"__annotations__": typed, "__doc__": about, **named})
-    return dataclass(frozen=True)(described)
+"""Options of the command that have one."""
 
 
 if TYPE_CHECKING:
-    _Options = ConversionOptions
-    StartOptions = ConversionOptions
+    ConvertOptions = ConversionOptions
 else:
-    _Options = _with_placeholders(ConversionOptions)
-    # What a fine-tuning starts with looks like its targets.
-    StartOptions = _with_placeholders(ConversionOptions, without=("look",))
+    ConvertOptions = as_cli_options(
+        ConversionOptions,
+        "Default: the value of the preset.",
+        metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
+    )
 
 
 @dataclass(frozen=True)
-class Convert:
-    """Turns splats into a mesh of translucent, vertex-coloured triangles: .glb, .ply or .npz by the name
-    given; several files or folders, into a folder. Meshes are written in the other format. With --as-splats,
-    into a splat .ply: other formats made plain, or a part cut out.
+class Convert(Command):
+    """Converts splats to a mesh of translucent, vertex-coloured triangles; several files or folders, into a
+    folder. Converts meshes to other formats. With --as-splats, writes splats: other formats as a plain .ply,
+    or a part.
 
-    Writes a preview picture and the configuration beside it.
+    Writes a preview and the configuration beside the result.
     """
 
+    COMMON = (
+        *("input", "output", "formats", "preset", "cameras", "data", "up", "lit"),
+        *("alpha", "as_splats", "max_splats", "max_triangles", "crop", "json", "force"),
+    )
+    EXCLUSIVE = (("cameras", "data"),)
+    CONFIGURABLE = True
+
     input: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...")]]
-    """Splat file, the folder of a trained model, or a mesh; several of them; a folder that holds some; - for
-    standard input."""
+    """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
+    input."""
     output: Output
     """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or a
     folder, for files named like the inputs."""
     formats: tuple[Literal["glb", "npz", "ply", "usdc", "usda", "usd", "obj"], ...] = ()
-    """With a folder: the formats to write, one or several. Default: glb."""
+    """With a folder: formats to write. Default: glb."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
     cameras: File = None
-    """Where the mesh will be seen from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the
-    model folder that has one. Default: the cameras of the input where it is a model folder, else none."""
+    """Cameras that the mesh will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
+    folder that has one. Default: those of the input if it is a model folder, else none."""
     data: Folder = None
-    """Data set of the photographs: the cameras of its training views are where the mesh will be seen from."""
+    """Data set of photographs, in place of --cameras: the cameras of its training views."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else -y."""
     lit: bool = False
-    """.glb, .usd: a material that lights and shadows act on, not one that shows the colours as they are."""
+    """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
     color_type: Literal["uint16", "float32"] = "uint16"
-    """.glb: how colours are stored."""
-    alpha: Literal["blend", "mask", "hash-friendly"] = "blend"
-    """.glb: blend: true opacities. For viewers that neither sort nor blend well: mask draws solid what is at
-    least 20 % opaque; hash-friendly gives each splat a cutoff of its own, right on average, grainy."""
+    """.glb: storage of colours."""
+    alpha: Literal["blend", "mask"] = "blend"
+    """.glb: blend: true opacities. mask, for viewers that neither sort nor blend well: makes opaque what has
+    an opacity of 0.2 or more."""
     compression: Literal["none", "meshopt"] = "none"
-    """.glb: about a fifth of the size, for viewers; needs the program gltfpack."""
+    """.glb: meshopt: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
-    """Write splats, not a mesh: a float .ply as the 3DGS code lays it out, of all splats or of what --crop,
-    --min-opacity and --max-splats leave."""
+    """Write splats, not a mesh: a float .ply in the layout of the 3DGS code, of all splats or of those that
+    --crop, --min-opacity and --max-splats leave."""
     fidelity: Count = None
-    """Compare the mesh with its splats from N of the cameras, or N places round it, and tell the PSNR and the
-    SSIM."""
+    """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
     no_preview: bool = False
-    """Draw no preview."""
+    """Write no preview."""
     no_sidecar: bool = False
-    """Write nothing beside the result: neither preview nor configuration."""
-    conversion: _Options = field(default_factory=_Options)
+    """Write neither preview nor configuration."""
+    conversion: ConvertOptions = field(default_factory=ConvertOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
     """Print the results as JSON, a line for each input, errors too."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> int:
+    def execute(self) -> int:
         if not self.input:
             raise UsageError("give a splat file, a mesh or a folder to convert")
         batch = is_batch(self.input)
@@ -159,15 +145,15 @@ class Convert:
         todo = jobs(found, self.output, formats, preview=not self.no_preview, sidecars=not self.no_sidecar)
         cameras = self._cameras()
         if not folder:
-            self._tell(self._convert(todo[0], cameras), todo[0], cameras)
+            self._print_result(self._convert(todo[0], cameras), todo[0], cameras)
             return OK
-        made = not self.output.exists()
-        if made:
+        new = not self.output.exists()
+        if new:
             self.output.mkdir()
         try:
-            return self._all(todo, cameras)
+            return self._convert_all(todo, cameras)
         finally:
-            if made:
+            if new:
                 with suppress(OSError):
                     self.output.rmdir()  # where nothing was written
 
@@ -187,7 +173,7 @@ class Convert:
         return ("ply",)
 
     def _check(self, kinds: Sequence[str]) -> None:
-        """UsageError or ValueError for options that contradict each other or would do nothing."""
+        """UsageError or ValueError for options that contradict each other or have no effect."""
         if self.fidelity is not None and self.fidelity < 1:
             raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
         if self.as_splats:
@@ -202,38 +188,44 @@ class Convert:
             raise UsageError("give --cameras or --data, not both")
         if self.up is not None:
             parse_up(self.up)
-        # Mistakes are told before the work; cameras may lie beside an input.
-        self.conversion.resolved(self.preset, has_cameras=bool(self.cameras or self.data) or self._beside())
+        self._resolved(sources(self.input))  # checks the values before the work
 
-    def _beside(self) -> bool:
-        return any((path / "cameras.json").is_file() for path in sources(self.input) if path.is_dir())
+    def resolved(self) -> dict[str, Any]:
+        if self.as_splats or all(identify(path) == "mesh" for path in self.input):
+            return {}
+        return asdict(self._resolved(self.input))
+
+    def _resolved(self, inputs: Sequence[Path]) -> ConversionOptions:
+        beside = any((path / "cameras.json").is_file() for path in inputs if path.is_dir())
+        has_cameras = bool(self.cameras or self.data) or beside
+        return self.conversion.resolved(self.preset, has_cameras=has_cameras)
 
     def _check_splat_options(self) -> None:
-        standard = {f.name: f.default for f in fields(self) if f.name not in _OF_SPLATS}
+        standard = {f.name: f.default for f in fields(self) if f.name not in _FOR_SPLATS}
         idle = [name for name, value in standard.items() if getattr(self, name) != value]
-        given = asdict(self.conversion)
+        explicit = asdict(self.conversion)
         if self.conversion.budget == "drop" or self.conversion.max_splats is None:
             idle += [name for name in ("cameras", "data") if getattr(self, name) is not None]
-        idle += [name for name, value in given.items() if value is not None and name not in _CHOOSING]
+        idle += [name for name, value in explicit.items() if value is not None and name not in _SELECTION]
         if idle:
-            flags = ", ".join("--" + name.replace("_", "-") for name in idle)
+            flags = ", ".join(map(flag, idle))
             raise UsageError(f"{flags}: for a mesh, no effect with --as-splats")
         self.conversion.resolved("paper", has_cameras=False)
 
     def _cameras(self) -> list[Camera] | None:
-        """Those that were named; None: each input may have its own."""
+        """The cameras of the options; None: each input may have its own."""
         if self.data is not None:
             dataset = load_dataset(self.data)
             return [view.camera for view in dataset.train or dataset.views]
         return None if self.cameras is None else load_cameras(self.cameras)
 
-    def _all(self, todo: Sequence[Job], cameras: list[Camera] | None) -> int:
-        """Every job, whatever becomes of the others; a full disk ends them. Returns the exit code: that of
-        the failures if they are all of one kind."""
+    def _convert_all(self, todo: Sequence[Job], cameras: list[Camera] | None) -> int:
+        """Does every job, also after failures; a full disk ends them. Returns the exit code: that of the
+        failures if they are all of one kind."""
         codes = []
         for job in track(todo, "converting", len(todo)):
             try:
-                self._tell_line(self._convert(job, cameras), job)
+                self._print_line(self._convert(job, cameras), job)
             except BrokenPipeError:
                 raise
             except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
@@ -250,11 +242,11 @@ class Convert:
         return OK if not codes else codes[-1] if len(set(codes)) == 1 or codes[-1] == NO_SPACE else FAILED
 
     def _convert(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
-        """Does ``job``; what is told of it, for JSON."""
+        """Does ``job``; its result, for JSON."""
         import meshsplats
 
         job.check(self.force)
-        with warnings_kept() as told:
+        with warnings_kept() as warned:
             kind = identify(job.source)
             if kind == "cameras" or (kind == "mesh" and self.as_splats):
                 raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
@@ -264,13 +256,11 @@ class Convert:
                 result = self._save_again(job)
             else:
                 result = self._save_mesh(job, cameras)
-            if job.config:
-                record = configuration("convert", self)
-                record["options"] |= {"input": job.shown, "output": str(job.outputs[0])}
-                write_json(job.config, record)
+            for path, config in zip(job.outputs, job.configs, strict=False):
+                write_configuration(config, "convert", self._alone(job, path))
         outputs = [{"path": str(path), "bytes": path.stat().st_size} for path in job.outputs]
-        begin = {"input": job.shown, "outputs": outputs, "preview": str(job.preview) if job.preview else None}
-        return begin | result | {"warnings": told, "meshsplats": meshsplats.__version__}
+        base = {"input": job.shown, "outputs": outputs, "preview": str(job.preview) if job.preview else None}
+        return base | result | {"warnings": warned, "meshsplats": meshsplats.__version__}
 
     def _save_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """The splats of ``job`` as a mesh."""
@@ -297,8 +287,16 @@ class Convert:
             "fidelity": self._fidelity(cloud, mesh, cameras),
         }
 
+    def _alone(self, job: Job, path: Path) -> Convert:
+        """The command that writes ``path`` of ``job`` alone."""
+        alone = replace(self, input=(job.source,), output=path, formats=())
+        suffix = path.suffix.lower()
+        if suffix != ".glb":
+            alone = replace(alone, color_type="uint16", alpha="blend", compression="none")
+        return alone if suffix == ".glb" or suffix.startswith(".usd") else replace(alone, lit=False)
+
     def _merges(self) -> bool:
-        """Whether a limit asks for splats to be merged."""
+        """Whether splats are merged to keep a limit."""
         limits = (self.conversion.max_splats, self.conversion.max_triangles)
         return self.conversion.budget != "drop" and any(limit is not None for limit in limits)
 
@@ -319,14 +317,14 @@ class Convert:
     def _fidelity(
         self, cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera]
     ) -> dict[str, Any] | None:
-        """How close the mesh comes to the splats that it was to show."""
+        """Scores of the mesh against its splats."""
         if self.fidelity is None:
             return None
         from meshsplats.evaluation.comparison import compare
 
         if self.conversion.crop is not None:
             cloud = choose_splats(cloud, crop=self.conversion.crop)
-        views = a_few(cameras, self.fidelity, 400) or orbit(
+        views = [camera.within(400) for camera in subsample(cameras, self.fidelity)] or orbit(
             mesh, self.fidelity, elevation=15, width=400, height=400
         )
         mean = compare(cloud, mesh, views).to_dict()["mean"]
@@ -340,8 +338,8 @@ class Convert:
         idle += ["preset"] if self.preset != "default" else []
         idle += [name for name, value in asdict(self.conversion).items() if value is not None]
         if idle:
-            flags = ", ".join("--" + name.replace("_", "-") for name in idle)
-            raise UsageError(f"{job.shown} is a mesh: {flags} would do nothing, as they are for splats")
+            flags = ", ".join(map(flag, idle))
+            raise UsageError(f"{job.shown} is a mesh: {flags} would have no effect, as they are for splats")
         times = [time.perf_counter()]
         mesh = load_mesh(job.source)
         if self.up is not None:
@@ -360,7 +358,7 @@ class Convert:
         }
 
     def _save_splats(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
-        """The splats themselves, in the format that everything reads."""
+        """The splats themselves, as .ply."""
         from meshsplats.formats.gaussians import save_gaussians
 
         start = time.perf_counter()
@@ -381,8 +379,8 @@ class Convert:
             draw_preview(kept, job.preview)
         return {"read": len(cloud), "written": len(kept), "seconds": round(seconds, 4)}
 
-    def _tell(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> None:
-        """What came of a single input."""
+    def _print_result(self, result: dict[str, Any], job: Job, cameras: list[Camera] | None) -> None:
+        """Prints the result of a single input."""
         if self.json:
             print(json.dumps(result))
             return
@@ -400,21 +398,21 @@ class Convert:
         if result.get("converted") is not None and self.compression == "none":
             print(f"next: {self._next(cameras or cameras_beside(job.source))}")
 
-    def _tell_line(self, result: dict[str, Any], job: Job) -> None:
-        """What came of one of several."""
+    def _print_line(self, result: dict[str, Any], job: Job) -> None:
+        """Prints the result of one of several inputs."""
         if self.json:
             print(json.dumps(result), flush=True)
             return
-        what = f"{result['written']:,} splats" if "written" in result else _counts(result)
+        sizes = f"{result['written']:,} splats" if "written" in result else _counts(result)
         files = ", ".join(f"{path.name} ({size_of(path)})" for path in job.outputs)
-        print(f"{job.shown}: {what}: {files}", flush=True)
+        print(f"{job.shown}: {sizes}: {files}", flush=True)
 
     def _next(self, cameras: Sequence[Camera] | None) -> str:
-        """The command that compares the mesh with the splats from where it was made for, or one that shows it
-        where only a part of them was converted."""
+        """The command that compares the mesh with the splats in its cameras, or one that renders it if only a
+        part of them was converted."""
         folder, source = self.output.with_suffix(""), shown_path(self.input[0])
         if self.conversion.crop is not None or source == "-":
-            return shlex.join(["meshsplats", "render", str(self.output), "-o", f"{folder}-pictures"])
+            return shlex.join(["meshsplats", "render", str(self.output), "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
         if self.data is not None:
             words += ["--data", self.data]
@@ -424,8 +422,8 @@ class Convert:
 
 
 def _counts(result: dict[str, Any]) -> str:
-    """What a mesh was made of, and what it has."""
-    has = f"{result['triangles']:,} triangles, {result['vertices']:,} vertices"
+    """Sizes before and after."""
+    sizes = f"{result['triangles']:,} triangles, {result['vertices']:,} vertices"
     if "splats" in result:
         share = result["converted"] / result["splats"]
         kept = f", merged into {result['converted']:,} ({share:.1%})"
@@ -433,23 +431,10 @@ def _counts(result: dict[str, Any]) -> str:
             kept = ""
         elif not result["merged"]:
             kept = f", {result['converted']:,} of them converted ({share:.1%})"
-        has = f"{result['splats']:,} splats{kept} -> {has}"
+        sizes = f"{result['splats']:,} splats{kept} -> {sizes}"
     fidelity = result["fidelity"]
     if fidelity is None:
-        return has
+        return sizes
     psnr = "equal" if fidelity["psnr"] is None else f"{fidelity['psnr']:.2f} dB"
     views = plural(fidelity["views"], "view")
-    return f"{has}; {psnr}, SSIM {fidelity['ssim']:.4f} against the splats, {views}"
-
-
-def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
-    from meshsplats.evaluation.report import image_of
-    from meshsplats.images.writing import save_png
-    from meshsplats.rendering import render_splats
-    from meshsplats.rendering.samples import needed_samples
-
-    camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
-    if isinstance(scene, SplatMesh):
-        save_png(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
-    else:
-        save_png(path, render_splats(scene, camera).color)
+    return f"{sizes}; {psnr}, SSIM {fidelity['ssim']:.4f} against the splats, {views}"

@@ -10,35 +10,36 @@ from typing import Annotated
 
 import tyro
 
-from meshsplats.cli import UsageError
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import Number, Output, check_mesh_suffix, check_outputs, plural, size_of, track
+from meshsplats.cli.messages import UsageError
 from meshsplats.mesh import SplatMesh
 
 
 @dataclass(frozen=True)
-class Deform:
+class Deform(Command):
     """Moves splats with the mesh that they are bound to; nothing is trained.
 
-    Several bases, the frames of an animation say, give a file each.
+    Several bases, such as the frames of an animation, give a file each.
     """
 
     input: tyro.conf.Positional[Path]
-    """What 'meshsplats prior' wrote: .npz or .glb."""
+    """The result of 'meshsplats prior': .npz or .glb."""
     base: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE...")]
-    """The edited base, or several: the same vertices and faces in the same order, at other places."""
+    """The edited base, or several: the same vertices and faces in the same order, at other positions."""
     output: Output
-    """The moved splats: .glb, .npz (both can be moved again), .ply, .usdc, .obj. With several bases the files
+    """The moved splats: .glb, .npz (both can be moved again), .ply, .usdc, .obj. With several bases, files
     are numbered: edited.glb becomes edited_0001.glb, edited_0002.glb ..."""
     lift: Number = None
-    """Scene units from one layer to the next along the normals. Default: the prior's own spacing; where its
-    layers are coplanar, 0 for .npz and 1/50000 of the base's diagonal for other formats, whose readers do not
-    know the order of coplanar layers."""
+    """Distance between layers along the normals, scene units. Default: the spacing of the prior; for coplanar
+    layers 0 in .npz, and 1/50000 of the base's diagonal in other formats, whose readers do not know the order
+    of coplanar layers."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         from meshsplats.formats.base_meshes import load_base
         from meshsplats.prior import load_prior
 
@@ -74,7 +75,7 @@ class Deform:
         )
 
     def targets(self) -> list[Path]:
-        """Where each base's splats go."""
+        """The output for each base."""
         if len(self.base) == 1:
             return [self.output]
         width = max(4, len(str(len(self.base))))
@@ -87,6 +88,6 @@ def _save(mesh: SplatMesh, target: Path) -> None:
 
     from meshsplats.formats.meshes import BOUND_SUFFIXES, save_mesh
 
-    # Where there is no place for the binding, that is what was asked for.
+    # Formats without a place for the binding would warn of it.
     bound = target.suffix.lower() in BOUND_SUFFIXES
     save_mesh(mesh if bound else replace(mesh, binding=None), target)

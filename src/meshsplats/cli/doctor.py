@@ -1,4 +1,4 @@
-"""``meshsplats doctor``: what is installed here, and what is missing."""
+"""``meshsplats doctor``: installed libraries, and missing ones."""
 
 from __future__ import annotations
 
@@ -6,21 +6,24 @@ import json
 import platform
 import re
 import shlex
+import sys
 from dataclasses import dataclass
 from importlib import metadata
 
 import numpy as np
 
+from meshsplats.cli.arguments import Command
+
 
 @dataclass(frozen=True)
-class Doctor:
-    """Shows what is installed, the instruction set in use, and what is missing. Exit code 1 if nothing can be
-    drawn."""
+class Doctor(Command):
+    """Lists installed and missing libraries, and the instruction set in use. Exit code 1 if rendering
+    fails."""
 
     json: bool = False
     """Print the findings as JSON."""
 
-    def run(self) -> int:
+    def execute(self) -> int:
         findings = examine()
         if self.json:
             print(json.dumps(findings, indent=1))
@@ -64,7 +67,7 @@ def _core() -> dict:
         result["in_use"] = library.load_core().ms_variant().decode()
         result["works"] = _draws()
         if not result["works"]:
-            result["problem"] = "the picture of one triangle is wrong"
+            result["problem"] = "the image of one triangle is wrong"
     except (ImportError, OSError, ValueError, RuntimeError) as error:
         result["problem"] = " ".join(str(error).split())
     return result
@@ -83,8 +86,8 @@ def _draws() -> bool:
 
 
 def _requirements() -> dict[str, dict[str, str]]:
-    """The libraries that the package asks for, by extra and name, as pip takes them; those always needed
-    under ''."""
+    """The libraries that the package needs here, by extra and name, in pip's form; those that are always
+    needed under ''."""
     try:
         lines = metadata.requires("meshsplats") or []
     except metadata.PackageNotFoundError:
@@ -93,7 +96,8 @@ def _requirements() -> dict[str, dict[str, str]]:
     for line in lines:
         name = re.match(r"[A-Za-z0-9._-]+", line)
         extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)['\"]", line)
-        if name:
+        older_python = re.search(r"python_version\s*<\s*['\"]3\.(\d+)['\"]", line)
+        if name and not (older_python and sys.version_info >= (3, int(older_python[1]))):
             wanted = found.setdefault(extra[1] if extra else "", {})
             wanted[name[0]] = line.partition(";")[0].strip()
     return found
@@ -115,7 +119,7 @@ def _text(findings: dict) -> str:
     ]
     if core["works"]:
         lines.append(
-            f"core: {core['in_use']} in use; runs here: {', '.join(core['available'])}; draws correctly"
+            f"core: {core['in_use']} in use; runs here: {', '.join(core['available'])}; renders correctly"
         )
     else:
         lines.append(f"core: DOES NOT WORK: {core['problem']}")

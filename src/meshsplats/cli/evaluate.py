@@ -1,4 +1,4 @@
-"""``meshsplats evaluate``: scores against held-out photographs, or against the splats' own pictures."""
+"""``meshsplats evaluate``: scores against held-out photographs, or against images of the splats."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from meshsplats._arrays import spread_indices
 from meshsplats.cameras.files import load_cameras
-from meshsplats.cli import UsageError
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
     File,
@@ -24,13 +25,13 @@ from meshsplats.cli.common import (
     Text,
     check_outputs,
     chosen_background,
-    configuration,
     load_scene,
     parse_color,
     track,
     view_names,
-    write_json,
 )
+from meshsplats.cli.messages import UsageError, flag
+from meshsplats.cli.records import CONFIGURATION, write_configuration, write_json
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.splat_targets import splat_views
@@ -55,82 +56,86 @@ from meshsplats.evaluation.strips import (
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION = (
-    "results.json",
-    "per_view.json",
-    "report.json",
-    "table.md",
-    "config.json",
-)
-Weights = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
-Meshes = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
+RESULTS, PER_VIEW, REPORT, TABLE = "results.json", "per_view.json", "report.json", "table.md"
+Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
-class Evaluate:
-    """Scores pictures of meshes, and of splats beside them: PSNR, SSIM and LPIPS of each view, their means
-    and medians, and strips truth | mesh | splats | error.
+class Evaluate(Command):
+    """Scores images of meshes and splats on held-out views: PSNR, SSIM and LPIPS of each view, means and
+    medians, and strips ground truth | mesh | splats | error.
 
-    results.json and per_view.json have the shape of those that the 3DGS code writes; report.json has
-    everything.
+    results.json and per_view.json have the structure of those of the 3DGS code; report.json has everything.
     """
 
-    mesh: tyro.conf.Positional[Meshes] = ()
+    COMMON = (
+        *("mesh", "output", "data", "splats", "before", "cameras", "downscale", "test_every"),
+        *("background", "samples", "lpips", "fit_exposure", "threads", "json", "force"),
+    )
+    EXCLUSIVE = (("data", "cameras"),)
+    CONFIGURABLE = True
+
+    mesh: tyro.conf.Positional[Files] = ()
     """The mesh, or several to score side by side. With --protocol: a folder with a mesh, splats or a model
     folder for each scene, by its name."""
     output: Output = tyro.MISSING
     """Folder for the results."""
     data: Folder = None
-    """Data set of photographs; with --protocol the folder of its scenes. Default: the splats' pictures."""
+    """Data set of photographs; with --protocol the folder of its scenes. Default: images of the splats."""
     before: File = None
-    """Another mesh to score beside, for instance the one before it was fine-tuned."""
+    """Another mesh to score, the one before fine-tuning say."""
     splats: File = None
-    """The splats: with --data, or pictures made elsewhere, scored beside the mesh at degree 0 and with all
-    their spherical harmonics; without --data their pictures are the truth, beside it they are scored at
-    degree 0."""
-    pictures: Folder = None
-    """Pictures made elsewhere, by Blender say: a file for each view, by its name or in the views' order."""
+    """The splats. With --data: scored, too, at SH degree 0 and with all spherical harmonics. Without: their
+    images are the ground truth (also scored at SH degree 0)."""
+    images: Folder = None
+    """Images by other programs to score, Blender say: a file for each view, by its name or in order."""
     cameras: File = None
-    """Without --data: cameras to draw the splats from. Default: as finetune holds them out."""
+    """Without --data: cameras. Default: those that finetune holds out."""
     look: Literal["area", "splats"] = "area"
-    """Without --data: what the splats' pictures show, the truth. area: means over each pixel's area, as in
-    programs that take several samples a pixel. splats: what a 3DGS viewer shows at this size."""
+    """Without --data: kind of ground truth. area: means over each pixel's area, as in programs that take
+    several samples per pixel. splats: images of a 3DGS viewer at this size."""
     sh_degree: Count = None
-    """Without --data: the splats' pictures are the truth up to this degree. Default: all that are stored."""
-    lpips: Weights = ()
+    """Without --data: SH degree of the ground truth. Default: all that are stored."""
+    lpips: Files = ()
     """Weights of LPIPS, files or a folder: torchvision's vgg16-397923af.pth and vgg.pth of the package lpips,
-    or one file of both (docs/finetuning.md says where they are); without them there is no such column."""
+    or one file of both (see docs/finetuning.md). Default: no LPIPS."""
     network: Literal["vgg", "alex"] = "vgg"
     """Network of LPIPS; splatting papers use vgg."""
     fit_exposure: bool = False
-    """Also score after a gain and an offset a channel are fitted to each picture."""
+    """Also score with a gain and an offset per channel, fitted to each image."""
     samples: Count = None
-    """Side of the grid of samples in each pixel, for meshes. Default: as many as the mesh needs at this size,
-    2 to 8; 1 with --look splats."""
+    """Side of the sample grid in each pixel, for meshes. Default: what the mesh needs at this size, 2 to 8; 1
+    with --look splats."""
     background: Text = None
-    """Behind everything: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; for photographs
-    without alpha what the model folder says, else of black and white the one that fits the splats best."""
+    """Background: white, black, grey, #rrggbb, or r,g,b from 0 to 1. Default: white; for photographs without
+    alpha that of the model folder, else black or white, the one that fits the splats best."""
     downscale: Count = None
-    """Pictures this many times smaller. Default: 1; that of the protocol."""
+    """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
-    """Every n-th view is held out where the data set has no split of its own."""
-    protocol: Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None = None
-    """Score all scenes of a benchmark as the paper's Table 1 does."""
-    tune: Literal["default", "paper", "published"] | None = None
-    """With --protocol: fine-tune the scenes' splats on the training views first, with this preset."""
+    """Every n-th view is held out, if the data set has no split."""
+    protocol: Annotated[
+        Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None,
+        tyro.conf.arg(metavar="{" + ",".join(BENCHMARKS) + "}", help_behavior_hint=""),
+    ] = None
+    """Score all scenes of a benchmark as in the paper's Table 1."""
+    tune: Annotated[
+        Literal["default", "paper", "published"] | None,
+        tyro.conf.arg(metavar="{default,paper,published}", help_behavior_hint=""),
+    ] = None
+    """With --protocol: first fine-tune each scene on its training views, with this preset."""
     strips: int = 8
-    """For so many views, spread over all, write strips and enlarged crops."""
+    """Number of views, spread over all, for which strips and enlarged crops are written."""
     amplify: float = 4.0
-    """Factor that makes the error visible in the strips."""
+    """Factor of the error in the strips."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
-    """At most N threads. Default: all processors."""
+    """Maximum number of threads. Default: all processors."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         self._check()
         start = time.perf_counter()
         if self.protocol is not None:
@@ -145,12 +150,12 @@ class Evaluate:
             source = self.splats or (self.mesh[0] if self.mesh else None)
             background = self._background(dataset, scenes, source)
             if self.data is None and splats is not None:
-                # Their own pictures are the truth; what a mesh could show of it is degree 0.
+                # Their images are the ground truth; a mesh can reach degree 0 of it.
                 more = splats.sh_degree > 0 and self.sh_degree != 0
                 splats = replace(splats, sh=splats.sh[:, :1]) if more else None
             reports = [self._score(self.output, dataset, background, meshes, splats, before)]
         seconds = round(time.perf_counter() - start, 2)
-        write_json(self.output / CONFIGURATION, configuration("evaluate", self))
+        write_configuration(self.output / CONFIGURATION, "evaluate", self)
         if self.json:
             print(json.dumps({"scenes": [r.to_dict() for r in reports], "seconds": seconds}, indent=1))
             return
@@ -167,20 +172,20 @@ class Evaluate:
         if self.protocol is not None:
             if self.data is None or len(self.mesh) != 1:
                 raise UsageError("--protocol needs a folder of meshes or models, and --data with the scenes")
-            for name in ("before", "splats", "pictures", "cameras", "sh_degree"):
+            for name in ("before", "splats", "images", "cameras", "sh_degree"):
                 if getattr(self, name) is not None:
-                    raise UsageError(f"--{name.replace('_', '-')} has no effect with --protocol")
+                    raise UsageError(f"{flag(name)} has no effect with --protocol")
             return
         if self.tune is not None:
             raise UsageError("--tune is for --protocol; otherwise use meshsplats finetune, then evaluate")
-        if not self.mesh and self.pictures is None and (self.splats is None or self.data is None):
-            raise UsageError("nothing to score: give a mesh, --pictures, or --splats with --data")
+        if not self.mesh and self.images is None and (self.splats is None or self.data is None):
+            raise UsageError("nothing to score: give a mesh, --images, or --splats with --data")
         if self.data is None and self.splats is None:
             raise UsageError("nothing to compare with: give --data, or --splats")
-        given = {"cameras": self.cameras, "sh_degree": self.sh_degree, "look": self.look}
-        for name, value in given.items():
+        of_splats = {"cameras": self.cameras, "sh_degree": self.sh_degree, "look": self.look}
+        for name, value in of_splats.items():
             if self.data is not None and value not in (None, "area"):
-                raise UsageError(f"--{name.replace('_', '-')} has no effect with --data")
+                raise UsageError(f"{flag(name)} has no effect with --data")
         if self.data is None and self.downscale is not None:
             raise UsageError("--downscale has no effect without --data")
 
@@ -241,9 +246,9 @@ class Evaluate:
 
         dataset = dataset.over(background.color)
         views = dataset.test or dataset.views
-        pictures = None if self.pictures is None else image_folder(self.pictures, [v.camera for v in views])
+        images = None if self.images is None else image_folder(self.images, [v.camera for v in views])
         lpips = load_lpips(list(self.lpips) or None, network=self.network)
-        shown = set(np.linspace(0, len(views) - 1, min(self.strips, len(views))).round().astype(int).tolist())
+        with_strips = set(spread_indices(len(views), self.strips))
         names = view_names(len(views))
         folder.mkdir(exist_ok=True)
         bar = iter(track(range(len(views)), "scoring", len(views)))
@@ -252,7 +257,7 @@ class Evaluate:
 
         def keep(scored: ScoredView) -> None:
             nonlocal count
-            if count in shown:
+            if count in with_strips:
                 _save_strips(folder, names[count], scored, self.amplify)
             count += 1
             next(bar, None)
@@ -262,7 +267,7 @@ class Evaluate:
             dataset,
             before=before,
             splats=splats,
-            images=pictures,
+            images=images,
             samples=self.samples,
             lpips=lpips,
             fit_exposure=self.fit_exposure,
@@ -274,7 +279,7 @@ class Evaluate:
             "lpips_network": self.network if lpips else None,
         }
         if self.cameras is not None:
-            about["held_out"] = None  # nobody knows what a mesh was trained on
+            about["held_out"] = None  # it is unknown what a mesh was trained on
         report = replace(report, about={**report.about, **about})
         write_json(folder / RESULTS, report.results())
         write_json(folder / PER_VIEW, report.per_view())
@@ -321,8 +326,8 @@ class Evaluate:
 
 
 def mesh_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """A name for each mesh in tables: ``mesh`` for a single one, else that of its file, with as many of the
-    folders above as tell them apart."""
+    """A name for each mesh in tables: ``mesh`` for a single one, else that of its file, with the folders
+    above that make names differ."""
     if len(paths) == 1:
         return {"mesh": paths[0]}
     whole = [Path(os.path.abspath(path)) for path in paths]
@@ -342,12 +347,12 @@ def _tuned(mesh: SplatMesh, dataset: Dataset, preset: str, threads: int | None) 
 
 
 def _save_strips(folder: Path, name: str, scored: ScoredView, amplify: float) -> None:
-    from meshsplats.images.writing import save_png
+    from meshsplats.images.writing import save_image
 
     makers: dict[str, Callable[[ScoredView, float], np.ndarray]] = {"strips": view_strip, "crops": view_crop}
     for part, make in makers.items():
         (folder / part).mkdir(exist_ok=True)
-        save_png(folder / part / name, make(scored, amplify))
+        save_image(folder / part / name, make(scored, amplify))
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -357,11 +362,11 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _notes(reports: Sequence[Report]) -> list[str]:
-    """What a reader of the table has to know of the scenes' backgrounds."""
-    told = [(report.scene, report.about["background_description"]) for report in reports]
-    if len(told) == 1:
-        return [f"Background: {told[0][1]}."]
-    return [f"Background of {scene}: {text}." for scene, text in told]
+    """Notes under the table: the scenes' backgrounds."""
+    backgrounds = [(report.scene, report.about["background_description"]) for report in reports]
+    if len(backgrounds) == 1:
+        return [f"Background: {backgrounds[0][1]}."]
+    return [f"Background of {scene}: {text}." for scene, text in backgrounds]
 
 
 def _print_table(reports: Sequence[Report]) -> None:

@@ -1,4 +1,4 @@
-"""``meshsplats info``: what is in a splat file, a mesh, a camera file, a model folder or a data set."""
+"""``meshsplats info``: the content of a splat file, a mesh, a camera file, a model folder or a data set."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ import tyro
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, read_json
 from meshsplats.cameras.framing import guess_up, scene_bounds
-from meshsplats.cli import shown_path
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions, cameras_beside, identify
+from meshsplats.cli.messages import shown_path
 from meshsplats.datasets.colmap import count_points
 from meshsplats.datasets.folder import Layout, find_layout, load_dataset
 from meshsplats.datasets.image_files import PhotoFile
@@ -24,28 +25,28 @@ from meshsplats.formats.gaussians import splat_file, splat_format
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
-TRIED = 4000
-"""Splats that are converted to tell how large the mesh will be."""
+SAMPLE = 4000
+"""Number of splats that are converted to estimate the size of the mesh."""
 
 
 @dataclass(frozen=True)
-class Info:
-    """Shows what is in a splat file, a mesh, a camera file, a model folder, or a data set of photographs."""
+class Info(Command):
+    """Describes a splat file, a mesh, a camera file, a model folder, or a data set of photographs."""
 
     input: tyro.conf.Positional[Path]
     """The file or folder."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     json: bool = False
-    """Print it as JSON."""
+    """Print the findings as JSON."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         findings = describe(self.input, self.reading)
         if self.json:
             print(json.dumps(findings, indent=1, allow_nan=False))
             return
         width = max(map(len, findings))
         for key, value in findings.items():
-            print(f"{key.replace('_', ' '):<{width}}  {_shown(value)}")
+            print(f"{key.replace('_', ' '):<{width}}  {_in_words(value)}")
 
 
 def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
@@ -93,7 +94,7 @@ def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
     found: dict[str, Any] = {
         "layout": layout.name,
         "read_from": str(layout.source),
-        "pictures": len({photo.path for photo in photos}),
+        "images": len({photo.path for photo in photos}),
         "training_views": len(dataset.train),
         "held_out_views": len(dataset.test),
         "split": "the data set's own" if own else "every 8th by name",
@@ -112,10 +113,10 @@ def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
 def _splats(cloud: GaussianCloud) -> dict[str, Any]:
     from meshsplats.conversion import convert
 
-    sample = cloud.select(np.arange(0, len(cloud), -(-len(cloud) // TRIED)))
+    sample = cloud.select(np.arange(0, len(cloud), -(-len(cloud) // SAMPLE)))
     try:
         tried = convert(sample)
-    except ValueError:  # nothing that would be worth drawing
+    except ValueError:  # nothing visible
         tried = SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros((0, 4)))
     share = len(cloud) / len(sample)
     ordered = np.sort(cloud.scales, axis=1).astype(np.float64)
@@ -129,8 +130,8 @@ def _splats(cloud: GaussianCloud) -> dict[str, Any]:
         "faint_splats": int((cloud.opacities < 1 / 255).sum()),
         "scale_5_50_95_percent": _quantiles(ordered.mean(axis=1)),
         "flatness_median": float(np.float32(np.median(flatness))),
-        "becomes_triangles_about": round(len(tried.faces) * share),
-        "becomes_vertices_about": round(len(tried.vertices) * share),
+        "estimated_triangles": round(len(tried.faces) * share),
+        "estimated_vertices": round(len(tried.vertices) * share),
     }
 
 
@@ -159,7 +160,7 @@ def _cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     return {
         "cameras": len(cameras),
-        "picture_sizes": [list(size) for size in sizes[:8]],
+        "image_sizes": [list(size) for size in sizes[:8]],
         "fx": _range([camera.fx for camera in cameras]),
         "near": _range([camera.near for camera in cameras]),
         "lower": _rounded(centers.min(axis=0)),
@@ -186,12 +187,12 @@ def _range(values: Sequence[float]) -> list[float]:
 
 
 def _rounded(values: np.ndarray) -> list[float]:
-    """Six digits, and 0 for what is rounding error beside the others."""
+    """Six digits, and 0 for rounding errors."""
     largest = float(np.abs(values).max())
     return [float(f"{v:.6g}") if abs(v) > 1e-12 * largest else 0.0 for v in values]
 
 
-def _shown(value: Any) -> str:
+def _in_words(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
@@ -201,5 +202,5 @@ def _shown(value: Any) -> str:
     if isinstance(value, list):
         if value and isinstance(value[0], list):
             return ", ".join(" x ".join(map(str, size)) for size in value)
-        return "  ".join(_shown(v) for v in value) or "none"
+        return "  ".join(_in_words(v) for v in value) or "none"
     return str(value)

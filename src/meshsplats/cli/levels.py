@@ -1,4 +1,4 @@
-"""``meshsplats levels``: a chain of meshes, from the finest to the coarsest."""
+"""``meshsplats levels``: levels of detail, a chain of meshes from the finest to the coarsest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import tyro
 
-from meshsplats.cli import UsageError
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
     Number,
@@ -21,69 +21,78 @@ from meshsplats.cli.common import (
     SplatOptions,
     Text,
     check_outputs,
-    configuration,
     identify,
     parse_up,
     size_of,
+)
+from meshsplats.cli.messages import UsageError, flag, say
+from meshsplats.cli.records import (
+    CONFIGURATION,
+    configuration,
+    recorded_options,
+    write_configuration,
     write_json,
 )
-from meshsplats.cli.training import say, shown
+from meshsplats.cli.training import progress_display
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_config
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import Level, level_targets, likeness, make_level, plan_levels
 
 TABLE = "levels.json"
-ASKED = "config.json"
 MINUTES = 2.0
-"""Fine-tuning of a level where nothing else is said."""
-_NOT_OF_THE_RESULT = ("output", "resume", "json", "force", "threads")
+"""Default length of the fine-tuning of a level."""
+_CHANGEABLE = ("output", "threads")
+"""Options that may change when a chain is resumed."""
 
 
 @dataclass(frozen=True)
-class Levels:
-    """Levels of detail: a chain of meshes, each with a quarter (or half) of the triangles of the last, made
-    for pictures with a quarter (or half) of the pixels.
+class Levels(Command):
+    """Levels of detail: a chain of meshes, each with a quarter (or half) of the triangles of the one before,
+    for images with a quarter (or half) of the pixels.
 
-    Alike splats are merged, never dropped, and each mesh is fine-tuned at the size at which it is seen. The
+    Similar splats are merged, never dropped, and each mesh is fine-tuned at the size at which it is seen. The
     folder holds the meshes, level_0 being the finest, and levels.json: triangles, bytes, screen size, PSNR.
     """
+
+    EXCLUSIVE = (("minutes", "steps", "no_tune"),)
+    CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
     """Splat file, or the folder of a trained model."""
     output: Output
-    """Folder for the meshes; it appears when all of them are there."""
+    """Folder for the meshes; it appears when all of them are done."""
     levels: int = 4
-    """How many meshes."""
+    """Number of meshes."""
     factor: Literal[2, 4] = 4
-    """Each has this fraction of the splats of the last: 4, for half the size on the screen, or 2."""
+    """Splats of each level per splat of the next: 4, for half the size on the screen, or 2."""
     width: int = 800
-    """Size of the finest on the screen: side in pixels of pictures that just hold the subject."""
+    """Screen size of the finest level: side in pixels of images that just hold the subject."""
     max_splats: Count = None
-    """Splats of the finest at most. Default: all."""
+    """Maximum number of splats of the finest level. Default: all."""
     format: Literal["glb", "npz", "ply", "usdc", "usda", "obj"] = "glb"
     """File format of the meshes."""
     no_tune: bool = False
     """Convert only: seconds in place of minutes."""
     minutes: Number = None
-    """Fine-tuning of each level. Default: 2."""
+    """Length of the fine-tuning of each level. Default: 2."""
     steps: Count = None
-    """Fine-tuning of each level, in steps."""
+    """Length of the fine-tuning of each level, in place of --minutes."""
     sh_degree: Count = None
-    """Draw the splats with spherical harmonics up to this degree. Default: all that are stored."""
+    """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: -y."""
     resume: bool = False
-    """Go on with the levels that an interrupted run of the same command left in FOLDER.partial."""
+    """Continue an interrupted run of the same command, from the levels in FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
-    """At most N threads. Default: all processors."""
+    """Maximum number of threads. Default: all processors."""
     json: bool = False
     """Print the table as JSON."""
     force: bool = False
     """Overwrite an older chain in the folder."""
 
-    def run(self) -> int:
+    def execute(self) -> int:
         config = self._configured()
         self._check_output()
         if identify(self.input) != "splats":
@@ -99,7 +108,7 @@ class Levels:
                 try:
                     row = self._make(cloud, number, level, config, folder)
                 except Interrupted as stop:
-                    say(f"stopped in level {number}: the same command with --resume goes on with it")
+                    say(f"stopped in level {number}: the same command with --resume continues with it")
                     return 128 + (stop.signal or signal.SIGINT)
                 write_json(done, row)
             rows.append(json.loads(done.read_text(encoding="utf-8")))
@@ -108,11 +117,15 @@ class Levels:
         if self.json:
             print(json.dumps(table | {"folder": str(self.output)}, indent=1))
         else:
-            self._show(rows)
+            self._print_table(rows)
         return 0
 
+    def resolved(self) -> dict[str, Any]:
+        config = self._configured()
+        return {} if config is None else config.to_dict()
+
     def _configured(self) -> FinetuneConfig | None:
-        """How levels are fine-tuned; UsageError for options that contradict each other."""
+        """Configuration of the fine-tuning; UsageError for options that contradict each other."""
         if self.levels < 1:
             raise UsageError(f"--levels must be at least 1, got {self.levels}")
         if self.max_splats is not None and self.max_splats < 1:
@@ -122,7 +135,7 @@ class Levels:
         if self.minutes is not None and self.steps is not None:
             raise UsageError("give --minutes or --steps, not both")
         if self.resume and self.force:
-            raise UsageError("--resume goes on, --force begins anew: give one of them")
+            raise UsageError("--resume continues, --force starts again: give one of them")
         if self.up is not None:
             parse_up(self.up)
         if self.no_tune:
@@ -143,45 +156,44 @@ class Levels:
         check_outputs([self.output], self.force)
         if self.output.exists() and not (self.output / TABLE).is_file():
             raise FileExistsError(f"{self.output} is there and holds no {TABLE}: give another folder")
-        if self.resume and not (partial / ASKED).is_file():
-            raise FileNotFoundError(f"nothing to go on with in {partial}: leave out --resume to begin anew")
+        if self.resume and not (partial / CONFIGURATION).is_file():
+            raise FileNotFoundError(f"nothing to resume in {partial}: leave out --resume to start again")
         if partial.exists() and not self.resume and not self.force:
             raise FileExistsError(
-                f"{partial} is left from an earlier run: --resume goes on with it, --force begins anew"
+                f"{partial} is left from an earlier run: --resume continues it, --force starts again"
             )
 
     def _partial(self) -> Path:
-        """The folder in which levels gather; with --resume that of the same command, else an empty one."""
+        """The folder of unfinished levels; with --resume that of the same command, else an empty one."""
         partial = self._partial_folder
-        asked = configuration("levels", self)
-        wanted = {k: v for k, v in asked["options"].items() if k not in _NOT_OF_THE_RESULT}
         if self.resume:
-            found = json.loads((partial / ASKED).read_text(encoding="utf-8"))["options"]
-            for name, value in wanted.items():
-                if found.get(name) != value:
-                    flag = "--" + name.replace("_", "-")
-                    raise UsageError(f"{partial} was begun with {flag} {found.get(name)}, not {value}")
+            before = recorded_options(partial / CONFIGURATION, "levels") or {}
+            for name, value in configuration("levels", self, partial)["options"].items():
+                if name not in _CHANGEABLE and before.get(name) != value:
+                    raise UsageError(
+                        f"{partial} was started with {flag(name)} {before.get(name)}, not {value}"
+                    )
             return partial
         if partial.exists():
-            if not (partial / ASKED).is_file():
-                raise FileExistsError(f"{partial} is there and not of this command: remove it")
+            if not (partial / CONFIGURATION).is_file():
+                raise FileExistsError(f"{partial} exists and is not of this command: remove it")
             shutil.rmtree(partial)
         partial.mkdir()
-        write_json(partial / ASKED, asked)
+        write_configuration(partial / CONFIGURATION, "levels", self)
         return partial
 
     def _make(
         self, cloud: GaussianCloud, number: int, level: Level, config: FinetuneConfig | None, folder: Path
     ) -> dict[str, Any]:
-        """Writes the mesh of a level; returns its line of the table."""
+        """Writes the mesh of a level; returns its row of the table."""
         from meshsplats.formats.meshes import save_mesh
 
-        began = time.perf_counter()
+        start = time.perf_counter()
         say(f"level {number}: {level.splats:,} splats for {level.width} pixels")
         up = None if self.up is None else parse_up(self.up)
         targets = level_targets(cloud, level, config, up=up, sh_degree=self.sh_degree, threads=self.threads)
-        run = RunOptions(threads=self.threads, spent=time.perf_counter() - began)
-        with shown() as show:
+        run = RunOptions(threads=self.threads, spent=time.perf_counter() - start)
+        with progress_display() as show:
             mesh = make_level(cloud, level, targets, config, run=run, on_progress=show, up=up)
         path = folder / f"level_{number}.{self.format}"
         save_mesh(mesh, path)
@@ -194,7 +206,7 @@ class Levels:
             "bytes": path.stat().st_size,
             "screen_size": level.width,
             "psnr": round(score, 3),
-            "seconds": round(time.perf_counter() - began, 2),
+            "seconds": round(time.perf_counter() - start, 2),
         }
 
     def _finish(self, folder: Path, table: dict[str, Any]) -> None:
@@ -210,7 +222,7 @@ class Levels:
         os.rename(folder, self.output)
         shutil.rmtree(old)
 
-    def _show(self, rows: list[dict[str, Any]]) -> None:
+    def _print_table(self, rows: list[dict[str, Any]]) -> None:
         print(f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}")
         for row in rows:
             size = size_of(self.output / row["file"])

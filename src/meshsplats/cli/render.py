@@ -1,4 +1,4 @@
-"""``meshsplats render``: pictures of splats or of a mesh."""
+"""``meshsplats render``: images of splats or of a mesh."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
-from meshsplats.cli import UsageError
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     DrawOptions,
     Output,
@@ -23,26 +23,24 @@ from meshsplats.cli.common import (
     ViewOptions,
     check_outputs,
     chosen_background,
-    configuration,
     load_scene,
     parse_color,
     plural,
-    record_beside,
-    recorded_options,
     size_of,
     track,
     view_names,
-    write_json,
 )
+from meshsplats.cli.messages import UsageError
+from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, recorded_options, write_configuration
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 
 @dataclass(frozen=True)
 class _Files:
-    """Where everything goes."""
+    """The outputs."""
 
-    pictures: list[Path]
+    images: list[Path]
     depths: list[Path]
     turntable: Path | None
     cameras: Path
@@ -51,42 +49,54 @@ class _Files:
     @property
     def every(self) -> list[Path]:
         turntable = [self.turntable] if self.turntable else []
-        return [*self.pictures, *self.depths, *turntable, self.cameras, self.config]
+        return [*self.images, *self.depths, *turntable, self.cameras, self.config]
 
 
 @dataclass(frozen=True)
-class Render:
-    """Draws splats or a mesh: one picture (-o picture.png) or a folder of pictures with a turntable.
+class Render(Command):
+    """Renders splats or a mesh: one image (-o image.png), or a folder of images with a turntable.
 
     Splats (.ply, or the folder of a trained model) are converted to a mesh first, with default settings;
-    --as-splats draws them as 3D Gaussian Splatting does.
+    --as-splats renders them as 3D Gaussian Splatting does.
     """
+
+    COMMON = (
+        *("input", "output", "as_splats", "orbit", "look_around", "cameras"),
+        *("data", "elevation", "azimuth", "distance", "up", "width"),
+        *("height", "background", "transparent", "depth", "json", "force"),
+    )
+    EXCLUSIVE = (
+        ("orbit", "dome", "look_around", "cameras", "data"),
+        ("fov", "focal_length"),
+        ("background", "transparent"),
+    )
+    CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh."""
     output: Output
     """A .png for one view, or a folder. Without other options: the front view, or an orbit of 60 views."""
     as_splats: bool = False
-    """Draw the splats themselves, not the mesh made of them."""
+    """Render the splats themselves, not the mesh that they become."""
     views: ViewOptions = field(default_factory=ViewOptions)
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
     transparent: bool = False
-    """No background: pictures with an alpha channel."""
+    """No background: images with an alpha channel."""
     depth: Literal["none", "png", "npy"] = "none"
-    """Depth pictures of a mesh too: 16-bit PNG (the scale is in config.json, depth_unit) or float arrays. 0:
-    nothing."""
+    """Also depth images of a mesh: 16-bit PNG (depth_unit in the configuration is its scale) or float arrays;
+    0: empty."""
     animation: Literal["webp", "gif", "png", "none"] = "webp"
-    """Kind of the turntable that an orbit ends with; png is an animated PNG."""
+    """Format of the turntable of an orbit; png is an animated PNG."""
     fps: float = 15.0
-    """Pictures a second of the turntable."""
+    """Images per second of the turntable."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         single = self.output.suffix.lower() == ".png"
         self._check(single)
         start = time.perf_counter()
@@ -103,40 +113,42 @@ class Render:
             from meshsplats.conversion import convert
 
             scene = convert(scene)
-        record = configuration("render", self)
+        result: dict[str, Any] = {}
         unit = None
         if self.depth == "png" and isinstance(scene, SplatMesh):
-            record["depth_unit"] = unit = _depth_unit(scene, cameras)
-        behind = (0.0, 0.0, 0.0)
+            result["depth_unit"] = unit = _depth_unit(scene, cameras)
+        color = (0.0, 0.0, 0.0)
         if not self.transparent:
-            what = "splats" if isinstance(scene, GaussianCloud) else "mesh"
+            kind = "splats" if isinstance(scene, GaussianCloud) else "mesh"
             background = chosen_background(
-                self.draw.background, photographs, {what: scene}, self.input, self.draw.threads, whole=False
+                self.draw.background, photographs, {kind: scene}, self.input, self.draw.threads, whole=False
             )
-            behind, record["background"] = background.color, background.to_dict()
+            color = background.color
+            result |= background.to_dict()
         if not single:
             _remove_older(self.output, files.every)
-        self._draw(scene, cameras, files, unit, behind)
+        self._draw(scene, cameras, files, unit, color)
         if files.turntable:
-            from meshsplats.images.writing import load_png, save_animation
+            from meshsplats.images.reading import load_image
+            from meshsplats.images.writing import save_animation
 
-            save_animation(files.turntable, map(load_png, files.pictures), fps=self.fps)
+            save_animation(files.turntable, map(load_image, files.images), fps=self.fps)
         save_cameras(cameras, files.cameras)
-        write_json(files.config, record)
+        write_configuration(files.config, "render", self, result)
         seconds = time.perf_counter() - start
         if self.json:
-            result = {
-                "pictures": files.pictures,
+            output = {
+                "images": files.images,
                 "depth": files.depths,
                 "turntable": files.turntable,
                 "cameras": files.cameras,
                 "seconds": round(seconds, 3),
             }
-            print(json.dumps(result, default=str, indent=1))
+            print(json.dumps(output, default=str, indent=1))
             return
         size = f"{cameras[0].width} x {cameras[0].height}"
         where = f"{self.output} ({size_of(self.output)})" if single else f"{self.output}/"
-        print(f"{plural(len(cameras), 'picture')} of {size} in {seconds:.1f} s: {where}")
+        print(f"{plural(len(cameras), 'image')} of {size} in {seconds:.1f} s: {where}")
         if files.turntable:
             print(f"turntable: {files.turntable} ({size_of(files.turntable)})")
 
@@ -144,8 +156,8 @@ class Render:
         out = self.output
         if single:
             depths = [out.with_suffix(f".depth.{self.depth}")] if self.depth != "none" else []
-            return _Files([out], depths, None, record_beside(out, "cameras"), record_beside(out, "config"))
-        pictures = [out / name for name in view_names(count)]
+            return _Files([out], depths, None, beside(out, CAMERAS), beside(out, CONFIGURATION))
+        images = [out / name for name in view_names(count)]
         depths = (
             [out / name for name in view_names(count, "depth", f".{self.depth}")]
             if self.depth != "none"
@@ -153,16 +165,14 @@ class Render:
         )
         turns = self.views.moving and self.animation != "none" and count > 1
         turntable = out / f"turntable.{self.animation}" if turns else None
-        return _Files(pictures, depths, turntable, out / "cameras.json", out / "config.json")
+        return _Files(images, depths, turntable, out / CAMERAS, out / CONFIGURATION)
 
     def _check(self, single: bool) -> None:
         self.views.check()
         if self.draw.background is not None:
             parse_color(self.draw.background)
         if not single and self.output.suffix:
-            raise UsageError(
-                f"-o must end in .png for one picture, or name a folder, got {self.output.name!r}"
-            )
+            raise UsageError(f"-o must end in .png for one image, or name a folder, got {self.output.name!r}")
         if self.transparent and self.draw.background is not None:
             raise UsageError("--transparent and --background exclude each other")
         if self.transparent and self.animation == "gif":
@@ -176,7 +186,7 @@ class Render:
         if isinstance(scene, SplatMesh) and self.as_splats:
             raise ValueError(f"{self.input} is a mesh: --as-splats needs a splat file")
         if self.draw.sh_degree is not None and not self.as_splats:
-            raise UsageError("--sh-degree is for splats: a mesh has one colour a vertex; add --as-splats")
+            raise UsageError("--sh-degree is for splats: a mesh has one colour per vertex; add --as-splats")
 
     def _draw(
         self,
@@ -187,11 +197,11 @@ class Render:
         background: tuple[float, ...],
     ) -> None:
         from meshsplats.colors import linear_to_srgb, srgb_to_linear
-        from meshsplats.images.writing import save_array, save_depth_png, save_png, straight_rgba
+        from meshsplats.images.writing import save_array, save_depth_png, save_image, straight_rgba
         from meshsplats.rendering import render, render_splats
         from meshsplats.rendering.samples import needed_samples
 
-        # A mesh made for blending in linear light is drawn so and encoded for display after.
+        # A mesh for linear light is blended in it and encoded for display afterwards.
         linear = isinstance(scene, SplatMesh) and scene.blending == "linear"
         if linear:
             background = tuple(srgb_to_linear(np.array(background)).tolist())
@@ -209,16 +219,15 @@ class Render:
                 drawn = render_splats(scene, camera, sh_degree=degree, **options)
             else:
                 drawn = render(scene, camera, max_layers=layers, depth=bool(files.depths), **options)
-            if not files.pictures[i].parent.exists():
-                files.pictures[i].parent.mkdir()  # not before something is there to be written
-            picture = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color
+            if not files.images[i].parent.exists():
+                files.images[i].parent.mkdir()  # not before there is something to write
+            image = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color
             if linear:
-                picture[..., :3] = linear_to_srgb(picture[..., :3])
-            save_png(files.pictures[i], picture)
+                image[..., :3] = linear_to_srgb(image[..., :3])
+            save_image(files.images[i], image)
             if drawn.depth is None:
                 continue
-            covered = drawn.alpha > 0
-            mean = np.where(covered, drawn.depth / np.where(covered, drawn.alpha, 1), 0).astype(np.float32)
+            mean = drawn.mean_depth(empty=0)
             if unit is None:
                 save_array(files.depths[i], mean)
             else:
@@ -226,8 +235,7 @@ class Render:
 
 
 def _depth_unit(scene: GaussianCloud | SplatMesh, cameras: Sequence[Camera]) -> float:
-    """Scene units that one step of a 16-bit depth picture stands for: the farthest vertex of all views
-    fits."""
+    """Scene units per step of a 16-bit depth image: the farthest vertex of all views fits."""
     assert isinstance(scene, SplatMesh)
     corners = scene.vertices if len(scene.vertices) else np.zeros((1, 3), np.float32)
     farthest = max(
@@ -237,11 +245,11 @@ def _depth_unit(scene: GaussianCloud | SplatMesh, cameras: Sequence[Camera]) -> 
 
 
 def _remove_older(folder: Path, kept: Sequence[Path]) -> None:
-    """The pictures of an earlier run in ``folder``, as its records tell, apart from ``kept``."""
-    if recorded_options(folder / "config.json", "render") is None:
+    """Removes the images of an earlier run in ``folder``, which its records name, except ``kept``."""
+    if recorded_options(folder / CONFIGURATION, "render") is None:
         return
     try:
-        count = len(load_cameras(folder / "cameras.json"))
+        count = len(load_cameras(folder / CAMERAS))
     except (OSError, ValueError):
         return
     names = [f"turntable.{kind}" for kind in ("webp", "gif", "png")]

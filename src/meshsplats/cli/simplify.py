@@ -11,8 +11,7 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
-from meshsplats.cli import UsageError
-from meshsplats.cli.batch import record_names
+from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
     File,
@@ -22,53 +21,56 @@ from meshsplats.cli.common import (
     SplatOptions,
     cameras_beside,
     check_outputs,
-    configuration,
+    draw_preview,
     identify,
     size_of,
-    write_json,
 )
-from meshsplats.cli.convert import draw_preview
+from meshsplats.cli.messages import UsageError
+from meshsplats.cli.records import CONFIGURATION, PREVIEW, beside, write_configuration
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
 
 
 @dataclass(frozen=True)
-class Simplify:
-    """Fewer splats that look the same: those that are most alike are merged, none are dropped.
+class Simplify(Command):
+    """Merges the splats that are most alike: fewer splats that look the same, and none are dropped.
 
-    Writes a float .ply as the 3DGS code lays it out, with a preview picture and the configuration beside it.
+    Writes a float .ply in the layout of the 3DGS code, with a preview and the configuration beside it.
     """
+
+    EXCLUSIVE = (("count", "share"), ("cameras", "data"))
+    CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
     """Splat file, or the folder of a trained model."""
     output: Output
     """The splats: .ply."""
     count: Count = None
-    """How many splats to keep."""
+    """Number of splats to keep."""
     share: Number = None
-    """How many to keep as a share of all, above 0 to 1: 0.25 keeps a quarter."""
+    """Share of the splats to keep, above 0 to 1: 0.25 keeps a quarter."""
     cameras: File = None
-    """Where the splats will be seen from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the
-    model folder that has one. Detail that is finer than their pixels goes first. Default: the cameras of the
-    input where it is a model folder, else pictures of 1000 pixels that hold the subject."""
+    """Cameras that the splats will be seen from: a JSON list, a cameras.json of a 3DGS trainer, or the model
+    folder that has one. Detail finer than their pixels goes first. Default: those of the input if it is a
+    model folder, else images of 1000 pixels that hold the subject."""
     data: Folder = None
-    """Data set of the photographs: the cameras of its training views."""
+    """Data set of photographs, in place of --cameras: the cameras of its training views."""
     no_preview: bool = False
-    """Draw no preview."""
+    """Write no preview."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
-    """At most N threads. Default: all processors."""
+    """Maximum number of threads. Default: all processors."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
     """Overwrite existing outputs."""
 
-    def run(self) -> None:
+    def execute(self) -> None:
         from meshsplats.conversion.merging import simplify
         from meshsplats.formats.gaussians import save_gaussians
 
         self._check()
-        preview, config = record_names(self.output.with_suffix(""))
+        preview, config = beside(self.output, PREVIEW), beside(self.output, CONFIGURATION)
         outputs = [self.output, config] if self.no_preview else [self.output, preview, config]
         check_outputs(outputs, self.force, inputs=[self.input])
         if identify(self.input) != "splats":
@@ -81,7 +83,7 @@ class Simplify:
         kept = simplify(cloud, count, cameras=cameras, threads=self.threads)
         seconds = time.perf_counter() - start
         save_gaussians(kept, self.output)
-        write_json(config, configuration("simplify", self))
+        write_configuration(config, "simplify", self)
         if not self.no_preview:
             draw_preview(kept, preview)
         if self.json:

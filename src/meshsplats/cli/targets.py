@@ -1,16 +1,18 @@
-"""Options of the commands that compare pictures with a truth: photographs, or the splats' own pictures."""
+"""Options of targets: photographs, or images of the splats."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
-from meshsplats.cli import UsageError
 from meshsplats.cli.common import Count, File, Folder, Text, cameras_beside, parse_up
+from meshsplats.cli.messages import UsageError, flag
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning import FEWEST_VIEWS
@@ -23,60 +25,61 @@ PLACING = ("placement", "distance", "up")
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """What the pictures should look like: photographs (--data), or else the splats' own pictures."""
+    """Targets: photographs (--data), else images of the splats."""
 
     data: Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio)."""
     downscale: int = 1
-    """With --data: pictures this many times smaller."""
+    """With --data: factor by which images are smaller than the photographs."""
     test_every: int = 8
-    """With --data: every n-th view is held out, where the data set has no split of its own; 0: none."""
+    """With --data: every n-th view is held out, if the data set has no split; 0: none."""
     views: Count = None
-    """Without --data: number of pictures of the splats to learn from. Default: 200, and more in a long run:
-    one for each second, or for two --steps, up to 1000."""
+    """Without --data: number of training images. Default: one per second, or per two --steps, from 200 to
+    1000."""
     held_out: int = 8
-    """Without --data: number of further pictures to measure with."""
+    """Without --data: number of further images, for scores."""
     width: int = 400
-    """Without --data: side of these pictures in pixels."""
+    """Without --data: side of the images in pixels."""
     distance: tuple[float, float] = (0.9, 1.1)
     """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
-    sphere with 90 % of the splats' opacity just fits the picture. The mesh looks best from there."""
+    sphere with 90 % of the splats' opacity just fits the image. The mesh looks best from there."""
     placement: Literal["auto", "object", "surrounded", "inside"] = "auto"
-    """Without --data: cameras all round an object, above the ground round an object in its surroundings, or
+    """Without --data: cameras all around an object, above the ground around an object in its surroundings, or
     inside a room."""
     cameras: File = None
-    """Without --data: cameras to draw from, a JSON list or a cameras.json of a 3DGS trainer. Default: those
-    of a model folder, unless --placement, --distance or --up is given; else cameras are placed."""
+    """Without --data: cameras, a JSON list or a cameras.json of a 3DGS trainer. Default: those of a model
+    folder, unless --placement, --distance or --up is given; else they are placed."""
     up: Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
-    look: Literal["area", "splats"] | None = None
-    """Without --data: what the pictures show. area: means over each pixel's area, right at every size in
-    programs that take several samples a pixel: Blender, MSAA, ray tracers. splats: what a 3DGS viewer shows;
-    the mesh is then made to be drawn with the viewer's filter, by this project's own pictures, and wants
-    'meshsplats bake' for others. Default: area; splats, without the filter, with --preset paper and
-    published."""
+    look: Annotated[
+        Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
+    ] = None
+    """Without --data: kind of images. area: means over each pixel's area, right at every size in programs
+    that take several samples per pixel: Blender, MSAA, ray tracers. splats: those of a 3DGS viewer; the mesh
+    is then rendered with the viewer's filter here, and needs 'meshsplats bake' for other programs. Default:
+    area; with --preset paper and published: splats, without the filter."""
     sh_degree: Count = None
-    """Without --data: draw the splats with spherical harmonics up to this degree. Default: all that are
+    """Without --data: render the splats with spherical harmonics up to this degree. Default: all that are
     stored."""
     cache: float = 2.0
-    """Gigabytes of pictures kept in memory; the others are read or drawn again when they are needed."""
+    """Gigabytes of images kept in memory; others are read or rendered again when they are needed."""
 
     def check(self) -> None:
-        """UsageError for options that would do nothing."""
+        """UsageError for options without effect."""
         idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "look", "sh_degree")
         names, source = (idle, "--data") if self.data is not None else (("downscale", "test_every"), "splats")
         for name in names:
-            if self._given(name):
-                raise UsageError(f"--{name.replace('_', '-')} has no effect with {source}")
+            if self._is_set(name):
+                raise UsageError(f"{flag(name)} has no effect with {source}")
         for name in PLACING:
-            if self.cameras is not None and self._given(name):
+            if self.cameras is not None and self._is_set(name):
                 raise UsageError(f"--{name} has no effect with --cameras")
         if self.views is not None and self.views < 1:
             raise UsageError(f"--views must be at least 1, got {self.views}")
         if not self.cache >= 0:
             raise ValueError(f"--cache must be a number of gigabytes, >= 0, got {self.cache}")
 
-    def _given(self, name: str) -> bool:
+    def _is_set(self, name: str) -> bool:
         return getattr(self, name) != next(f.default for f in fields(self) if f.name == name)
 
     @property
@@ -92,8 +95,7 @@ class TargetOptions:
         worthwhile: int = FEWEST_VIEWS,
         preset: str = "default",
     ) -> Dataset:
-        """The data set; of so many views as are ``worthwhile`` where nothing else was said, and with the look
-        that suits the ``preset``."""
+        """The data set: by default with ``worthwhile`` views, and with the look of the ``preset``."""
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
@@ -115,7 +117,7 @@ class TargetOptions:
         if self.cameras is not None:
             cameras: list[Camera] | None = load_cameras(self.cameras)
         else:
-            cameras = None if any(map(self._given, PLACING)) else cameras_beside(source)
+            cameras = None if any(map(self._is_set, PLACING)) else cameras_beside(source)
         return splat_dataset(
             scene,
             placement=self.placement,

@@ -1,4 +1,4 @@
-"""What ``finetune`` and ``prior`` share: options of an optimisation, its files, how it is shown and told."""
+"""Base of ``finetune`` and ``prior``: options of an optimisation, its files, its progress and its result."""
 
 from __future__ import annotations
 
@@ -7,30 +7,40 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import tyro
 
 from meshsplats._files.locks import locked
-from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import UsageError
+from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
+    Count,
+    Number,
+    Output,
+    SplatOptions,
     check_outputs,
     chosen_background,
-    configuration,
+    draw_preview,
     plural,
-    recorded_options,
     size_of,
-    write_json,
+)
+from meshsplats.cli.messages import UsageError, flag, say
+from meshsplats.cli.records import (
+    CONFIGURATION,
+    PREVIEW,
+    beside,
+    configuration,
+    recorded_options,
+    write_configuration,
 )
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import Background
-from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
 from meshsplats.finetuning.config import LENGTHS
 from meshsplats.gaussians import GaussianCloud
@@ -39,95 +49,78 @@ from meshsplats.mesh import SplatMesh
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
-STARTING_UP = 1.0
-"""Seconds that Python and the libraries take before the command's own clock begins."""
+STARTUP_SECONDS = 1.0
+"""Time that Python and the libraries take before the command's own clock starts."""
+_CHANGEABLE = {
+    *("resume", "force", "json", "threads", "report_every", "preview_every", "cache", "output"),
+    *LENGTHS,
+}
+"""Options that may change when a run is resumed."""
+ShowProgress = Callable[[Progress], None]
 
 
-class TrainingCommand(Protocol):
-    """The options that ``finetune`` and ``prior`` share."""
-
-    @property
-    def target(self) -> TargetOptions: ...
-    @property
-    def tuning(self) -> FinetuneConfig: ...
-    @property
-    def resume(self) -> bool: ...
-    @property
-    def report_every(self) -> int: ...
-    @property
-    def preview_every(self) -> int: ...
-    @property
-    def threads(self) -> int | None: ...
-    @property
-    def json(self) -> bool: ...
+def tuning_options(default_of: Callable[[str], str]) -> type[FinetuneConfig]:
+    """The configuration of an optimisation as command-line options. ``default_of``: the end of an option's
+    help."""
+    return as_cli_options(
+        FinetuneConfig,
+        "Default: the value of the preset.",
+        without=("preset", *LENGTHS),
+        defaults=default_of,
+        checked=False,
+    )
 
 
-def described(config: type[FinetuneConfig], standard: FinetuneConfig | None = None) -> type[FinetuneConfig]:
-    """The choices of a configuration as options that may be left out; their docstrings are the help. Values
-    that they have then are those of ``standard``, or the preset default's."""
-    typed: dict[str, Any] = {}
-    values: dict[str, Any] = {"__post_init__": lambda self: None}
-    for name, hint in get_type_hints(config).items():
-        if name in ("preset", "epochs", "steps", "minutes"):
-            typed[name] = tyro.conf.Suppress[object]  # type: ignore[misc]
-        else:
-            hint = next((part for part in get_args(hint) if part in (int, float)), hint)  # of those or None
-            choices = "{" + ",".join(map(str, get_args(hint))) + "}"
-            metavar = {int: "N", float: "X", bool: "{True,False}"}.get(hint, choices)
-            told = f"(default preset: {getattr(FinetuneConfig, name)})"
-            if standard is not None:
-                told = f"(default: {getattr(standard, name)})"
-            typed[name] = Annotated[hint | None, tyro.conf.arg(metavar=metavar, help_behavior_hint=told)]
-        values[name] = None
-    about = "What is not given is left to the preset."
-    made = type("TuningOptions", (config,), {"__annotations__": typed, "__doc__": about, **values})
-    return dataclass(frozen=True)(made)
+if TYPE_CHECKING:
+    TuningOptions = FinetuneConfig
+else:
+    TuningOptions = tuning_options(lambda name: f"(default preset: {getattr(FinetuneConfig, name)})")
 
 
 @dataclass(frozen=True)
 class RunFiles:
-    """Where the results of a run go."""
+    """The files of a run. ``mesh`` is the result."""
 
     mesh: Path
 
     @property
     def config(self) -> Path:
-        return self.mesh.with_suffix(".config.json")
+        return beside(self.mesh, CONFIGURATION)
 
     @property
     def preview(self) -> Path:
-        return self.mesh.with_suffix(".preview.png")
+        return beside(self.mesh, PREVIEW)
 
     @property
-    def run(self) -> Path:
-        return self.mesh.with_suffix(".run")
+    def folder(self) -> Path:
+        """Metrics, previews and the checkpoint."""
+        return beside(self.mesh, "run")
 
     @property
     def command(self) -> Path:
-        """What the run was asked for, while it is not done."""
-        return self.run / "command.json"
+        """The configuration, from the start of the run."""
+        return self.folder / "command.toml"
 
     @property
     def held_out(self) -> Path:
-        """Cameras of the pictures that were held out, where they were drawn."""
-        return self.run / "held_out.cameras.json"
+        """Cameras of held-out images of splats."""
+        return self.folder / "held_out.cameras.json"
 
     def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
-        """Before the work: OSError if something would be overwritten, cannot be written, or is missing to go
-        on from."""
+        """OSError if something would be overwritten, cannot be written, or is missing for --resume."""
         from meshsplats.finetuning.journal import CHECKPOINT
 
-        checkpoint = self.run / CHECKPOINT
+        checkpoint = self.folder / CHECKPOINT
         if resume and not checkpoint.is_file():
-            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to begin anew")
+            raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to start again")
         if checkpoint.exists() and not (resume or force):
             raise FileExistsError(
-                f"{checkpoint} is left from an earlier run: --resume goes on with it, --force begins anew"
+                f"{checkpoint} is left from an earlier run: --resume continues it, --force starts again"
             )
         if resume and self.mesh.exists() and not force:
             raise FileExistsError(
-                f"{self.mesh} is there: the run has come to its end, or there was one before;"
-                " --resume --force goes on and overwrites it"
+                f"{self.mesh} exists: the run has ended, or there was one before;"
+                " --resume --force continues it and overwrites the mesh"
             )
         check_outputs([self.mesh, self.config, self.preview], force, inputs=inputs)
 
@@ -135,40 +128,235 @@ class RunFiles:
     def claimed(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> Iterator[None]:
         """While the block runs, no other process writes this run. FileExistsError if one does, and the errors
         of ``check``, as one may have ended meanwhile."""
-        self.run.mkdir(exist_ok=True)
+        self.folder.mkdir(exist_ok=True)
         try:
-            with locked(self.run / ".lock") as ours:
+            with locked(self.folder / ".lock") as ours:
                 if not ours:
                     raise FileExistsError(
                         errno.EEXIST,
                         "another process is writing this run; give another name for the output",
-                        str(self.run),
+                        str(self.folder),
                     )
                 self.check(inputs, resume=resume, force=force)
                 yield
         finally:
             with suppress(OSError):
-                self.run.rmdir()  # where nothing was written
+                self.folder.rmdir()  # where nothing was written
 
 
-def given(command: TrainingCommand) -> dict[str, Any]:
-    """What of the configuration was given, its length with it."""
-    tuning = {k: v for k, v in asdict(command.tuning).items() if v is not None}
-    if tuning.get("exposure") and command.target.data is None:
-        raise UsageError("--exposure has no effect without --data: drawn pictures are all exposed alike")
-    lengths = {name: getattr(command, name) for name in ("epochs", "steps", "minutes")}
-    lengths = {name: value for name, value in lengths.items() if value is not None}
-    if len(lengths) > 1:
-        raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
-    return tuning | lengths
+@dataclass(frozen=True)
+class Trained:
+    """The end of an optimisation."""
+
+    saved: SplatMesh
+    """As the output file has it."""
+    shown: SplatMesh
+    """As the preview has it."""
+    counts: Mapping[str, int]
+    """Sizes, for JSON."""
+    summary: str
+    """Sizes, in words."""
 
 
-def background_of(config: FinetuneConfig) -> tuple[float, float, float]:
-    """Behind pictures where the configuration names none of its own."""
+@dataclass(frozen=True)
+class Plan:
+    """An optimisation that is ready to run."""
+
+    mesh: SplatMesh
+    dataset: Dataset
+    summary: str
+    background: Background | None
+    """That of photographs, where it was looked for."""
+    optimise: Callable[[RunOptions, ShowProgress], Trained]
+
+
+@dataclass(frozen=True)
+class TrainingCommand(Command):
+    """An optimisation. Subclasses define ``configured``, ``plan`` and ``next_steps``."""
+
+    CONFIGURABLE = True
+    EXCLUSIVE: ClassVar[tuple[tuple[str, ...], ...]] = (("epochs", "steps", "minutes"), ("data", "cameras"))
+
+    input: tyro.conf.Positional[Path]
+    """Input."""
+    output: Output
+    """The mesh."""
+    epochs: Number = None
+    """Length of the run: passes over all training views."""
+    steps: Count = None
+    """Length of the run: number of steps."""
+    minutes: Number = None
+    """Length of the run: time for the whole command."""
+    resume: bool = False
+    """Continue an interrupted run of the same command; with --force also one that has ended, for longer."""
+    target: TargetOptions = field(default_factory=TargetOptions)
+    tuning: TuningOptions = field(default_factory=TuningOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    report_every: int = 100
+    """Steps between two scores on held-out views."""
+    preview_every: int = 500
+    """Steps between two previews; after each quarter of a short run. 0: none."""
+    threads: Count = None
+    """Maximum number of threads. Default: all processors."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Overwrite existing outputs."""
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files that must not be overwritten."""
+        return [self.input]
+
+    def configured(self) -> FinetuneConfig:
+        """The preset with the explicit settings."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """UsageError for options that contradict each other or have no effect."""
+        self.target.check()
+
+    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
+        """Reads the input and prepares the optimisation. ``earlier``: checkpoint of a resumed run."""
+        raise NotImplementedError
+
+    def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
+        """Lines that name a next command."""
+        raise NotImplementedError
+
+    def resolved(self) -> dict[str, Any]:
+        return self.configured().to_dict()
+
+    def execute(self) -> int:
+        from meshsplats.formats.meshes import save_mesh
+
+        start = time.perf_counter() - STARTUP_SECONDS
+        config = self.configured()
+        self.check()
+        files = RunFiles(self.output)
+        files.check(self.inputs, resume=self.resume, force=self.force)
+        earlier = self._earlier(files)
+        plan = self.plan(config, earlier)
+        print_plan(plan, self.target.cache_bytes)
+        options = self._run_options(files, start)
+        try:
+            with (
+                files.claimed(self.inputs, resume=self.resume, force=self.force),
+                progress_display() as show,
+            ):
+                self._record_start(files)
+                trained = plan.optimise(options, show)
+        except Interrupted as stop:
+            return report_interrupt(stop, files)
+        except OtherRunError as error:
+            raise self._naming_options(error, files) from None
+        save_mesh(trained.saved, files.mesh)
+        result = None if plan.background is None else plan.background.to_dict()
+        write_configuration(files.config, self._name, self, result)
+        self.save_more(files, plan)
+        draw_preview(trained.shown, files.preview)
+        self._print_result(files, time.perf_counter() - start, earlier, trained)
+        if not self.json:
+            for line in self.next_steps(files, config, plan):
+                print(line)
+        return 0
+
+    def save_more(self, files: RunFiles, plan: Plan) -> None:
+        """Further files of the run."""
+
+    def explicit_settings(self) -> dict[str, Any]:
+        """The settings on the command line, with the length of the run."""
+        tuning = {name: value for name, value in asdict(self.tuning).items() if value is not None}
+        if tuning.get("exposure") and self.target.data is None:
+            raise UsageError("--exposure has no effect without --data: rendered images have one exposure")
+        lengths = {name: getattr(self, name) for name in LENGTHS if getattr(self, name) is not None}
+        if len(lengths) > 1:
+            raise UsageError(f"give one of --epochs, --steps and --minutes, not {len(lengths)}")
+        return tuning | lengths
+
+    @property
+    def _name(self) -> str:
+        return type(self).__name__.lower()
+
+    def _earlier(self, files: RunFiles) -> Checkpoint | None:
+        """Of a run that is resumed, the checkpoint without its arrays; None for one that starts."""
+        from meshsplats.finetuning.checkpoint import load_checkpoint
+        from meshsplats.finetuning.journal import CHECKPOINT
+
+        return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if self.resume else None
+
+    def _run_options(self, files: RunFiles, start: float) -> RunOptions:
+        """Of a run whose command started at ``start`` by the performance counter."""
+        return RunOptions(
+            folder=files.folder,
+            resume=self.resume,
+            report_every=self.report_every,
+            preview_every=self.preview_every,
+            threads=self.threads,
+            spent=time.perf_counter() - start,
+            cache_bytes=self.target.cache_bytes,
+        )
+
+    def _record_start(self, files: RunFiles) -> None:
+        """Keeps the options, to name those that differ when the run is resumed."""
+        if not self.resume:
+            files.folder.mkdir(exist_ok=True)
+            write_configuration(files.command, self._name, self)
+
+    def _naming_options(self, error: OtherRunError, files: RunFiles) -> Exception:
+        """``error`` with the options that differ from those of the run that was to be resumed."""
+        before = recorded_options(files.command, self._name)
+        if before is None:
+            return error
+        now = configuration(self._name, self, files.folder)["options"]
+        differ = [key for key in now if key not in _CHANGEABLE and before.get(key) != now[key]]
+        if not differ:
+            return OtherRunError(f"{error}. No option differs, so the files themselves have changed")
+        changes = ", ".join(
+            f"{flag(key)} was {_in_words(before.get(key))} and is {_in_words(now[key])}" for key in differ
+        )
+        return OtherRunError(f"{error}. Options that differ: {changes}")
+
+    def _print_result(
+        self, files: RunFiles, seconds: float, earlier: Checkpoint | None, trained: Trained
+    ) -> None:
+        """Prints the result of a run of ``seconds``, after those of the ``earlier`` part."""
+        from meshsplats.finetuning.journal import Journal
+
+        lines = Journal(files.folder).metrics()
+        scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
+        steps = lines[-1]["step"] if lines else 0
+        total = seconds + (0 if earlier is None else earlier.seconds)
+        resumed = "" if earlier is None else f", {seconds:.1f} s of it since it was resumed"
+        if self.json:
+            result = {
+                "mesh": str(files.mesh),
+                "steps": steps,
+                "seconds": round(total, 2),
+                "seconds_since_resumed": None if earlier is None else round(seconds, 2),
+                **trained.counts,
+                "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
+                "run": str(files.folder),
+            }
+            print(json.dumps(result, indent=1))
+            return
+        made = f"{files.mesh} ({size_of(files.mesh)}, {trained.summary})"
+        quality = f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else ""
+        print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
+        print(f"preview: {files.preview}; metrics: {files.folder}/metrics.jsonl")
+
+
+def default_background(config: FinetuneConfig) -> tuple[float, float, float]:
+    """The background of images of splats."""
     return (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
 
 
-def behind(
+def views_for(config: FinetuneConfig, earlier: Checkpoint | None) -> int:
+    """Number of images of splats. A run that is made longer keeps its views."""
+    return earlier.views if earlier and earlier.views else worthwhile_views(config)
+
+
+def over_background(
     dataset: Dataset,
     scene: GaussianCloud | SplatMesh,
     config: FinetuneConfig,
@@ -177,128 +365,47 @@ def behind(
     *,
     whole: bool = True,
 ) -> tuple[Dataset, Background]:
-    """``dataset`` of photographs over the background that ``scene`` is trained over, which the configuration
-    or the model folder ``source`` names, or fits best; and that background. It is said."""
-    given = config.background if config.background in ("black", "white") else None
-    what = "splats" if isinstance(scene, GaussianCloud) else "mesh"
-    found = chosen_background(given, dataset, {what: scene}, source, threads, whole=whole)
+    """``dataset`` of photographs over the background of the training, and that background: the one that the
+    configuration or the model folder ``source`` names, else the one that fits ``scene`` best. Prints it."""
+    color = config.background if config.background in ("black", "white") else None
+    kind = "splats" if isinstance(scene, GaussianCloud) else "mesh"
+    found = chosen_background(color, dataset, {kind: scene}, source, threads, whole=whole)
     say(f"background: {found.describe()}")
     return dataset.over(found.color), found
 
 
-def announce(what: str, mesh: SplatMesh, dataset: Dataset, cache_bytes: int) -> None:
-    """Says what is ahead. MemoryError if it would not fit."""
+def print_plan(plan: Plan, cache_bytes: int) -> None:
+    """Prints sizes and the memory that is needed. MemoryError if it is not there."""
     from meshsplats.finetuning.memory import available_memory, check_memory, readable
 
-    needed, free = check_memory(mesh, dataset, cache_bytes=cache_bytes), available_memory()
+    dataset = plan.dataset
+    needed, free = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes), available_memory()
     camera = dataset.train[0].camera
     views = f"{plural(len(dataset.train), 'training view')}, {len(dataset.test)} held out"
     views += f", of {camera.width} x {camera.height} pixels"
-    say(f"{what}; {views}; memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else ""))
+    memory = f"memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else "")
+    say(f"{plan.summary}; {views}; {memory}")
 
 
-def run_options(command: TrainingCommand, files: RunFiles, began: float) -> RunOptions:
-    """Those of a command that began at ``began`` by the performance counter."""
-    return RunOptions(
-        folder=files.run,
-        resume=command.resume,
-        report_every=command.report_every,
-        preview_every=command.preview_every,
-        threads=command.threads,
-        spent=time.perf_counter() - began,
-        cache_bytes=command.target.cache_bytes,
-    )
+def report_interrupt(stop: Interrupted, files: RunFiles) -> int:
+    """Says how to resume; returns the exit code."""
+    say(f"stopped after step {stop.step:,}; the checkpoint is in {files.folder}: the same command with")
+    say("  --resume continues from there")
+    return 128 + (stop.signal or signal.SIGINT)
 
 
-def earlier_part(command: TrainingCommand, files: RunFiles) -> Checkpoint | None:
-    """Of a run that is to go on, what was done, without the arrays; None for one that begins."""
-    from meshsplats.finetuning.checkpoint import load_checkpoint
-    from meshsplats.finetuning.journal import CHECKPOINT
-
-    return load_checkpoint(files.run / CHECKPOINT, only_header=True) if command.resume else None
-
-
-def note_command(name: str, command: TrainingCommand, files: RunFiles) -> None:
-    """Keeps what a run was asked for, to tell later what differs."""
-    if not command.resume:
-        files.run.mkdir(exist_ok=True)
-        write_json(files.command, configuration(name, command))
-
-
-def naming_options(error: OtherRunError, name: str, command: TrainingCommand, files: RunFiles) -> Exception:
-    """``error`` with the options that differ from those of the run that was to go on."""
-    before = recorded_options(files.command, name)
-    if before is None:
-        return error
-    now = configuration(name, command)["options"]
-    differ = [key for key in now if key not in _FREE and before.get(key) != now[key]]
-    if not differ:
-        return OtherRunError(f"{error}. No option differs, so the files themselves have changed")
-    told = ", ".join(
-        f"--{key.replace('_', '-')} was {_said(before.get(key))} and is {_said(now[key])}" for key in differ
-    )
-    return OtherRunError(f"{error}. Options that differ: {told}")
-
-
-def _said(value: Any) -> str:
+def _in_words(value: Any) -> str:
     if value is None:
         return "not given"
     return " ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-_FREE = {
-    *("resume", "force", "json", "threads", "report_every", "preview_every", "cache", "output"),
-    *LENGTHS,
-}
-"""Options that may change when a run goes on."""
-
-
-def stopped(stop: Interrupted, files: RunFiles) -> int:
-    """Says how to go on; returns the exit status."""
-    say(f"stopped after step {stop.step:,}; the checkpoint is in {files.run}: the same command with")
-    say("  --resume goes on from there")
-    return 128 + (stop.signal or signal.SIGINT)
-
-
-def tell(
-    command: TrainingCommand,
-    files: RunFiles,
-    seconds: float,
-    earlier: Checkpoint | None,
-    counts: dict[str, int],
-    made: str,
-) -> None:
-    """Prints what came of it: JSON with ``counts``, or text in which ``made`` stands for them. It took
-    ``seconds`` since it was begun, or resumed after what was done ``earlier``."""
-    from meshsplats.finetuning.journal import Journal
-
-    lines = Journal(files.run).metrics()
-    scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
-    steps = lines[-1]["step"] if lines else 0
-    total = seconds + (0 if earlier is None else earlier.seconds)
-    resumed = "" if earlier is None else f", {seconds:.1f} s of it since it was resumed"
-    if command.json:
-        result = {
-            "mesh": str(files.mesh),
-            "steps": steps,
-            "seconds": round(total, 2),
-            "seconds_since_resumed": None if earlier is None else round(seconds, 2),
-            **counts,
-            "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
-            "run": str(files.run),
-        }
-        print(json.dumps(result, indent=1))
-        return
-    print(
-        f"{files.mesh} ({size_of(files.mesh)}, {made}): {steps:,} steps in {total:.1f} s{resumed}"
-        + (f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else "")
-    )
-    print(f"preview: {files.preview}; metrics: {files.run}/metrics.jsonl")
+# ---- Progress
 
 
 @contextmanager
-def shown() -> Iterator[Any]:
-    """A function that shows a ``Progress``: as a bar where stderr is a terminal, else a line a score."""
+def progress_display() -> Iterator[ShowProgress]:
+    """A function that shows a ``Progress``: as a bar where stderr is a terminal, else one line per score."""
     if not sys.stderr.isatty():
         yield _Lines()
         return
@@ -317,7 +424,7 @@ class _InBar:
         self._loss: float | None = None
 
     def __call__(self, progress: Progress) -> None:
-        if progress.loss is not None:  # one view's loss jumps about
+        if progress.loss is not None:  # smoothed: it differs from view to view
             self._loss = progress.loss if self._loss is None else 0.95 * self._loss + 0.05 * progress.loss
         self._bar.update(self._task, completed=progress.fraction, text=_text(progress, self._loss))
 
@@ -342,16 +449,3 @@ def _text(progress: Progress, loss: float | None) -> str:
         left = int(progress.seconds_left)
         parts.append(f"{left // 60}:{left % 60:02d} left")
     return ", ".join(parts)
-
-
-def draw_preview(mesh: SplatMesh, path: Path) -> None:
-    from meshsplats.evaluation.report import image_of
-    from meshsplats.images.writing import save_png
-    from meshsplats.rendering.samples import needed_samples
-
-    camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
-    save_png(path, image_of(mesh, camera, (1, 1, 1), samples=needed_samples(mesh, [camera]))[0])
-
-
-def say(text: str) -> None:
-    print(f"meshsplats: {text}", file=sys.stderr, flush=True)

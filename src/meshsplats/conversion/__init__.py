@@ -15,7 +15,7 @@ from meshsplats.conversion.baking import bake_filter
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
-from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, Views, pixel_sizes, widen
+from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.merging import simplify
 from meshsplats.conversion.options import PRESETS, ConversionOptions, Preset, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
@@ -41,8 +41,8 @@ __all__ = [
 ]
 
 CROSSED_REACH = 1.06
-"""Rim of crossed ellipses as a multiple of the radius that fits a Gaussian best: seen from between their
-axes, two ellipses are narrower than the splat. Of the same integrated opacity, they gain 0.1 to 0.8 dB."""
+"""Rim of crossed ellipses as a multiple of the radius that fits a Gaussian best. Seen from between their
+axes, two ellipses are narrower than the splat; at equal integrated opacity, this gains 0.1 to 0.8 dB."""
 
 
 def convert(
@@ -54,14 +54,14 @@ def convert(
     up: Sequence[float] | np.ndarray | None = None,
     **changes: Unpack[ConversionChanges],
 ) -> SplatMesh:
-    """Every splat as one or more fans of translucent triangles round its centre.
+    """Turns every splat into one or more fans of translucent triangles around its centre.
 
     ``preset='paper'`` is the conversion of MeshSplats (arXiv 2502.07754): the two largest axes of a splat
-    span an ellipse of 2.7 standard deviations whose opacity falls linearly from the splat's at the centre to
-    a fifth of it at the rim, 8 triangles; or, with ``mode='3d'``, three such ellipses. ``preset='default'``
-    draws as many triangles and comes closer to the splats' own image: two crossed ellipses of 4 triangles,
-    rim opacity 0, a falloff fitted to the Gaussian and integrated opacity kept. With ``look='splats'`` they
-    are also widened by the low-pass filter that a splat viewer draws with.
+    span an ellipse of 8 triangles with a radius of 2.7 standard deviations, whose opacity falls linearly from
+    the splat's at the centre to a fifth of it at the rim; with ``mode='3d'``, there are three such ellipses.
+    ``preset='default'`` has the same number of triangles and comes closer to the image of the splats: two
+    crossed ellipses of 4 triangles, rim opacity 0, a falloff fitted to the Gaussian and its integrated
+    opacity. With ``look='splats'`` they are also widened by the low-pass filter of splat viewers.
 
     Args:
         cloud: the splats.
@@ -75,14 +75,15 @@ def convert(
             ``options``: ``convert(cloud, max_triangles=500_000)``.
 
     Returns:
-        A mesh whose vertices are ordered by splat; within a splat the centre comes first, then ring by ring
-        in order round the ellipse. ``face_splat`` numbers rows of ``cloud``; where a limit had splats merged
-        (``budget``), those of the merged splats, in the order of the first of each that they were made of.
-        Triangles that touch the centre list it first, and all triangles of an ellipse wind the same way.
+        A mesh whose vertices are ordered by splat; within a splat the centre comes first, then the rings from
+        the inside out, each in order around the ellipse. ``face_splat`` holds rows of ``cloud``; where a
+        limit made splats merge (``budget``), rows of the merged splats, which are in the order of the first
+        splat in each. Triangles at the centre list it first, and all triangles of an ellipse have the same
+        winding.
 
     Raises:
         TypeError: an option that does not exist.
-        ValueError: an option out of range, options that contradict each other, or nothing left to draw.
+        ValueError: an option out of range, options that contradict each other, or no splat left to convert.
     """
     given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
@@ -95,15 +96,15 @@ def convert(
     if len(rows) < len(cloud):
         part = part.select(rows)
     chosen, count = within_limits(given, chosen, len(part))
-    whole = _Place(part, chosen, cameras, direction)
-    place = whole
+    whole = _ViewedSplats(part, chosen, cameras, direction)
+    viewed = whole
     if chosen.budget == "merge" and count < len(part):
-        place = _Place(simplify(part, count, low_pass=whole.low_pass), chosen, cameras, direction)
-        rows, cloud = np.arange(count, dtype=np.int32), place.cloud
-    part = place.cloud
+        viewed = _ViewedSplats(simplify(part, count, low_pass=whole.low_pass), chosen, cameras, direction)
+        rows, cloud = np.arange(count, dtype=np.int32), viewed.cloud
+    part = viewed.cloud
 
     axes = _axis_order(part, chosen)
-    sigma, opacity = _drawn_gaussians(part, chosen, place.pixel, axes)
+    sigma, opacity = _drawn_gaussians(part, chosen, viewed.pixel, axes)
     areas = disc_areas(sigma)
     shadow = mean_shadow(areas)
     shapes, choice = _shapes(sigma, chosen)
@@ -113,15 +114,15 @@ def convert(
         raise ValueError(f"none of the {len(part)} splats has a visible area")
     if count < len(part):
         importance = opacity * shadow
-        if chosen.footprint == "cameras" and place.pixel is not None:
-            importance = importance / np.square(place.pixel)
-        # Splats without area last of all.
+        if chosen.footprint == "cameras" and viewed.pixel is not None:
+            importance = importance / np.square(viewed.pixel)
+        # Splats without area come last.
         importance[~keep] = -1
         keep &= most_important(importance, count)
 
     colors = part.colors
-    if chosen.colors == "cameras" and part.sh_degree > 0 and place.views is not None:
-        colors = place.views.mean_colors(part.sh)
+    if chosen.colors == "cameras" and part.sh_degree > 0 and viewed.coverage is not None:
+        colors = viewed.coverage.mean_colors(part.sh)
 
     def assembled(shapes: list[Shape], choice: np.ndarray, keep: np.ndarray) -> SplatMesh:
         drawn = opacity
@@ -147,17 +148,17 @@ def convert(
     mesh = assembled(shapes, choice, keep)
     if chosen.detail == "cameras":
         wanted: Look = "splats" if chosen.footprint == "filter" else chosen.look or "area"
-        seen = visibility(mesh, cloud.means, whole.cloud, cameras or (), wanted)
-        visible = keep & ~seen.hidden[rows]
+        shown = visibility(mesh, cloud.means, whole.cloud, cameras or (), wanted)
+        visible = keep & ~shown.hidden[rows]
         keep = visible if visible.any() else keep
         budget = len(mesh.faces) if chosen.max_triangles is None else chosen.max_triangles
-        choice[keep] = choose_levels(seen.need[rows[keep]], budget)
+        choice[keep] = choose_levels(shown.need[rows[keep]], budget)
         mesh = assembled([_ellipse(sides, rings, chosen) for sides, rings in LEVELS], choice, keep)
     return mesh
 
 
 def _filter_of(cloud: GaussianCloud, options: ConversionOptions) -> float:
-    """Variance in square pixels of the filter that the mesh is to be drawn with, 0 for none."""
+    """``filter_px2`` of the mesh: variance in square pixels, 0 for none."""
     if options.footprint != "filter":
         return 0.0
     if cloud.kernel != "3dgs":
@@ -168,8 +169,8 @@ def _filter_of(cloud: GaussianCloud, options: ConversionOptions) -> float:
     return DRAWN_PX2 if options.footprint_px2 is None else float(options.footprint_px2)
 
 
-class _Place:
-    """Splats and how they are seen."""
+class _ViewedSplats:
+    """Splats, with the size of a pixel at each of them."""
 
     def __init__(
         self,
@@ -179,25 +180,25 @@ class _Place:
         up: np.ndarray,
     ) -> None:
         self.cloud = cloud
-        self.views = None
+        self.coverage = None
         if cameras and "cameras" in (options.footprint, options.colors):
-            self.views = Views(cloud.means, cameras)
-        self.pixel = pixel_sizes(cloud, options, self.views, up)
-        """(n,) or None, as ``pixel_sizes`` has it."""
+            self.coverage = CameraCoverage(cloud.means, cameras)
+        self.pixel = pixel_sizes(cloud, options, self.coverage, up)
+        """(n,) scene units, or None: no low-pass filter."""
         px2 = _filter_px2(cloud, options)
         self.low_pass: float | np.ndarray = 0.0 if self.pixel is None else np.sqrt(px2) * self.pixel
         """Standard deviation of the filter, scene units."""
 
 
 def _filter_px2(cloud: GaussianCloud, options: ConversionOptions) -> float:
-    """Variance of the filter, square pixels."""
+    """Variance of the low-pass filter, square pixels."""
     if options.footprint_px2 is not None:
         return options.footprint_px2
     return FILTER_PX2[options.look or "area"][cloud.kernel]
 
 
 def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:
-    """(k,) int32 rows of the splats inside the crop box and not too faint, ascending."""
+    """(k,) int32 rows of the splats that are inside the crop box and opaque enough, ascending."""
     if len(cloud) == 0:
         raise ValueError("the cloud has no splats: there is nothing to convert")
     keep = np.ones(len(cloud), bool)
@@ -217,7 +218,7 @@ def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarr
 def _drawn_gaussians(
     cloud: GaussianCloud, options: ConversionOptions, pixel: np.ndarray | None, axes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) standard deviations along ``axes`` and (n,) opacities of the splats as a renderer draws them."""
+    """(n, 3) standard deviations along ``axes`` and (n,) opacities of splats after the low-pass filter."""
     widened = widen(cloud.scales, pixel, _filter_px2(cloud, options), cloud.kernel)
     sigma = np.take_along_axis(widened, axes, axis=1)
     opacity = cloud.opacities
@@ -227,17 +228,17 @@ def _drawn_gaussians(
         after = mean_shadow(disc_areas(sigma))
         opacity = opacity * np.divide(before, after, out=np.zeros_like(after), where=after > 0)
     if options.shrink_faint:
-        # Of its integrated opacity, the share 1 - 1 / (255 o) lies within the radius sqrt(2 ln(255 o))
-        # at which it has fallen to 1/255, where 3DGS stops drawing.
+        # 3DGS stops drawing where the opacity has fallen to 1/255, at the radius sqrt(2 ln(255 o)). Within it
+        # lies the share 1 - 1 / (255 o) of the integrated opacity.
         sigma = sigma * np.sqrt(1 - 1 / np.maximum(255 * cloud.opacities, 1))[:, None]
     return sigma, opacity
 
 
 def _axis_order(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:
-    """(n, 3) numbers of each splat's axes in the order in which the ellipses use them.
+    """(n, 3) indices of each splat's axes in the order in which the ellipses use them.
 
-    flat: the smallest one (the third of a '2dgs' cloud) last, the others following it cyclically, so that
-    first x second points along it. crossed: by size, largest first. 3d: as stored.
+    flat: the smallest axis (the third of a '2dgs' cloud) last, the others in cyclic order, so that first x
+    second points along it. crossed: by size, largest first. 3d: as stored.
     """
     n = len(cloud)
     if options.mode == "3d":
@@ -249,8 +250,7 @@ def _axis_order(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarray:
 
 
 def _by_size(scales: np.ndarray) -> np.ndarray:
-    """(n, 3) stable descending order of three columns, by comparisons: much quicker than a sort along short
-    rows."""
+    """(n, 3) stable descending order of three columns, by comparisons: faster than sorting short rows."""
     a, b, c = scales.T
     return _ORDERS[(a >= b) * np.int8(4) + (a >= c) * np.int8(2) + (b >= c)]
 
@@ -258,11 +258,11 @@ def _by_size(scales: np.ndarray) -> np.ndarray:
 _ORDERS = np.array(
     [[2, 1, 0], [1, 2, 0], [2, 1, 0], [1, 0, 2], [2, 0, 1], [2, 0, 1], [0, 2, 1], [0, 1, 2]], np.int8
 )
-"""By which of a >= b, a >= c and b >= c hold; third and sixth cannot be."""
+"""Indexed by the bits a >= b, a >= c and b >= c; the third and sixth combination cannot occur."""
 
 
 def _shapes(sigma: np.ndarray, options: ConversionOptions) -> tuple[list[Shape], np.ndarray]:
-    """The shapes in use and (n,) which of them each splat takes."""
+    """The shapes in use, and (n,) int8 index of the one that each splat has."""
     sides, rings = int(options.sides), int(options.rings)  # type: ignore[arg-type]
     choice = np.zeros(len(sigma), np.int8)
     if options.mode != "crossed":
@@ -272,7 +272,7 @@ def _shapes(sigma: np.ndarray, options: ConversionOptions) -> tuple[list[Shape],
 
 
 def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "flat") -> Shape:
-    """That of so many sides and rings with the profile that ``options`` ask for."""
+    """An ellipse, or two crossed ones, with the profile that ``options`` ask for."""
     fit = partial(
         fit_profile,
         sides,
@@ -288,8 +288,8 @@ def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "fl
 
 
 def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
-    """(n,) mean area of a splat's projection over all directions, over that of its ellipses: |cos| is 1/2 on
-    average."""
+    """(n,) mean area of a splat's projection over all directions, divided by that of its ellipses, whose mean
+    |cos| is 1/2."""
     last = np.array([shape.pattern.ellipses - 1 for shape in shapes])[choice]
     drawn = 0.5 * np.take_along_axis(np.cumsum(areas, axis=1), last[:, None], axis=1)[:, 0]
     return np.divide(shadow, drawn, out=np.ones_like(shadow), where=drawn > 0)

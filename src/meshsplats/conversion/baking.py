@@ -1,5 +1,4 @@
-"""bake_filter: the filter that a mesh wants when it is drawn, made part of its triangles for programs without
-one."""
+"""bake_filter: the low-pass filter of a mesh as part of its triangles, for programs that draw without one."""
 
 from __future__ import annotations
 
@@ -11,19 +10,19 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks
-from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, Views
+from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, CameraCoverage
 from meshsplats.mesh import SplatMesh, checked_filter, splat_starts
 
 NARROWEST = 1e-4
-"""No splat counts as narrower than a variance of this share of the filter's, as in ``render``."""
+"""Least variance of a splat as a share of the filter's, as in ``render``."""
 FAINTEST = 1e-6
-"""Added to opacities, so that a splat without any has a shape, too."""
+"""Added to opacities, so that a splat with none has a shape, too."""
 FLATTEST = 1e-10
-"""A splat with less than this share of its largest variance along an axis is flat: only rounding would be
-widened."""
+"""A splat is flat along an axis with less than this share of its largest variance: that is rounding, and is
+not widened."""
 
 _CHUNK = 1 << 13
-"""Splats done at a time."""
+"""Splats per chunk."""
 
 
 def bake_filter(
@@ -33,25 +32,25 @@ def bake_filter(
     pixel: float | None = None,
     filter_px2: float | None = None,
 ) -> SplatMesh:
-    """``mesh`` with its filter as a part of the triangles, for programs that draw triangles as they are.
+    """``mesh`` with its low-pass filter as part of the triangles, for programs that draw them as they are.
 
-    Right where a pixel has one size at each splat: the one that it has in the mean for ``cameras``, or
-    ``pixel``; by default that of pictures of 1000 pixels from all round that just hold the mesh. With c and S
-    the mean and the covariance of a splat's opacity in the world, its vertices p move to ``c + (S + s
-    I)^(1/2) S^(-1/2) (p - c)``, s = ``filter_px2`` times the square of that size. The variance along each
-    principal axis is taken from the two views along the others, so that of crossed ellipses each counts only
-    where it is seen. Flat splats stay flat.
+    The result is right for one size of a pixel at each splat: the mean for ``cameras``, or ``pixel``; by
+    default that of images of 1000 pixels from all sides that just hold the mesh. With c and S the mean and
+    the covariance of a splat's opacity in the world, its vertices p move to ``c + (S + s I)^(1/2) S^(-1/2) (p
+    - c)``, where s is ``filter_px2`` times the square of that size. The variance along each principal axis is
+    taken from the two views along the other axes, so that each of two crossed ellipses counts only where it
+    is seen. Flat splats stay flat.
 
     Args:
-        mesh: whose triangles know their splats.
-        cameras: where it will be seen from, with the size of the pictures. Splats that none of them sees take
+        mesh: a mesh with ``face_splat``.
+        cameras: where it will be seen from, with the size of the images. Splats that none of them sees take
             the median pixel of the others.
-        pixel: instead of cameras, size of a pixel at the mesh in scene units: distance / focal length.
+        pixel: instead of cameras, the size of a pixel at the mesh in scene units: distance / focal length.
         filter_px2: variance in square pixels; ``mesh.filter_px2`` by default.
 
     Returns:
-        A mesh of ``filter_px2`` 0 and, as its vertices no longer lie where a base has them, without a
-        binding. Nothing else has changed where there is no filter.
+        A mesh of ``filter_px2`` 0. It has no binding, as its vertices have left the base mesh. Without a
+        filter, nothing but these two fields changes.
 
     Raises:
         ValueError: both of cameras and pixel, cameras that see nothing of the mesh, a mesh without
@@ -78,7 +77,7 @@ def bake_filter(
         found = _shapes(mesh, faces, starts[part] - starts[part.start])
         means[part], axes[part], variances[part] = found
     if cameras:
-        sizes = Views(means.astype(np.float32), cameras).pixel_sizes().astype(np.float64)
+        sizes = CameraCoverage(means.astype(np.float32), cameras).pixel_sizes().astype(np.float64)
         if not (sizes > 0).any():
             raise ValueError(f"none of the {len(cameras)} cameras sees any splat of the mesh")
         sizes = np.where(sizes > 0, sizes, np.median(sizes[sizes > 0]))
@@ -100,7 +99,7 @@ def bake_filter(
 
 
 def _owners(mesh: SplatMesh, starts: np.ndarray) -> np.ndarray:
-    """(v,) number of the splat, from 0, whose triangles use a vertex; -1 for none."""
+    """(v,) index of the splat whose triangles use a vertex, by its place in ``starts``; -1: none."""
     fan = np.zeros(len(mesh.faces), np.int64)
     fan[starts[1:]] = 1
     fan = np.cumsum(fan)
@@ -114,11 +113,13 @@ def _owners(mesh: SplatMesh, starts: np.ndarray) -> np.ndarray:
 def _shapes(
     mesh: SplatMesh, faces: np.ndarray, starts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of n splats with triangles ``faces`` (f, 3) from numbers ``starts`` (n,) on: the mean (n, 3) of their
-    opacity, its principal axes as columns (n, 3, 3), and the variances along them (n, 3).
+    """Moments of the opacity of n splats, whose triangles ``faces`` (f, 3) begin at indices ``starts`` (n,).
 
-    The integrals of opacity, linear in a triangle, and its moments are polynomials of the corners; constant
-    factors are left out of all alike.
+    The integral of opacity, linear in a triangle, and its moments are polynomials of the corners; a constant
+    factor that all share is left out.
+
+    Returns:
+        (n, 3) means, (n, 3, 3) principal axes as columns, and (n, 3) variances along them.
     """
     counts = np.diff(np.append(starts, len(faces)))
     total = lambda values: np.add.reduceat(values, starts)  # noqa: E731
@@ -147,7 +148,7 @@ def _shapes(
     covariance = total(area[:, None, None] * second) / np.where(solid, everything, 1)[:, None, None]
     axes = np.linalg.eigh(covariance)[1]
     of_face = np.repeat(axes, counts, axis=0)
-    seen = np.abs(np.einsum("tc,tck->tk", normal, of_face))  # areas from along each axis
+    seen = np.abs(np.einsum("tc,tck->tk", normal, of_face))  # areas of projections along each axis
     along = np.einsum("tik,tij,tjk->tk", of_face, second, of_face)
     others = seen.sum(axis=1, keepdims=True) - seen
     masses = total(others * mass[:, None])

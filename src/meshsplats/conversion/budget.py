@@ -1,4 +1,4 @@
-"""How limits on splats and triangles are kept: how many splats, of how many triangles each."""
+"""Limits on splats and triangles: how many splats stay, with how many triangles each."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from meshsplats.conversion.fans import PLANES
 from meshsplats.conversion.options import ConversionOptions
 
 SHARE_KEPT = 2 / 3
-"""Splats that are kept in mode 'flat', as a share of what there could be if each had only as many triangles
-as there are for each."""
+"""Share of the splats that stay in mode 'flat'. Each of them then has 3/2 of the triangles that each splat
+would have if all stayed."""
 
 FEWEST = 4
-"""Triangles of a flat splat at least. With three, more splats can be kept, but only opaque things look better
-so."""
+"""Fewest triangles of a flat splat. With three, more splats could stay, but only opaque subjects would look
+better."""
 
 
 def triangles_each(options: ConversionOptions) -> int:
-    """Triangles of a splat by ``mode``, ``sides`` and ``rings``; in the mean where ``detail`` shares them
-    out."""
+    """Triangles of a splat by ``mode``, ``sides`` and ``rings``; their mean for ``detail='cameras'``."""
     ellipses = len(PLANES[options.mode])  # type: ignore[index]
     return ellipses * (2 * options.rings - 1) * options.sides  # type: ignore[operator]
 
@@ -26,11 +25,11 @@ def triangles_each(options: ConversionOptions) -> int:
 def within_limits(
     given: ConversionOptions, chosen: ConversionOptions, n: int
 ) -> tuple[ConversionOptions, int]:
-    """The options for a cloud of ``n`` splats, and how many splats are to stay of them.
+    """The options for a cloud of ``n`` splats, and how many of the splats stay.
 
-    Crossed ellipses keep their 8 triangles: half as many such splats look better than all of them with 4
-    triangles each. A flat one, where neither its triangles nor its profile were ``given``, gets fewer, 4 to
-    8, for the sake of more splats (benchmarks/simplification.py).
+    Crossed ellipses keep their 8 triangles: half the splats with 8 triangles look better than all of them
+    with 4. Flat splats get fewer triangles, 4 to 8, so that more splats stay, unless ``given`` sets their
+    triangles or profile (benchmarks/simplification.py).
 
     Raises ValueError if not even one splat fits.
     """

@@ -1,12 +1,12 @@
-"""Work on long arrays, a cache's worth at a time."""
+"""Work on long arrays, in chunks that fit the processor's cache."""
 
 from __future__ import annotations
 
 import numpy as np
 
 SINGLE_THREADED = 200_000
-"""Multiplications up to which OpenBLAS does a product in one thread. More threads are no quicker on products
-this thin, and far slower where another program has one of the processors: all wait for that one."""
+"""Multiplications up to which OpenBLAS computes a product in one thread. More threads are no faster on
+products this thin, and far slower where another program occupies a processor: all wait for that one."""
 
 
 def thin_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Floaters and other things that a subject is better without: which splats they are."""
+"""Which splats are floaters, or otherwise better left out."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ from typing import TypeVar
 import numpy as np
 
 from meshsplats._cells import Cells
+from meshsplats._geometry import spacing
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.fans import semi_axes
-from meshsplats.conversion.footprint import spacing
 from meshsplats.conversion.selection import inside
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, splat_starts
 
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
 CELL = 2.5
-"""Side of the cells in which neighbours are counted and parts are connected, in spacings."""
+"""Side of the cells for counting neighbours and connecting parts, in spacings of the splats."""
 REACH = 1.5
-"""Standard deviations at which a splat ends, for its neighbours."""
+"""Standard deviations at which a splat ends where its neighbours are counted."""
 
 
 @dataclass(frozen=True)
 class CleaningRules:
-    """Which splats go: all that any of these rules names. None: there is no such rule."""
+    """Which splats are removed: those that any of these rules names. None: no such rule."""
 
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Those whose centre is outside the box x0 y0 z0 x1 y1 z1, in the coordinates of the file."""
+    """Centre outside the box x0 y0 z0 x1 y1 z1, in the coordinates of the file."""
     min_opacity: float | None = None
-    """Those fainter than this, 0 to 1."""
+    """Opacity below this, 0 to 1."""
     max_distance: float | None = None
-    """Those farther from the middle than this many radii of the subject; within one lies nine tenths of its
+    """Farther from the middle than this many radii of the subject. Within one radius lie nine tenths of its
     opacity."""
     sparse: float | None = None
-    """Those with fewer neighbours than this share of what is usual, 0 to 1: 0.05 takes single floaters
-    and thin clouds."""
+    """Fewer neighbours than this share of the median, 0 to 1. 0.05 removes single floaters and thin
+    clouds."""
     min_part: float | None = None
-    """Those in parts that touch nothing else and hold less than this share of all opacity, 0 to 1: 0.01 takes
+    """In a part that touches nothing else and has less than this share of all opacity, 0 to 1. 0.01 removes
     clumps in the air."""
 
     def __post_init__(self) -> None:
@@ -53,27 +53,27 @@ class CleaningRules:
 
 
 FLOATERS = CleaningRules(sparse=0.05, min_part=0.01)
-"""What goes where nothing else was said."""
+"""The default rules."""
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the rules name, before anything is taken away."""
+    """The splats that the rules name."""
 
     gone: dict[str, np.ndarray]
-    """For each rule (n,) bool: the splats that it takes."""
+    """For each rule (n,) bool: the splats that it removes."""
     opacities: np.ndarray
-    """(n,) float32 of the splats; of a mesh, the largest of each splat's vertices."""
+    """(n,) float32 opacities of the splats; for a mesh, the greatest of each splat's vertices."""
     owner: np.ndarray | None = None
-    """(f,) int64 of a mesh: the splat that each triangle belongs to; None for splats themselves."""
+    """(f,) int64 index of the splat that each triangle of a mesh belongs to; None for splats themselves."""
 
     @property
     def kept(self) -> np.ndarray:
-        """(n,) bool: the splats that no rule takes."""
+        """(n,) bool: the splats that no rule removes."""
         return ~np.any(list(self.gone.values()), axis=0)
 
     def counts(self) -> dict[str, dict[str, float]]:
-        """For each rule, and for ``all`` together: how many splats go, and their share of all opacity."""
+        """For each rule, and for ``all`` together: count of removed splats and their share of all opacity."""
         whole = max(float(self.opacities.sum(dtype=np.float64)), 1e-300)
         masks = {**self.gone, "all": ~self.kept}
         return {
@@ -86,17 +86,16 @@ class Findings:
 
 
 def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> Findings:
-    """The splats of ``scene`` that each of the ``rules`` takes. A mesh that does not know its splats counts
-    each triangle as one.
+    """The splats of ``scene`` that each of the ``rules`` removes.
 
-    Parts and neighbours are told by centres sorted into cells of 2.5 spacings of the splats: centres in
-    neighbouring cells are connected.
+    Each triangle of a mesh without ``face_splat`` counts as a splat. For parts and neighbours, centres are
+    sorted into cells with a side of 2.5 spacings of the splats: those in adjacent cells are connected.
 
-    Raises ValueError where there are no rules, and where nothing would be left.
+    Raises ValueError where there are no rules, and where no splat would be left.
     """
     given = [name for name, value in vars(rules).items() if value is not None]
     if not given:
-        raise ValueError("there is no rule that says what goes")
+        raise ValueError("no rule is given: set at least one of the cleaning rules")
     centers, reach, opacities, owner = _splats(scene)
     gone: dict[str, np.ndarray] = {}
     if rules.crop is not None:
@@ -121,29 +120,33 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
             gone["min_part"] = (held < rules.min_part * held.sum())[part]
     found = Findings(gone, opacities, owner)
     if not found.kept.any():
-        told = ", ".join(f"{name} {int(mask.sum()):,}" for name, mask in gone.items())
-        raise ValueError(f"none of the {len(centers):,} splats would be left ({told})")
+        counts = ", ".join(f"{name} {int(mask.sum()):,}" for name, mask in gone.items())
+        raise ValueError(f"none of the {len(centers):,} splats would be left ({counts})")
     return found
 
 
 def take_away(scene: Scene, found: Findings) -> Scene:
-    """``scene`` without the splats that ``find`` found in it."""
+    """``scene`` without the splats that ``find`` has found."""
     if isinstance(scene, SplatMesh):
         return scene.keep_faces(found.kept[found.owner])  # type: ignore[return-value]
     return scene.select(np.flatnonzero(found.kept))
 
 
 def cropped(scene: Scene, box: Sequence[float] | None) -> Scene:
-    """The splats of ``scene``, or the triangles of those, whose centre is in ``box`` x0 y0 z0 x1 y1 z1; all
-    for None. ValueError if there are none."""
+    """``scene`` with the splats whose centre is in the ``box`` x0 y0 z0 x1 y1 z1; None: all of them.
+
+    Raises ValueError if there are none.
+    """
     if box is None:
         return scene
     return take_away(scene, find(scene, CleaningRules(crop=tuple(box))))  # type: ignore[arg-type]
 
 
 def _neighbours(centers: np.ndarray, size: np.ndarray, cell: float) -> np.ndarray:
-    """(n,) how many centres lie round each, in cells twice as large as its own ``size`` (n,) or ``cell``: a
-    wall has few splats because they are large, small ones lie scattered on it, and none of them floats."""
+    """(n,) counts of the centres around each, in cells of twice its own ``size`` (n,), or twice ``cell``.
+
+    A wall has few splats because they are large, with small ones scattered on it: none of them is a floater.
+    """
     level = np.clip(np.ceil(np.log2(np.maximum(size / cell, 1))), 0, 8).astype(int)
     near = np.empty(len(centers), np.int64)
     for step in np.unique(level):
@@ -155,8 +158,8 @@ def _neighbours(centers: np.ndarray, size: np.ndarray, cell: float) -> np.ndarra
 def _splats(
     scene: GaussianCloud | SplatMesh,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-    """Centres (n, 3) float64, (n, 4, 3) float64 where each splat ends, from its centre, opacities (n,), and
-    the splat of each triangle of a mesh."""
+    """(n, 3) float64 centres, (n, 4, 3) float64 offsets to the ends of each splat, (n,) opacities, and for a
+    mesh the (f,) index of each triangle's splat."""
     if isinstance(scene, GaussianCloud):
         order = np.argsort(scene.scales, axis=1)[:, 1:]
         sigma = np.take_along_axis(scene.scales, order, axis=1)

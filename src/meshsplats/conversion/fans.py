@@ -1,4 +1,4 @@
-"""Patterns of triangles that stand for one splat, and meshes built from a pattern per splat."""
+"""Patterns of triangles, fans, that represent one splat; meshes of one pattern for each splat."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from meshsplats._geometry import rotation_rows
 from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.profiles import Profile
 
 CHUNK = 1 << 13
-"""Splats built at a time: the blocks of a chunk stay in the processor's cache."""
+"""Splats per chunk: its arrays stay in the processor's cache."""
 
 PLANES = {"flat": [(0, 1)], "crossed": [(0, 1), (0, 2)], "3d": [(0, 1), (1, 2), (0, 2)]}
 """Axes that span the ellipses of each mode, in the order of their triangles."""
@@ -21,10 +22,10 @@ PLANES = {"flat": [(0, 1)], "crossed": [(0, 1), (0, 2)], "3d": [(0, 1), (1, 2), 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """How the vertices of one splat hang on its semi-axes.
+    """Vertices of one splat in terms of its semi-axes, and its triangles.
 
     Concretely, vertex i of a splat with centre m and one-sigma semi-axes ``A`` (a, 3) is at
-    ``m + radius[level[i]] * directions[i] @ A`` and takes the opacity of ``level[i]``.
+    ``m + radius[level[i]] * directions[i] @ A`` and has the opacity of ``level[i]``.
     """
 
     directions: np.ndarray
@@ -32,8 +33,7 @@ class Pattern:
     level: np.ndarray
     """(m,) int: 0 for the centre, j for ring j; the last ring is the rim."""
     faces: np.ndarray
-    """(t, 3) int32, all with the same winding in each ellipse; those round the centre list the centre
-    first."""
+    """(t, 3) int32, all with the same winding in each ellipse; those at the centre list the centre first."""
     ellipses: int
 
 
@@ -47,13 +47,13 @@ class Shape:
 
 @lru_cache(maxsize=64)
 def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
-    """Ellipses of ``sides`` triangles round the centre, with ``rings`` concentric rings of vertices (the last
-    is the rim).
+    """Ellipses of ``sides`` triangles around the centre, with ``rings`` concentric rings of vertices (the
+    last is the rim).
 
     ``mode='flat'``: one ellipse, ``1 + rings * sides`` vertices and ``(2 * rings - 1) * sides`` triangles;
     rim vertex i is at the angle ``-pi + 2 pi i / sides`` from the first axis towards the second.
     ``mode='crossed'``: a second one of the first and third axis; ``mode='3d'``: three, in the planes of axes
-    1-2, 2-3 and 1-3. Their centre and the vertices that meet on an axis are one: '3d' has, with one ring,
+    1-2, 2-3 and 1-3. They share the centre and the vertices that meet on an axis: '3d' has, with one ring,
     ``3 * sides - 5`` vertices and ``3 * sides`` triangles where ``sides`` is a multiple of 4; 'crossed' has
     ``2 * sides - 1`` and ``2 * sides`` where it is even.
     """
@@ -64,7 +64,7 @@ def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
     # Exact zeros on the axes: there the ellipses meet.
     cos[np.abs(cos) < 1e-12] = 0
     sin[np.abs(sin) < 1e-12] = 0
-    number: dict[tuple, int] = {}
+    index: dict[tuple, int] = {}
     directions = [np.zeros(axes)]
     level = [0]
 
@@ -72,11 +72,11 @@ def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
         direction = np.zeros(axes)
         direction[plane[0]], direction[plane[1]] = cos[i], sin[i]
         key = (ring, *(np.round(direction, 9) + 0.0))
-        if key not in number:
-            number[key] = len(directions)
+        if key not in index:
+            index[key] = len(directions)
             directions.append(direction)
             level.append(ring)
-        return number[key]
+        return index[key]
 
     ids = [
         [[vertex(ring, plane, i) for i in range(sides)] for plane in planes] for ring in range(1, rings + 1)
@@ -95,22 +95,23 @@ def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
 
 
 def semi_axes(quaternions: np.ndarray, order: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(3, 3, n) float32 one-sigma semi-axes in the world frame; [k] holds x, y and z of ``sigma[:, k]`` along
-    axis ``order[:, k]`` of ``quaternions`` (n, 4)."""
+    """(k, 3, n) float32 one-sigma semi-axes in the world frame.
+
+    Item i holds x, y and z of the axes ``order[:, i]`` of ``quaternions`` (n, 4), times ``sigma[:, i]``;
+    ``order`` and ``sigma`` are (n, k).
+    """
     n = len(quaternions)
-    w, x, y, z = np.ascontiguousarray(quaternions.T)
-    two = np.float32(2)
-    columns = np.empty((3, 3, n), np.float32)
-    columns[0] = 1 - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)
-    columns[1] = two * (x * y - w * z), 1 - two * (x * x + z * z), two * (y * z + w * x)
-    columns[2] = two * (x * z + w * y), two * (y * z - w * x), 1 - two * (x * x + y * y)
+    columns = np.empty((3, 3, n), np.float32)  # by axis, then coordinate
+    for coordinate, row in enumerate(rotation_rows(*np.ascontiguousarray(quaternions.T))):
+        for axis, entry in enumerate(row):
+            columns[axis, coordinate] = entry
     result = np.empty((order.shape[1], 3, n), np.float32)
     for k in range(order.shape[1]):
         # int64 before the product: NumPy 1 keeps the small type of an array times a scalar, and overflows.
-        numbers = order[:, k].astype(np.int64) * (3 * n) + np.arange(n)
+        indices = order[:, k].astype(np.int64) * (3 * n) + np.arange(n)
         for coordinate in range(3):
-            np.take(columns, numbers, out=result[k, coordinate], mode="clip")
-            numbers += n
+            np.take(columns, indices, out=result[k, coordinate], mode="clip")
+            indices += n
         result[k] *= sigma[:, k]
     return result
 
@@ -127,9 +128,15 @@ def build(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (v, 3), faces (f, 3) and colours (v, 4), splat after splat.
 
-    ``choice`` (n,) numbers each splat's of the ``shapes``. ``order`` (n, 3) and
-    ``sigma`` (n, 3) give its axes as in ``semi_axes``; ``opacity`` (n,) multiplies the profile, and the
-    product is clamped to 1.
+    Args:
+        shapes: the shapes in use.
+        choice: (n,) index of each splat's shape.
+        centers, quaternions: (n, 3) and (n, 4) of the splats.
+        order, sigma: (n, 3) axes and their standard deviations, as in ``semi_axes``.
+        rgb: (n, 3) display colours.
+        opacity: (n,) multiplies the profile; the product is clamped to 1.
+
+    Raises ValueError for more vertices or triangles than int32 can index.
     """
     n = len(centers)
     corners = [shape.pattern.faces.ravel() for shape in shapes]
@@ -147,23 +154,24 @@ def build(
             rows = np.flatnonzero(choice[part] == number)
             if not len(rows):
                 continue
-            own = [
+            own_first, own_first_face = first[part][rows], first_face[part][rows]
+            own_centers, own_quaternions, own_order, own_sigma, own_rgb, own_opacity = (
                 np.take(array[part], rows, axis=0)
-                for array in (first, centers, quaternions, order, sigma, rgb, opacity, first_face)
-            ]
+                for array in (centers, quaternions, order, sigma, rgb, opacity)
+            )
             levels = np.array(shape.profile.opacities, np.float32)
             used = shape.pattern.directions.shape[1]
-            axes = semi_axes(own[2], own[3][:, :used], own[4][:, :used])
-            parts = np.concatenate([own[1].T, axes.reshape(3 * used, -1)])
-            paint = np.concatenate([own[5].T, np.minimum(levels[:, None] * own[6], np.float32(1))])
-            _put(vertices, own[0], thin_product(parts.T, place))
-            _put(colors, own[0], thin_product(paint.T, tint))
-            _put(faces, own[7], own[0].astype(np.int32)[:, None] + corners[number])
+            axes = semi_axes(own_quaternions, own_order[:, :used], own_sigma[:, :used])
+            parts = np.concatenate([own_centers.T, axes.reshape(3 * used, -1)])
+            paint = np.concatenate([own_rgb.T, np.minimum(levels[:, None] * own_opacity, np.float32(1))])
+            _put(vertices, own_first, thin_product(parts.T, place))
+            _put(colors, own_first, thin_product(paint.T, tint))
+            _put(faces, own_first_face, own_first.astype(np.int32)[:, None] + corners[number])
     return vertices, faces, colors
 
 
 def _firsts(counts: np.ndarray) -> tuple[np.ndarray, int]:
-    """Numbers of the first of ``counts`` (n,) things each, one after the other, and that of all."""
+    """(n,) indices of the first item of each group, for groups of ``counts`` (n,) items; count of all."""
     ends = np.cumsum(counts, dtype=np.int64)
     return ends - counts, int(ends[-1]) if len(ends) else 0
 
@@ -173,19 +181,19 @@ def _put(out: np.ndarray, first: np.ndarray, blocks: np.ndarray) -> None:
     ascending."""
     width = out.shape[1]
     rows = blocks.size // width
-    if first[-1] - first[0] == rows - blocks.shape[1] // width:  # one after the other
+    if first[-1] - first[0] == rows - blocks.shape[1] // width:  # contiguous
         out[first[0] : first[0] + rows] = blocks.reshape(-1, width)
         return
-    # Every run of m rows as one item: written whole, much quicker than row by row.
+    # Each run of m rows is written as one item: much faster than row by row.
     runs = sliding_window_view(out.reshape(-1), blocks.shape[1], writeable=True)
     runs[first * width] = blocks
 
 
 def _recipe(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """Two matrices that do a splat's vertices in one product each.
+    """Two matrices, each of which gives values of a splat's m vertices in one product.
 
-    (3 + 3 a, 3 m) from centre and semi-axes to positions; (3 + rings + 1, 4 m), of ones and zeros, from r, g,
-    b and the opacities of centre and rings to RGBA.
+    (3 + 3 a, 3 m), from centre and semi-axes to positions; (3 + rings + 1, 4 m), of ones and zeros, from r,
+    g, b and the opacities of centre and rings to RGBA.
     """
     directions, level = shape.pattern.directions, shape.pattern.level
     m, a = directions.shape

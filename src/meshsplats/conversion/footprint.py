@@ -1,8 +1,7 @@
-"""How large a pixel is at each splat, and the low-pass filter of that size which splats were trained with.
+"""The footprint: how large a pixel is at each splat, and the low-pass filter of that size.
 
-3DGS adds 0.3 px^2 to the covariance of every splat on the picture, 2DGS never draws one narrower than a
-standard deviation of sqrt(1/2) px. A mesh has no such filter: its triangles must be wide enough from the
-start.
+3DGS adds 0.3 px^2 to the covariance of every splat in the image; 2DGS never draws one with a standard
+deviation below sqrt(1/2) px. A mesh has no such filter: its triangles must be wide enough from the start.
 """
 
 from __future__ import annotations
@@ -11,6 +10,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from meshsplats._arrays import spread_indices
+from meshsplats._geometry import spacing
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import SAMPLE
 from meshsplats.cameras.trajectories import orbit
@@ -23,59 +24,59 @@ FILTER_PX2: dict[str, dict[str, float]] = {
     "area": {"3dgs": 0.05, "antialiased": 0.05, "2dgs": 0.05},
     "splats": {"3dgs": 0.5, "antialiased": 0.4, "2dgs": 0.3},
 }
-"""Variance of the filter in square pixels, by look and kernel. 3DGS and its antialiased kernel add 0.3 and
-2DGS has 0.5; those of 'splats' serve best over the distances of the given cameras and up to eight times as
-far. Means over a pixel's area need none but for the few samples that a pixel has: against these, 0.03 to 0.08
-gain 0.6 dB over none, and 0.5 lose 2 to 3 dB."""
+"""Variance of the filter in square pixels, by look and kernel. 3DGS and its antialiased kernel add 0.3, 2DGS
+has 0.5; the values for 'splats' are the best from the distances of the given cameras to eight times as far.
+Means over a pixel's area need a filter only because a pixel has few samples: 0.03 to 0.08 gain 0.6 dB over
+none, and 0.5 loses 2 to 3 dB."""
 
 DRAWN_PX2 = 0.3
-"""Variance that 3DGS adds at whatever size it draws: that of the filter of a mesh that is drawn with one."""
+"""Variance that 3DGS adds at any size of the image; that of the filter of a mesh that is drawn with one."""
 
 MAX_CAMERAS = 32
-"""Of more cameras, so many are used, evenly spaced in their order."""
+"""Of more cameras this many are used, evenly spaced in their order."""
 
 SPACING_SHARE = 0.35
-"""Pixel size as a share of the spacing of the splats, where nothing else is known: of six scenes, the
-pictures that they were made from, or shown at, have 0.31 to 0.91."""
+"""Pixel size as a share of the spacing of the splats, where nothing else is known. In the training images of
+six scenes, or the images that they are shown in, it is 0.31 to 0.91."""
 
 SPACING_POWER = 0.3
-"""How far the pixel size follows the local spacing (1) rather than the scene's median (0). Splats lie closer
-where there is more detail, not only where cameras come closer."""
+"""How far the pixel size follows the local spacing (1) rather than the scene's median (0). Splats are denser
+where there is more detail, not only where cameras are closer."""
 
 FRAMING_PIXELS = 1000
 FRAMING_VIEWS = 6
-"""Side and number of the square pictures for 'framing'."""
+"""Side and count of the square images for 'framing'."""
 FRAMING_SPACING = 0.7
-"""The most that a pixel of 'framing' may be, as a share of the median spacing of the splats: twice that of
-'density'. Only clouds that hold far more detail than such pictures show come to it."""
+"""Largest pixel for 'framing', as a share of the median spacing of the splats: twice that of 'density'. Only
+clouds with far more detail than such images can show reach it."""
 
 _CHUNK = 1 << 14
 
 
-class Views:
-    """What the cameras see of each splat: weights (f / d)^2, the pixels that a unit of area at the splat
-    covers."""
+class CameraCoverage:
+    """How many pixels of each camera a unit of area at each splat covers: weights (f / d)^2.
+
+    Args:
+        means: (n, 3) float32 centres of the splats.
+        cameras: at least one; of more than ``MAX_CAMERAS``, some are chosen.
+    """
 
     def __init__(self, means: np.ndarray, cameras: Sequence[Camera]) -> None:
-        chosen = np.unique(
-            np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS)).round().astype(int)
-        )
-        self.cameras = [cameras[i] for i in chosen]
+        self.cameras = [cameras[i] for i in spread_indices(len(cameras), MAX_CAMERAS)]
         self.means = means
-        # Differences of nearby positions lose nothing in float32, positions far from the origin would.
+        # Relative to an origin among the splats: positions far from zero lose digits in float32.
         self.origin = (
             means[:: max(1, len(means) // 1000)].mean(axis=0, dtype=np.float64) if len(means) else np.zeros(3)
         )
 
     def _each(self, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """For each camera: (3, k) offsets of the splats ``part`` from its centre in the world frame, (k,) the
-        squares of their lengths, (k,) bool which of them it sees, and (k,) weights; 0: not seen."""
+        """For each camera: (3, k) offsets from its centre to the splats ``part`` in the world frame, (k,)
+        squares of their lengths, (k,) bool which of them it sees, and (k,) weights, 0 for the others."""
         points = np.ascontiguousarray((self.means[part] - self.origin).T, np.float32)
         for camera in self.cameras:
             rotation, center = camera.world_to_camera[:3, :3], camera.center - self.origin
             fx, fy = camera.fx, camera.fy
-            # Rows that give 2 x' / width * z and 2 y' / height * z, with x' and y' pixels from the middle of
-            # the picture, and z: on the picture is what has none of the first two larger than z.
+            # Rows to clip space: a point is in the image if and only if abs(x) <= z and abs(y) <= z.
             lens = np.array(
                 [
                     [2 * fx / camera.width, 0, 2 * camera.cx / camera.width - 1],
@@ -84,13 +85,13 @@ class Views:
                 ]
             )
             matrix = lens @ rotation
-            across = matrix.astype(np.float32) @ points
-            across -= (matrix @ center).astype(np.float32)[:, None]
-            z = across[2]
+            clip = matrix.astype(np.float32) @ points
+            clip -= (matrix @ center).astype(np.float32)[:, None]
+            z = clip[2]
             seen = z > camera.near
-            np.abs(across[:2], out=across[:2])
-            seen &= across[0] <= z
-            seen &= across[1] <= z
+            np.abs(clip[:2], out=clip[:2])
+            seen &= clip[0] <= z
+            seen &= clip[1] <= z
             away = points - center.astype(np.float32)[:, None]
             square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
             np.maximum(square, np.float32(1e-30), out=square)
@@ -99,9 +100,11 @@ class Views:
             yield away, square, seen, weight
 
     def pixel_sizes(self) -> np.ndarray:
-        """(n,) float32 size of a pixel at each splat in scene units: d / f with 1 / d^2 averaged over the
-        cameras that see it, so that near views, where it covers more pixels, count for more. 0 where no
-        camera sees the splat."""
+        """(n,) float32 size of a pixel at each splat in scene units; 0 where no camera sees it.
+
+        Concretely, d / f with (f / d)^2 averaged over the cameras that see the splat: close views, in which
+        it covers more pixels, count for more.
+        """
         sizes = np.empty(len(self.means), np.float32)
         for part in chunks(len(sizes), _CHUNK):
             count, total = np.zeros((2, part.stop - part.start), np.float32)
@@ -112,22 +115,21 @@ class Views:
         return sizes
 
     def mean_colors(self, sh: np.ndarray) -> np.ndarray:
-        """(n, 3) display colour of coefficients ``sh`` (n, k, 3) averaged over the cameras that see each
-        splat, in [0, 1].
+        """(n, 3) float32 display RGB in [0, 1]: colours of ``sh`` (n, k, 3), averaged over the cameras.
 
-        Views count by the pixels that the splat covers. Averaged first, clipped after. Degree 0 for unseen
-        splats.
+        Each camera that sees the splat counts by the pixels that the splat covers. The mean is clipped, not
+        the single colours. A splat that no camera sees has its colour of degree 0.
         """
         colors = np.empty((len(sh), 3), np.float32)
         degree = int(sh.shape[1] ** 0.5) - 1
         matrix = _from_monomials(degree)
-        # Each coefficient three times, as colours lie in memory; and the sum over the coefficients.
+        # Repeats each coefficient for r, g and b; sums over the coefficients.
         spread = np.repeat(matrix, 3, axis=1)
         gather = np.tile(np.eye(3, dtype=np.float32), (sh.shape[1], 1))
         terms = MONOMIALS[1 : len(matrix)]
         for part in chunks(len(sh), _CHUNK):
             k = part.stop - part.start
-            # Harmonics are polynomials of the direction: the means of its monomials are all that is needed.
+            # Harmonics are polynomials of the direction, so their means follow from those of its monomials.
             mean = np.zeros((len(matrix), k), np.float32)
             values = np.empty_like(mean)
             for away, square, _, weight in self._each(part):
@@ -153,74 +155,26 @@ MONOMIALS = [
     *[(1, 0), (1, 1), (2, 1), (1, 2), (2, 2)],  # xx xy yy xz yz
     *[(4, 0), (4, 1), (6, 0), (6, 1), (4, 2), (5, 2), (6, 2)],  # xxx xxy xyy yyy xxz xyz yyz
 ]
-"""Monomials of a direction up to degree 3, each as the product of an earlier one, by number, and an axis.
-zz is 1 - xx - yy on the sphere, so those of degree d and less are as many as spherical harmonics."""
+"""Monomials of a direction up to degree 3, each as an earlier one, by index, times an axis. As zz is
+1 - xx - yy on the sphere, there is one for each spherical harmonic of the same degrees."""
 
 
 def _from_monomials(degree: int) -> np.ndarray:
-    """((degree + 1)^2, (degree + 1)^2) float32 whose product with ``MONOMIALS`` of a direction, in rows, is
-    ``sh_basis`` of it."""
+    """(k, k) float32 matrix M, k = (degree + 1)^2, with ``sh_basis(d) = m @ M`` for the ``MONOMIALS`` m of a
+    direction d.
+
+    Found by least squares over random directions: the system has an exact solution.
+    """
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     values = np.ones((64, (degree + 1) ** 2))
-    for number, (factor, axis) in list(enumerate(MONOMIALS))[1 : values.shape[1]]:
-        values[:, number] = values[:, factor] * directions[:, axis]
+    for index, (factor, axis) in list(enumerate(MONOMIALS))[1 : values.shape[1]]:
+        values[:, index] = values[:, factor] * directions[:, axis]
     return np.linalg.lstsq(values, sh_basis(directions, degree), rcond=None)[0].astype(np.float32)
 
 
-def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
-    """(n,) float32 spacing of ``points`` (n, 3) round each of them, in their units.
-
-    Concretely, the points are sorted into a cubic grid of halving cells; a point's spacing is ``side /
-    sqrt(count)`` of the smallest cell round it that holds at least ``share`` points, as if these lay on a
-    surface. Points in one spot have the spacing of the smallest cell, 2^-20 of the extent.
-    """
-    levels = 20
-    low = points.min(axis=0).astype(np.float64)
-    extent = float((points.max(axis=0) - low).max())
-    n = len(points)
-    if n == 1 or extent == 0:
-        return np.zeros(n, np.float32)
-    cells = ((points - low) * ((1 << levels) * (1 - 1e-9) / extent)).astype(np.uint64)
-    code = np.zeros(n, np.uint64)
-    for axis in range(3):
-        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
-    order = np.argsort(code)  # points of one cell get one spacing: their order does not matter
-    code = code[order]
-    found = np.full(n, extent / np.sqrt(n), np.float32)
-    settled = np.zeros(n, bool)
-    for level in range(levels + 1):
-        parent = code >> np.uint64(3 * level)
-        starts = np.flatnonzero(np.concatenate([[True], parent[1:] != parent[:-1]]))
-        counts = np.diff(np.append(starts, n))
-        enough = np.repeat(counts >= share, counts) & ~settled
-        if enough.any():
-            side = extent / (1 << (levels - level))
-            found[enough] = np.repeat(side / np.sqrt(counts), counts)[enough]
-            settled |= enough
-            if settled.all():
-                break
-    result = np.empty(n, np.float32)
-    result[order] = found
-    return result
-
-
-def _every_third_bit(values: np.ndarray) -> np.ndarray:
-    """21-bit numbers with two zero bits after each bit."""
-    v = values.astype(np.uint64)
-    for shift, mask in [
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ]:
-        v = (v | (v << np.uint64(shift))) & np.uint64(mask)
-    return v
-
-
 def pixel_sizes(
-    cloud: GaussianCloud, options: ConversionOptions, views: Views | None, up: np.ndarray
+    cloud: GaussianCloud, options: ConversionOptions, coverage: CameraCoverage | None, up: np.ndarray
 ) -> np.ndarray | None:
     """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none' and
     'filter'.
@@ -240,15 +194,15 @@ def pixel_sizes(
         return np.float32(SPACING_SHARE) * typical * np.power(relative, np.float32(SPACING_POWER))
     if options.footprint == "framing":
         side = FRAMING_PIXELS
-        views = Views(cloud.means, orbit(cloud, FRAMING_VIEWS, width=side, height=side, up=up))
-    if views is None:
+        coverage = CameraCoverage(cloud.means, orbit(cloud, FRAMING_VIEWS, width=side, height=side, up=up))
+    if coverage is None:
         raise ValueError("footprint='cameras' needs cameras")
-    sizes = views.pixel_sizes()
+    sizes = coverage.pixel_sizes()
     seen = sizes > 0
     if not seen.any():
         raise ValueError(
-            f"none of the {len(views.cameras)} cameras sees any of the {len(cloud)} splats: are they of one"
-            " scene? Choose footprint='density' or 'none' to go without them"
+            f"none of the {len(coverage.cameras)} cameras sees any of the {len(cloud)} splats: are they of"
+            " one scene? Choose footprint='density' or 'none' to go without them"
         )
     sizes = np.where(seen, sizes, np.median(sizes[seen]))
     if options.footprint == "framing":
@@ -261,8 +215,12 @@ def pixel_sizes(
 
 
 def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str) -> np.ndarray:
-    """(n, 3) standard deviations with the filter of variance ``px2`` square pixels applied, as ``kernel``
-    does it."""
+    """(n, 3) standard deviations after the low-pass filter of ``kernel``, variance ``px2`` square pixels.
+
+    Args:
+        scales: (n, 3) standard deviations, scene units.
+        pixel: (n,) size of a pixel at each splat, scene units; None: no filter.
+    """
     if pixel is None:
         return scales
     low_pass = (px2 * np.square(pixel, dtype=np.float32))[:, None]

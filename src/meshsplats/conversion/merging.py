@@ -1,4 +1,4 @@
-"""simplify: fewer splats that look the same from as far away as their number allows.
+"""simplify: fewer splats that look the same from a distance, by merging pairs.
 
 Splats are merged pair by pair; dropping some of them would tear holes. A pair becomes one splat of the same
 mass, mean and covariance, and colours are averaged by mass. Mass is integrated optical depth: that of a splat
@@ -21,26 +21,26 @@ import numpy as np
 from meshsplats._core.library import pointer, processors, run
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
-from meshsplats.conversion.footprint import Views, pixel_sizes, widen
+from meshsplats.conversion.footprint import CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.formats._orientation import quaternions_of
 from meshsplats.gaussians import GaussianCloud
 
 NEIGHBOURS = 8
-"""Nearest splats that each may be merged with at first; a merged one has those of both. Of 16, in twice the
-time, results are 0.1 dB better at most."""
+"""Nearest splats with which each may be merged at first; a merged one has the neighbours of both. With 16,
+results are at most 0.1 dB better, in twice the time."""
 
 COLOR_WEIGHT = 1.0
-"""What a colour's difference costs against a growth of the area: e-fold growth of both costs as much as half
-the square of a difference of 1. Between 1 and 4 nothing changes."""
+"""Cost of a difference in colour relative to growth of the area: e-fold growth of both splats costs as much
+as half the square of a difference of 1. Between 1 and 4 nothing changes."""
 
 FINEST = 0.5
-"""Width that every splat has at least when it is compared with others, as a share of the median splat's.
-Between a quarter and 1, 0.2 dB change."""
+"""Least width of a splat when it is compared with others, as a share of the median splat's. Values between a
+quarter and 1 differ by 0.2 dB."""
 
 FILTER_PX2 = 0.3
-"""Variance in square pixels of the low-pass filter that splats are drawn with."""
+"""Variance in square pixels of the low-pass filter of splat renderers."""
 
 FAINTEST = 1 / 255
 """Opacity below which 3DGS draws nothing."""
@@ -86,34 +86,33 @@ def simplify(
     low_pass: float | np.ndarray | None = None,
     threads: int | None = None,
 ) -> GaussianCloud:
-    """``cloud`` as ``count`` splats, by merging those that are most alike; itself if it has no more.
+    """``cloud`` as ``count`` splats, by merging similar ones; the cloud itself if it has no more.
 
-    Neighbours are merged, always the pair that costs least: whose area grows least by it, and whose colours
-    differ least, in proportion to their mass. Mass, mean and covariance of the whole are kept, spherical
-    harmonics of every degree averaged by mass. A splat that was not merged keeps its values to the last bit.
-    Mass beyond what an opaque splat has is lost: many opaque layers become one. Splats of less opacity than
-    1/255, which are never drawn, have no mass; they go first.
+    Neighbours are merged, always the pair of least cost: growth of the area and difference in colour, in
+    proportion to their mass. Mass, mean and covariance of the whole are preserved; spherical harmonics of
+    every degree are averaged by mass. A splat that was not merged keeps its values to the last bit. Mass
+    beyond that of an opaque splat is lost: many opaque layers become one. Splats of less opacity than 1/255,
+    which are never drawn, have no mass and go first.
 
-    Merged splats are of the same kernel. Those of '2dgs' stay flat: the least of their three axes is left
-    out, and so is its part of the covariance.
+    Merged splats have the cloud's kernel. Those of '2dgs' stay flat: the smallest of their three axes is
+    dropped, with its part of the covariance.
 
     Args:
         cloud: the splats.
         count: how many to keep, at least 1.
-        cameras: where the result will be seen from. They say how large a pixel is at each splat, for
-            ``low_pass``. Default: pictures of 1000 pixels from all round that just hold the subject.
-        low_pass: standard deviation, in scene units, of the filter that the splats are drawn with: one
-            number or (n,), >= 0. What is finer is not told apart; and it widens what is narrower than a
-            pixel, so that more of it shows (but for 'antialiased'). Default: sqrt(0.3) pixels, sqrt(0.5) for
-            '2dgs'.
+        cameras: where the result will be seen from: they give the size of a pixel at each splat for
+            ``low_pass``. Default: images of 1000 pixels from all sides that just hold the subject.
+        low_pass: standard deviation, in scene units, of the low-pass filter that the splats are drawn with:
+            one number or (n,), >= 0. Finer differences do not count, and splats narrower than the filter
+            count as widened by it (but for 'antialiased'). Default: sqrt(0.3) pixels, sqrt(0.5) for '2dgs'.
         threads: at most this many; all processors by default. The result has the same bits with any number.
 
     Returns:
-        A cloud of min(count, n) splats, in the order of the first of each that they were made of.
+        A cloud of min(count, n) splats, in the order of the first of the splats merged into each.
 
     Raises:
         ValueError: ``count`` or ``low_pass`` out of range.
-        MemoryError: about 600 bytes a splat do not fit.
+        MemoryError: the work does not fit; it takes about 600 bytes a splat.
     """
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
         raise ValueError(f"count must be a whole number of splats, at least 1, got {count!r}")
@@ -138,7 +137,7 @@ def optical_depth(opacity: np.ndarray) -> np.ndarray:
     """Integrated optical depth of a splat over 2 pi, as a multiple of the product of its two standard
     deviations: the dilogarithm of its ``opacity`` (0 to 1); float64, 0 to pi^2 / 6."""
     o = np.asarray(opacity, np.float64)
-    # Beyond a half by Euler's reflection, so that the series is short.
+    # Above a half by Euler's reflection formula, so that the series is short.
     small = np.minimum(o, 1 - o)
     series, power = np.zeros_like(o), np.ones_like(o)
     for k in range(1, 50):
@@ -150,7 +149,7 @@ def optical_depth(opacity: np.ndarray) -> np.ndarray:
 
 
 def opacity_of(depth: np.ndarray) -> np.ndarray:
-    """The opacity of which ``depth`` >= 0 is the ``optical_depth``, within 1e-5; 1 for what is beyond."""
+    """Inverse of ``optical_depth`` for ``depth`` >= 0, within 1e-5; 1 beyond its range."""
     return np.interp(depth, *_table())
 
 
@@ -161,10 +160,11 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 
 def nearest(points: np.ndarray, count: int, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The ``count`` nearest others of each of ``points`` (n, 3) float64, n > count.
+    """The ``count`` nearest neighbours of each of ``points`` (n, 3) float64, n > count.
 
-    Returns (n,) int32, an order of the points in which neighbours lie close to each other, and (n, count)
-    int32: the places in that order of those nearest to point ``order[i]``, nearest first.
+    Returns:
+        (n,) int32 ``order`` of the points in which neighbours lie close to each other; and (n, count) int32:
+        row i holds the positions, in that order, of the neighbours of point ``order[i]``, nearest first.
     """
     points = np.ascontiguousarray(points, np.float64)
     order = np.empty(len(points), np.int32)
@@ -186,14 +186,14 @@ def nearest(points: np.ndarray, count: int, threads: int | None = None) -> tuple
 def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> np.ndarray:
     px2 = 0.5 if cloud.kernel == "2dgs" else FILTER_PX2
     source = ConversionOptions(footprint="cameras" if cameras else "framing")
-    views = Views(cloud.means, cameras) if cameras else None
-    pixel = pixel_sizes(cloud, source, views, guess_up(None, cameras))
+    coverage = CameraCoverage(cloud.means, cameras) if cameras else None
+    pixel = pixel_sizes(cloud, source, coverage, guess_up(None, cameras))
     assert pixel is not None
     return np.sqrt(px2) * pixel
 
 
 def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:
-    """(n, 3) float64 standard deviations with the filter, where it adds to what shows."""
+    """(n, 3) float64 standard deviations after the low-pass filter, where it adds to the opacity."""
     if kernel == "antialiased":
         return scales.astype(np.float64)
     return widen(scales.astype(np.float64), low_pass, 1.0, kernel)
@@ -202,15 +202,15 @@ def _drawn(scales: np.ndarray, low_pass: np.ndarray, kernel: str) -> np.ndarray:
 def _groups(
     cloud: GaussianCloud, masses: np.ndarray, low_pass: np.ndarray, count: int, threads: int
 ) -> np.ndarray:
-    """(n,) numbers 0 to count - 1 of the splats that each becomes part of."""
+    """(n,) indices, 0 to count - 1, of the merged splats that each becomes part of."""
     seen = mean_shadow(disc_areas(cloud.scales[masses > 0].astype(np.float64)))
     unit = float(np.sqrt(np.median(seen))) if len(seen) else 0.0
     unit = unit or float(low_pass.max()) or 1.0
     colors = cloud.colors.astype(np.float64)
     means = (cloud.means - np.median(cloud.means, axis=0).astype(np.float64)) / unit
     covariances = _covariances(cloud) / unit**2
-    # Nothing is told apart that is finer than the filter; or, without one, than a share of the usual splat:
-    # else it would cost endlessly much to merge what is flat or thin with anything at its side.
+    # Differences finer than the filter, or than a share of the median splat, do not count. Otherwise, merging
+    # flat or thin splats with anything beside them would have an unbounded cost.
     covariances[:, [0, 3, 5]] += np.square(np.maximum(low_pass / unit, FINEST))[:, None]
     group = np.arange(len(cloud))
     all_moments = _Moments(means, covariances, masses, colors)
@@ -220,13 +220,13 @@ def _groups(
         group = part[group]
         if left <= count:
             return group
-        # Parts of the scene that were no neighbours of each other are, now that few splats are left.
+        # Neighbours ran out. Among the few splats that are left, others are neighbours.
         moments = all_moments.together(_Groups(group, masses))
 
 
 def _merge_neighbours(moments: _Moments, count: int, threads: int) -> tuple[np.ndarray, int]:
-    """(n,) numbers of groups, in the order of their first members, and how many there are: ``count``, or more
-    where neighbours ran out."""
+    """(n,) indices of groups, in the order of their first members, and their count: ``count``, or more where
+    neighbours ran out."""
     n = len(moments.means)
     neighbours = min(NEIGHBOURS, n - 1)
     order, near = nearest(moments.means, neighbours, threads)
@@ -255,19 +255,19 @@ def _merge_neighbours(moments: _Moments, count: int, threads: int) -> tuple[np.n
 
 
 class _Moments(NamedTuple):
-    """Of n splats or groups, float64."""
+    """Moments and colours of n splats or groups, float64."""
 
     means: np.ndarray
-    """(n, 3)."""
+    """(n, 3)"""
     covariances: np.ndarray
     """(n, 6) xx, xy, xz, yy, yz, zz."""
     masses: np.ndarray
-    """(n,)."""
+    """(n,)"""
     colors: np.ndarray
     """(n, 3) RGB."""
 
     def together(self, groups: _Groups) -> _Moments:
-        """Those of all members of each group together."""
+        """The moments of each group: those of all its members together."""
         middle = groups.averages(self.means)
         apart = self.means - middle[groups.group]
         spread = apart[:, [0, 0, 0, 1, 1, 2]] * apart[:, [0, 1, 2, 1, 2, 2]]
@@ -276,7 +276,7 @@ class _Moments(NamedTuple):
 
 
 class _Groups:
-    """Sums over the members of groups 0 to g - 1, in the order of their rows."""
+    """Sums over the members of groups 0 to g - 1; members are added in the order of their rows."""
 
     def __init__(self, group: np.ndarray, masses: np.ndarray) -> None:
         self.group = group
@@ -285,7 +285,7 @@ class _Groups:
         self.starts = np.cumsum(sizes) - sizes
         self.masses = self.sums(masses)
         total = self.masses[group]
-        # Those without mass count alike.
+        # In a group without mass, all members count alike.
         self.weights = np.where(
             total > 0, np.divide(masses, total, where=total > 0, out=np.zeros_like(masses)), 1 / sizes[group]
         )
@@ -294,7 +294,7 @@ class _Groups:
         return np.add.reduceat(np.take(values, self.order, axis=0), self.starts, axis=0)
 
     def averages(self, values: np.ndarray) -> np.ndarray:
-        """(g, k) float64 by mass, of (n, k)."""
+        """(g, k) float64 means of ``values`` (n, k), weighted by mass."""
         return self.sums(self.weights[:, None] * values)
 
 

@@ -1,13 +1,13 @@
-"""The choices of a conversion, its presets, and what can be told wrong before any work is done."""
+"""Options of a conversion, validated up front, and its presets."""
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Literal, TypedDict, get_args
 
 import numpy as np
 
+from meshsplats._options import Range, check_choices, check_flags, check_names, check_ranges
 from meshsplats.rendering.looks import Look
 
 if TYPE_CHECKING:
@@ -23,88 +23,87 @@ Preset = Literal["default", "paper"]
 
 @dataclass(frozen=True)
 class ConversionOptions:
-    """Every choice of ``convert``. None leaves it to the preset; lengths called radius are standard
-    deviations."""
+    """The options of ``convert``. None: the preset's value."""
 
     mode: Mode | None = None
-    """flat: one ellipse in the two largest axes of each splat. crossed: a second one, upright on it along the
-    longest axis, so that no splat vanishes edge-on; a splat flatter than ``flat_below`` gets one finer
-    ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3."""
+    """flat: one ellipse in the plane of the two largest axes of each splat. crossed: a second one at right
+    angles to it, along the longest axis, so that no splat vanishes edge-on; a splat flatter than
+    ``flat_below`` is one finer ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3.
+    Default: crossed; paper: flat."""
     rim_radius: float | None = None
     """Radius of the rim in standard deviations, 0.1 to 10. Default: calibrated; paper: 2.7."""
     sides: int | None = None
-    """Number of triangles that make up an ellipse, a fan round its centre: 3 to 64 (3d: a multiple of 4;
-    crossed: even). The name is the paper's. Default: 8 for flat, else 4; paper: 8."""
+    """Sides of an ellipse, which is a fan of as many triangles around its centre: 3 to 64 (3d: a multiple of
+    4; crossed: even). Default: 8 for flat, else 4; paper: 8."""
     rim_opacity: float | None = None
     """Opacity of the rim as a fraction of the splat's, 0 to 1. Default: 0; paper: 0.2."""
     center_opacity: float | None = None
     """Opacity of the centre as a multiple of the splat's, above 0 to 2; the product is clamped to 1. Default:
     calibrated; paper: 1."""
     rings: int | None = None
-    """Rings of vertices in an ellipse, 1 to 4; the last is the rim. More follow the Gaussian closer: 2 rings
-    draw 3 * sides triangles an ellipse. Default and paper: 1."""
+    """Rings of vertices in an ellipse, 1 to 4; the last is the rim. More rings follow the Gaussian more
+    closely: 2 rings make 3 * sides triangles. Default and paper: 1."""
     detail: Detail | None = None
-    """How triangles are shared out among splats. even: every splat has the same number. cameras: that number
-    on average, 3 to 80 by what the cameras given see of the splat: most where it is large in the pictures and
-    a plain fan would look wrong, none where it is hidden inside a solid; for mode 'flat', which it implies,
-    with one ring. Fine-tuning begins so. Default and paper: even."""
+    """Level of detail. even: every splat has the same number of triangles. cameras: that number on average, 3
+    to 80 for each splat; most where the splat is large in the cameras' images and a plain fan would look
+    wrong, none where it is hidden inside a solid. It implies mode 'flat' and needs one ring. Fine-tuning
+    begins with it. Default and paper: even."""
     flat_below: float | None = None
-    """crossed: a splat whose smallest standard deviation (with its footprint) is less than this fraction of
-    the middle one is drawn as one ellipse of twice as many triangles, 0 to 1."""
+    """crossed: a splat whose smallest standard deviation (with its footprint) is at most this fraction of the
+    middle one becomes one ellipse of twice as many triangles, 0 to 1. Default: 0.15."""
     compensation: float | None = None
-    """0 to 1. 1 scales a splat's opacity so that its ellipses cover, on average over all directions, as much
-    opacity times area as the splat itself; 0 leaves the opacity; between, a power of that factor. Paper:
+    """1: opacities are scaled so that the ellipses of a splat have the same opacity times area as the splat,
+    averaged over all directions. 0: opacities stay. Between: a power of that factor. Default: 1; paper:
     0."""
     look: Look | None = None
-    """What the mesh is to look like. area: each pixel the mean over its area, in programs that take several
-    samples a pixel: Blender, engines with MSAA, ray tracers. splats: at the size of the cameras or of the
-    framing, as a 3DGS viewer shows it; it is then wider, and blurs in larger pictures. Default: area; paper:
-    area, as it has no footprint."""
+    """How the mesh should look. area: each pixel is the mean over its area, for programs that take several
+    samples a pixel: Blender, engines with MSAA, ray tracers. splats: as a 3DGS viewer shows the splats at the
+    image size of the cameras or the framing; fans are then wider, and blur in larger images. Default and
+    paper: area."""
     footprint: Footprint | None = None
-    """Where the size of a pixel at each splat comes from, for the low-pass filter that splats were trained
-    with. cameras: the cameras given. framing: pictures of 1000 pixels from all round that just hold the
-    subject, or finer where splats lie too densely for these. distance: one stated distance. density: the
-    spacing of the splats alone. filter: none of these; the mesh is to be drawn with a filter of its own
-    (``SplatMesh.filter_px2``), which is right at every size, but which only this project's pictures have; for
-    splats of kernel '3dgs'. none: no filter, for a model trained without it. Default: cameras if there are
-    any, else distance if stated, else framing; paper: none."""
+    """Source of the size of a pixel at each splat, for the low-pass filter that splats were trained with.
+    cameras: the given cameras. framing: images of 1000 pixels from all sides that just hold the subject, with
+    finer pixels for very dense splats. distance: ``viewing_distance``. density: the spacing of the splats.
+    filter: the mesh gets a filter of its own (``SplatMesh.filter_px2``) instead, which is right at every size
+    but which only this project's renderer applies; for splats of kernel '3dgs'. none: no filter, for a model
+    trained without one. Default: cameras if there are any, else distance if it is given, else framing; paper:
+    none."""
     footprint_px2: float | None = None
-    """Variance of that filter in square pixels, 0 to 100; every standard deviation s becomes
-    sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats trained as 2DGS.
-    Default: 0.05 for the look 'area', which the samples of a pixel need; for 'splats' 0.5, or 0.4 and 0.3
-    for splats of kernel 'antialiased' and '2dgs'. footprint = filter: ``filter_px2`` of the mesh, 0.3 by
-    default, as 3DGS draws."""
+    """Variance of that filter in square pixels, 0 to 100. Every standard deviation s becomes
+    sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats of kernel '2dgs'.
+    Default: 0.05 for the look 'area', against sampling noise; for 'splats' 0.5, or 0.4 for splats of kernel
+    'antialiased' and 0.3 for '2dgs'. With footprint = filter: ``filter_px2`` of the mesh, by default 0.3 as
+    in 3DGS."""
     viewing_distance: float | None = None
-    """Distance the mesh will be seen from, scene units; for footprint = distance."""
+    """Distance from which the mesh will be seen, scene units; for footprint = distance."""
     focal: float | None = None
-    """Focal length in pixels of the pictures taken from ``viewing_distance``. Default: 1000, such as 1000
-    pixels over 53 degrees."""
+    """Focal length, in pixels, of images from ``viewing_distance``. Default: 1000, which is 1000 pixels over
+    53 degrees."""
     min_opacity: float | None = None
-    """Splats of less opacity than this are left out, 0 to 1; above 0 also those without any area. Default:
-    1/255, below which they do not show; paper: 0."""
+    """Leave out splats of less opacity than this, 0 to 1; above 0, also splats without area. Default: 1/255,
+    below which splats are invisible; paper: 0."""
     shrink_faint: bool | None = None
-    """Draw faint splats smaller, with as much area as they keep where 3DGS cuts their opacity off, at 1/255:
-    the share 1 - 1 / (255 opacity). Paper: no."""
+    """Make faint splats smaller: 3DGS cuts them off where their opacity falls below 1/255, which leaves the
+    share 1 - 1 / (255 opacity) of their area. Default: yes; paper: no."""
     crop: tuple[float, float, float, float, float, float] | None = None
-    """Box x0 y0 z0 x1 y1 z1 in scene units: splats with their centre outside are left out."""
+    """Box x0 y0 z0 x1 y1 z1 in scene units: leave out splats whose centre is outside."""
     max_splats: int | None = None
-    """At most so many splats: see ``budget``."""
+    """Largest number of splats: see ``budget``."""
     max_triangles: int | None = None
-    """At most so many triangles: see ``budget``. In mode 'flat', where neither ``sides`` nor the profile
-    is given, splats get fewer triangles each, 4 at least, before they get fewer."""
+    """Largest number of triangles: see ``budget``. In mode 'flat', unless ``sides``, ``rings``,
+    ``rim_radius`` or ``center_opacity`` is given, splats first get fewer triangles each, at least 4."""
     budget: Budget | None = None
-    """How max_splats and max_triangles are kept. merge: splats that are alike are merged. drop: only the most
-    important stay, by opacity times visible area: that on the pictures of the cameras where there are any
-    (splats that none of them sees count as at the median distance), else that in scene units; it tears
-    holes. Default and paper: merge."""
+    """How to keep to max_splats and max_triangles. merge: merge similar splats. drop: keep only the most
+    important ones, by opacity times area in the images of the cameras (splats that no camera sees count as at
+    the median distance), or in scene units without cameras; this tears holes. Default and paper: merge."""
     colors: Colors | None = None
-    """degree0: the view-independent part of the colour. cameras: the mean of the colours that the cameras
-    see, where the splats have spherical harmonics."""
+    """degree0: the view-independent part of the colour. cameras: where splats have spherical harmonics, the
+    mean of the colours that the cameras see. Default and paper: degree0."""
 
     def resolved(self, preset: str, *, has_cameras: bool) -> ConversionOptions:
-        """With the preset's values where nothing was said, checked.
+        """A checked copy with the preset's values in place of None.
 
-        Raises ValueError for an unknown preset, values out of range and choices that contradict each other.
+        Raises ValueError for an unknown preset, values out of range and options that contradict each other.
         """
         if preset not in PRESETS:
             raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
@@ -124,21 +123,9 @@ class ConversionOptions:
         return full
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
-        for name, kind in _KINDS.items():
-            if getattr(self, name) not in get_args(kind):
-                raise ValueError(
-                    f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}"
-                )
-        for name, low, high, whole in _RANGES:
-            value = getattr(self, name)
-            if value is None:
-                continue
-            number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-            if not number or not low <= value <= high or (whole and int(value) != value):
-                what = "a whole number" if whole else "a number"
-                raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
-        if not isinstance(self.shrink_faint, bool):
-            raise ValueError(f"shrink_faint must be True or False, got {self.shrink_faint!r}")
+        check_choices(self, _CHOICES)
+        check_ranges(self, _RANGES, types=(int, float, np.integer, np.floating))
+        check_flags(self, ("shrink_faint",))
         if self.mode == "3d" and self.sides % 4:  # type: ignore[operator]
             raise ValueError(f"sides must be a multiple of 4 in mode '3d', got {self.sides}")
         if self.mode == "crossed" and self.sides % 2:  # type: ignore[operator]
@@ -163,7 +150,7 @@ class ConversionOptions:
             named = " and ".join(sorted(given & {"viewing_distance", "focal"}))
             raise ValueError(f"{named} is for footprint='distance', got footprint={self.footprint!r}")
         if self.footprint == "none" and "footprint_px2" in given:
-            raise ValueError("footprint_px2 says how wide the footprint is, but footprint is 'none'")
+            raise ValueError("footprint_px2 is the variance of the footprint, but footprint is 'none'")
         if self.colors == "cameras" and not has_cameras:
             raise ValueError("colors='cameras' needs cameras")
         if self.crop is not None:
@@ -174,16 +161,16 @@ class ConversionOptions:
                 )
 
 
-_KINDS = {
-    "mode": Mode,
-    "look": Look,
-    "footprint": Footprint,
-    "colors": Colors,
-    "detail": Detail,
-    "budget": Budget,
+_CHOICES = {
+    "mode": get_args(Mode),
+    "look": get_args(Look),
+    "footprint": get_args(Footprint),
+    "colors": get_args(Colors),
+    "detail": get_args(Detail),
+    "budget": get_args(Budget),
 }
 
-_RANGES: list[tuple[str, float, float, bool]] = [
+_RANGES: list[Range] = [
     ("rim_radius", 0.1, 10, False),
     ("sides", 3, 64, True),
     ("rim_opacity", 0, 1, False),
@@ -233,8 +220,8 @@ PRESETS = {
         colors="degree0",
     ),
 }
-"""default: calibrated to look like the splats. paper: arXiv 2502.07754 with the rim opacity and the
-number of sides of its published code."""
+"""default: calibrated to look like the splats. paper: arXiv 2502.07754, with the rim opacity and the number
+of sides of its published code."""
 
 
 class ConversionChanges(TypedDict, total=False):
@@ -268,10 +255,5 @@ def make_options(
 ) -> ConversionOptions:
     """``options``, none by default, with ``changes``. A misspelt name is a TypeError that says which names
     there are."""
-    known = [f.name for f in fields(ConversionOptions)]
-    for name in changes:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
-            raise TypeError(f"convert has no option {name!r}{hint}")
+    check_names("convert", changes, [f.name for f in fields(ConversionOptions)])
     return replace(options or ConversionOptions(), **changes)

@@ -1,5 +1,4 @@
-"""How the opacity of a fan falls from its centre to its rim, and the fall that comes nearest to a
-Gaussian."""
+"""Profiles of opacity from the centre of a fan to its rim, and the one closest to a Gaussian."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Profile:
-    """Concentric regular polygons with a common orientation; between them opacity is linear.
+    """Concentric regular polygons of one orientation; opacity is linear between them.
 
     Concretely, a splat of opacity o has opacity ``opacities[0] * o`` at its centre and ``opacities[j] * o``
     on ring j, whose corners are ``radii[j - 1]`` standard deviations away.
@@ -39,7 +38,7 @@ class Profile:
 
 
 def _grid(sides: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quadrature over half a sector, by symmetry enough: ring radius, Gaussian and weight at each node."""
+    """Quadrature over half a sector, which suffices by symmetry: ring radii, Gaussian and weights."""
     turn = np.pi / sides
     nodes, node_weights = np.polynomial.legendre.leggauss(10)
     angle = (nodes + 1) * turn / 2
@@ -52,8 +51,8 @@ def _grid(sides: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def fidelity(profile: Profile) -> tuple[float, float]:
-    """Relative L2 error against ``exp(-r^2 / 2)`` over the plane, and integrated opacity as a multiple of its
-    2 pi."""
+    """Relative L2 error against ``exp(-r^2 / 2)`` over the plane, and integrated opacity divided by that
+    Gaussian's, 2 pi."""
     ring, gaussian, weight = _grid(profile.sides)
     drawn = np.interp(ring, (0.0, *profile.radii), profile.opacities, right=0.0)
     error = np.sqrt(weight @ (drawn - gaussian) ** 2 / (weight @ gaussian**2))
@@ -72,10 +71,15 @@ def fit_profile(
 ) -> Profile:
     """The profile of least squared error against the Gaussian falloff ``exp(-r^2 / 2)`` over the plane.
 
-    What is given stays as it is; the rest (radii; opacities of centre and inner rings) is fitted. For given
-    radii the opacities solve a small linear system; the radii are searched one after the other. With
-    ``conserve`` the integrated opacity is kept at the Gaussian's 2 pi, as far as an opacity is free: many
-    faint layers then add up as they should.
+    Radii and the opacities of centre and inner rings are fitted where they are None. For fixed radii the
+    opacities solve a small linear system; the radii are found by coordinate descent.
+
+    Args:
+        sides, rings: as in ``Profile``.
+        rim_radius: in standard deviations; None: fitted.
+        rim_opacity, center_opacity: as multiples of the splat's; ``center_opacity`` None: fitted.
+        conserve: keep the integrated opacity at the Gaussian's 2 pi, if an opacity is fitted: many faint
+            layers then add up to the right opacity.
     """
     ring, gaussian, weight = _grid(sides)
     fixed = {rings: rim_opacity}

@@ -1,4 +1,4 @@
-"""Which splats are worth triangles."""
+"""Which splats are kept: crop box, opacity, importance."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ THOMSEN = 1.6075
 
 
 def disc_areas(sigma: np.ndarray) -> np.ndarray:
-    """(n, 3) products of two standard deviations each, planes 1-2, 1-3 and 2-3; float32."""
+    """(n, 3) products of pairs of standard deviations ``sigma`` (n, 3): planes 1-2, 1-3 and 2-3."""
     return np.stack([sigma[:, 0] * sigma[:, 1], sigma[:, 0] * sigma[:, 2], sigma[:, 1] * sigma[:, 2]], axis=1)
 
 
 def mean_shadow(areas: np.ndarray) -> np.ndarray:
     """(n,) product of the two standard deviations of a Gaussian's projection, averaged over all directions.
 
-    Seen along the unit vector v of its own frame it is ``sqrt((v3 a12)^2 + (v2 a13)^2 + (v1 a23)^2)``, the
-    shadow of an ellipsoid; the mean shadow of a convex body is a quarter of its surface (Cauchy), for which
-    Thomsen's formula stands.
+    Along the unit vector v of the splat's frame the product is ``sqrt((v3 a12)^2 + (v2 a13)^2 + (v1
+    a23)^2)``, the shadow of an ellipsoid. The mean shadow of a convex body is a quarter of its surface
+    (Cauchy), for which Thomsen's approximation is used.
+
+    Args:
+        areas: (n, 3) as from ``disc_areas``.
     """
     a, b, c = areas.T
     largest = np.maximum(np.maximum(a, b), c)
@@ -37,10 +40,14 @@ def choose_splats(
     min_opacity: float | None = None,
     max_splats: int | None = None,
 ) -> GaussianCloud:
-    """The splats inside ``crop`` (x0 y0 z0 x1 y1 z1) of at least ``min_opacity``, of these the ``max_splats``
-    with the greatest opacity times mean projected area, in their old order. None: no such limit.
+    """The splats within the limits, in their old order.
 
-    Raises ValueError if none is left.
+    Args:
+        crop: box x0 y0 z0 x1 y1 z1 in scene units that the centres must lie in.
+        min_opacity: least opacity, 0 to 1.
+        max_splats: keep this many, those with the greatest opacity times mean projected area.
+
+    Raises ValueError if no splat is left.
     """
     keep = np.ones(len(cloud), bool) if crop is None else inside_box(cloud, crop)
     if min_opacity is not None:
@@ -74,7 +81,7 @@ def inside(points: np.ndarray, box: Sequence[float]) -> np.ndarray:
 
 
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:
-    """(n,) bool: the ``count`` splats of greatest ``importance`` (ties: lower number first)."""
+    """(n,) bool: the ``count`` splats of greatest ``importance`` (ties: lower index first)."""
     keep = np.ones(len(importance), bool)
     if count < len(importance):
         keep[np.argsort(-importance, kind="stable")[count:]] = False

@@ -1,5 +1,5 @@
-// The plain C interface of the core. Validation, memory of results and Python stay outside
-// (_core/library.py).
+// The plain C interface of the core. Callers validate arguments and own the memory of results: see
+// _core/library.py.
 #include <cstdio>
 #include <memory>
 #include <new>

@@ -56,8 +56,7 @@ class FanFilter {
         });
         std::atomic<bool> shared{false};
         for_fan_blocks(threads, [&](int32_t begin, int32_t end, int) {
-            // Separate loops: the steps of solve_transform depend on each other, but not on those of other
-            // fans.
+            // Separate loops: the steps of one solve_transform wait for each other, but not for other fans.
             for (int32_t fan = begin; fan < end; ++fan) accumulate_moments(fan);
             for (int32_t fan = begin; fan < end; ++fan) solve_transform(fans_[fan]);
             bool clash = false;
@@ -86,14 +85,13 @@ class FanFilter {
   private:
     static constexpr double MIN_VARIANCE = 1e-4;  // added to M, as a share of the filter's variance
     static constexpr double DEPTH_SHARE = 0.1;
-    static constexpr double OPACITY_BIAS =
-        1e-6;  // added to opacities, so that transparent fans have moments, too
+    static constexpr double OPACITY_BIAS = 1e-6;  // added to opacities: transparent fans need moments, too
 
     struct Fan {
-        double inverse_mass;  // 1 / (60 integral of opacity over doubled areas); the reciprocal before
-                              // solve_transform
-        double x, y;          // mean c; before solve_transform its sum, relative to the origin
-        double m[3];          // covariance M: xx, xy, yy; before solve_transform its sums, likewise
+        // Until solve_transform, the first three are sums relative to the origin: see accumulate_moments.
+        double inverse_mass;  // 1 / (60 integral of opacity over doubled areas)
+        double x, y;          // mean c
+        double m[3];          // covariance M: xx, xy, yy
         double x0, y0;        // origin of the sums: a vertex of the fan
         double k;             // scale of depths
         double a[3];          // A: xx, xy, yy
@@ -169,10 +167,10 @@ class FanFilter {
     }
 
     // The sums over the triangles of a fan, from which solve_transform finds its mean and covariance.
-    void accumulate_moments(int32_t number) {
-        const int64_t first = starts_[number], end = starts_[number + 1];
+    void accumulate_moments(int32_t fan_index) {
+        const int64_t first = starts_[fan_index], end = starts_[fan_index + 1];
         const Projected &origin = unfiltered_[mesh_.faces[3 * first]];
-        Fan &fan = fans_[number];
+        Fan &fan = fans_[fan_index];
         fan.k = origin.w > 0 ? depth_scale_ / origin.w : 0;
         bool visible = true;
         Batch t;
@@ -244,12 +242,12 @@ class FanFilter {
     }
 
     // Writes the filtered vertices of a fan; false if another fan owns one of them.
-    bool transform_vertices(int32_t number) {
-        const Fan &fan = fans_[number];
+    bool transform_vertices(int32_t fan_index) {
+        const Fan &fan = fans_[fan_index];
         bool owned = true;
-        for_each_corner(number, [&](int32_t v) {
+        for_each_corner(fan_index, [&](int32_t v) {
             const Projected p = unfiltered_[v];
-            if (owner_[v] != number) {
+            if (owner_[v] != fan_index) {
                 owned = false;
             } else if (!fan.active) {
                 filtered_[v] = p;
@@ -262,16 +260,16 @@ class FanFilter {
         return owned;
     }
 
-    void backward_fan(int32_t number, const float *grad, int32_t *index,
+    void backward_fan(int32_t fan_index, const float *grad, int32_t *index,
                       std::vector<FanVertexGradient> &buffer, const MsVertexGradients &out) const {
-        const Fan &fan = fans_[number];
-        const size_t max_vertices = 3 * (size_t)(starts_[number + 1] - starts_[number]);
+        const Fan &fan = fans_[fan_index];
+        const size_t max_vertices = 3 * (size_t)(starts_[fan_index + 1] - starts_[fan_index]);
         if (buffer.size() < max_vertices) buffer.resize(max_vertices);
         FanVertexGradient *vertices = buffer.data();
         int count = 0;
         bool any = false;
-        for_each_corner(number, [&](int32_t v) {
-            if (index[v] != number) return;
+        for_each_corner(fan_index, [&](int32_t v) {
+            if (index[v] != fan_index) return;
             index[v] = -1 - count;
             vertices[count++].vertex = v;
             const float *g = grad + 3 * (int64_t)v;
@@ -285,7 +283,7 @@ class FanFilter {
             }
             return;
         }
-        backward_density(number, backward_positions(fan, grad, vertices, count), index, vertices);
+        backward_density(fan_index, backward_positions(fan, grad, vertices, count), index, vertices);
         for (int i = 0; i < count; ++i) {
             const FanVertexGradient &g = vertices[i];
             const Projected &p = unfiltered_[g.vertex];
@@ -334,11 +332,11 @@ class FanFilter {
 
     // Adds the gradients by way of the density, whose moments determine A and c: the derivatives of the
     // integrals in the header with respect to opacities, positions and areas.
-    void backward_density(int32_t number, const DensityGradient &density, const int32_t *index,
+    void backward_density(int32_t fan_index, const DensityGradient &density, const int32_t *index,
                           FanVertexGradient *vertices) const {
-        const Fan &fan = fans_[number];
+        const Fan &fan = fans_[fan_index];
         const double *h = density.h, *c = density.c;
-        const int64_t first = starts_[number], end = starts_[number + 1];
+        const int64_t first = starts_[fan_index], end = starts_[fan_index + 1];
         double grad_k = 0;
         Batch t;
         for (int64_t i = first; i < end; i += BATCH) {

@@ -29,9 +29,8 @@ struct FragmentWeights {
 //
 // Invariants between calls:
 // - The first `count_` entries are in use, each with at least one lane.
-// - The fragments of an entry belong to faces of one group, and `face` is the first of them. Entries of one
-// group are
-//   added in the order of their faces.
+// - All fragments of an entry belong to faces of one group. `face` is the first of these faces.
+// - Entries of one group follow each other in the order of their faces.
 // - A lane leaves its entry when its fragment is emitted or its sample is no longer active.
 // The caller owns the mask of active lanes, which the emit callbacks may shrink.
 class FragmentQueue {

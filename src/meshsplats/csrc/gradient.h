@@ -30,7 +30,7 @@ struct TileGradients {
     PooledVector<float> attributes;  // (count, attribute_count)
     size_t count = 0;
 
-    // Makes room to append so many vertices.
+    // Makes room to append `more` vertices.
     void reserve(size_t more, int channels) {
         if (vertices.size() >= count + more) return;
         vertices.resize(std::max(count + more, 2 * vertices.size()));

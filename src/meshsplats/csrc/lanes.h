@@ -51,7 +51,7 @@ inline void store_lanes(float *p, const Lanes &a) {
     }
 MS_LANES(operator+, x + y)
 MS_LANES(operator-, x - y)
-MS_LANES(operator*, x *y)
+MS_LANES(operator*, (x * y))
 MS_LANES(operator/, x / y)
 MS_LANES(min_lanes, vmin(x, y))
 MS_LANES(max_lanes, vmax(x, y))

@@ -212,7 +212,7 @@ class ComparisonTile {
             sum += set1(weight_[k]) * (load(rows[RADIUS - k] + i) + load(rows[RADIUS + k] + i));
         return sum;
     }
-    // The place of an image row in a ring. Rows begin at -2 RADIUS.
+    // The slot of an image row in a ring. Rows begin at -2 RADIUS.
     template <class Row>
     static auto ring_row(Row *ring, int row) {
         MS_ASSERT(row >= -4 * TAPS);

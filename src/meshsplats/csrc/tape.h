@@ -32,7 +32,7 @@ struct TileCoverage {
     std::vector<CoverageMask> masks;
     uint32_t triangle_count = 0, mask_count = 0;
 
-    // Makes room to append so many triangles and masks.
+    // Makes room to append this many triangles and masks.
     void reserve(size_t new_triangles, size_t new_masks) {
         if (triangles.size() < triangle_count + new_triangles)
             triangles.resize(2 * (triangle_count + new_triangles));
@@ -69,7 +69,7 @@ struct TileTape {
         std::vector<Step> steps;         // at every sample front to back
         uint32_t entry_count = 0, step_count = 0;
 
-        // Makes room for so many new entries, each of which takes at most one step per lane.
+        // Makes room for new entries, each of which takes at most one step per lane.
         void reserve(size_t new_entries) {
             if (entries.size() < entry_count + new_entries) entries.resize(2 * (entry_count + new_entries));
             if (steps.size() < step_count + LANES * new_entries)

@@ -16,19 +16,20 @@ from typing import IO
 
 import numpy as np
 
+from meshsplats._geometry import rotation_rows
 from meshsplats.camera import MAX_SIDE
 from meshsplats.datasets.image_files import MAX_NAME, Frame
 from meshsplats.datasets.lens import MODELS, Lens
 from meshsplats.errors import FileFormatError
 
 MAX_FRAMES = 200_000
-"""More cameras or pictures than this are refused."""
+"""More cameras or images than this are refused."""
 _MODEL_NAMES = list(MODELS)
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _POINT_BYTES = 24
 _LEAST_POINT = 43
-"""Bytes of a point in three dimensions without the pictures that see it."""
+"""Bytes of a point in three dimensions without the images that see it."""
 
 
 def find_model(folder: Path, places: tuple[str, ...]) -> Path | None:
@@ -41,7 +42,7 @@ def find_model(folder: Path, places: tuple[str, ...]) -> Path | None:
 
 
 def read_model(model: Path, images: str) -> list[Frame]:
-    """The pictures of a sparse model, sorted by name; their files lie in the folder ``images``.
+    """The images of a sparse model, sorted by name; their files lie in the folder ``images``.
 
     Raises FileFormatError, which names file and record, for what is broken.
     """
@@ -54,7 +55,7 @@ def read_model(model: Path, images: str) -> list[Frame]:
     frames.sort(key=lambda frame: frame.name)
     for before, after in pairwise(frames):
         if before.name == after.name:
-            raise FileFormatError(f"{model}: two pictures have the name {after.name[:200]!r}")
+            raise FileFormatError(f"{model}: two images have the name {after.name[:200]!r}")
     return frames
 
 
@@ -147,8 +148,8 @@ def _binary_cameras(path: Path) -> dict[int, Lens]:
 def _binary_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame]:
     frames = []
     with _mapped(path) as data:
-        for i in range(data.count(_IMAGE.size + 9, "pictures")):
-            what = f"picture {i}"
+        for i in range(data.count(_IMAGE.size + 9, "images")):
+            what = f"image {i}"
             _, *pose, camera = data.unpack(_IMAGE, what)
             name = data.text(f"the name of {what}")
             (points,) = data.unpack(struct.Struct("<Q"), what)
@@ -198,24 +199,24 @@ def _text_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame
             words = line.split(None, 9)
             if len(words) < 10:
                 raise FileFormatError(
-                    f"{where}: a picture is 'ID QW QX QY QZ TX TY TZ CAMERA NAME', then a line of points"
+                    f"{where}: an image is 'ID QW QX QY QZ TX TY TZ CAMERA NAME', then a line of points"
                 )
             name = _decoded(words[9], path, f"line {row}")
             pose = list(_floats(words[1:8], where))
             frames.append(_frame(name, pose, _whole(words[8], where), lenses, images, where))
             if len(frames) > MAX_FRAMES:
-                raise FileFormatError(f"{path}: more than {MAX_FRAMES:,} pictures")
+                raise FileFormatError(f"{path}: more than {MAX_FRAMES:,} images")
             points = next(lines, None)  # on a line that may be empty
-            if points is not None and _looks_like_a_picture(points[1]):
+            if points is not None and _looks_like_an_image_line(points[1]):
                 raise FileFormatError(
-                    f"{path}: line {points[0]}: a picture, where the points of the one before it are"
+                    f"{path}: line {points[0]}: an image, where the points of the one before it are"
                     " expected; a line for them must be there, if empty"
                 )
     return frames
 
 
-def _looks_like_a_picture(line: bytes) -> bool:
-    """Points are numbers throughout; a picture's line ends in a name."""
+def _looks_like_an_image_line(line: bytes) -> bool:
+    """Points are numbers throughout; an image's line ends in a name."""
     words = line.split(None, 9)
     try:
         float(words[9].split()[0] if len(words) == 10 else 0)
@@ -251,7 +252,7 @@ def _floats(words: list[bytes], where: str) -> tuple[float, ...]:
 def _lens(model: str, width: int, height: int, parameters: tuple[float, ...], where: str) -> Lens:
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise FileFormatError(
-            f"{where}: a picture of {width} x {height} pixels; sides go from 1 to {MAX_SIDE}"
+            f"{where}: an image of {width} x {height} pixels; sides go from 1 to {MAX_SIDE}"
         )
     try:
         return Lens.from_colmap(model, width, height, parameters)
@@ -269,10 +270,6 @@ def _frame(
         raise FileFormatError(f"{where}: its pose is no rotation and translation: {pose}")
     w, x, y, z = (q / length for q in pose[:4])
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = list(rotation_rows(w, x, y, z))
     matrix[:3, 3] = pose[4:7]
     return Frame(name, f"{images}/{name}", lenses[camera], matrix)

@@ -62,7 +62,7 @@ def find_layout(path: Path) -> Layout | None:
 
 
 def _other_model(path: Path) -> Path | None:
-    """The only numbered model in sparse/, or one that lies beside the folder of its pictures."""
+    """The only numbered model in sparse/, or one beside the folder of its images."""
     if (path / "sparse").is_dir():
         numbers = [name for name in os.listdir(path / "sparse") if name.isdecimal()]
         found = [model for name in numbers if (model := find_model(path / "sparse", (name,)))]
@@ -77,7 +77,7 @@ def _other_model(path: Path) -> Path | None:
 
 
 def _colmap(model: Path, album: Album, test_every: int) -> Views:
-    # Sizes of the model's cameras are those of images/; without it, pictures may lie beside sparse/.
+    # Cameras of the model have the size of the files in images/; without it, these may lie beside sparse/.
     frames = read_model(model, "images")
     numbered = model.parent.name == "sparse"
     if numbered:
@@ -173,7 +173,7 @@ def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
 
     train, test = members(held["train"]), members(out)
     if not train:
-        raise FileFormatError(f"{path}: none of its pictures is in 'train_filenames'")
+        raise FileFormatError(f"{path}: none of its images is in 'train_filenames'")
     return _views(train, test)
 
 
@@ -230,27 +230,29 @@ def load_dataset(
     - COLMAP with ``colmap/sparse/0/`` or ``colmap/sparse/``, with the only model in ``sparse/``, or with the
       model beside ``images/``.
 
-    ``masks/``, or the masks a file names, say which pixels count. Photographs of lenses that are no pinhole
-    are undistorted when they are read; what the lens did not see is black and masked. Only the headers of
-    pictures are read here: cameras are scaled to the size the pictures really have.
+    ``masks/``, or the masks that a file names, say which pixels count. Photographs of lenses that are not
+    pinholes are undistorted when they are read; pixels that the lens did not see are black and masked. Only
+    the headers of images are read here: cameras are scaled to the size of the images.
 
-    Parameters
-    ----------
-    downscale: whole factor of the pictures' sides, 1 to 64. ``images_2/``, ``images_4/`` and so on are used
-        where they exist; else each pixel becomes the mean of those it covers.
-    test_every: views 0, n, 2n ... by name are held out, unless the data set has a split of its own; 0: none.
-    background: RGB in [0, 1] of ``View.image`` where pictures have alpha. ``ViewImage.over`` takes another.
-    cache_bytes: pictures are kept up to this many bytes after their first use; the others are read anew each
-        time.
+    Args:
+        path: the folder, or ``transforms.json`` itself.
+        downscale: whole factor of the images' sides, 1 to 64. ``images_2/``, ``images_4/`` and so on are used
+            where they exist; else each pixel is the mean of those that it covers.
+        test_every: views 0, n, 2n ... by name are held out, unless the data set has a split of its own; 0:
+            none.
+        background: RGB in [0, 1] over which ``View.image`` shows images with alpha. ``ViewImage.over`` takes
+            another.
+        cache_bytes: images are kept up to this many bytes after their first use; the others are read anew
+            each time.
 
-    Raises
-    ------
-    FileFormatError: a folder of no known layout, a broken file in it, a picture whose shape does not fit its
-        camera, a path that leaves the folder; no picture is there at all.
-    FileNotFoundError: nothing at ``path``.
-    ValueError: an option out of its range.
+    Raises:
+        FileFormatError: a folder of no known layout, a broken file in it, an image whose shape does not fit
+            its camera, a path that leaves the folder, or a folder without any image.
+        FileNotFoundError: nothing at ``path``.
+        ValueError: an option out of its range.
 
-    Warns with a DataWarning if some pictures or masks are missing: their views are left out, or count wholly.
+    Warns with a DataWarning if images or masks are missing: views without an image are left out, all pixels
+    of those without a mask count.
     """
     for option, value, least, most in (("downscale", downscale, 1, 64), ("test_every", test_every, 0, 10**9)):
         if int(value) != value or not least <= value <= most:

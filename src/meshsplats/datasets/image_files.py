@@ -21,7 +21,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", "
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""
 MAX_NAME = 1000
 MAX_STRETCH = 0.02
-"""How much width and height may be scaled differently before a picture is not the one the camera took."""
+"""Largest difference between the scales of width and height at which an image still fits its camera."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Frame:
     name: str
     """Name of the view."""
     file: str
-    """Path of the picture in the folder, as written there."""
+    """Path of the image in the folder, as written there."""
     lens: Lens | None
-    """None if neither the file nor the picture, which is missing, tells its size."""
+    """None if the file does not give a size and the image is missing."""
     world_to_camera: np.ndarray
     mask: str | None = None
     """Path of its mask in the folder; None: looked for in ``masks/``."""
@@ -62,7 +62,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
 
 def find(folder: Path, name: str, where: str, *, other_suffix: bool = False) -> Path | None:
     """The file ``name`` in ``folder``, or None. A name without one of the known suffixes may lack it;
-    ``other_suffix`` admits the same picture in another format."""
+    ``other_suffix`` admits the same image in another format."""
     path = inside(folder, name, where)
     if path.is_file():
         return path
@@ -85,18 +85,18 @@ class PhotoFile:
     """As the data set has it."""
     path: Path
     lens: Lens
-    """The lens before the picture at the size it is used in."""
+    """The lens before the image at the size it is used in."""
     pinhole: Pinhole
     mask: Path | None
     has_alpha: bool
     store: ImageCache = field(repr=False)
 
     def load(self) -> ViewImage:
-        picture = self.store.find(self)
-        if picture is None:
-            picture = self._read()
-            self.store.keep(self, picture)
-        return picture
+        image = self.store.find(self)
+        if image is None:
+            image = self._read()
+            self.store.keep(self, image)
+        return image
 
     @property
     def nbytes(self) -> int:
@@ -104,7 +104,8 @@ class PhotoFile:
         return ((8 if self.has_alpha else 3) + masked) * self.pinhole.width * self.pinhole.height
 
     def _read(self) -> ViewImage:
-        color, alpha = load_image(self.path)
+        pixels = load_image(self.path)
+        color, alpha = pixels[..., :3], pixels[..., 3] if pixels.shape[2] == 4 else None
         size = (self.lens.width, self.lens.height)
         if alpha is None:
             color = _resized(color, size)
@@ -132,10 +133,10 @@ class PhotoFile:
         """(h, w) bool. A pixel counts if the mask is light (128 of 255 or more), and opaque where it has
         alpha, all over it."""
         assert self.mask is not None
-        color, alpha = load_image(self.mask)
-        light = color.max(axis=2)
-        if alpha is not None:
-            light = np.minimum(light, alpha)
+        pixels = load_image(self.mask)
+        light = pixels[..., :3].max(axis=2)
+        if pixels.shape[2] == 4:
+            light = np.minimum(light, pixels[..., 3])
         return _resized((light >= 128).astype(np.float32), size) >= WHOLE
 
 
@@ -150,7 +151,7 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 Taken = list[tuple[Camera, PhotoFile]]
-"""What was made of one photograph: one view, or the six of a panorama."""
+"""The views made from one photograph: one, or the six of a panorama."""
 
 
 @dataclass
@@ -165,13 +166,13 @@ class Album:
     no_mask: list[str] = field(default_factory=list)
 
     def views(self, frames: Iterable[Frame], where: str) -> list[Taken]:
-        """Cameras and photographs of each frame whose picture is there, in order."""
+        """Cameras and photographs of each frame whose image is there, in order."""
         result: list[Taken] = []
         masks = (self.folder / "masks").is_dir()
         for frame in frames:
-            told = f"{where}: picture {frame.name[:60]!r}"
-            full = find(self.folder, frame.file, told)
-            small = self._smaller(frame.file, told)
+            label = f"{where}: image {frame.name[:60]!r}"
+            full = find(self.folder, frame.file, label)
+            small = self._smaller(frame.file, label)
             if frame.lens is None or (full is None and small is None):
                 self.missing.append(frame.file)
                 continue
@@ -182,14 +183,14 @@ class Album:
             width, height = header.width, header.height
             if small is None:
                 width, height = (max(1, round(side / self.downscale)) for side in (width, height))
-            mask = self._mask(frame, told, masks)
+            mask = self._mask(frame, label, masks)
             if mask is not None:
                 _check_shape(frame.lens, read_header(mask), mask)
             lens = frame.lens.scaled(width, height)
             taken = []
             for pinhole in pinholes(lens):
                 source = PhotoFile(frame.name, path, lens, pinhole, mask, header.has_alpha, self.store)
-                taken.append((_camera(frame, pinhole, told), source))
+                taken.append((_camera(frame, pinhole, label), source))
             result.append(taken)
         return result
 
@@ -204,8 +205,8 @@ class Album:
                 found = find(self.folder, str(beside.joinpath(*parts[i + 1 :])), where, other_suffix=True)
                 if found is None:
                     raise FileFormatError(
-                        f"{where}: {str(beside)!r} has no such picture; complete that folder, or remove it:"
-                        f" pictures are then made smaller here"
+                        f"{where}: {str(beside)!r} has no such image; complete that folder, or remove it:"
+                        f" images are then made smaller here"
                     )
                 return found
         return None
@@ -232,11 +233,11 @@ class Album:
     def report(self, where: str, found: int) -> None:
         """Warns of what is missing; FileFormatError if nothing is left."""
         if not found:
-            what = "names no pictures" if not self.missing else f"none of its pictures is there{self._hint()}"
+            what = "names no images" if not self.missing else f"none of its images is there{self._hint()}"
             raise FileFormatError(f"{where}: {what}")
         for names, text in (
-            (self.missing, "pictures are missing; their views are left out"),
-            (self.no_mask, "pictures have no mask and count wholly"),
+            (self.missing, "images are missing; their views are left out"),
+            (self.no_mask, "images have no mask and count wholly"),
         ):
             if names:
                 shown = ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
@@ -264,13 +265,13 @@ def _camera(frame: Frame, pinhole: Pinhole, where: str) -> Camera:
 
 
 def _check_shape(lens: Lens, header: Header, path: Path) -> None:
-    """FileFormatError unless the picture is the camera's, but for its scale and a pixel of rounding."""
+    """FileFormatError unless the image is the camera's, but for its scale and a pixel of rounding."""
     width, height = header.width, header.height
     stretch = (width / lens.width) / (height / lens.height)
     if abs(stretch - 1) > MAX_STRETCH + 1 / min(width, height):
         turned = ""
         if abs(stretch / (width / height) ** 2 - 1) < 0.05:
-            turned = ". It is turned: cameras belong to pictures as they are stored, before any rotation"
+            turned = ". It is turned: cameras belong to images as they are stored, before any rotation"
         raise FileFormatError(
             f"{path}: {width} x {height} pixels do not fit its camera, which took {lens.width} x"
             f" {lens.height}{turned}"

@@ -1,8 +1,8 @@
-"""Lenses: the camera models of COLMAP, and pictures taken through them as a pinhole would have taken them.
+"""Lenses: the camera models of COLMAP, and undistortion of their images to those of a pinhole.
 
-A ray that leaves the camera at (u, v, 1), OpenCV axes, meets the picture at ``(fx * u' + cx, fy * v' + cy)``
+A ray that leaves the camera at (u, v, 1), OpenCV axes, meets the image at ``(fx * u' + cx, fy * v' + cy)``
 pixels. The models differ in how (u', v') follows from (u, v); every one has a closed form in that direction,
-which is the one needed here: each pixel of the pinhole picture looks up where its ray met the photograph.
+as needed here: each pixel of the pinhole image is looked up where its ray meets the photograph.
 Formulas: the camera models of COLMAP 4.2 (src/colmap/sensor/models.h) and the papers named there.
 """
 
@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 
 ROWS_BYTES = 4 << 20
-"""Pictures are undistorted in strips of rows, so that each array of a strip takes at most about this much."""
+"""Images are undistorted in strips of rows, so that each array of a strip takes at most about this much."""
 WHOLE = 0.999
 """A pixel between others counts only if all of those it mixes count, but for rounding."""
 
@@ -24,7 +24,7 @@ Point = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Lens:
-    """How a camera maps rays to its picture."""
+    """How a camera maps rays to its image."""
 
     model: str
     """Name of a camera model as COLMAP has it, a key of ``MODELS``."""
@@ -37,7 +37,7 @@ class Lens:
     width: int
     height: int
     coefficients: tuple[float, ...] = ()
-    """What the model has beside focal lengths and principal point, in COLMAP's order."""
+    """Parameters of the model besides focal lengths and principal point, in COLMAP's order."""
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -69,26 +69,26 @@ class Lens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether straight lines are straight on the picture, so that it can be taken as it is."""
+        """Whether straight lines are straight in the image, so that no undistortion is needed."""
         if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
             return True
         straight_at_zero = MODELS[self.model].straight_at_zero
         return straight_at_zero and not any(self.coefficients)
 
     def scaled(self, width: int, height: int) -> Lens:
-        """The same lens before a picture of another size; each axis is scaled by itself."""
+        """The same lens for an image of another size; each axis is scaled separately."""
         x, y = width / self.width, height / self.height
         fx, fy = (self.fx, self.fy) if self.model == "EQUIRECTANGULAR" else (self.fx * x, self.fy * y)
         return Lens(self.model, fx, fy, self.cx * x, self.cy * y, width, height, self.coefficients)
 
     def distort(self, u: np.ndarray, v: np.ndarray) -> Point:
-        """(u', v') of rays (u, v, 1), any shape, float64; NaN or infinite where no picture point belongs to a
+        """(u', v') of rays (u, v, 1), any shape, float64; NaN or infinite where no image point belongs to a
         ray."""
         with np.errstate(all="ignore"):
             return MODELS[self.model].distort(u, v, self.coefficients)
 
     def pixels(self, rays: np.ndarray) -> np.ndarray:
-        """(..., 2) picture points in pixels of rays (..., 3), which need no particular length.
+        """(..., 2) image points in pixels of rays (..., 3), which need no particular length.
 
         Rays with z <= 0 have none and give NaN, except with EQUIRECTANGULAR. So have rays beyond
         ``reach``, where the polynomials of a model have turned back.
@@ -108,7 +108,7 @@ class Lens:
         return points
 
     def reach(self) -> float:
-        """Largest sqrt(u^2 + v^2) up to which picture points move outwards with it, in all directions.
+        """Largest sqrt(u^2 + v^2) up to which image points move outwards with it, in all directions.
 
         The polynomials fit within the photograph only; farther out many of them turn back, and rays from
         far outside would land on the photograph once more.
@@ -271,12 +271,12 @@ MODELS: dict[str, _Model] = {
 """Camera models in the order of COLMAP's numbers, 0 to 17."""
 
 
-# ---- Pinhole pictures from what a lens shows
+# ---- Undistortion to pinhole images
 
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """A pinhole picture that can be made from a picture taken through a lens."""
+    """A pinhole image that the image of a lens is undistorted to."""
 
     rotation: np.ndarray
     """(3, 3) from the lens's frame to that of the pinhole, OpenCV axes."""
@@ -287,11 +287,11 @@ class Pinhole:
     width: int
     height: int
     suffix: str = ""
-    """What tells several pinholes of one lens apart."""
+    """Distinguishes several pinholes of one lens."""
 
 
 def pinholes(lens: Lens) -> list[Pinhole]:
-    """The pinhole pictures made of one picture: one with the lens's own focal lengths, principal point and
+    """The pinhole images made of one image: one with the lens's own focal lengths, principal point and
     size; of an equirectangular panorama the six sides of a cube, a quarter of its width each."""
     if lens.model != "EQUIRECTANGULAR":
         return [Pinhole(np.eye(3), lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height)]
@@ -307,17 +307,17 @@ def pinholes(lens: Lens) -> list[Pinhole]:
     return sides
 
 
-def undistort(picture: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.ndarray, np.ndarray]:
-    """What the pinhole would have seen, from ``picture`` (lens.height, lens.width, c), uint8 or float32.
+def undistort(image: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.ndarray, np.ndarray]:
+    """The image of the pinhole, from ``image`` (lens.height, lens.width, c), uint8 or float32.
 
     Values between pixels are bilinear. Returns (h, w, c) of the same type, 0 where the lens saw nothing, and
-    (h, w) bool that is True where all four pixels around lie on the picture.
+    (h, w) bool that is True where all four pixels around lie in the image.
     """
-    h, w, channels = picture.shape
-    result = np.zeros((pinhole.height, pinhole.width, channels), picture.dtype)
+    h, w, channels = image.shape
+    result = np.zeros((pinhole.height, pinhole.width, channels), image.dtype)
     seen = np.zeros((pinhole.height, pinhole.width), bool)
     wraps = lens.model == "EQUIRECTANGULAR"
-    flat = picture.reshape(h * w, channels)
+    flat = image.reshape(h * w, channels)
     for rows, points in _strips(lens, pinhole):
         x, y = points[..., 0] - 0.5, points[..., 1] - 0.5  # pixel centres are at halves
         slack = 1e-6
@@ -342,7 +342,7 @@ def undistort(picture: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.nda
         mixed = np.zeros((*x.shape, channels), np.float32)
         for places, weights in corners:
             mixed += np.take(flat, places, axis=0) * weights[..., None]
-        if picture.dtype == np.uint8:
+        if image.dtype == np.uint8:
             mixed = np.rint(mixed)
         mixed[~valid] = 0
         result[rows] = mixed
@@ -351,7 +351,7 @@ def undistort(picture: np.ndarray, lens: Lens, pinhole: Pinhole) -> tuple[np.nda
 
 
 def _strips(lens: Lens, pinhole: Pinhole) -> Iterator[tuple[slice, np.ndarray]]:
-    """Rows of the pinhole picture, and the points (rows, w, 2) where their rays meet the lens's picture."""
+    """Rows of the pinhole image, and the points (rows, w, 2) where their rays meet the lens's image."""
     across = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
     down = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
     step = max(1, ROWS_BYTES // (24 * pinhole.width))

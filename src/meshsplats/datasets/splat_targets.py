@@ -1,4 +1,4 @@
-"""Data sets without photographs: cameras placed round a scene, or inside it, that see its splats."""
+"""Data sets without photographs: images of splats from cameras placed around a scene, or inside it."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ Placement = Literal["auto", "object", "surrounded", "inside"]
 
 STEPS = (1.324717957244746**-1, 1.324717957244746**-2, 2**0.5 - 1)
 """Steps of Kronecker's sequence for azimuth, height and distance: its points modulo 1 fill the unit cube
-evenly wherever one begins and however many are taken. The first two are powers of the plastic number's
-inverse, which are the most even pair known: directions matter most."""
+evenly in every run of successive points. The first two are powers of the inverse of the plastic number, the
+most even pair known: directions matter most."""
 OBJECT_ELEVATIONS = (0.0, 60.0)
 SURROUNDED_ELEVATIONS = (3.0, 60.0)
-"""Degrees above the horizon, where people look from. Few captures have anything to show from below, and flat
-ground seen from the side is so hard to match that such views spoil the others."""
+"""Degrees above the horizon. Few captures show anything from below, and flat ground seen from the side is so
+hard to match that such views make the others worse."""
 INSIDE_ELEVATIONS = (-35.0, 35.0)
 DISTANCES = (0.9, 1.1)
-"""Multiples of the distance from which the subject just fits. A mesh is not filtered as splats are, so it
-cannot be right at every size: the wider this range, the less so at each."""
+"""Multiples of the distance at which the subject just fits. Without the filter of splats, a mesh cannot be
+right at every size: the wider this range, the larger the error at each."""
 SURROUNDINGS_SHARE = 0.01
-"""More of the opacity than this beyond the subject, and it stands in surroundings."""
+"""A subject has surroundings if more than this share of the opacity lies beyond it."""
 STANDS = 12
-"""Most places from which a scene is seen from inside."""
+"""Largest number of places for cameras inside a scene."""
 HELD_OUT = 8
-"""Views that are held out at the least, asked for or not: a mesh can be measured on them later
-without knowing what it was trained on."""
+"""Least number of views that are never trained on, used or not: a mesh can be evaluated on them later,
+however it was trained."""
 ZOOMS = {"area": (1,), "splats": (1, 1, 2, 4)}
-"""Training views of each look, in turn: the whole image, or as large a window of one so many times as large.
-A splat viewer's filter is another in every size of image, and a mesh that is drawn with it has to learn what
-lies under it. Means over areas hold for all sizes at once."""
+"""Zooms of the training views of each look, in turn: 1 is the whole image; 2 is a window of the same size of
+an image twice as large. The filter of splat viewers has another width in the scene at every image size, and
+a mesh that is drawn with it has to learn the unfiltered shape. Means over areas hold for all sizes."""
 TRAINING_SAMPLES = 2
-"""Side of the grid of samples in the pixels of images to learn from, for the look 'area'."""
+"""Side of the grid of samples in each pixel of training views, for the look 'area'."""
 CANDIDATES = 512
-"""Points tried as such a place."""
+"""Number of points that are tried as such places."""
 ROOMY = 0.4
-"""Least clearance of a place, as a share of the best one's."""
+"""Least clearance of a place as a share of the largest one."""
 
 
 def splat_dataset(
@@ -76,35 +76,34 @@ def splat_dataset(
     threads: int | None = None,
     cache_bytes: int = CACHE_BYTES,
 ) -> Dataset:
-    """A data set made of splats alone: their images from cameras placed round them.
+    """A data set made of splats alone: their images from cameras placed around them.
 
-    Parameters
-    ----------
-    placement: 'object': cameras on all sides, from the horizon up. 'surrounded': an object in its
-        surroundings, as of a walk round it; cameras a little above the ground. 'inside': cameras that stand
-        where it is free between the splats and look outwards, for rooms and other scenes taken from inside.
-        'auto': 'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object'.
-        'inside' must be asked for: splats do not tell a room from a hollow thing.
-    cameras: where the scene was trained from, as in a model folder's cameras.json. They are used in place of
-        a placement: as many as are asked for, spread over all, those held out (at most every eighth)
-        between the others, scaled to ``width``. ``height``, ``fov``, ``distance`` and ``up`` then have no
-        part.
-    train, test: numbers of views. Those held out are the first of a sequence with which the others go on, so
-        both are spread evenly, none lies on another, and the first ``HELD_OUT`` are never trained on,
-        however many views are.
-    width, height: size in pixels; height: as width.
-    fov: degrees that the shorter side spans; 50, or 75 inside.
-    distance: nearest and farthest camera of 'object' and 'surrounded', as multiples of the distance from
-        which the sphere just fits the picture that holds 90 % of the splats' opacity (or all of the subject,
-        if it is smaller than that).
-    up: (3,) direction; None: ``framing.guess_up``.
-    look: what the images are. 'area': means over each pixel's area, right for every program that takes
-        several samples a pixel. 'splats': what a 3DGS viewer shows.
-    zooms: training views in turn are the whole image (1), or as large a window of one so many times as
-        large. None: ``ZOOMS`` of the look.
-    samples: side of the grid of samples in each pixel. None: for 'area', ``TRAINING_SAMPLES`` in training
-        views, which are quick to draw, and the exact mean in test views; else 1.
-    sh_degree, background, threads, cache_bytes: as in ``dataset.splat_views``.
+    Args:
+        cloud: the splats.
+        placement: 'object': cameras on all sides, from the horizon up. 'surrounded': an object in its
+            surroundings, seen from all around; cameras a little above the ground. 'inside': cameras in free
+            places between the splats that look outwards, for rooms and other scenes captured from inside.
+            'auto': 'surrounded' if more than 1 % of the opacity lies far beyond the subject, else 'object';
+            never 'inside', as splats of a room and of a hollow object look alike.
+        cameras: cameras that the scene was trained from, as in the cameras.json of a model folder, instead of
+            a placement. ``train`` and ``test`` of them are used (at most every eighth for testing), evenly
+            spread and scaled to ``width``; ``height``, ``fov``, ``distance`` and ``up`` have no effect.
+        train, test: numbers of views. Held-out views are the first of a sequence that the training views
+            continue, so both are evenly spread and none coincide; the first ``HELD_OUT`` are never trained
+            on, for any number of views.
+        width, height: size in pixels; ``height`` None: as ``width``.
+        fov: degrees that the shorter side spans; None: 50, or 75 inside.
+        distance: nearest and farthest camera of 'object' and 'surrounded', as multiples of the distance at
+            which the sphere with 90 % of the splats' opacity (or the whole subject, if that is smaller) just
+            fits into the image.
+        up: (3,) direction; None: ``framing.guess_up``.
+        look: 'area': means over each pixel's area, for programs that take several samples a pixel. 'splats':
+            as a 3DGS viewer shows them.
+        zooms: zooms of the training views, in turn: 1 is the whole image, 2 a window of the same size of an
+            image twice as large. None: ``ZOOMS`` of the look.
+        samples: side of the grid of samples in each pixel. None: for 'area', ``TRAINING_SAMPLES`` in training
+            views, which is faster, and the exact mean in test views; else 1.
+        sh_degree, background, threads, cache_bytes: as in ``splat_views``.
 
     Raises ValueError for an empty cloud or an option out of its range.
     """
@@ -184,14 +183,14 @@ def outside_cameras(
     height: int = 400,
     fov: float = 50.0,
 ) -> list[Camera]:
-    """``count`` cameras that look at the subject's middle, spread evenly over directions and distances.
+    """``count`` cameras that look at the subject's middle, evenly spread over directions and distances.
 
     Directions are even on the sphere between two ``elevations`` (degrees), distances on a logarithmic scale.
-    Each run of these cameras is even by itself. The rest is as in ``splat_dataset``.
+    Every run of successive cameras is evenly spread, too. The other arguments are those of ``splat_dataset``.
     """
     axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
     bounds = scene_bounds(cloud)  # refuses an empty cloud
-    # Surroundings may hold most of the opacity; then it is the subject alone that has to fit.
+    # Surroundings may have most of the opacity; then only the subject has to fit.
     reach = float(np.linalg.norm(bounds.points - bounds.center, axis=1).max(initial=0))
     fit = (min(bounds.radius, reach) or bounds.radius) / np.sin(np.radians(fov / 2))
     turns, heights, share = _sequence(count)
@@ -218,7 +217,7 @@ def _sequence(count: int) -> np.ndarray:
 
 
 def _towards(axes: np.ndarray, turn: float, height: float) -> np.ndarray:
-    """(3,) unit direction ``turn`` radians round the up axis; ``height``: the sine of its elevation."""
+    """(3,) unit direction ``turn`` radians around the up axis; ``height``: the sine of its elevation."""
     right, upward, forward = axes
     level = np.sqrt(1 - height * height)
     return level * (np.sin(turn) * right + np.cos(turn) * forward) + height * upward
@@ -236,7 +235,7 @@ def inside_cameras(
     """``count`` cameras inside the scene that look outwards, in all directions near the horizon.
 
     They stand in up to ``STANDS`` places, far from each other, in the middle parts of the scene where the
-    nearest splat is farthest away; each place looks all round.
+    nearest splat is farthest away; the cameras in each place look in all directions.
     """
     axes = front_axes(guess_up(cloud) if up is None else unit_up(up))
     places, clearances = _free_places(cloud, axes, max(1, min(STANDS, count // 6)))
@@ -315,7 +314,7 @@ def _window(camera: Camera, zoom: int, number: int) -> Camera:
 
 def _given(cameras: Sequence[Camera], train: int, test: int, width: int) -> tuple[list[Camera], int]:
     """Up to ``test`` of the cameras, at most every eighth, spread over them, then up to ``train`` of the
-    others; with pictures ``width`` pixels wide. And the number of the first of those."""
+    others; with images ``width`` pixels wide. And the number of the first of those."""
     if len(cameras) < 1:
         raise ValueError("cameras is empty; leave it out to have cameras placed")
     held = _spread(len(cameras), min(test, -(-len(cameras) // 8) if len(cameras) > 1 else 0))
@@ -325,7 +324,7 @@ def _given(cameras: Sequence[Camera], train: int, test: int, width: int) -> tupl
 
 
 def _spread(count: int, some: int) -> list[int]:
-    """``some`` of the numbers below ``count``, evenly spread."""
+    """``some`` indices below ``count``, evenly spread."""
     return [int((i + 0.5) * count / some) for i in range(some)]
 
 
@@ -340,11 +339,11 @@ def splat_views(
     threads: int | None = None,
     cache_bytes: int = CACHE_BYTES,
 ) -> tuple[View, ...]:
-    """Views of the splats themselves: targets where there are no photographs.
+    """Views whose images are rendered from the splats: targets where there are no photographs.
 
     ``look``, ``sh_degree``, ``samples`` and ``threads`` are those of ``rendering.looks.draw_splats``. Images
-    have alpha, so any background can be put behind them; ``background`` is that of ``View.image``. They are
-    drawn when first asked for and kept in float16, 8 bytes a pixel, as in ``load_dataset``.
+    have alpha, so that they can be laid over any background; ``background`` is that of ``View.image``. They
+    are rendered at first use and kept in float16, 8 bytes a pixel, as in ``load_dataset``.
     """
     check_look(look)
     red, green, blue = map(float, background)
@@ -361,7 +360,7 @@ def splat_views(
 
 @dataclass(frozen=True, eq=False)
 class RenderedSplats:
-    """A picture of splats, drawn when it is asked for."""
+    """An image of splats, rendered on demand."""
 
     cloud: GaussianCloud
     camera: Camera
@@ -375,13 +374,12 @@ class RenderedSplats:
         return self._drawn(self.samples)
 
     def points(self) -> ViewImage:
-        """The values at the pixels' centres alone, of which the mean over their areas is made (look
-        'area')."""
+        """The values at the pixels' centres, without the mean over their areas of the look 'area'."""
         return self._drawn(1)
 
     def _drawn(self, samples: int | None) -> ViewImage:
-        picture = self.store.find((self, samples))
-        if picture is None:
+        image = self.store.find((self, samples))
+        if image is None:
             drawn = draw_splats(
                 self.cloud,
                 self.camera,
@@ -391,11 +389,11 @@ class RenderedSplats:
                 sh_degree=self.sh_degree,
                 threads=self.threads,
             )
-            # Beyond float16 lies only what no display can show.
+            # Values beyond float16 are far brighter than any display.
             color = np.clip(drawn.color, 0, 60_000).astype(np.float16)
-            picture = ViewImage(color, drawn.alpha.astype(np.float16))
-            self.store.keep((self, samples), picture)
-        return picture
+            image = ViewImage(color, drawn.alpha.astype(np.float16))
+            self.store.keep((self, samples), image)
+        return image
 
     @property
     def nbytes(self) -> int:

@@ -40,8 +40,8 @@ class Transforms:
 
 
 def read_transforms(path: Path) -> Transforms:
-    """The frames of ``path``. Where sizes are not in the file they are read from the pictures beside it; a
-    frame whose picture is missing then has no lens.
+    """The frames of ``path``. Where sizes are not in the file they are read from the images beside it; a
+    frame whose image is missing then has no lens.
 
     Raises FileFormatError, which names the frame and the field, for what is broken.
     """

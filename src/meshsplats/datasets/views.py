@@ -1,4 +1,4 @@
-"""Dataset: cameras with the pictures they took, for training and for testing; read from folders, or drawn
+"""Dataset: cameras with their images, for training and for testing; read from folders, or rendered
 from splats."""
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from meshsplats.camera import Camera
 from meshsplats.rendering.looks import Look
 
 CACHE_BYTES = 2 << 30
-"""Pictures of a data set kept in memory after their first use, in bytes, where nothing else is asked for."""
+"""Default limit on the images of a data set that are kept in memory after their first use, bytes."""
 WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class ViewImage:
-    """What a camera saw. Values are display-referred (sRGB-encoded), rows run from top to bottom."""
+    """The image of one view. Values are display-referred (sRGB-encoded), rows run from top to bottom."""
 
     color: np.ndarray
     """(h, w, 3) RGB as it is on black, so times alpha where there is one: uint8 (255 is 1), or float16 or
@@ -28,7 +28,7 @@ class ViewImage:
     alpha: np.ndarray | None = None
     """(h, w) opacity, of the same type; None: opaque, as photographs are."""
     mask: np.ndarray | None = None
-    """(h, w) bool, True where the picture counts; None: everywhere."""
+    """(h, w) bool, True where pixels count; None: all of them."""
 
     def __post_init__(self) -> None:
         shape = self.color.shape
@@ -60,48 +60,46 @@ class ViewImage:
 
 
 class ImageSource(Protocol):
-    """Something a picture can be had from when it is asked for."""
+    """Loads an image on demand."""
 
     def load(self) -> ViewImage: ...
 
     @property
     def nbytes(self) -> int:
-        """Memory the picture takes once loaded, in bytes, known before it is."""
+        """Memory of the loaded image in bytes, known in advance."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and what it saw. Pictures are read or drawn when they are first asked for."""
+    """A camera and its image, which is read or rendered at first use."""
 
     camera: Camera
-    """Pinhole of the picture's size; photographs of other lenses are undistorted to it."""
+    """Pinhole camera of the image's size; photographs of other lenses are undistorted to it."""
     source: ViewImage | ImageSource
     background: tuple[float, float, float] = WHITE
-    """RGB in [0, 1] behind pictures with alpha in ``image``."""
+    """RGB in [0, 1] over which ``image`` shows images with alpha."""
 
     def __repr__(self) -> str:
         return f"View({self.name!r}, {self.camera.width} x {self.camera.height})"
 
     @property
     def name(self) -> str:
-        """The picture's name, relative to the data set."""
+        """The image's name, relative to the data set."""
         return self.camera.name
 
     def load(self) -> ViewImage:
         """The image as stored: read or rendered now, or from the cache. ValueError if its size is not
         the camera's."""
-        picture = self.source if isinstance(self.source, ViewImage) else self.source.load()
+        image = self.source if isinstance(self.source, ViewImage) else self.source.load()
         size = (self.camera.height, self.camera.width)
-        if picture.color.shape[:2] != size:
-            raise ValueError(
-                f"view {self.name!r}: its picture has shape {picture.color.shape[:2]}, not {size}"
-            )
-        return picture
+        if image.color.shape[:2] != size:
+            raise ValueError(f"view {self.name!r}: its image has shape {image.color.shape[:2]}, not {size}")
+        return image
 
     @property
     def image(self) -> np.ndarray:
-        """(h, w, 3) float32 RGB in [0, 1], over ``background`` where the picture has alpha."""
+        """(h, w, 3) float32 RGB in [0, 1], over ``background`` where the image has alpha."""
         return self.load().over(self.background)
 
     @property
@@ -112,21 +110,22 @@ class View:
 
     @property
     def mask(self) -> np.ndarray | None:
-        """(h, w) bool, True where the picture counts; None: everywhere. Photographs do not count outside
-        their masks, and beyond the borders that undistortion leaves black."""
+        """(h, w) bool, True where pixels count; None: all of them.
+
+        Pixels of photographs do not count outside the masks, and where undistortion leaves borders black.
+        """
         return self.load().mask
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Views to train with and views held out for testing, each sorted by name unless drawn from splats."""
+    """Training views and held-out views, each sorted by name unless rendered from splats."""
 
     train: tuple[View, ...]
     test: tuple[View, ...] = ()
     name: str = ""
     look: Look = "area"
-    """What the images are the truth of (``rendering.looks``); photographs are means over each pixel's
-    area."""
+    """Look of the images (``rendering.looks``); photographs are means over each pixel's area."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "train", tuple(self.train))
@@ -134,10 +133,10 @@ class Dataset:
 
     def __repr__(self) -> str:
         sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
-        told = [f"{width} x {height}" for width, height in sizes[:3]] + ["..."] * (len(sizes) > 3)
+        shapes = [f"{width} x {height}" for width, height in sizes[:3]] + ["..."] * (len(sizes) > 3)
         name = [repr(self.name)] if self.name else []
         counts = [f"{len(self.train)} views to train with", f"{len(self.test)} held out"]
-        return f"Dataset({', '.join([*name, *counts, *told])})"
+        return f"Dataset({', '.join([*name, *counts, *shapes])})"
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -145,12 +144,12 @@ class Dataset:
 
     @property
     def memory(self) -> int:
-        """Bytes that all pictures take together once loaded (of which only so many are kept as
-        ``cache_bytes`` says): 3 a pixel for photographs, 8 with alpha, 1 more with masks or undistorted."""
+        """Bytes of all images together once loaded, of which at most ``cache_bytes`` are kept: 3 a pixel for
+        photographs, 8 with alpha, 1 more with masks or undistorted."""
         return sum(view.source.nbytes for view in self.views)
 
     def over(self, background: Sequence[float]) -> Dataset:
-        """The same views with another ``background`` behind pictures with alpha."""
+        """The same views with another ``background`` for images with alpha."""
         red, green, blue = map(float, background)
 
         def changed(views: tuple[View, ...]) -> tuple[View, ...]:
@@ -160,10 +159,10 @@ class Dataset:
 
 
 class ImageCache:
-    """Pictures that are kept, up to a number of bytes; those that come later are not.
+    """Keeps images up to a number of bytes, first come, first served.
 
-    Nothing is put out again: training goes through all views over and over, and a store that puts out the
-    oldest would then never have the one asked for.
+    Nothing is ever evicted: training cycles through all views, and evicting the oldest image would then
+    always evict the one that is needed next.
     """
 
     def __init__(self, limit: int) -> None:
@@ -176,11 +175,11 @@ class ImageCache:
     def find(self, key: object) -> ViewImage | None:
         return self._kept.get(key)
 
-    def keep(self, key: object, picture: ViewImage) -> None:
+    def keep(self, key: object, image: ViewImage) -> None:
         with self._lock:
-            if key not in self._kept and picture.nbytes <= self._left:
-                self._left -= picture.nbytes
-                self._kept[key] = picture
+            if key not in self._kept and image.nbytes <= self._left:
+                self._left -= image.nbytes
+                self._kept[key] = image
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

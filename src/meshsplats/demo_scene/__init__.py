@@ -1,9 +1,9 @@
-"""A small still life made of splats, to try everything on: no download, no training, the same everywhere.
+"""A small still life made of splats, for demos and tests: no download, no training, the same everywhere.
 
 A glazed vase with ferns and flowers, a striped ball and two oranges on a chequered table. Splats lie on the
 surfaces as training would put them: flat, and stretched along the pattern. Light is baked in (a key light
 with soft shadows, sky light with ambient occlusion); gloss is stored in spherical harmonics of degree 3, so
-the picture changes with the view. The y axis points down, as in files trained from COLMAP cameras; the
+the image changes with the view. The y axis points down, as in files trained from COLMAP cameras; the
 table top is the plane y = 0 and the vase is 1.07 units tall.
 
 ``python -m meshsplats.demo_scene scene.ply`` writes it as a splat file.
@@ -24,7 +24,7 @@ GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
 UP = np.array([0.0, -1.0, 0.0])
 Skin = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
-# Share of each part in the number of splats; the table takes what is left.
+# Share of each part in the count of splats; the table takes the rest.
 SHARES = {"vase": 0.22, "ball": 0.13, "orange": 0.045, "leaves": 0.17, "flowers": 0.08}
 
 VASE_FOOT = np.array([-0.10, 0.0, 0.15])
@@ -83,7 +83,7 @@ def make_scene(count: int = 20_000, seed: int = 0) -> GaussianCloud:
 
 
 def _vase(n: int, rng: np.random.Generator) -> Patch:
-    """A surface of revolution: equal areas along the profile, golden angle round the axis."""
+    """A surface of revolution: equal areas along the profile, golden angle around the axis."""
     radius, height = _smooth_curve(np.array(VASE_PROFILE), 400).T
     step = np.hypot(np.diff(radius), np.diff(height))
     area = np.concatenate([[0], np.cumsum(step * (radius[1:] + radius[:-1]) * np.pi)])
@@ -95,10 +95,10 @@ def _vase(n: int, rng: np.random.Generator) -> Patch:
     angle = np.arange(n) * GOLDEN_ANGLE
     c, s = np.cos(angle), np.sin(angle)
     normals = np.stack([slope_h * c, slope_r, slope_h * s], axis=1) / length[:, None]
-    along = np.stack([-s, np.zeros(n), c], axis=1)  # round the axis: the bands of the glaze run this way
+    along = np.stack([-s, np.zeros(n), c], axis=1)  # around the axis: the bands of the glaze run this way
     spacing = np.sqrt(area[-1] / n)
     sigmas = np.tile(spacing * np.array([0.68, 0.54, 0.05]), (n, 1))
-    sigmas[:, 0] = np.minimum(sigmas[:, 0], 0.4 * r)  # flat splats cannot go round a narrow neck
+    sigmas[:, 0] = np.minimum(sigmas[:, 0], 0.4 * r)  # flat splats cannot bend around a narrow neck
     inside = at > np.interp(np.argmax(height), np.arange(len(area)), area)
 
     glaze = mix(np.array([0.004, 0.022, 0.13]), np.array([0.008, 0.085, 0.20]), np.clip(h, 0, 1))
@@ -238,7 +238,7 @@ def _flowers(n: int, tips: np.ndarray, rng: np.random.Generator) -> Patch:
 
 
 def _table(n: int, rng: np.random.Generator) -> Patch:
-    """A round chequered table top whose edge fades out."""
+    """A circular chequered table top whose edge fades out."""
     # A sunflower spiral, a little denser in the middle, where the objects and their shadows are.
     share = (np.arange(n) + 0.5) / n
     radius = TABLE_RADIUS * share**0.55
@@ -312,7 +312,7 @@ def _quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """``python -m meshsplats.demo_scene FILE.ply [COUNT]`` writes the scene, over a file that is there."""
+    """``python -m meshsplats.demo_scene FILE.ply [COUNT]`` writes the scene; replaces an existing file."""
     from meshsplats import save_gaussians
 
     arguments = sys.argv[1:] if arguments is None else arguments

@@ -10,7 +10,7 @@ from meshsplats.gaussians import SH_C0
 from meshsplats.spherical_harmonics import sh_basis
 
 KEY_LIGHT = np.array([-0.60, -0.70, -0.40]) / np.linalg.norm([-0.60, -0.70, -0.40])
-"""(3,) unit direction towards the key light: above, left of and before the table."""
+"""(3,) unit direction towards the key light: above, left of and in front of the table."""
 
 
 @dataclass
@@ -32,13 +32,13 @@ class Patch:
     gloss: float = 0.0
     """Height of the highlight in display RGB."""
     translucency: float = 0.0
-    """Share of the light that comes through from behind."""
+    """Share of light transmitted from the back."""
     occlusion: np.ndarray | None = None
-    """(n,) share of the sky light that arrives, beyond what the other objects take; None: all of it."""
+    """(n,) share of the sky light that arrives, apart from occlusion by other objects; None: all of it."""
 
 
 def diffuse(patch: Patch, blockers: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-    """(n, 3) display RGB of the light that leaves each splat the same way in all directions."""
+    """(n, 3) display RGB of the diffuse light that leaves each splat."""
     lit = patch.normals @ KEY_LIGHT
     through = patch.translucency
     key = (1 - through) * np.clip(lit, 0, None) + through * np.abs(lit)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.views import WHITE, Dataset, View
 from meshsplats.errors import DataWarning
@@ -101,7 +101,7 @@ def find_background(
         The background with its reason and the scores. A DataWarning names each scene that loses more than
         ``WARNING_GAIN`` dB by it.
     """
-    views = evenly(dataset.train or dataset.views, MAX_VIEWS)
+    views = subsample(dataset.train or dataset.views, MAX_VIEWS)
     chosen = given if given is not None else named
     reason: Reason = "given" if given is not None else "model folder"
     candidates = dict(CANDIDATES)

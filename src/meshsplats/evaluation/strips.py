@@ -84,10 +84,10 @@ def image_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> I
     paths = {id(camera): path for camera, path in zip(cameras, chosen, strict=True)}
 
     def at(camera: Camera, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray | None]:
-        from meshsplats.images.writing import load_png
+        from meshsplats.images.reading import load_image
 
         path = paths[id(camera)]
-        pixels = load_png(path).astype(np.float32) / 255
+        pixels = load_image(path).astype(np.float32) / 255
         if pixels.shape[:2] != (camera.height, camera.width):
             raise ValueError(
                 f"{path} has {pixels.shape[1]} x {pixels.shape[0]} pixels, the view"

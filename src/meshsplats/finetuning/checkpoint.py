@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.binding import Binding
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
@@ -25,7 +24,6 @@ from meshsplats.mesh import SplatMesh
 
 VERSION = 1
 _KEY = "meshsplats"
-_BINDING = ("base_vertices", "base_faces", "vertex_face", "weights", "layers")
 _REQUIRED = ("version", "step", "seconds", "config", "mesh", "dataset", "losses")
 
 
@@ -126,44 +124,17 @@ def check_same_run(found: Checkpoint, config: FinetuneConfig, mesh: str, dataset
 
 def mesh_arrays(mesh: SplatMesh) -> dict[str, np.ndarray]:
     """The arrays of a mesh, by their names in a checkpoint."""
-    arrays = {
-        "mesh.vertices": mesh.vertices,
-        "mesh.faces": mesh.faces,
-        "mesh.colors": mesh.colors,
-        "mesh.up": mesh.up,
-        "mesh.filter_px2": np.array(mesh.filter_px2),
-    }
-    for name in ("face_splat", "depth_group"):
-        if getattr(mesh, name) is not None:
-            arrays[f"mesh.{name}"] = getattr(mesh, name)
-    if mesh.binding is not None:
-        arrays |= {f"mesh.binding.{name}": getattr(mesh.binding, name) for name in _BINDING}
-        arrays["mesh.binding.lift"] = np.array(mesh.binding.lift)
-    return arrays | {f"mesh.attribute.{name}": value for name, value in mesh.attributes.items()}
+    arrays = mesh.arrays() | {"filter_px2": np.array(mesh.filter_px2)}
+    return {f"mesh.{name}": a for name, a in arrays.items() if name not in ("blending", "normals")}
 
 
 def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
     """The mesh in a checkpoint's arrays. FileFormatError if an array is missing or does not fit."""
-    prefix = "mesh.attribute."
+    own = {name.removeprefix("mesh."): a for name, a in arrays.items() if name.startswith("mesh.")}
     try:
-        binding = None
-        if "mesh.binding.lift" in arrays:
-            parts = {name: arrays[f"mesh.binding.{name}"] for name in _BINDING}
-            binding = Binding(**parts, lift=float(arrays["mesh.binding.lift"]))
-        return SplatMesh(
-            arrays["mesh.vertices"],
-            arrays["mesh.faces"],
-            arrays["mesh.colors"],
-            face_splat=arrays.get("mesh.face_splat"),
-            depth_group=arrays.get("mesh.depth_group"),
-            up=arrays["mesh.up"],
-            blending=blending,  # type: ignore[arg-type]
-            attributes={n[len(prefix) :]: a for n, a in arrays.items() if n.startswith(prefix)},
-            filter_px2=float(arrays.get("mesh.filter_px2", 0.0)),
-            binding=binding,
-        )
+        return SplatMesh.from_arrays(own | {"blending": np.array(blending)})
     except KeyError as error:
-        raise FileFormatError(f"the checkpoint lacks {error}") from None
+        raise FileFormatError(f"the checkpoint lacks 'mesh.{error.args[0]}'") from None
     except (ValueError, TypeError) as error:
         raise FileFormatError(f"the checkpoint's mesh is broken: {error}") from None
 
@@ -175,7 +146,7 @@ def mesh_fingerprint(mesh: SplatMesh) -> str:
         digest.update(repr(mesh.filter_px2).encode())
     arrays = [mesh.vertices, mesh.faces, mesh.colors]
     if mesh.binding is not None:
-        arrays += [getattr(mesh.binding, name) for name in _BINDING]
+        arrays += [getattr(mesh.binding, field.name) for field in mesh.binding.FIELDS]
     for array in arrays:
         digest.update(repr(array.shape).encode())
         digest.update(array.data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, get_args
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+from meshsplats._options import Range, check_choices, check_flags, check_names, check_ranges
 
 Unit = Literal["splat", "scene"]
 BackgroundMode = Literal["mixed", "random", "white", "black"]
@@ -105,24 +106,9 @@ class FinetuneConfig:
     number of threads, unless the length is given in minutes."""
 
     def __post_init__(self) -> None:
-        for name, low, high, whole in _RANGES:
-            value = getattr(self, name)
-            if value is None and name in (*LENGTHS, "samples"):
-                continue
-            number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or not low <= value <= high or (whole and int(value) != value):
-                what = "a whole number" if whole else "a number"
-                raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
-        for name, kind in [
-            ("position_unit", get_args(Unit)),
-            ("background", get_args(BackgroundMode)),
-            ("blending", ("mesh", "display", "linear")),
-        ]:
-            if getattr(self, name) not in kind:
-                raise ValueError(f"{name} must be one of {', '.join(kind)}, got {getattr(self, name)!r}")
-        for name in ("exposure", "soft_edges"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
+        check_ranges(self, _RANGES, optional=(*LENGTHS, "samples"))
+        check_choices(self, _CHOICES)
+        check_flags(self, ("exposure", "soft_edges"))
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
@@ -146,7 +132,13 @@ class FinetuneConfig:
         return asdict(self)
 
 
-_RANGES: list[tuple[str, float, float, bool]] = [
+_CHOICES = {
+    "position_unit": get_args(Unit),
+    "background": get_args(BackgroundMode),
+    "blending": ("mesh", "display", "linear"),
+}
+
+_RANGES: list[Range] = [
     ("epochs", 0, 1e6, False),
     ("steps", 0, 10**9, True),
     ("minutes", 0, 1e5, False),
@@ -223,7 +215,7 @@ class FinetuneChanges(TypedDict, total=False):
     epsilon: float
     ssim_weight: float
     l2_weight: float
-    background: Backdrop
+    background: BackgroundMode
     exposure: bool
     exposure_rate: float
     prune_epochs: float
@@ -253,11 +245,7 @@ def with_changes(config: FinetuneConfig, **changes: Unpack[FinetuneChanges]) -> 
     """``config`` with ``changes``; a length that is given takes the place of its own. Errors are those of
     ``make_config``."""
     known = [f.name for f in fields(FinetuneConfig) if f.name != "preset"]
-    for name in changes:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
-            raise TypeError(f"fine-tuning has no option {name!r}{hint}")
+    check_names("fine-tuning", changes, known)
     if any(changes.get(name) is not None for name in LENGTHS):
         whole: FinetuneChanges = {"epochs": None, "steps": None, "minutes": None}
         whole.update(changes)

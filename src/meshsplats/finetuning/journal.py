@@ -13,7 +13,7 @@ import numpy as np
 
 from meshsplats._files.atomic import write_text
 from meshsplats.finetuning.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from meshsplats.images.writing import amplified_error, save_png, strip
+from meshsplats.images.writing import amplified_error, save_image, strip
 
 CHECKPOINT, METRICS, CONFIGURATION, PREVIEWS = (
     "checkpoint.safetensors",
@@ -102,7 +102,7 @@ class Journal:
         error = amplified_error(target, image, ERROR_FACTOR)
         captions = ("truth", f"mesh, step {step}", f"error x {ERROR_FACTOR:g}")
         path = self.folder / PREVIEWS / f"step_{step:07d}.png"
-        save_png(path, strip([target, image, error], captions))
+        save_image(path, strip([target, image, error], captions))
 
     def _previews(self) -> list[Path]:
         found = (self.folder / PREVIEWS).glob("step_*.png")

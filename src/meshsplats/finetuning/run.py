@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import masked_ssim
@@ -210,7 +210,7 @@ class TrainingLoop:
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = self.save_cost = self.step_cost = 0.0
-        self.scored_views: tuple[View, ...] = evenly(dataset.test, SCORED_VIEWS)
+        self.scored_views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
         self.quarter = int(MIN_PREVIEWS * self.fraction)
 
     @property

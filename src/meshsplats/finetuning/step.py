@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats._core.kernels import compare_images
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.splat_targets import RenderedSplats
@@ -16,7 +16,7 @@ from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
-from meshsplats.rendering.backward import TapedRendering, shown_pixels
+from meshsplats.rendering.backward import TapedRendering, visible_pixels
 
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""
@@ -87,7 +87,7 @@ class RenderedView:
             grad_color = grad_color * encoding_slope(self._rendering.color)
         count = self._rendering.vertex_count
         gradients = Gradients(np.zeros((count, 3), np.float32), np.zeros((count, 4), np.float32))
-        self._rendering.back(grad_color, None, None, vertices=gradients.vertices, colors=gradients.colors)
+        self._rendering.backward(grad_color, None, None, vertices=gradients.vertices, colors=gradients.colors)
         return gradients
 
 
@@ -205,7 +205,7 @@ def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
     config, mesh = state.config, state.result()
     keep = (mesh.colors[mesh.faces, 3] >= config.prune_opacity).any(axis=1)
     if config.prune_importance > 0:
-        sampled = evenly(views, IMPORTANCE_VIEWS)
+        sampled = subsample(views, IMPORTANCE_VIEWS)
         pixels, in_view = importance(state, sampled)
         pixels *= len(views) / len(sampled)  # extrapolated to all views
         face_pixels, face_in_view = pixels[mesh.faces].sum(axis=1), in_view[mesh.faces].any(axis=1)
@@ -225,7 +225,7 @@ def relocate(state: State, views: Sequence[View]) -> int:
         return 0
     positions = state.vertices
     in_view = np.zeros(len(positions), bool)
-    for view in evenly(views, IMPORTANCE_VIEWS):
+    for view in subsample(views, IMPORTANCE_VIEWS):
         in_view |= view.camera.sees(positions)
     return state.relocate(in_view)
 
@@ -241,7 +241,7 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
     pixels = np.zeros(len(vertices), np.float32)
     in_view = np.zeros(len(pixels), bool)
     for view in views:
-        pixels += shown_pixels(
+        pixels += visible_pixels(
             vertices,
             state.mesh.faces,
             colors,

@@ -1,5 +1,5 @@
-"""Files. Readers return physical values, writers take them; logits, logs and axis flips stay in here.
+"""Readers and writers of files. They take and return physical values: logits, logs and axis flips stay here.
 
-``splats`` chooses the reader of a splat file by content, ``meshes`` the reader and writer of a mesh; each
-file format has a module of its own with reading and writing side by side.
+``sniff`` recognises files by content. ``gaussians`` chooses the reader and writer of splats, ``meshes`` those
+of meshes, ``base_meshes`` reads meshes with textures. Each family of formats has a folder.
 """

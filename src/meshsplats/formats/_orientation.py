@@ -1,4 +1,4 @@
-"""Splats moved, turned and scaled: what node transforms and other axes of files ask for."""
+"""Affine transforms of splats, for the nodes of scenes and for files with other axes."""
 
 from __future__ import annotations
 
@@ -10,20 +10,23 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
 
 HALF_TURN_X = np.diag([1.0, -1.0, -1.0])
-"""Turns y up into y down and back, z being turned with it."""
+"""Half turn about x: from y up to y down and back; reverses z, too."""
 HALF_TURN_Z = np.diag([-1.0, -1.0, 1.0])
-"""Turns y up into y down and back, x being turned with it."""
+"""Half turn about z: from y up to y down and back; reverses x, too."""
 
 # Spherical harmonics 1 to 15 are polynomials whose terms all change sign with the axes named here.
 _ODD = ["y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x"]
 
 
 def transformed(cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud:
-    """``cloud`` after the affine map ``matrix``, (3, 3) or (4, 4): world from the file's frame.
+    """``cloud`` after the affine map ``matrix``, (3, 3) or (4, 4), from the file's frame to the world's.
 
     Concretely, a splat of covariance C and mean m gets covariance A C A^T and mean A m + t. Its colour seen
-    from direction d becomes the one that was seen from U^T d, U being the orthogonal factor of A; mirrors are
-    allowed. Raises ValueError for a matrix that is not finite or flattens space.
+    from direction d becomes its earlier colour seen from U^T d, where U is the orthogonal factor of A.
+    Mirrors are allowed.
+
+    Raises:
+        ValueError: the matrix is not finite or is singular.
     """
     matrix = np.asarray(matrix, np.float64)
     a, shift = matrix[:3, :3], matrix[:3, 3:].reshape(-1)
@@ -35,7 +38,7 @@ def transformed(cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud:
 
 
 def _mirrored(cloud: GaussianCloud, signs: np.ndarray) -> GaussianCloud:
-    """Each axis kept or reversed: only signs change, nothing is rounded."""
+    """Reverses axes: only signs change, nothing is rounded."""
     if (signs > 0).all():
         return cloud
     sign = dict(zip("xyz", signs, strict=True))
@@ -58,9 +61,9 @@ def _mapped(cloud: GaussianCloud, a: np.ndarray) -> GaussianCloud:
         raise ValueError("the transform is not finite")
     u, stretch, vt = np.linalg.svd(a)
     if stretch[2] <= 1e-12 * stretch[0]:
-        raise ValueError("the transform flattens space")
+        raise ValueError("the transform flattens space (a singular matrix)")
     orthogonal = u @ vt
-    proper = orthogonal * np.sign(np.linalg.det(orthogonal))  # a Gaussian does not know x from -x
+    proper = orthogonal * np.sign(np.linalg.det(orthogonal))  # a Gaussian is symmetric: x and -x are the same
     if stretch[0] <= stretch[2] * (1 + 1e-6):
         quaternions = _product(quaternions_of(proper[None])[0], cloud.quaternions.astype(np.float64))
         scales = cloud.scales * np.float32(stretch.mean())
@@ -77,20 +80,19 @@ def _mapped(cloud: GaussianCloud, a: np.ndarray) -> GaussianCloud:
 
 
 def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:
-    """(k - 1, k - 1) float32: coefficients 1 to k - 1 of a colour function after it was turned by
-    ``orthogonal``.
+    """(k - 1, k - 1) float32 map of the coefficients 1 to k - 1 under the rotation or mirror ``orthogonal``.
 
-    Each degree spans a space that turns into itself, so the map is found exactly by comparing values in some
-    directions.
+    The functions of a degree span a space that rotations map to itself, so a least-squares fit to values in a
+    few directions is exact.
     """
     i = np.arange(64) + 0.5  # directions on a Fibonacci spiral
     z, angle = 1 - i / 32, i * np.pi * (1 + 5**0.5)
     r = np.sqrt(1 - z * z)
     directions = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
     before = sh_basis(directions @ orthogonal, degree)[:, 1:]
-    found = np.linalg.lstsq(sh_basis(directions, degree)[:, 1:], before, rcond=None)[0]
-    found[np.abs(found) < 1e-12] = 0
-    return found.astype(np.float32)
+    matrix = np.linalg.lstsq(sh_basis(directions, degree)[:, 1:], before, rcond=None)[0]
+    matrix[np.abs(matrix) < 1e-12] = 0
+    return matrix.astype(np.float32)
 
 
 def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -104,7 +106,7 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     """(n, 4) unit quaternions w, x, y, z of proper rotation matrices (n, 3, 3)."""
     r = rotations
     trace = np.trace(r, axis1=1, axis2=2)
-    # 4 q q^T, each of whose rows is a multiple of q; the one with the largest diagonal is the most exact.
+    # 4 q q^T: each row is a multiple of q, and the row with the largest diagonal is the most exact.
     k = np.empty((len(r), 4, 4))
     k[:, 0, 0] = 1 + trace
     for i in range(3):

@@ -1,26 +1,28 @@
-"""What all mesh readers share: a memory budget and the way from a stranger's arrays to a SplatMesh."""
+"""Shared by all readers: a memory budget, and checks of arrays from untrusted files."""
 
 from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
-from meshsplats.binding import Binding
 from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning
 from meshsplats.mesh import SplatMesh
 
+T = TypeVar("T")
 _BASE_BYTES = 256 << 20
 _FACTOR = 64
 
 
 class Budget:
-    """Bytes that reading one file may take: 256 MiB, and 64 times its size.
+    """Bytes of memory that reading one file may take: 256 MiB, and 64 times its size.
 
-    No mesh file of the known formats unpacks further, save for long runs of equal values; a decompression
-    bomb or a small file that repeats one mesh a million times does.
+    Real files of the known formats unpack to less, save for long runs of equal values. A decompression bomb
+    needs more, and so does a small file that repeats one mesh a million times.
     """
 
     def __init__(self, path: Path) -> None:
@@ -35,13 +37,16 @@ class Budget:
         return self._file_bytes
 
     def extend(self, file_bytes: int) -> None:
-        """Adds the share of a further file that belongs to the first."""
+        """Adds the share of another file that belongs to the first."""
         self._file_bytes += file_bytes
         self._left += _FACTOR * file_bytes
 
     def spend(self, count: int, what: str) -> None:
-        """Books ``count`` bytes for ``what``; FileFormatError when the budget is exceeded. Call it before
-        allocating."""
+        """Takes ``count`` bytes for ``what`` from the budget; call it before allocating.
+
+        Raises:
+            FileFormatError: the budget is exceeded.
+        """
         self._left -= count
         if self._left < 0:
             raise FileFormatError(
@@ -71,9 +76,9 @@ def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:
     with np.errstate(over="ignore"):
         result[:, : colors.shape[1]] = colors
     low, high = (result.min(), result.max()) if result.size else (0, 1)
-    # Values that are not finite are left to the mesh's own check, which names their row.
+    # Values that are not finite are left to the check of SplatMesh, which names their row.
     if (low < 0 or high > 1) and np.isfinite(result).all():
-        if low < -1e-6 or high > 1 + 1e-6:  # a rounding error outside is no news
+        if low < -1e-6 or high > 1 + 1e-6:  # a rounding error needs no warning
             outside = int(((result < 0) | (result > 1)).any(axis=1).sum())
             warnings.warn(
                 f"{path}: {outside:,} vertex colours lay outside [0, 1] and were clipped",
@@ -90,27 +95,16 @@ def check_attribute_names(mesh: SplatMesh) -> None:
         try:
             encoded = name.encode()
         except UnicodeEncodeError:
-            raise ValueError(f"attribute name {name[:40]!r} is no valid text and cannot be stored") from None
+            raise ValueError(f"attribute name {name[:40]!r} is not valid text and cannot be stored") from None
         if b"\0" in encoded or len(encoded) > 200:
             raise ValueError(f"attribute name {name[:40]!r} cannot be stored (NUL in it, or over 200 bytes)")
 
 
-def checked_binding(path: Path, **parts) -> Binding:
-    """A Binding of arrays from a file; what does not fit together becomes a FileFormatError naming
-    ``path``."""
+def checked(path: Path, make: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+    """``make(...)`` of arrays from a file; its ValueError becomes a FileFormatError that names ``path``."""
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            return Binding(**parts)
-    except (ValueError, TypeError) as error:
-        raise FileFormatError(f"{path}: the binding to a base: {error}") from None
-
-
-def checked_mesh(path: Path, **arrays) -> SplatMesh:
-    """A SplatMesh of arrays from a file; what does not fit together becomes a FileFormatError naming
-    ``path``."""
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return SplatMesh(**arrays)
+            return make(*args, **kwargs)
     except FileFormatError:
         raise
     except (ValueError, TypeError) as error:

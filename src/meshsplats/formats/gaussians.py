@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import BinaryIO, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -13,63 +13,60 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.splats import read_splat_gltf
-from meshsplats.formats.ply.compressed_splats import is_compressed_splat, read_compressed_ply
-from meshsplats.formats.ply.header import read_header
+from meshsplats.formats.ply.compressed_splats import read_compressed_ply
 from meshsplats.formats.ply.splats import read_float_ply, write_float_ply
-from meshsplats.formats.splats.dot_splat import is_dot_splat, read_dot_splat
+from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats
+from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
-from meshsplats.formats.splats.spz import is_spz, read_spz
+from meshsplats.formats.splats.spz import read_spz
 from meshsplats.formats.splats.streamed_sog import read_streamed_sog
 from meshsplats.gaussians import GaussianCloud
 
 Axes = Literal["auto", "y-down", "y-up"]
-SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "streamed sog", "gltf"]
-
-_CONVERT = "convert it first: npx @playcanvas/splat-transform {name} {stem}.ply"
-_SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
-_EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
-
-
-class UnreadSplats(FileFormatError):
-    """Splats, or what should be some, of a kind that is known and not read."""
 
 
 def load_gaussians(
     path: str | os.PathLike[str], *, strict: bool = False, axes: Axes = "auto"
 ) -> GaussianCloud:
-    """Splats of a file or folder, after activation. The content decides which format it is, not the name:
-    `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json),
-    streamed SOG (folder or its lod-meta.json), glTF and GLB with KHR_gaussian_splatting.
+    """Splats of a file or folder, after activation.
 
-    A folder is a model of the 3D Gaussian Splatting code, of which the
-    ``point_cloud/iteration_*/point_cloud.ply`` of the highest iteration is read, or an unpacked SOG file. A
-    streamed SOG scene is read in the finest level that each of its places has; its coarser levels are folders
-    in it that can be read by themselves.
+    The content decides the format, not the name: `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1
+    to 4, SOG (archive, folder or its meta.json), streamed SOG (folder or its lod-meta.json), glTF and GLB
+    with KHR_gaussian_splatting.
 
-    The cloud has y down and z forward, as float .ply files have it. ``axes`` says what the file has: 'auto'
-    is what its format prescribes ('y-up' for SPZ and glTF, 'y-down' for the others), so that files of one
-    model agree; but some programs write SPZ with y down, which nothing in the file tells. A 'y-up' file is
-    turned by half a turn, about z if it is glTF, about x otherwise.
+    A folder is a model of the 3D Gaussian Splatting code, read from the highest iteration of
+    ``point_cloud/iteration_*/point_cloud.ply``, or an unpacked SOG file. A streamed SOG scene is read at the
+    finest level of detail of each of its nodes; its coarser levels are folders inside it that can be read by
+    themselves.
 
-    Splats with values that are not finite after activation (an infinite opacity logit is finite: 0 or 1), or
-    with a zero quaternion, are left out with a DataWarning that counts them; with ``strict`` they are an
-    error.
+    The cloud has y down and z forward, as float .ply files have. Splats with values that are not finite after
+    activation (an infinite opacity logit gives 0 or 1, which is finite) or with a zero quaternion are left
+    out, with a DataWarning that counts them.
 
-    Raises FileNotFoundError, or FileFormatError for a file that is broken, of another kind, or without a
-    single usable splat; the message says what is wrong and where. MissingDependencyError for SPZ 4 without
-    Zstandard.
+    Args:
+        path: the file or folder.
+        strict: raise an error for unusable splats instead of the warning.
+        axes: the axes of the file. 'auto' follows its format ('y-up' for SPZ and glTF, 'y-down' for the
+            others). Some programs write SPZ with y down, which the file does not say. A 'y-up' file is
+            rotated by half a turn, about z if it is glTF, about x otherwise.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        FileFormatError: the file is broken, of another kind, or without a single usable splat; the message
+            says what is wrong and where.
+        MissingDependencyError: SPZ 4 without Zstandard.
     """
     if axes not in get_args(Axes):
         raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
     found = splat_file(Path(path))
+    content = Content(found)
+    kind = content.splat_format()
+    to_y_down, turn = np.eye(3), HALF_TURN_X
     with found.open("rb") as file:
-        kind = _recognised(file, found)
-        file.seek(0)
-        to_y_down, turn = np.eye(3), HALF_TURN_X
         if kind == "ply":
-            cloud = read_float_ply(file, read_header(file, found), found, strict=strict)
+            cloud = read_float_ply(file, content.ply_header, found, strict=strict)
         elif kind == "compressed.ply":
-            cloud = read_compressed_ply(file, read_header(file, found), found, strict=strict)
+            cloud = read_compressed_ply(file, content.ply_header, found, strict=strict)
         elif kind == "splat":
             cloud = read_dot_splat(file, found, strict=strict)
         elif kind == "spz":
@@ -86,16 +83,17 @@ def load_gaussians(
 
 
 def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
-    """The splat format that a file or folder has by its beginning, None if it has none.
+    """The splat format of a file or folder by its first bytes, None if it has none.
 
-    Some containers serve meshes too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to hold one, and any
-    file may be broken. Raises FileNotFoundError, and UnreadSplats for a kind that is known and not read.
+    Some containers hold meshes, too: a 'ply', 'gltf' or 'sog' (zip) file may turn out to be one, and any file
+    may be broken.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        UnreadSplats: the kind is known, but not read.
     """
-    source = Path(path)
     try:
-        found = splat_file(source)
-        with found.open("rb") as file:
-            return _recognised(file, found)
+        return Content(splat_file(Path(path))).splat_format()
     except UnreadSplats:
         raise
     except FileFormatError:
@@ -103,15 +101,16 @@ def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
 
 
 def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
-    """Writes ``cloud`` as a float .ply laid out as by the 3D Gaussian Splatting code, whole or not at all.
+    """Writes ``cloud`` as a float .ply in the layout of the 3D Gaussian Splatting code, whole or not at all.
 
     Opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, are stored as
-    sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as 2DGS files
-    have it, an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both read back as what
-    they are. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three,
-    with a DataWarning, and reads back as '3dgs'.
+    sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as in 2DGS
+    files, and an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both kernels are read
+    back. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three, with
+    a DataWarning, and is read back as '3dgs'.
 
-    Raises ValueError for another suffix than .ply or for a cloud without splats.
+    Raises:
+        ValueError: the suffix is not .ply, or the cloud has no splats.
     """
     target = Path(path)
     if target.suffix.lower() != ".ply":
@@ -121,66 +120,9 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     write_float_ply(cloud, target)
 
 
-def _recognised(file: BinaryIO, path: Path) -> SplatFormat:
-    """The format of an opened file. Raises FileFormatError, saying what it is instead if that is clear."""
-    head = file.read(4096)
-    name = path.name.lower()
-    convert = _CONVERT.format(name=path.name, stem=path.stem)
-    if not head:
-        raise FileFormatError(f"{path}: the file is empty")
-    if re.match(rb"ply[ \t]*[\r\n]", head):
-        file.seek(0)
-        header = read_header(file, path)
-        # A mesh is left to the float reader, which says what is missing.
-        return "compressed.ply" if is_compressed_splat(header) else "ply"
-    if is_spz(head):
-        return "spz"
-    if head[:4] in (b"PK\x03\x04", b"PK\x05\x06"):
-        return "sog"
-    if head[:4] == b"glTF":
-        return "gltf"
-    if re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
-        return _recognised_json(file, path, convert)
-    if name.endswith(".ksplat"):
-        raise UnreadSplats(f"{path}: .ksplat files are not read here; {convert}")
-    if is_dot_splat(file):
-        return "splat"
-    if name.endswith(".splat"):
-        raise UnreadSplats(
-            f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
-            f" (it has {path.stat().st_size:,} bytes)"
-        )
-    if head[:2] == b"\x1f\x8b":
-        raise UnreadSplats(f"{path}: a gzip file, but not SPZ; unpack it first")
-    if head.startswith(b"version https://git-lfs"):
-        raise UnreadSplats(f"{path}: a Git LFS pointer, not the file itself, which 'git lfs pull' brings")
-    if re.match(rb"\s*<(!doctype html|html)", head, re.IGNORECASE):
-        raise UnreadSplats(f"{path}: a web page, not the file itself: did the download ask for a login?")
-    raise FileFormatError(
-        f"{path}: not a splat file that is known here, it begins with {head[:8]!r}; expected {_EXPECTED}"
-    )
-
-
-def _recognised_json(file: BinaryIO, path: Path, convert: str) -> SplatFormat:
-    """What a JSON file is, by the words in it; its reader parses it."""
-    file.seek(0)
-    text = file.read(8 << 20)
-    if all(name in text for name in _SOG_SECTIONS):  # some name their generator in an asset, as glTF does
-        return "sog"
-    if b'"lodLevels"' in text:
-        return "streamed sog"
-    if b'"asset"' in text:
-        return "gltf"
-    if path.suffix.lower() in (".lcc", ".lcc2") or (b'"splats"' in text and b'"totalLevel"' in text):
-        raise UnreadSplats(f"{path}: .lcc scenes are not read here; {convert}")
-    if b'"means"' in text:
-        return "sog"
-    raise FileFormatError(f"{path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
-
-
 def subject_name(path: Path) -> str:
-    """What ``path`` holds, in a word: the name of the file without its suffix; that of the folder where the
-    file has a name that all have (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
+    """A name for the contents of ``path``: the file's without its suffix, or the folder's where all such
+    files have one name (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
     if path.name in ("point_cloud.ply", "meta.json", "lod-meta.json"):
         folder = path.absolute().parent
         if re.fullmatch(r"iteration_[0-9]+", folder.name):
@@ -198,7 +140,7 @@ def subject_name(path: Path) -> str:
 
 
 def splat_file(path: Path) -> Path:
-    """The file that ``path`` stands for: itself, or the newest one of a model folder."""
+    """The file to read for ``path``: itself, or the latest one in a model folder."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if path.is_file():

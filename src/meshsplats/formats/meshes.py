@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import DataWarning, FileFormatError
@@ -19,7 +16,8 @@ from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
 from meshsplats.formats.npz import read_npz, write_npz
 from meshsplats.formats.obj.mesh import read_obj, write_obj
 from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_ply
-from meshsplats.formats.usd.reader import is_usd, read_usd
+from meshsplats.formats.sniff import Content
+from meshsplats.formats.usd.reader import read_usd
 from meshsplats.formats.usd.writer import write_usd
 from meshsplats.mesh import SplatMesh
 
@@ -35,7 +33,7 @@ _GLB = (".glb",)
 BOUND_SUFFIXES = (".npz", ".glb")
 """Formats that keep the binding of a mesh prior."""
 _UNFILTERED = (*_GLB, *_USD, ".obj")
-"""Formats for programs that draw triangles as they are."""
+"""Formats of programs that render triangles without a low-pass filter."""
 _OPTION_SUFFIXES = {"lit": (*_GLB, *_USD), "color_type": _GLB, "alpha": _GLB, "compression": _GLB}
 
 MESH_SUFFIXES = tuple(_WRITERS)
@@ -43,42 +41,38 @@ MESH_SUFFIXES = tuple(_WRITERS)
 
 
 def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
-    """The mesh in a file: `.npz`, `.ply`, `.glb`, `.gltf`, `.usdc`, `.usda`, `.usd` or `.obj`, recognised by
-    what it holds.
+    """The mesh in a file: `.npz`, `.ply`, `.glb`, `.gltf`, `.usdc`, `.usda`, `.usd` or `.obj`.
 
-    A file that ``save_mesh`` wrote comes back with its positions, faces and extra arrays exactly (`.obj` has
-    no extra arrays); colours are exact from `.npz` and `.ply`, within 1e-6 from USD and within 1/2000 from
-    `.glb`. Meshes of other programs are read as far
-    as triangles and vertex colours go: polygons are cut into triangles, textures left out with a
-    DataWarning.
+    The content decides the format. A file that ``save_mesh`` wrote gives back its positions, faces and extra
+    arrays exactly (`.obj` has no extra arrays); colours are exact from `.npz` and `.ply`, within 1e-6 from
+    USD and within 1/2000 from `.glb`. From the files of other programs, triangles and vertex colours are
+    read: polygons are cut into triangles, textures are left out with a DataWarning.
 
-    Raises FileNotFoundError or IsADirectoryError, and FileFormatError for a file that is broken, of
-    another kind or holds no mesh; the message says what is wrong and where. MissingDependencyError for USD
-    without the extra ``usd``.
+    Raises:
+        FileNotFoundError, IsADirectoryError: ``path`` is not a file.
+        FileFormatError: the file is broken, of another kind, or holds no mesh; the message says what is wrong
+            and where.
+        MissingDependencyError: USD without the extra ``usd``.
     """
     source = Path(path)
-    with open(source, "rb") as file:
-        head = file.read(4096)
-    if not head:
-        raise FileFormatError(f"{source}: the file is empty")
-    if head[:4] in (b"PK\x03\x04", b"PK\x05\x06"):
+    content = Content(source)
+    content.refuse_empty()
+    if content.container == "zip":
         if source.suffix.lower() == ".usdz":
             raise FileFormatError(
                 f"{source}: .usdz packages are not read; unpack it: usdcat in.usdz -o out.usdc"
             )
         return read_npz(source)
-    if re.match(rb"ply[ \t]*[\r\n]", head):
+    if content.container == "ply":
         return read_mesh_ply(source)
-    if head[:4] == b"glTF" or re.match(rb"(\xef\xbb\xbf)?\s*\{", head):
+    if content.container in ("glb", "json"):
         return read_gltf(source)
-    if is_usd(head):
+    if content.container == "usd":
         return read_usd(source)
-    if b"\0" not in head and (
-        source.suffix.lower() == ".obj" or re.search(rb"(^|\n)v[ \t]+[-+.\d]", head) is not None
-    ):
+    if content.is_obj:
         return read_obj(source)
     raise FileFormatError(
-        f"{source}: not a mesh file that is known here, it begins with {head[:8]!r};"
+        f"{source}: not a mesh file of a known format, it begins with {content.head[:8]!r};"
         " expected .npz, .ply, .glb, .gltf, .usdc, .usda or .obj"
     )
 
@@ -96,29 +90,32 @@ def save_mesh(
 
     - `.npz`, `.ply` keep everything exactly, `.ply` without the binding to a base mesh.
     - `.glb` keeps colours as linear values of 16 bits (within 1/2000 as display values), the rest exactly.
-    - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat numbers and attributes become
-      primvars. Needs the extra ``usd``.
+    - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat indices and attributes become
+      primvars. They need the extra ``usd``.
     - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
 
     All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning. All but `.obj` keep
-    ``filter_px2``; as the programs that `.glb`, USD and `.obj` are for draw without a filter, a mesh that
-    wants one is written to these with a DataWarning: ``bake_filter`` makes it part of the triangles.
+    ``filter_px2``, but other programs render without a low-pass filter: writing a mesh with one as `.glb`,
+    USD or `.obj` gives a DataWarning; ``bake_filter`` makes the filter part of the triangles.
 
-    Options, each for the formats named; given for another one they are a ValueError:
+    An older file at ``path`` is replaced at the end; an error leaves it as it was.
 
-    - ``lit`` (`.glb`, USD; default False): a material that scene lights shade instead of one that shows the
-      colours as they are.
-    - ``color_type`` (`.glb`; default 'uint16'): 'float32' stores colours exactly, but larger.
-    - ``alpha`` (`.glb`; default 'blend'): 'mask' or 'hash-friendly' for viewers that do not sort; they are
-      drawn solid where opacity reaches a cutoff, one for all or one for each splat.
-    - ``compression`` (`.glb`): 'meshopt' makes files about a fifth as large, with the external program
-      gltfpack. Each coordinate is moved by at most 1/131070 of the longest side of the mesh's box; triangles
-      change their order a little; splat numbers and attributes are left out. Such files are for viewers;
-      ``load_mesh`` does not read them.
+    Args:
+        mesh: the mesh.
+        path: the file; its suffix decides the format.
+        lit: (`.glb`, USD; default False) a material that scene lights shade, instead of an unlit one.
+        color_type: (`.glb`; default 'uint16') 'float32' stores colours exactly, but larger.
+        alpha: (`.glb`; default 'blend') 'mask' for viewers that do not sort: rendered solid where the opacity
+            reaches a cutoff.
+        compression: (`.glb`) 'meshopt' makes files about a fifth as large, with the external program
+            gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
+            order of triangles changes a little; splat indices and attributes are left out. Such files are for
+            viewers; ``load_mesh`` does not read them.
 
-    Raises ValueError for an unknown suffix, an option that the format does not have, or a mesh that the
-    format cannot hold, MissingDependencyError where a package or program is missing, and OSError for a place
-    that cannot be written, all before an older file at ``path`` is touched; if all goes well, it is replaced.
+    Raises:
+        ValueError: the suffix is unknown, the format does not have an option, or cannot hold the mesh.
+        MissingDependencyError: a package or program is missing.
+        OSError: the file cannot be written.
     """
     target = Path(path)
     suffix = target.suffix.lower()
@@ -126,24 +123,23 @@ def save_mesh(
     if writer is None:
         known = ", ".join(_WRITERS)
         raise ValueError(f"{target.name!r} does not name a mesh format; choose a name that ends in {known}")
-    given = {"lit": lit, "color_type": color_type, "alpha": alpha, "compression": compression}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    chosen = {"lit": lit, "color_type": color_type, "alpha": alpha, "compression": compression}
+    options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
     for name in options:
         if suffix not in _OPTION_SUFFIXES[name]:
             suffixes = ", ".join(_OPTION_SUFFIXES[name])
             raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
     if mesh.binding is not None and (suffix not in BOUND_SUFFIXES or "compression" in options):
         warnings.warn(
-            f"{target.name}: the binding to a base mesh is left out; only .npz or .glb keep what later poses"
-            " need",
+            f"{target.name}: the binding to a base mesh is left out; later poses need .npz or .glb",
             DataWarning,
             stacklevel=2,
         )
     if mesh.filter_px2 and suffix in _UNFILTERED:
         warnings.warn(
-            f"{target.name}: the mesh is to be drawn with a filter of {mesh.filter_px2:g} px^2, which other"
-            " programs do not have: from afar it will look thin there. Make it part of the triangles for the"
-            " views that count: bake_filter(mesh, cameras), or meshsplats bake",
+            f"{target.name}: the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which"
+            " other programs do not have: from afar it will look thin there. Make it part of the triangles"
+            " for the views that count: bake_filter(mesh, cameras), or meshsplats bake",
             DataWarning,
             stacklevel=2,
         )
@@ -156,13 +152,12 @@ def save_mesh(
 
 
 def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False) -> int:
-    """About how large the file of ``mesh`` with this ``suffix`` will be: exact to a few kilobytes for `.npz`
-    and `.ply`, within 15 % for `.glb` with colours of 16 bits, a rough figure for the others."""
+    """Estimated size of the file of ``mesh`` with this ``suffix``: within a few kilobytes for `.npz` and
+    `.ply`, within 15 % for `.glb` with colours of 16 bits, rough for the others."""
     v, f = len(mesh.vertices), len(mesh.faces)
-    extra = [mesh.normals, mesh.face_splat, mesh.depth_group, *mesh.attributes.values()]
-    held = sum(array.nbytes for array in extra if array is not None)
-    if mesh.binding is not None and suffix in BOUND_SUFFIXES:
-        held += sum(value.nbytes for value in vars(mesh.binding).values() if isinstance(value, np.ndarray))
+    bound = suffix in BOUND_SUFFIXES
+    arrays = {n: a for n, a in mesh.arrays().items() if a.ndim and (bound or not n.startswith("binding."))}
+    held = sum(array.nbytes for array in arrays.values()) - 28 * v - 12 * f - 12  # beyond the required arrays
     if suffix == ".obj":
         return 75 * v + (26 if mesh.normals is None else 50) * f
     if suffix == ".usda":

@@ -24,13 +24,7 @@ import numpy as np
 
 from meshsplats.binding import Binding
 from meshsplats.errors import FileFormatError
-from meshsplats.formats._validation import (
-    Budget,
-    check_attribute_names,
-    checked_binding,
-    checked_mesh,
-    straight_colors,
-)
+from meshsplats.formats._validation import Budget, check_attribute_names, checked, straight_colors
 from meshsplats.mesh import SplatMesh
 
 _ATTRIBUTE = "attribute_"
@@ -47,38 +41,35 @@ _BROKEN_ZIP = (
     ValueError,
     OverflowError,
 )
-"""What the zip reader raises on broken archives; its own checks do not cover every field."""
-_BINDING = ("base_vertices", "base_faces", "vertex_face", "weights", "layers", "lift")
-_BOUND = tuple(f"binding_{name}" for name in _BINDING)
-_OPTIONAL = ("normals", "face_splat", "depth_group", "up", "blending", "filter_px2", *_BOUND)
+"""Errors of the zip reader for broken archives; its own checks do not cover every field."""
+_DEFAULTS = {"up": np.array([0, -1, 0], np.float32), "blending": np.array("display")}
+"""For files of the published MeshSplats code, which lack them."""
+
+
+def _stored(name: str) -> str:
+    """The name in the file of one of the arrays of ``SplatMesh.arrays``."""
+    return "vertex_colors" if name == "colors" else name.replace(".", "_", 1)
+
+
+_NAMES = {
+    _stored(name): name
+    for name in (
+        *(f.name for f in SplatMesh.FIELDS),
+        *("blending", "filter_px2", "binding.lift"),
+        *(f"binding.{f.name}" for f in Binding.FIELDS),
+    )
+}
+"""Names of ``SplatMesh.arrays`` by those in the file, without the attributes."""
 
 
 def write_npz(mesh: SplatMesh, path: Path) -> None:
-    """Writes every array of the mesh, uncompressed, which is 15 to 20 times as fast as compressed."""
+    """Writes every array of the mesh, uncompressed: 15 to 20 times as fast as compressed."""
     check_attribute_names(mesh)
-    arrays: dict[str, np.ndarray] = {
-        "vertices": mesh.vertices,
-        "faces": mesh.faces,
-        "vertex_colors": mesh.colors,
-        "up": mesh.up,
-        "blending": np.array(mesh.blending),
-    }
-    for name in ("normals", "face_splat", "depth_group"):
-        value = getattr(mesh, name)
-        if value is not None:
-            arrays[name] = value
-    if mesh.filter_px2:
-        arrays["filter_px2"] = np.array(mesh.filter_px2)
-    for name, value in mesh.attributes.items():
-        arrays[_ATTRIBUTE + name] = value
-    if mesh.binding is not None:
-        for stored, name in zip(_BOUND, _BINDING, strict=True):
-            arrays[stored] = np.asarray(getattr(mesh.binding, name))
-    # As np.savez does, which in older versions leaves the archive open where the disk is full.
+    # Like np.savez, whose older versions leave the archive open when the disk is full.
     with zipfile.ZipFile(path, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+        for name, array in mesh.arrays().items():
+            with archive.open(f"{_stored(name)}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def read_npz(path: Path) -> SplatMesh:
@@ -99,13 +90,13 @@ def read_npz(path: Path) -> SplatMesh:
 
 
 class _BoundedReader(io.BufferedReader):
-    """Refuses a single read beyond 16 MiB: a zip directory of that size is an attack, and members are read in
-    blocks."""
+    """Refuses a single read beyond 16 MiB: a zip directory of that size is an attack, and members are read
+    block by block."""
 
     _limit = 1 << 24
 
     def read(self, size: int | None = -1) -> bytes:
-        # As many bytes as are asked for would be allocated, even where the file ends before.
+        # BufferedReader would allocate ``size`` bytes even where the file ends earlier.
         left = os.fstat(self.fileno()).st_size - self.tell()
         wanted = left if size is None or size < 0 else min(size, left)
         if wanted > self._limit:
@@ -115,7 +106,7 @@ class _BoundedReader(io.BufferedReader):
 
 @dataclass(frozen=True)
 class _Member:
-    """An array of the archive, known by its header only."""
+    """An array of the archive of which only the header has been read."""
 
     info: zipfile.ZipInfo
     shape: tuple[int, ...]
@@ -128,7 +119,7 @@ def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
     members: dict[str, _Member] = {}
     for info in archive.infolist():
         name = info.filename.removesuffix(".npy")
-        if name in ("vertices", "faces", "vertex_colors", *_OPTIONAL) or name.startswith(_ATTRIBUTE):
+        if name in _NAMES or name.startswith(_ATTRIBUTE):
             if name in members:
                 raise FileFormatError(f"{path}: array {name!r} is stored twice")
             members[name] = _parse_member(archive, info, name, path)
@@ -141,35 +132,13 @@ def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
     for name, member in members.items():
         budget.spend(member.info.file_size, f"array {name!r}")
     arrays = {name: _load(archive, member, name, path) for name, member in members.items()}
-    blending = str(arrays.pop("blending", np.array("display")))
-    filter_px2 = float(arrays.pop("filter_px2", np.array(0.0)))
-    bound = {
-        name: arrays.pop(stored) for stored, name in zip(_BOUND, _BINDING, strict=True) if stored in arrays
-    }
-    return checked_mesh(
-        path,
-        vertices=arrays.pop("vertices"),
-        faces=arrays.pop("faces"),
-        colors=straight_colors(arrays.pop("vertex_colors"), path),
-        blending=blending,
-        filter_px2=filter_px2,
-        attributes={
-            name.removeprefix(_ATTRIBUTE): arrays.pop(name)
-            for name in list(arrays)
-            if name.startswith(_ATTRIBUTE)
-        },
-        binding=_binding(bound, path),
-        **arrays,
-    )
-
-
-def _binding(parts: dict[str, np.ndarray], path: Path) -> Binding | None:
-    if not parts:
-        return None
-    missing = [name for name in _BINDING if name not in parts]
-    if missing:
-        raise FileFormatError(f"{path}: the binding to a base is not whole: binding_{missing[0]} is missing")
-    return checked_binding(path, lift=float(parts.pop("lift")), **parts)
+    arrays["vertex_colors"] = straight_colors(arrays["vertex_colors"], path)
+    named = {_NAMES.get(name) or name.replace("_", ".", 1): array for name, array in arrays.items()}
+    try:
+        return checked(path, SplatMesh.from_arrays, _DEFAULTS | named)
+    except KeyError as error:
+        lost = _stored(error.args[0])
+        raise FileFormatError(f"{path}: the binding to a base is not whole: {lost} is missing") from None
 
 
 def _parse_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str, path: Path) -> _Member:
@@ -224,30 +193,27 @@ def _product(shape: tuple[int, ...]) -> int:
 
 
 def _check_shapes(members: dict[str, _Member], path: Path) -> None:
-    """Whether the arrays fit each other, before any is allocated."""
+    """FileFormatError unless the shapes of the arrays fit each other; before any is allocated."""
     shapes = {name: member.shape for name, member in members.items()}
 
     def rows_of(name: str) -> int:
         return shapes[name][0] if shapes.get(name) else 0
 
-    v, f = rows_of("vertices"), rows_of("faces")
+    v = rows_of("vertices")
+    counts = {
+        "vertex": v,
+        "face": rows_of("faces"),
+        "base vertex": rows_of("binding_base_vertices"),
+        "base face": rows_of("binding_base_faces"),
+    }
     wanted: dict[str, tuple[tuple[int, ...], ...]] = {
-        "vertices": ((v, 3),),
-        "faces": ((f, 3),),
         "vertex_colors": ((v, 4), (v, 3)),
-        "normals": ((v, 3),),
-        "face_splat": ((f,),),
-        "depth_group": ((f,),),
-        "up": ((3,),),
         "blending": ((), (1,)),
         "filter_px2": ((),),
-        "binding_base_vertices": ((rows_of("binding_base_vertices"), 3),),
-        "binding_base_faces": ((rows_of("binding_base_faces"), 3),),
-        "binding_vertex_face": ((v,),),
-        "binding_weights": ((v, 3),),
-        "binding_layers": ((v,),),
         "binding_lift": ((),),
     }
+    for prefix, fields in (("", SplatMesh.FIELDS), ("binding_", Binding.FIELDS)):
+        wanted |= {prefix + field.name: (field.shape(counts),) for field in fields}
     for name, shape in shapes.items():
         if name.startswith(_ATTRIBUTE):
             fits = len(shape) in (1, 2) and shape[0] == v

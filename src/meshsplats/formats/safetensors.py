@@ -1,8 +1,8 @@
 """Safetensors: named arrays and a few texts in one file.
 
-The length of a JSON header (8 bytes, little endian); the header, which gives each array's type, shape and
-place, and texts under ``__metadata__``; then the arrays, one after the other in C order, without gaps.
-https://huggingface.co/docs/safetensors has the format.
+A file is the length of a JSON header (8 bytes, little endian), the header with each array's type, shape and
+offsets and with texts under ``__metadata__``, then the arrays in C order without gaps. Specification:
+https://huggingface.co/docs/safetensors.
 """
 
 from __future__ import annotations
@@ -34,25 +34,26 @@ _TYPES = {
 }
 _NAMES = {np.dtype(dtype): name for name, dtype in _TYPES.items()}
 _TEXTS = "__metadata__"
-_MOST_HEADER = 100_000_000
-"""Bytes; the limit of the format."""
+_MAX_HEADER_BYTES = 100_000_000
+"""Limit of the format, in bytes."""
 
 
 def save_safetensors(
     path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]
 ) -> None:
-    """Writes ``arrays`` and the texts ``metadata``, in place of an older file once it is whole.
+    """Writes ``arrays`` and the texts ``metadata``, whole or not at all; replaces an older file.
 
-    Raises TypeError for arrays of a type that the format does not have.
+    Raises:
+        TypeError: the format does not have the type of an array.
     """
     packed = {}
     for name, array in arrays.items():
         little = np.asarray(array, order="C")
         little = little.astype(little.dtype.newbyteorder("<"), copy=False)
         if little.dtype not in _NAMES or name == _TEXTS:
-            raise TypeError(f"safetensors files have no array {name!r} of type {little.dtype}")
+            raise TypeError(f"safetensors files cannot hold an array {name!r} of type {little.dtype}")
         packed[name] = little
-    # The largest elements first: every array is then aligned.
+    # With the largest elements first, every array is aligned.
     order = sorted(packed, key=lambda name: (-packed[name].itemsize, name))
     header: dict[str, Any] = {_TEXTS: dict(metadata)} if metadata else {}
     end = 0
@@ -73,14 +74,17 @@ def load_safetensors(
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """The arrays in the file (none with ``only_texts``) and its texts.
 
-    Numbers of bfloat16, which NumPy lacks, come as float32. Raises FileFormatError for a file that is broken,
-    or of types that are not known here, before memory is taken; OSError if it cannot be read.
+    Numbers of bfloat16, which NumPy lacks, become float32.
+
+    Raises:
+        FileFormatError: the file is broken or has an unknown type; raised before memory is allocated.
+        OSError: the file cannot be read.
     """
     arrays = {}
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         length = int.from_bytes(file.read(8), "little")
-        if size < 8 or length > min(size - 8, _MOST_HEADER):
+        if size < 8 or length > min(size - 8, _MAX_HEADER_BYTES):
             raise _error(path, f"{size:,} bytes do not hold its header")
         entries, texts = _parse_header(path, file.read(length), size - 8 - length)
         for name, entry in ({} if only_texts else entries).items():
@@ -91,7 +95,7 @@ def load_safetensors(
             file.seek(8 + length + entry.begin)
             if array.size and file.readinto(array.reshape(-1).view(np.uint8).data) != array.nbytes:
                 raise _error(path, "it ends too early")
-            if entry.brain:
+            if entry.bfloat16:
                 array = (array.astype(np.uint32) << np.uint32(16)).view(np.float32)
             arrays[name] = array
     return arrays, texts
@@ -101,14 +105,14 @@ class _Entry(NamedTuple):
     dtype: np.dtype
     shape: tuple[int, ...]
     begin: int
-    brain: bool
-    """Of bfloat16: the upper halves of float32."""
+    bfloat16: bool
+    """The values are the upper halves of float32."""
 
 
 def _parse_header(
     path: str | os.PathLike[str], text: bytes, size: int
 ) -> tuple[dict[str, _Entry], dict[str, str]]:
-    """What a header says of ``size`` bytes of arrays, and its texts."""
+    """The entries of a header for ``size`` bytes of arrays, and its texts."""
     try:
         header = json.loads(text)
     except (ValueError, RecursionError) as problem:
@@ -119,16 +123,16 @@ def _parse_header(
     if not isinstance(texts, dict) or not all(isinstance(value, str) for value in texts.values()):
         raise _error(path, f"{_TEXTS} must hold texts")
     entries, total = {}, 0
-    for name, said in header.items():
-        said = said if isinstance(said, dict) else {}
-        stored = str(said.get("dtype"))
-        shape, place = _whole(said.get("shape")), _whole(said.get("data_offsets"))
-        if shape is None or place is None or len(place) != 2:
-            raise _error(path, f"{name[:60]!r} needs a shape, and where it begins and ends")
+    for name, entry in header.items():
+        entry = entry if isinstance(entry, dict) else {}
+        stored = str(entry.get("dtype"))
+        shape, offsets = _whole(entry.get("shape")), _whole(entry.get("data_offsets"))
+        if shape is None or offsets is None or len(offsets) != 2:
+            raise _error(path, f"{name[:60]!r} needs a shape and two data_offsets")
         if stored != "BF16" and stored not in _TYPES:
             raise _error(path, f"{name[:60]!r} is of the unknown type {stored[:20]}")
         dtype = np.dtype("<u2" if stored == "BF16" else _TYPES[stored])
-        begin, end = place
+        begin, end = offsets
         if not begin <= end <= size or end - begin != math.prod(shape) * dtype.itemsize:
             raise _error(path, f"{name[:60]!r} of shape {shape} in bytes {begin} to {end} of {size:,}")
         entries[name] = _Entry(dtype, shape, begin, stored == "BF16")

@@ -1,8 +1,9 @@
-"""Image files from strangers: their size from the header, their pixels within limits."""
+"""Reading image files within limits: their size from the header, then their pixels."""
 
 from __future__ import annotations
 
 import io
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,14 @@ from meshsplats.camera import MAX_SIDE
 from meshsplats.errors import FileFormatError, MissingDependencyError
 
 MAX_PIXELS = 1 << 26
-"""Pictures of more pixels than this (67 million) are refused: a small file can claim any size."""
+"""Images of more pixels than this (67 million) are refused: a small file can claim any size."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
-"""What Pillow may read here. Other formats of its start programs, or hold no photographs."""
+"""Formats that Pillow may read here. Others start programs, or hold no photographs."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the start of a picture file tells."""
+    """Size and kind of an image file."""
 
     width: int
     height: int
@@ -28,48 +29,49 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Size and kind of a picture. FileFormatError for what is none, or too large."""
+    """Size and kind of an image, without its pixels. FileFormatError if it is none, or too large."""
     with _opened(path) as image:
         return Header(image.width, image.height, _has_alpha(image))
 
 
-def load_image(path: Path, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """uint8 (h, w, 3) RGB, and uint8 (h, w) straight alpha or None. FileFormatError for a broken picture.
+def load_image(path: str | os.PathLike[str], data: bytes | None = None) -> np.ndarray:
+    """uint8 (h, w, 3) RGB, or (h, w, 4) straight RGBA if the image has alpha.
 
-    ``data`` is a picture that lies inside another file, which ``path`` then names in messages."""
+    Args:
+        path: the image file.
+        data: an image inside another file, which ``path`` then names in messages.
+
+    Raises:
+        FileFormatError: the image is broken, too large, or of no known format.
+    """
     with _opened(path, data) as image:
         try:
             if image.mode.startswith("I;16") or image.mode == "I":
                 grey = np.asarray(image, np.int64)
                 if grey.min(initial=0) < 0 or grey.max(initial=0) > 65535:
-                    raise FileFormatError(f"{path}: integers beyond 16 bits are no picture")
-                return np.repeat(np.rint(grey / 257).astype(np.uint8)[..., None], 3, axis=2), None
+                    raise FileFormatError(f"{path}: an image cannot hold integers beyond 16 bits")
+                return np.repeat(np.rint(grey / 257).astype(np.uint8)[..., None], 3, axis=2)
             if image.mode == "F":
                 raise FileFormatError(f"{path}: holds floating-point values; convert it to 8 bits")
-            if _has_alpha(image):
-                pixels = np.asarray(image.convert("RGBA"))
-                return pixels[..., :3], pixels[..., 3]
-            return np.asarray(image.convert("RGB")), None
+            return np.asarray(image.convert("RGBA" if _has_alpha(image) else "RGB"))
         except FileFormatError:
             raise
         except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
-            raise FileFormatError(f"{path}: a broken picture: {str(error)[:120]}") from None
+            raise FileFormatError(f"{path}: a broken image: {str(error)[:120]}") from None
 
 
-def _opened(path: Path, data: bytes | None = None) -> Any:
+def _opened(path: str | os.PathLike[str], data: bytes | None = None) -> Any:
     try:
         from PIL import Image
     except ImportError:
-        raise MissingDependencyError("reading photographs needs Pillow: pip install pillow") from None
+        raise MissingDependencyError("reading images needs Pillow: pip install pillow") from None
     try:
         image = Image.open(path if data is None else io.BytesIO(data), formats=FORMATS)
-    except FileNotFoundError:
-        raise
-    except PermissionError:
+    except (FileNotFoundError, PermissionError):
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
         raise FileFormatError(
-            f"{path}: not a picture of a known kind ({', '.join(FORMATS)}): {str(error)[:120]}"
+            f"{path}: not an image of a known format ({', '.join(FORMATS)}): {str(error)[:120]}"
         ) from None
     width, height = image.size
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE or min(width, height) < 1:

@@ -1,4 +1,4 @@
-"""Picture files: 8-bit PNG, 16-bit depth PNG, animations, and pictures side by side.
+"""Writing image files: images, 16-bit depth PNG, animations; and images side by side.
 
 Values are display-referred (sRGB-encoded) RGB, as splats have them, and are stored as they are: value v
 becomes the byte round(255 v). Pillow is imported where it is used.
@@ -21,26 +21,31 @@ if TYPE_CHECKING:
 
 ANIMATIONS = (".webp", ".gif", ".png")
 """Suffixes of the animations that can be written; .png is an animated PNG."""
+_ENCODERS: dict[str, dict[str, Any]] = {
+    ".png": {"format": "PNG"},
+    ".jpg": {"format": "JPEG", "quality": 95, "subsampling": 0},
+    ".jpeg": {"format": "JPEG", "quality": 95, "subsampling": 0},
+    ".webp": {"format": "WEBP", "lossless": True, "exact": True},
+}
+"""Pillow's options for each suffix of an image."""
 GAP = 8
-"""Pixels between and round the pictures of a strip."""
+"""Pixels between and around the images of a strip."""
 CAPTION = 22
 """Height of the line of text above a strip, in pixels."""
 
 
-def to_bytes(picture: np.ndarray) -> np.ndarray:
-    """uint8 array of the same shape: ``round(255 * clip(picture, 0, 1))``. ValueError for values not
-    finite."""
-    picture = np.asarray(picture, np.float32)
-    if not np.isfinite(picture).all():
-        raise ValueError("a picture holds values that are not finite")
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """uint8 array of the same shape: ``round(255 * clip(image, 0, 1))``. ValueError for values not finite."""
+    image = np.asarray(image, np.float32)
+    if not np.isfinite(image).all():
+        raise ValueError("an image holds values that are not finite")
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 def straight_rgba(premultiplied: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """(h, w, 4) straight RGBA from a picture on black, which is colour times opacity, and its ``alpha`` (h,
-    w).
+    """(h, w, 4) straight RGBA of an image on black, which is colour times opacity, with ``alpha`` (h, w).
 
-    Composited over any background in display values, it gives the picture drawn on that background.
+    Composited over any background in display values, it gives the image rendered on that background.
     """
     covered = alpha > 0
     color = np.divide(
@@ -49,29 +54,30 @@ def straight_rgba(premultiplied: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return np.concatenate([np.clip(color, 0, 1), alpha[..., None]], axis=2).astype(np.float32)
 
 
-def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> None:
-    """Writes ``picture`` (h, w, 3) or (h, w, 4), RGB or straight RGBA in [0, 1], as PNG; replaces an older
-    file."""
+def save_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
+    """Writes an image in the format that the suffix of ``path`` names; replaces an older file.
+
+    Args:
+        path: .png and .webp keep each byte, .jpg or .jpeg loses a little.
+        image: (h, w, 3) RGB or, not for JPEG, (h, w, 4) straight RGBA, in [0, 1].
+
+    Raises:
+        ValueError: the suffix or the shape is another, or a value is not finite.
+    """
     from PIL import Image
 
-    if np.ndim(picture) != 3 or np.shape(picture)[2] not in (3, 4):
-        raise ValueError(f"a picture must have shape (h, w, 3) or (h, w, 4), got {np.shape(picture)}")
-    image = Image.fromarray(to_bytes(picture))
-    _save(path, image, format="PNG")
-
-
-def load_png(path: str | os.PathLike[str]) -> np.ndarray:
-    """uint8 (h, w, 3), or (h, w, 4) if the file has an alpha channel. OSError for what is not a picture."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        translucent = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-        return np.asarray(image.convert("RGBA" if translucent else "RGB"))
+    encoder = _ENCODERS.get(Path(path).suffix.lower())
+    if encoder is None:
+        raise ValueError(f"an image is written as {', '.join(_ENCODERS)}, got {Path(path).name!r}")
+    channels = (3,) if encoder["format"] == "JPEG" else (3, 4)
+    if np.ndim(image) != 3 or np.shape(image)[2] not in channels:
+        wanted = " or ".join(f"(h, w, {c})" for c in channels)
+        raise ValueError(f"{encoder['format']} images must have shape {wanted}, got {np.shape(image)}")
+    _save(path, Image.fromarray(to_bytes(image)), **encoder)
 
 
 def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float) -> None:
-    """Writes ``depth`` (h, w) as 16-bit grey PNG: ``round(depth / unit)``, at most 65535; 0 stays for
-    "nothing there".
+    """Writes ``depth`` (h, w) as 16-bit grey PNG: ``round(depth / unit)``, at most 65535; 0 means empty.
 
     ``unit`` is the depth of one step in scene units, > 0; a reader needs it to get depths back.
     """
@@ -80,14 +86,14 @@ def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float)
     if not (np.isfinite(unit) and unit > 0):
         raise ValueError(f"unit must be positive, got {unit}")
     steps = np.clip(np.rint(np.asarray(depth, np.float64) / unit), 0, 65535).astype(np.uint16)
-    # Something that is there must not become 0.
+    # A positive depth must not become 0, which means empty.
     steps[(depth > 0) & (steps == 0)] = 1
     _save(path, Image.fromarray(steps), format="PNG")
 
 
 def save_array(path: str | os.PathLike[str], array: np.ndarray) -> None:
     """Writes ``array`` as .npy; replaces an older file."""
-    encoded = io.BytesIO()  # as below: written to a file, NumPy tells how many numbers did not fit
+    encoded = io.BytesIO()  # as in _save: to a file, NumPy reports only how many numbers did not fit
     np.save(encoded, array, allow_pickle=False)
     write_bytes(path, encoded.getbuffer())
 
@@ -97,8 +103,8 @@ def save_animation(
 ) -> None:
     """Writes an endless animation as .webp, .gif or .png (APNG), by the suffix of ``path``.
 
-    ``frames`` are uint8 pictures (h, w, 3) or, not for GIF, (h, w, 4) of one size. Their longer side is
-    brought down to ``max_side`` pixels, as animations are large. GIF has 256 colours; the others lose little
+    ``frames`` are uint8 images (h, w, 3) or, not for GIF, (h, w, 4) of one size. Their longer side is
+    scaled down to ``max_side`` pixels, as animations are large. GIF has 256 colours; the others lose little
     or nothing.
 
     Raises ValueError for another suffix, no frames or a rate out of range (0.1 to 100 frames a second).
@@ -129,32 +135,29 @@ def save_animation(
 
 
 def _save(path: str | os.PathLike[str], image: Image.Image, **options: Any) -> None:
-    """Encoded in memory first: Pillow's encoders lose the reason why a disk takes no more."""
+    """Encodes in memory first: Pillow's encoders lose the reason why a write to disk fails."""
     encoded = io.BytesIO()
     image.save(encoded, **options)
     write_bytes(path, encoded.getbuffer())
 
 
-def strip(pictures: Sequence[np.ndarray], captions: Sequence[str] = ()) -> np.ndarray:
-    """(h', w', 3) float32: ``pictures`` (h, w, 3) of one size side by side on white, each under its
-    caption."""
-    height, width = np.shape(pictures[0])[:2]
-    if any(np.shape(picture) != (height, width, 3) for picture in pictures):
-        raise ValueError(
-            f"the pictures of a strip must have one shape, got {[np.shape(p) for p in pictures]}"
-        )
+def strip(images: Sequence[np.ndarray], captions: Sequence[str] = ()) -> np.ndarray:
+    """(h', w', 3) float32: ``images`` (h, w, 3) of one size side by side on white, each below its caption."""
+    height, width = np.shape(images[0])[:2]
+    if any(np.shape(image) != (height, width, 3) for image in images):
+        raise ValueError(f"the images of a strip must have one shape, got {[np.shape(i) for i in images]}")
     top = CAPTION if captions else GAP
-    sheet = np.ones((top + height + GAP, GAP + len(pictures) * (width + GAP), 3), np.float32)
-    for i, picture in enumerate(pictures):
+    sheet = np.ones((top + height + GAP, GAP + len(images) * (width + GAP), 3), np.float32)
+    for i, image in enumerate(images):
         left = GAP + i * (width + GAP)
-        sheet[top : top + height, left : left + width] = picture
+        sheet[top : top + height, left : left + width] = image
     if captions:
         sheet[:top] = _text(captions, width + GAP, sheet.shape[1])
     return sheet
 
 
 def amplified_error(a: np.ndarray, b: np.ndarray, factor: float) -> np.ndarray:
-    """(h, w, 3) float32 in [0, 1]: ``clip(factor * |a - b|)``; black where the pictures agree."""
+    """(h, w, 3) float32 in [0, 1]: ``clip(factor * |a - b|)``; black where the images agree."""
     return np.clip(np.float32(factor) * np.abs(np.asarray(a, np.float32) - b), 0, 1)
 
 
@@ -187,14 +190,14 @@ def _paletted(image):
     from PIL import Image
 
     if image.mode != "RGB":
-        raise ValueError("GIF has no translucency: write a .webp or .png animation of pictures with alpha")
+        raise ValueError("GIF has no translucency: write a .webp or .png animation of images with alpha")
     palette = image.quantize(255, method=Image.Quantize.MEDIANCUT)
-    numbers = np.array(image.quantize(255, palette=palette, dither=Image.Dither.FLOYDSTEINBERG))
-    # A plain background would be tinted by a mean of similar colours: the commonest colour gets a number of
+    indices = np.array(image.quantize(255, palette=palette, dither=Image.Dither.FLOYDSTEINBERG))
+    # A plain background would be tinted by a mean of similar colours: the commonest colour gets an index of
     # its own.
     commonest = max(image.getcolors(image.width * image.height))[1]
-    numbers[(np.asarray(image) == commonest).all(axis=2)] = 255
+    indices[(np.asarray(image) == commonest).all(axis=2)] = 255
     colors = (palette.getpalette() or [])[: 255 * 3]
-    result = Image.fromarray(numbers)
+    result = Image.fromarray(indices)
     result.putpalette([*colors, *[0] * (255 * 3 - len(colors)), *commonest])
     return result

@@ -9,8 +9,7 @@ from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.prior.bind import bind
 from meshsplats.prior.model import LIFT, MeshPrior, load_prior
 from meshsplats.prior.surface import base_surface
-from meshsplats.prior.training import prior_config, train
-from meshsplats.prior.training import train as train_prior
+from meshsplats.prior.training import prior_config, train_prior
 
 __all__ = [
     "LIFT",
@@ -21,6 +20,5 @@ __all__ = [
     "bind",
     "load_prior",
     "prior_config",
-    "train",
     "train_prior",
 ]

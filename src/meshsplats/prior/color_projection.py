@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats.binding import Binding
 from meshsplats.datasets.views import View
 from meshsplats.mesh import SplatMesh
@@ -46,7 +46,7 @@ def colors_from_views(binding: Binding, views: Sequence[View], *, threads: int |
     depths = np.abs(binding.layers * binding.lift)
     scores = np.zeros((len(points), BEST_VIEWS), np.float32)
     colors = np.zeros((len(points), BEST_VIEWS, 3), np.float32)
-    for view in evenly(views, MAX_VIEWS):
+    for view in subsample(views, MAX_VIEWS):
         rows, score, color = _visible_points(base, points, normals, depths, view, threads)
         # A better view replaces the worst of the best so far.
         worst = scores[rows].argmin(axis=1)
@@ -74,21 +74,14 @@ def _visible_points(
     ``depths`` (n,) are the distances of the points from the base.
     """
     camera, image = view.camera, view.load()
-    x, y, z = camera.world_to_camera[:3, :3] @ points.T + camera.world_to_camera[:3, 3:]
-    front = z > camera.near
-    depth = np.where(front, z, 1)
-    column, row = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-    rows = np.flatnonzero(
-        front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    )
-    place = row[rows].astype(np.int64), column[rows].astype(np.int64)
+    positions, z = camera.project(points)
+    rows = np.flatnonzero(camera.in_image(positions))
+    column, row = positions[rows].T.astype(np.int64)
+    place = row, column
     to_camera = camera.center - points[rows]
     cosine = np.abs(np.einsum("ij,ij->i", to_camera, normals[rows])) / np.linalg.norm(to_camera, axis=1)
-    drawn = render(base, camera, depth=True, threads=threads)
-    assert drawn.depth is not None
     # A point at a silhouette whose pixel centre misses the base has nothing in front of it.
-    solid = drawn.alpha > 0.5
-    surface = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)[place]
+    surface = render(base, camera, depth=True, threads=threads).mean_depth(min_alpha=0.5)[place]
     slack = _TOLERANCE * z[rows] / min(camera.fx, camera.fy) + depths[rows]
     slack /= np.maximum(cosine, 0.25)
     keep = (z[rows] <= surface + slack) & (cosine > _GRAZING)

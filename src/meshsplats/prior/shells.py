@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats.binding import surface_normals
+from meshsplats._arrays import spread_indices
+from meshsplats._geometry import vertex_normals
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import dome
 from meshsplats.mesh import SplatMesh
@@ -36,15 +37,11 @@ class DepthViews:
         """(k,) bool: which of ``points`` (k, 3) any camera sees in front of the base or beside it."""
         result = np.zeros(len(points), bool)
         for camera, nearest in zip(self.cameras, self.nearest, strict=True):
-            matrix = camera.world_to_camera
-            x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
-            rows = np.flatnonzero(z > camera.near)
-            column = np.floor(camera.fx * x[rows] / z[rows] + camera.cx)
-            row = np.floor(camera.fy * y[rows] / z[rows] + camera.cy)
-            on = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            rows, place = rows[on], (row[on].astype(np.intp), column[on].astype(np.intp))
+            positions, z = camera.project(points)
+            rows = np.flatnonzero(camera.in_image(positions))
+            column, row = positions[rows].T.astype(np.intp)
             slack = 1 + _TOLERANCE / min(camera.fx, camera.fy)
-            result[rows] |= z[rows] * slack < nearest[place]
+            result[rows] |= z[rows] * slack < nearest[row, column]
         return result
 
 
@@ -56,21 +53,18 @@ def render_depth_views(
     The views are up to ``MAX_VIEWS`` of the ``cameras``, evenly spread; without cameras, views from all
     directions.
     """
-    normals = surface_normals(vertices, faces)
+    normals = vertex_normals(np.asarray(vertices, np.float64), faces)
     colors = np.ones((len(vertices), 4), np.float32)
     base = SplatMesh(vertices, faces, colors, attributes={"normal": normals})
     if cameras:
-        chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, MAX_VIEWS).round().astype(int)]
-        chosen = [camera.within(MAX_SIDE) for camera in dict.fromkeys(chosen)]
+        chosen = [cameras[i].within(MAX_SIDE) for i in spread_indices(len(cameras), MAX_VIEWS)]
     else:
         chosen = dome(base, MAX_VIEWS, whole=True, width=MAX_SIDE, height=MAX_SIDE)
     nearest, front = [], 0.0
     for camera in chosen:
         drawn = render(base, camera, depth=True, attributes=["normal"], threads=threads)
-        assert drawn.depth is not None
+        nearest.append(_neighbourhood_minimum(drawn.mean_depth(min_alpha=0.5)))
         solid = drawn.alpha > 0.5
-        depth = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)
-        nearest.append(_neighbourhood_minimum(depth))
         rows, columns = np.nonzero(solid)
         ray = np.stack(
             [

@@ -91,10 +91,7 @@ def base_surface(
     views = []
     for camera in placed:
         drawn = render(mesh, camera, background=(0, 0, 0), depth=True, threads=threads)
-        assert drawn.depth is not None
-        solid = drawn.alpha >= _SOLID
-        depth = np.where(solid, drawn.depth / np.where(solid, drawn.alpha, 1), np.inf)
-        _integrate(total, weight, depth, camera, low, voxel)
+        _integrate(total, weight, drawn.mean_depth(min_alpha=_SOLID), camera, low, voxel)
         views.append(View(camera, ViewImage(np.clip(drawn.color, 0, 1), drawn.alpha)))
         if progress is not None:
             progress()

@@ -1,4 +1,4 @@
-"""train: optimises a mesh prior on images."""
+"""train_prior: optimises a mesh prior on images."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ CHOICES = {
 
 
 def prior_config(**changes: Any) -> FinetuneConfig:
-    """The default configuration of ``train``, with ``changes`` as in ``make_config``."""
+    """The default configuration of ``train_prior``, with ``changes`` as in ``make_config``."""
     from meshsplats.finetuning import make_config
 
     return make_config("default", **{**CHOICES, **changes})
 
 
-def train(
+def train_prior(
     prior: MeshPrior,
     dataset: Dataset,
     config: FinetuneConfig | None = None,

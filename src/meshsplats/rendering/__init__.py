@@ -1,4 +1,4 @@
-"""Pictures of meshes and of splats. See :mod:`meshsplats.rendering.api`."""
+"""Images of meshes and of splats. See :mod:`meshsplats.rendering.api`."""
 
 from meshsplats.rendering.api import Rendering, render, render_splats
 

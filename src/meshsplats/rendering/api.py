@@ -1,4 +1,4 @@
-"""render and render_splats: exact pictures of meshes and splats from the compiled core."""
+"""render and render_splats: exact images of meshes and splats from the compiled core."""
 
 from __future__ import annotations
 
@@ -13,28 +13,42 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, checked_filter
 
 MIN_TRANSMITTANCE = 1e-6
-"""A sample stops once less than this fraction of light comes through: what is left out stays below it."""
+"""Early termination: a sample stops once its transmittance is below this. The error stays below it, too."""
 
 MAX_SAMPLES = 16
-"""Largest side of the grid of samples in a pixel."""
+"""Largest side of the grid of samples in each pixel."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """A picture. Rows run from top to bottom."""
+    """An image with alpha, and further outputs. Rows run from top to bottom."""
 
     color: np.ndarray
-    """(h, w, 3) float32 RGB over the background, in the space of the colours given (display RGB)."""
+    """(h, w, 3) float32 RGB over the background, in the colour space of the mesh or splats (display RGB)."""
     alpha: np.ndarray
-    """(h, w) float32 opacity in [0, 1]: 1 minus the light that still comes from the background."""
+    """(h, w) float32 in [0, 1]: 1 minus the transmittance that is left for the background."""
     depth: np.ndarray | None = None
-    """(h, w) float32 camera depth z, summed with the weights of colour: the mean is this / ``alpha``."""
+    """(h, w) float32 camera depth z, summed with the blending weights of colour; see ``mean_depth``."""
     normals: np.ndarray | None = None
-    """(h, w, 3) float32 world-frame unit normals turned to the camera, summed with the same weights."""
+    """(h, w, 3) float32 world-frame unit normals that face the camera, summed with the same weights."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Per-vertex attributes asked for, (h, w) or (h, w, c) float32, summed with the same weights."""
+    """The requested vertex attributes, (h, w) or (h, w, c) float32, summed with the same weights."""
     fragments: int = 0
-    """How many samples of triangles (or splats) were blended."""
+    """Count of blended fragments: triangles, or splats, at samples."""
+
+    def mean_depth(self, *, min_alpha: float = 0.0, empty: float = np.inf) -> np.ndarray:
+        """(h, w) float32 mean depth z of the fragments in each pixel, weighted as their colours are.
+
+        Args:
+            min_alpha: pixels whose alpha is not above this are empty.
+            empty: depth of empty pixels.
+
+        Raises ValueError for a rendering without depth.
+        """
+        if self.depth is None:
+            raise ValueError("the rendering has no depth: render with depth=True")
+        covered = self.alpha > min_alpha
+        return np.where(covered, self.depth / np.where(covered, self.alpha, 1), np.float32(empty))
 
 
 def render(
@@ -51,40 +65,39 @@ def render(
     filter_px2: float | None = None,
     threads: int | None = None,
 ) -> Rendering:
-    """The picture of a mesh of translucent triangles, exact at every sample.
+    """The image of a mesh of translucent triangles, exact at every sample.
 
-    All triangles that cover a sample are sorted by their depth there (equal depths by face number) and
+    All triangles that cover a sample are sorted by their depth there (equal depths by face index) and
     blended front to back, ``C = sum_k T_k a_k c_k + T_end * background`` with ``T_k = prod_{j<k} (1 -
     a_j)``; colour and opacity are interpolated with perspective-correct weights. A sample on an edge shared
-    by two triangles belongs to exactly one (top-left rule). Triangles are seen from both sides and are cut
-    at the near plane.
+    by two triangles belongs to exactly one (top-left rule). Triangles are visible from both sides and are
+    clipped at the near plane.
 
-    A mesh that wants a filter of s = ``filter_px2`` is drawn with its splats' triangles spread on the
-    picture, as 3D Gaussian Splatting widens splats by 0.3 px^2 at whatever size they are drawn. With c and M
-    the mean and the covariance of a splat's opacity on the picture, projected vertices p move to ``c + A (p -
-    c)``, ``A = (M + s I)^(1/2) M^(-1/2)``; depths, colours and opacities stay. No direction counts as
-    narrower than a variance of s / 10,000: a splat seen exactly edge on has no triangle to spread. Splats
-    that reach nearer than the near plane stay as they are. The variance is that of pixels, whatever
-    ``samples`` is.
+    A mesh with a low-pass filter of s = ``filter_px2`` is drawn with the fan of each splat widened in screen
+    space, as 3D Gaussian Splatting widens splats by 0.3 px^2 at any size of the image. With c and M the mean
+    and the covariance of a splat's opacity in the image, projected vertices p move to ``c + A (p - c)``, ``A
+    = (M + s I)^(1/2) M^(-1/2)``; depths, colours and opacities stay. No direction counts as narrower than a
+    variance of s / 10,000: a splat seen exactly edge on has no triangle to widen. Splats that reach nearer
+    than the near plane stay as they are. The variance is in square pixels for any ``samples``.
 
     Args:
-        mesh: what to draw.
-        camera: from where.
+        mesh: the triangles.
+        camera: viewpoint, lens and size of the image.
         background: RGB, (3,) or (h, w, 3), in the space of the mesh's colours.
         samples: side of the grid of samples in each pixel, 1 to 16; 2 means 2 x 2 samples, averaged.
-        max_layers: blend only the nearest so many triangles at each sample, as depth peeling with that many
-            passes.
-        min_transmittance: a sample stops once less than this fraction of light comes through; 0 never stops.
+        max_layers: blend at most this many of the nearest triangles at each sample, as depth peeling does
+            with that many passes.
+        min_transmittance: early termination of samples with less transmittance than this; 0: none.
         depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
-        filter_px2: takes the place of ``mesh.filter_px2``; 0 draws the triangles as they are.
-        threads: at most this many; all processors by default. The picture does not depend on it.
+        filter_px2: overrides ``mesh.filter_px2``; 0 draws the triangles as they are.
+        threads: at most this many; all processors by default. The result does not depend on it.
 
     Raises:
         ValueError: an option out of its range, an attribute that the mesh does not have, or a filter for a
             mesh without ``face_splat`` or whose splats share vertices.
         MemoryError: the scene does not fit.
     """
-    keep = Alive()
+    keep = Pointers()
     options = checked_options(keep, camera, background, samples, threads)
     if max_layers is not None and not (
         isinstance(max_layers, (int, np.integer)) and 1 <= max_layers <= np.iinfo(np.int32).max
@@ -107,7 +120,7 @@ def render(
         columns = {name: value if value.ndim == 2 else value[:, None] for name, value in chosen.items()}
         widths = {name: column.shape[1] for name, column in columns.items()}
         values = np.ascontiguousarray(np.concatenate(list(columns.values()), axis=1))
-    subject = library.MeshStruct(
+    triangles = library.MeshStruct(
         vertex_count=len(mesh.vertices),
         face_count=len(mesh.faces),
         vertices=keep(mesh.vertices),
@@ -125,8 +138,8 @@ def render(
     depths = np.empty((h, w), np.float32) if depth else None
     directions = np.empty((h, w, 3), np.float32) if normals else None
     sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
-    picture = library.ImageStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
-    library.call("ms_render_mesh", subject, camera_struct(camera), options, picture)
+    image = library.ImageStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
+    library.call("ms_render_mesh", triangles, camera_struct(camera), options, image)
 
     named = {}
     start = 0
@@ -135,7 +148,7 @@ def render(
         part = sums[:, :, start : start + width]
         named[name] = part[:, :, 0] if mesh.attributes[name].ndim == 1 else part
         start += width
-    return Rendering(color, alpha, depths, directions, named, int(picture.fragments))
+    return Rendering(color, alpha, depths, directions, named, int(image.fragments))
 
 
 def render_splats(
@@ -148,39 +161,40 @@ def render_splats(
     dilation: float = 0.3,
     threads: int | None = None,
 ) -> Rendering:
-    """The picture of the splats themselves, as 3D Gaussian Splatting draws them.
+    """The image of the splats themselves, as 3D Gaussian Splatting draws them.
 
     Splats are projected by their local affine approximation (EWA), widened by ``dilation``, and blended
-    whole in the order of their centres' depth: opacity below 1/255 is skipped, at most 0.99 is taken, and a
-    sample ends before the splat that would leave less than 1e-4 of the light. Every sample where a splat's
-    opacity reaches 1/255 is drawn, however far from its centre. The cloud's kernel decides what is drawn:
-    '3dgs' as above, 'antialiased' with the opacity lowered by as much as the widening adds, '2dgs' flat
-    splats met by the ray (no widening; a low pass of variance 5/3 ``dilation``, so 1/2 px^2).
+    whole in the order of their centres' depth. Alpha below 1/255 is skipped and is limited to 0.99; a sample
+    terminates before the splat that would leave a transmittance below 1e-4. Every sample where a splat's
+    alpha reaches 1/255 is drawn, however far from its centre. The cloud's kernel decides the details: '3dgs'
+    as above; 'antialiased' with the opacity lowered by as much as the widening adds; '2dgs' flat splats
+    intersected by the ray (no widening; a low-pass filter of variance 5/3 ``dilation``, so 1/2 px^2).
 
     Args:
         cloud: the splats.
-        camera: from where; splats whose centres are nearer than ``camera.near`` are left out.
+        camera: viewpoint, lens and size of the image; splats whose centres are nearer than ``camera.near``
+            are left out.
         background: RGB, (3,) or (h, w, 3).
         samples: side of the grid of samples in each pixel, 1 to 16; the widening stays that of whole pixels.
-        sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default. Colour
-            is kept from falling below 0, as in 3DGS; that of degree 0 alone is ``cloud.colors``, kept in [0,
-            1].
-        dilation: variance added to the projected covariance, square pixels; models trained otherwise need
-            theirs.
-        threads: at most this many; all processors by default. The picture does not depend on it.
+        sh_degree: use spherical harmonics up to this degree, 0 to 3; all that are stored by default. Colours
+            are clamped to 0 and above, as in 3DGS; those of degree 0 alone are ``cloud.colors``, clamped to
+            [0, 1].
+        dilation: variance added to the projected covariance, square pixels. Models that were trained with
+            another one need theirs.
+        threads: at most this many; all processors by default. The result does not depend on it.
 
     Raises:
         ValueError: an option out of its range.
         MemoryError: the scene does not fit.
     """
-    keep = Alive()
+    keep = Pointers()
     options = checked_options(keep, camera, background, samples, threads)
     if sh_degree is not None and sh_degree not in (0, 1, 2, 3):
         raise ValueError(f"sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
     if not (np.isfinite(dilation) and dilation >= 0):
         raise ValueError(f"dilation must be a variance in square pixels, >= 0, got {dilation}")
     degree = cloud.sh_degree if sh_degree is None else min(int(sh_degree), cloud.sh_degree)
-    subject = library.SplatsStruct(
+    splats = library.SplatsStruct(
         count=len(cloud),
         means=keep(cloud.means),
         quaternions=keep(cloud.quaternions),
@@ -194,13 +208,13 @@ def render_splats(
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
-    picture = library.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
-    library.call("ms_render_splats", subject, camera_struct(camera), options, picture)
-    return Rendering(color, alpha, fragments=int(picture.fragments))
+    image = library.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
+    library.call("ms_render_splats", splats, camera_struct(camera), options, image)
+    return Rendering(color, alpha, fragments=int(image.fragments))
 
 
-class Alive:
-    """Addresses of arrays for the core; holds the arrays until the call is over."""
+class Pointers:
+    """Gives the core pointers to arrays, and keeps the arrays alive as long as itself."""
 
     def __init__(self) -> None:
         self._arrays: list[np.ndarray] = []
@@ -219,18 +233,18 @@ def camera_struct(camera: Camera) -> library.CameraStruct:
 
 
 def checked_options(
-    keep: Alive, camera: Camera, background, samples: int, threads: int | None
+    keep: Pointers, camera: Camera, background, samples: int, threads: int | None
 ) -> library.OptionsStruct:
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
     if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
         raise ValueError(f"threads must be at least 1, got {threads!r}")
-    behind = np.ascontiguousarray(background, np.float32)
-    if behind.shape not in ((3,), (camera.height, camera.width, 3)):
+    backdrop = np.ascontiguousarray(background, np.float32)
+    if backdrop.shape not in ((3,), (camera.height, camera.width, 3)):
         raise ValueError(
-            f"background must have shape (3,) or ({camera.height}, {camera.width}, 3), got {behind.shape}"
+            f"background must have shape (3,) or ({camera.height}, {camera.width}, 3), got {backdrop.shape}"
         )
-    if not np.isfinite(behind).all():
+    if not np.isfinite(backdrop).all():
         raise ValueError("background must be finite")
     assert max(camera.width, camera.height) <= MAX_SIDE
     return library.OptionsStruct(
@@ -238,13 +252,13 @@ def checked_options(
         max_layers=0,
         threads=min(int(threads) if threads else library.processors(), 256),
         min_transmittance=0,
-        background=keep(behind),
-        background_per_pixel=behind.ndim == 3,
+        background=keep(backdrop),
+        background_per_pixel=backdrop.ndim == 3,
     )
 
 
 def compact_groups(depth_group: np.ndarray | None) -> np.ndarray | None:
-    """The same groups under small numbers, so that tables over them stay as small as the mesh."""
+    """The same groups, numbered without gaps, so that tables over them are no larger than the mesh."""
     if depth_group is None or not len(depth_group) or depth_group.max() < len(depth_group):
         return depth_group
     values, numbers = np.unique(depth_group, return_inverse=True)

@@ -20,15 +20,15 @@ except ImportError as error:
 
 
 class Raster(NamedTuple):
-    """Pictures of b cameras; without the first axis if one camera was given, not a sequence."""
+    """Images of b cameras; without the first axis if one camera was given, not a sequence."""
 
     color: torch.Tensor
     """(b, h, w, 3) float32 RGB over the background."""
     alpha: torch.Tensor
     """(b, h, w) float32 opacity in [0, 1]."""
     attributes: torch.Tensor
-    """(b, h, w, k) float32: the vertices' further attributes, summed with the weights of colour; not over the
-    background."""
+    """(b, h, w, k) float32: the vertices' further attributes, summed with the blending weights of colour; the
+    background adds nothing to them."""
 
 
 def rasterize(
@@ -47,36 +47,38 @@ def rasterize(
     threads: int | None = None,
     tape_bytes: int = TAPE_BYTES,
 ) -> Raster:
-    """The pictures that ``render`` draws, differentiable once.
+    """The images that ``render`` gives, differentiable once.
 
-    Gradients go to ``vertices``, ``attributes``, ``background`` and ``world_to_camera``. They are those of
-    the pictures as drawn: values move with the interpolation (perspective included) and the blending; which
-    triangles a sample sees and in which order is constant, so an edge that passes over a sample gives no
-    gradient. An opacity of 1 is no exception: its gradient tells what is behind (at least six layers
-    of it). Memory for the way back is a log of at most ``tape_bytes`` a picture, about two bytes for each
-    fragment; tiles beyond are drawn once more. Every result has the same bits in every run, with any number
-    of threads.
+    Gradients go to ``vertices``, ``attributes``, ``background`` and ``world_to_camera``. They pass through
+    blending and perspective-correct interpolation. The fragments of a sample and their order count as
+    constant, so an edge that passes over a sample has no gradient. An opacity of 1 is no exception: its
+    gradient takes account of the fragments behind it, at least six layers of them.
+
+    The forward pass records a tape of at most ``tape_bytes`` for each image, about two bytes a fragment; the
+    backward pass renders tiles that did not fit once more. Every result has the same bits in every run, with
+    any number of threads.
 
     Args:
         vertices: (v, 3) float32 world positions.
-        faces: (f, 3) int32, numbers of vertices.
-        attributes: (v, 4 + k) float32: straight RGBA, opacities in [0, 1], then k further numbers. With k > 0
+        faces: (f, 3) int32 vertex indices.
+        attributes: (v, 4 + k) float32: straight RGBA, opacities in [0, 1], then k further values. With k > 0
             the two parts are copied.
-        cameras: one, or several of one size.
+        cameras: one, or several with images of one size.
         background: (3,), (h, w, 3) or (b, h, w, 3) RGB.
-        world_to_camera: (b, 4, 4), or (4, 4) for one camera: takes the place of the cameras' own, to optimise
+        world_to_camera: (b, 4, 4), or (4, 4) for one camera: overrides that of the cameras, to optimise
             poses. The last row is not used.
         samples: side of the grid of samples in each pixel.
         face_splat, depth_group: (f,) int32, as in ``SplatMesh``.
         filter_px2: variance in square pixels of the filter for splats, as in ``render``. Gradients go through
             the filter to positions and opacities.
-        min_transmittance: a sample stops once less than this fraction of light comes through.
+        min_transmittance: early termination of samples with less transmittance than this.
         threads: at most this many; all processors by default.
+        tape_bytes: limit on the size of the tape of each image.
 
     Raises:
-        ValueError: tensors of other types, shapes or devices; faces that name missing vertices; options out
-            of range; a filter without ``face_splat``, or for splats that share vertices.
-        RuntimeError: from torch, where a second derivative is asked for.
+        ValueError: tensors of other types, shapes or devices; faces with indices of missing vertices; options
+            out of range; a filter without ``face_splat``, or for splats that share vertices.
+        RuntimeError: from torch, for a second derivative.
     """
     single = isinstance(cameras, Camera)
     views: list[Camera] = [cameras] if isinstance(cameras, Camera) else list(cameras)
@@ -98,7 +100,7 @@ def rasterize(
         f"({len(vertices)}, 4 + k)",
         attributes.ndim == 2 and attributes.shape[1] >= 4 and len(attributes) == len(vertices),
     )
-    behind = _background(background, len(views), size)
+    backdrop = _background(background, len(views), size)
     poses = None
     if world_to_camera is not None:
         poses = world_to_camera[None] if single and world_to_camera.ndim == 2 else world_to_camera
@@ -116,12 +118,12 @@ def rasterize(
         dict(filter_px2=filter_px2, samples=samples, min_transmittance=min_transmittance, threads=threads),
         tape_bytes,
     )
-    inputs = (vertices, attributes, behind, poses)
+    inputs = (vertices, attributes, backdrop, poses)
     if torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in inputs):
-        pictures = _Rasterize.apply(*inputs, constant)
+        images = _Rasterize.apply(*inputs, constant)
     else:
-        pictures = _draw(*inputs, constant, None)
-    return Raster(*((part[0] for part in pictures) if single else pictures))
+        images = _forward(*inputs, constant, None)
+    return Raster(*((part[0] for part in images) if single else images))
 
 
 class _Constant(NamedTuple):
@@ -133,99 +135,102 @@ class _Constant(NamedTuple):
     tape_bytes: int
 
 
-def _draw(
+def _forward(
     vertices: torch.Tensor,
     attributes: torch.Tensor,
     background: torch.Tensor,
     poses: torch.Tensor | None,
     constant: _Constant,
-    records: list[TapedRendering] | None,
+    tapes: list[TapedRendering] | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The pictures; to ``records``, if given, what going back needs."""
+    """Colour, alpha and attributes of the images; appends the renderings to ``tapes``, where there is one."""
     points = _array(vertices)
     values = attributes.detach()
     colors = _array(values if values.shape[1] == 4 else values[:, :4])
     more = _array(values[:, 4:]) if values.shape[1] > 4 else None
-    behind = background.detach().numpy()
-    drawn = []
-    for number, camera in enumerate(constant.cameras):
-        picture = TapedRendering(
+    backdrop = background.detach().numpy()
+    images = []
+    for i, camera in enumerate(constant.cameras):
+        rendering = TapedRendering(
             points,
             constant.faces,
             colors,
             more,
             camera,
-            background=behind[number] if behind.ndim == 4 else behind,
-            world_to_camera=None if poses is None else poses[number].detach().double().numpy(),
+            background=backdrop[i] if backdrop.ndim == 4 else backdrop,
+            world_to_camera=None if poses is None else poses[i].detach().double().numpy(),
             face_splat=constant.face_splat,
             depth_group=constant.depth_group,
-            tape_bytes=None if records is None else constant.tape_bytes,
+            tape_bytes=None if tapes is None else constant.tape_bytes,
             **constant.options,
         )
-        drawn.append((picture.color, picture.alpha, picture.attributes))
-        if records is not None:
-            records.append(picture)
+        images.append((rendering.color, rendering.alpha, rendering.attributes))
+        if tapes is not None:
+            tapes.append(rendering)
 
-    def together(parts: Sequence[np.ndarray]) -> torch.Tensor:
+    def stacked(parts: Sequence[np.ndarray]) -> torch.Tensor:
         return torch.from_numpy(parts[0][None] if len(parts) == 1 else np.stack(parts))
 
-    color, alpha, extra = (together(parts) for parts in zip(*drawn, strict=True))
+    color, alpha, extra = (stacked(parts) for parts in zip(*images, strict=True))
     return color, alpha, extra
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, vertices, attributes, background, poses, constant):  # type: ignore[override]
-        ctx.records = []
-        pictures = _draw(vertices, attributes, background, poses, constant, ctx.records)
-        # What the core reads again must not have been changed in place: torch checks it.
-        ctx.save_for_backward(vertices, attributes, background, poses, pictures[1])
+        ctx.tapes = []
+        images = _forward(vertices, attributes, background, poses, constant, ctx.tapes)
+        # The core reads these arrays again: torch checks that nobody has changed them in place.
+        ctx.save_for_backward(vertices, attributes, background, poses, images[1])
         ctx.set_materialize_grads(False)
-        return pictures
+        return images
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, to_color, to_alpha, to_extra):  # type: ignore[override]
+    def backward(ctx, grad_color, grad_alpha, grad_extra):  # type: ignore[override]
         vertices, attributes, background, poses, alpha = ctx.saved_tensors
         needs = ctx.needs_input_grad
-        if to_color is None:
-            to_color = torch.zeros(*alpha.shape, 3)
-        towards = [None if part is None else _array(part) for part in (to_color, to_alpha, to_extra)]
-        to_points = to_values = to_poses = to_behind = None
+        if grad_color is None:
+            grad_color = torch.zeros(*alpha.shape, 3)
+        of_images = [None if part is None else _array(part) for part in (grad_color, grad_alpha, grad_extra)]
+        grad_vertices = grad_attributes = grad_poses = grad_background = None
         if needs[0] or needs[1] or needs[3]:
             width = attributes.shape[1] - 4
             points = np.zeros(vertices.shape, np.float32)
             colors = np.zeros((len(vertices), 4), np.float32)
             more = np.zeros((len(vertices), width), np.float32)
             by_pose = []
-            for number, record in enumerate(ctx.records):
-                given = [None if part is None else part[number] for part in towards]
-                moved = np.zeros_like(points) if needs[3] else points
-                record.back(*given, vertices=moved, colors=colors, vertex_attributes=more)
+            for i, rendering in enumerate(ctx.tapes):
+                of_image = [None if part is None else part[i] for part in of_images]
+                own = np.zeros_like(points) if needs[3] else points
+                rendering.backward(*of_image, vertices=own, colors=colors, vertex_attributes=more)
                 if needs[3]:
-                    by_pose.append(_pose_gradient(vertices, poses[number], moved))
-                    points += moved
+                    by_pose.append(_pose_gradient(vertices, poses[i], own))
+                    points += own
             if needs[3]:
-                to_poses = torch.from_numpy(np.stack(by_pose)).to(poses)
-            to_points = torch.from_numpy(points)
-            to_values = torch.from_numpy(np.concatenate([colors, more], axis=1) if width else colors)
+                grad_poses = torch.from_numpy(np.stack(by_pose)).to(poses)
+            grad_vertices = torch.from_numpy(points)
+            grad_attributes = torch.from_numpy(np.concatenate([colors, more], axis=1) if width else colors)
         if needs[2]:
-            to_behind = to_color * (1 - alpha)[..., None]
+            grad_background = grad_color * (1 - alpha)[..., None]
             if background.ndim < 4:
-                to_behind = to_behind.sum(dim=0 if background.ndim == 3 else (0, 1, 2))
-        return to_points, to_values, to_behind, to_poses, None
+                grad_background = grad_background.sum(dim=0 if background.ndim == 3 else (0, 1, 2))
+        return grad_vertices, grad_attributes, grad_background, grad_poses, None
 
 
-def _pose_gradient(vertices: torch.Tensor, pose: torch.Tensor, moved: np.ndarray) -> np.ndarray:
-    """(4, 4) from the gradients of the world's points, as p_camera = R p + t: dL/dp = R^T dL/dp_camera."""
+def _pose_gradient(vertices: torch.Tensor, pose: torch.Tensor, gradients: np.ndarray) -> np.ndarray:
+    """(4, 4) gradient of a pose from the ``gradients`` (v, 3) of the world positions p.
+
+    With p_camera = R p + t, dL/dp = R^T dL/dp_camera, so dL/dR = R^-T sum dL/dp p^T.
+    """
     rotation = pose.detach().double().numpy()[:3, :3]
     points = vertices.detach().numpy()
-    # Sums over all points first: they are what the rotation is to be taken from.
-    moved64 = moved.astype(np.float64)
-    back = np.linalg.inv(rotation.T)
+    # Sums over all points come first, in float64: the rotation is applied once.
+    of_world = gradients.astype(np.float64)
+    to_camera = np.linalg.inv(rotation.T)
     result = np.zeros((4, 4))
-    result[:3, :3] = back @ (moved64.T @ points.astype(np.float64))
-    result[:3, 3] = back @ moved64.sum(axis=0)
+    result[:3, :3] = to_camera @ (of_world.T @ points.astype(np.float64))
+    result[:3, 3] = to_camera @ of_world.sum(axis=0)
     return result
 
 
@@ -238,7 +243,7 @@ def _check(name: str, tensor: torch.Tensor, shape: str, fits: bool) -> None:
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:
-    """The tensor's own memory where it is contiguous, as it should be."""
+    """The tensor's own memory where it is contiguous, else a copy."""
     return tensor.detach().contiguous().numpy()
 
 
@@ -247,7 +252,9 @@ def _faces(faces: torch.Tensor | np.ndarray, vertices: int) -> np.ndarray:
     if array.ndim != 2 or array.shape[1] != 3 or not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"faces must be (f, 3) int32, got {array.shape} {array.dtype}")
     if len(array) and (array.min() < 0 or array.max() >= vertices):
-        raise ValueError(f"faces must name vertices 0 to {vertices - 1}, got {array.min()} to {array.max()}")
+        raise ValueError(
+            f"faces must be vertex indices from 0 to {vertices - 1}, got {array.min()} to {array.max()}"
+        )
     return array.astype(np.int32, copy=False)
 
 

@@ -1,4 +1,4 @@
-"""Pictures with a way back: from gradients of a picture to those of the mesh, on NumPy arrays."""
+"""Rendering with a backward pass: from image gradients to vertex gradients, on NumPy arrays."""
 
 from __future__ import annotations
 
@@ -10,15 +10,21 @@ import numpy as np
 from meshsplats._core import library
 from meshsplats.camera import Camera
 from meshsplats.mesh import checked_filter
-from meshsplats.rendering.api import MIN_TRANSMITTANCE, Alive, camera_struct, checked_options, compact_groups
+from meshsplats.rendering.api import (
+    MIN_TRANSMITTANCE,
+    Pointers,
+    camera_struct,
+    checked_options,
+    compact_groups,
+)
 
 TAPE_BYTES = 128 << 20
-"""Most memory that the log of one picture takes: about two bytes for each fragment. Going back, tiles whose
-log did not fit are drawn once more."""
+"""Largest size of the tape of one image, which takes about two bytes a fragment. The backward pass renders
+tiles that did not fit once more."""
 
 
 class TapedRendering:
-    """A picture of a mesh, drawn as ``render`` draws it, with a log of what was blended."""
+    """The image that ``render`` gives, with a tape of the blended fragments for the backward pass."""
 
     def __init__(
         self,
@@ -38,11 +44,21 @@ class TapedRendering:
         threads: int | None = None,
         tape_bytes: int | None = TAPE_BYTES,
     ) -> None:
-        """Arrays are those of a ``SplatMesh``, C-contiguous, float32 and int32, and are kept, not copied:
-        they must not change until ``back`` is called. ``attributes`` are (v, k); ``world_to_camera`` (4, 4)
-        takes the place of the camera's; without ``tape_bytes`` the picture is drawn faster and there is no
-        way back."""
-        keep = self._keep = Alive()
+        """Runs the forward pass.
+
+        Args:
+            vertices, faces, colors, face_splat, depth_group: as in ``SplatMesh``; C-contiguous, float32 and
+                int32. They are kept, not copied, and must not change before ``backward``.
+            attributes: (v, k) further values to interpolate and blend, or None.
+            camera: viewpoint, lens and size of the image.
+            background, filter_px2, samples, min_transmittance, threads: as in ``render``.
+            world_to_camera: (4, 4) float64, overrides the camera's.
+            tape_bytes: limit on the size of the tape; None: no tape and no backward pass, which is faster.
+
+        Raises ValueError for options out of range, and MemoryError where the scene does not fit.
+        """
+        self._tape = ctypes.c_void_p()
+        keep = self._pointers = Pointers()
         self._options = checked_options(keep, camera, background, samples, threads)
         self._options.min_transmittance = min_transmittance
         self._camera = camera_struct(camera)
@@ -66,34 +82,33 @@ class TapedRendering:
         self.color = np.empty((h, w, 3), np.float32)
         self.alpha = np.empty((h, w), np.float32)
         self.attributes = np.empty((h, w, width), np.float32)
-        picture = library.ImageStruct(
+        image = library.ImageStruct(
             keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
         )
-        self._log = ctypes.c_void_p()
         if tape_bytes is None:
-            library.call("ms_render_mesh", self._mesh, self._camera, self._options, picture)
+            library.call("ms_render_mesh", self._mesh, self._camera, self._options, image)
         else:
             library.call(
                 "ms_rasterize",
                 self._mesh,
                 self._camera,
                 self._options,
-                picture,
+                image,
                 tape_bytes,
-                ctypes.byref(self._log),
+                ctypes.byref(self._tape),
             )
-        self.fragments = int(picture.fragments)
+        self.fragments = int(image.fragments)
 
     @property
     def vertex_count(self) -> int:
         return self._mesh.vertex_count
 
     def __del__(self) -> None:
-        if getattr(self, "_log", None):
-            library.load_core().ms_free_tape(self._log)
-            self._log = ctypes.c_void_p()
+        if getattr(self, "_tape", None):
+            library.load_core().ms_free_tape(self._tape)
+            self._tape = ctypes.c_void_p()
 
-    def back(
+    def backward(
         self,
         color: np.ndarray,
         alpha: np.ndarray | None,
@@ -103,34 +118,50 @@ class TapedRendering:
         colors: np.ndarray,
         vertex_attributes: np.ndarray | None = None,
     ) -> None:
-        """Adds to ``vertices`` (v, 3), ``colors`` (v, 4) and ``vertex_attributes`` (v, k) the gradients that
-        follow from those of the picture's ``color`` (h, w, 3), ``alpha`` (h, w) and ``attributes`` (h, w, k).
-        All float32, C-contiguous.
+        """Runs the backward pass: adds vertex gradients to the arrays given.
 
-        Which triangles a sample sees and in which order is constant. The gradient of an opacity a of 1 is
-        that of what is behind it. The result has the same bits with any number of threads.
+        The fragments of a sample and their order count as constant. The gradient of an opacity of 1 takes
+        account of the fragments behind it. The result has the same bits with any number of threads.
+
+        Args:
+            color: (h, w, 3) gradient of the image's colour.
+            alpha, attributes: (h, w) and (h, w, k) gradients of those outputs, or None.
+            vertices, colors, vertex_attributes: (v, 3), (v, 4) and (v, k), to be added to.
+
+        All arrays are float32 and C-contiguous. Raises ValueError for a rendering without a tape.
         """
-        if not self._log:
-            raise ValueError("the picture was drawn without a log: there is no way back")
+        if not self._tape:
+            raise ValueError("rendered without a tape (tape_bytes=None): no gradients are available")
         if attributes is not None and not self._mesh.attribute_count:
             attributes = None
-        given = library.ImageGradientsStruct(
+        image_gradients = library.ImageGradientsStruct(
             library.pointer(color), library.pointer(alpha), library.pointer(attributes)
         )
-        out = library.VertexGradientsStruct(
+        vertex_gradients = library.VertexGradientsStruct(
             library.pointer(vertices),
             library.pointer(colors),
             None if attributes is None else library.pointer(vertex_attributes),
         )
-        library.call("ms_rasterize_backward", self._mesh, self._camera, self._options, self._log, given, out)
+        library.call(
+            "ms_rasterize_backward",
+            self._mesh,
+            self._camera,
+            self._options,
+            self._tape,
+            image_gradients,
+            vertex_gradients,
+        )
 
-    def spread(self, values: np.ndarray) -> np.ndarray:
-        """(v, k) float32: for each vertex the sum of ``values`` (h, w, k) by the weights with which it is
-        blended into the pixels. A picture made with k attributes, of any values: a weight is the derivative
-        of the picture of an attribute by that attribute."""
+    def scatter_to_vertices(self, values: np.ndarray) -> np.ndarray:
+        """(v, k) float32: for each vertex the sum of ``values`` (h, w, k) over the pixels, with the weights
+        by which the vertex is blended into them.
+
+        For renderings with k attributes, whose own values do not matter: a weight is the derivative of a
+        pixel's attribute with respect to the vertex's.
+        """
         mesh = self._mesh
         sums = np.zeros((mesh.vertex_count, mesh.attribute_count), np.float32)
-        self.back(
+        self.backward(
             np.zeros_like(self.color),
             None,
             np.ascontiguousarray(values, np.float32),
@@ -141,7 +172,7 @@ class TapedRendering:
         return sums
 
 
-def shown_pixels(
+def visible_pixels(
     vertices: np.ndarray,
     faces: np.ndarray,
     colors: np.ndarray,
@@ -154,9 +185,12 @@ def shown_pixels(
     filter_px2: float = 0.0,
     threads: int | None = None,
 ) -> np.ndarray:
-    """(v,) float32 pixels that a picture shows of each vertex: sums of its blending weights, of pixels where
-    ``mask``, (h, w) bool."""
-    picture = TapedRendering(
+    """(v,) float32 visible pixels of each vertex: sums of its blending weights over the image.
+
+    Args:
+        mask: (h, w) bool pixels that count; all by default. The others are those of ``TapedRendering``.
+    """
+    rendering = TapedRendering(
         vertices,
         faces,
         colors,
@@ -168,4 +202,5 @@ def shown_pixels(
         samples=samples,
         threads=threads,
     )
-    return picture.spread(np.ones_like(picture.attributes) if mask is None else mask[..., None])[:, 0]
+    ones = np.ones_like(rendering.attributes) if mask is None else mask[..., None]
+    return rendering.scatter_to_vertices(ones)[:, 0]

@@ -1,4 +1,4 @@
-"""What a picture of splats is the truth of: the splat viewer's, or what a pixel's area holds."""
+"""Two looks of an image of splats, the ground truth of a mesh: means over pixels, or a splat viewer's."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from meshsplats.rendering.api import Rendering, render, render_splats
 from meshsplats.rendering.samples import needed_samples
 
 Look = Literal["area", "splats"]
-"""area: each pixel is the mean over its area, which is what photographs are, and what Blender, engines with
-MSAA and every ray tracer show. splats: as a 3DGS viewer draws them, with its filter of 0.3 px^2 at the size
-of the image: fatter when small, thinner when near."""
+"""area: each pixel is the mean over its area, as in photographs, Blender, engines with MSAA and ray tracers.
+splats: as a 3DGS viewer draws them, with its filter of 0.3 px^2 at the size of the image: wider in small
+images, narrower in large ones."""
 
 AREA = 4
-"""The mean over a pixel's area is that of an image so many times as large."""
+"""The mean over a pixel's area is taken from an image this many times as large."""
 
 DILATION = 0.3
 """Variance of the filter of 3DGS, square pixels."""
@@ -33,8 +33,8 @@ def check_look(look: str) -> None:
 
 
 def mesh_samples(look: Look, mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
-    """Side of the grid of samples in each pixel with which ``mesh`` is compared with that look from
-    ``cameras``: 1 for 'splats', as many as it needs for 'area'."""
+    """Side of the grid of samples in each pixel for comparing ``mesh`` with images of that ``look`` from
+    ``cameras``: 1 for 'splats', ``needed_samples`` for 'area'."""
     return 1 if look == "splats" else needed_samples(mesh, cameras)
 
 
@@ -48,17 +48,17 @@ def draw_splats(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> Rendering:
-    """The image of the splats that a mesh should match, as ``look`` has it.
+    """The image of the splats that a mesh should match, in that ``look``.
 
     'splats' is ``render_splats`` with its defaults. 'area' is the mean over ``AREA`` x ``AREA`` blocks of the
-    image that is ``AREA`` times as large. It is drawn as that many samples in each pixel, with the filter of
-    the larger image, 0.3 / 16 px^2: the same sums.
+    image that is ``AREA`` times as large. It is computed from that many samples in each pixel, with the
+    filter of the larger image, 0.3 / 16 px^2: the same sums.
 
     Args:
         background: RGB, (3,) or (h, w, 3).
         samples: side of the grid of samples in each pixel; None: ``AREA`` for 'area', 1 for 'splats'. For
-            'area', 2 cost half of the time and are within 48 to 56 dB of the mean, and 1 gives the values at
-            the pixels' centres, of which the mean is made.
+            'area', 2 takes half the time and comes within 48 to 56 dB of the mean; 1 gives the values at the
+            pixels' centres.
         sh_degree, threads: as in ``render_splats``.
 
     Raises ValueError for an option out of its range.
@@ -85,9 +85,12 @@ def image_of(
     max_layers: int | None = None,
     threads: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(h, w, 3) display RGB over a display ``background`` and (h, w) alpha, blended in the space that the
-    mesh was made for: a mesh of linear colours is blended in linear light and encoded after."""
+    """(h, w, 3) display RGB over a display ``background``, and (h, w) alpha.
+
+    The mesh is blended in its own space: one with linear colours in linear light, encoded for display
+    afterwards. The other arguments are those of ``render``.
+    """
     linear = mesh.blending == "linear"
-    behind = srgb_to_linear(np.asarray(background)) if linear else background
-    drawn = render(mesh, camera, background=behind, samples=samples, max_layers=max_layers, threads=threads)
+    backdrop = srgb_to_linear(np.asarray(background)) if linear else background
+    drawn = render(mesh, camera, background=backdrop, samples=samples, max_layers=max_layers, threads=threads)
     return (linear_to_srgb(drawn.color) if linear else drawn.color), drawn.alpha

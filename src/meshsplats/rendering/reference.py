@@ -1,6 +1,6 @@
 """The executable specification of :mod:`meshsplats.rendering`: slow, in float64, written to be read.
 
-``render`` and ``render_splats`` here say what a correct picture is; the compiled core is tested against them.
+``render`` and ``render_splats`` here define a correct image; the compiled core is tested against them.
 Nothing is culled, binned or bounded: every triangle and every splat is tried at every sample, so the cost is
 their product (about a second for 2,000 triangles on 64 x 64 samples).
 """
@@ -22,12 +22,12 @@ SPLAT_MIN_ALPHA = 1 / 255
 SPLAT_MAX_ALPHA = 0.99
 """No splat is more opaque than this at a sample, as in 3DGS."""
 SPLAT_MIN_TRANSMITTANCE = 1e-4
-"""A sample ends before the splat that would let less light than this through, as in 3DGS."""
+"""A sample terminates before the splat that would leave less transmittance than this, as in 3DGS."""
 
 FILTER_NARROWEST = 1e-4
-"""No fan is narrower than this, as a share of its filter's variance, for the filter."""
+"""The filter takes no fan to have a smaller variance than this share of its own."""
 FILTER_SIDEWAYS = 0.1
-"""Share at which a fan's extent in depth counts for the areas of its triangles."""
+"""Weight of a fan's extent in depth in the areas of its triangles."""
 FILTER_FAINTEST = 1e-6
 """Added to opacities for the filter, so that a fan without any has a shape, too."""
 CUBATURE: list[tuple[np.ndarray, float]] = [
@@ -50,19 +50,19 @@ def render(
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
 ) -> Rendering:
-    """The picture of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
+    """The image of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
 
     At each of the ``samples`` x ``samples`` regularly spaced samples of a pixel, the triangles that cover it
-    are sorted by depth there, equal depths by face number, and blended front to back: C = sum T_k a_k c_k + T
+    are sorted by depth there, equal depths by face index, and blended front to back: C = sum T_k a_k c_k + T
     background, with T_k the product of the (1 - a) in front. Fragments with a = 0 do not count.
-    ``max_layers`` blends only that many of the nearest fragments of each sample; a sample stops once its T is
-    below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
+    ``max_layers`` blends only that many of the nearest fragments of each sample; a sample terminates once its
+    T is below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
 
-    ``filter_px2``, by default the mesh's, spreads the triangles of each splat first (see :func:`filtered`).
+    ``filter_px2``, by default the mesh's, widens the fan of each splat first (see :func:`filtered`).
 
     ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
 
-    Raises ValueError for options out of range, a background of another shape, or an attribute the mesh lacks.
+    Raises ValueError for options out of range, a background of another shape, or a missing attribute.
     """
     backdrop = _checked_background(background, camera)
     if max_layers is not None and not (max_layers == int(max_layers) and max_layers >= 1):
@@ -84,7 +84,7 @@ def render(
     rgba = interpolated(mesh.colors)
     share, transmittance = _front_to_back(sheet, rgba[:, 3], len(x), max_layers, min_transmittance)
 
-    def picture(values: np.ndarray) -> np.ndarray:
+    def blended(values: np.ndarray) -> np.ndarray:
         sums = np.empty((len(x), values.shape[1]))
         for channel, value in enumerate(values.T):
             sums[:, channel] = np.bincount(sheet.sample, share * value, minlength=len(x))
@@ -94,13 +94,13 @@ def render(
     extra = {}
     for name in attributes:
         values = mesh.attributes[name]
-        mean = picture(interpolated(values[:, None] if values.ndim == 1 else values))
+        mean = blended(interpolated(values[:, None] if values.ndim == 1 else values))
         extra[name] = mean[..., 0] if values.ndim == 1 else mean
     return Rendering(
-        color=picture(rgba[:, :3]) + through * backdrop,
+        color=blended(rgba[:, :3]) + through * backdrop,
         alpha=1 - through[..., 0],
-        depth=picture(sheet.depth[:, None])[..., 0] if depth else None,
-        normals=picture(_facing_normals(mesh, camera, sheet, x, y)) if normals else None,
+        depth=blended(sheet.depth[:, None])[..., 0] if depth else None,
+        normals=blended(_facing_normals(mesh, camera, sheet, x, y)) if normals else None,
         attributes=extra,
         fragments=int(np.count_nonzero(share)),
     )
@@ -115,13 +115,12 @@ def render_splats(
     sh_degree: int | None = None,
     dilation: float = 0.3,
 ) -> Rendering:
-    """The picture of splats as 3D Gaussian splatting draws it (Kerbl et al. 2023). Arrays are float64.
+    """The image of splats as 3D Gaussian Splatting draws it (Kerbl et al. 2023). Arrays are float64.
 
-    Splats are blended front to back in the order of the depth z of their centres, equal depths by number;
-    those with a centre nearer than ``camera.near`` are left out. ``dilation`` (pixels squared, of the picture
-    whatever ``samples`` is) widens every projected splat; for the kernel '2dgs' its low pass, 5/3 of it, is
-    the least variance. ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is
-    stored.
+    Splats are blended front to back in the order of the depth z of their centres, equal depths by index;
+    those with a centre nearer than ``camera.near`` are left out. ``dilation`` (square pixels for any
+    ``samples``) widens every projected splat; for the kernel '2dgs', 5/3 of it is the least variance.
+    ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
 
     Unlike the published rasterisers this has no tiles and no cut at three standard deviations: a splat is
     drawn wherever its alpha reaches 1/255.
@@ -205,7 +204,7 @@ def _to_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
 
 @dataclass
 class _Fragments:
-    """Where triangles meet samples, n fragments; sorted by sample, then nearest first, then face."""
+    """n fragments, triangles at samples; sorted by sample, then nearest first, then face."""
 
     sample: np.ndarray
     """(n,) int"""
@@ -220,28 +219,28 @@ class _Fragments:
 def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) -> np.ndarray:
     """(v, 3) the mesh's vertices in the camera's frame, ``points``, with the filter of variance ``px2``.
 
-    Over the picture, the opacity of a splat's triangles (linear inside each) is a density. With its mean c
+    In the image, the opacity of a splat's triangles (linear inside each) is a density. With its mean c
     and covariance M, px^2, the projected vertices p move to c + A (p - c), A = (M + px2 I)^(1/2) M^(-1/2), at
     their depth, so that the density has the covariance M + px2 I. M is widened by ``FILTER_NARROWEST`` px2
     before. Areas are those of triangles in (x, y, k / z), with k = ``FILTER_SIDEWAYS`` f z_1 and z_1 the
-    depth of the splat's first corner: what is seen edge on keeps a little of its own. A splat that reaches
+    depth of the splat's first corner: triangles seen edge on keep some area. A splat that reaches
     nearer than the near plane, or has no area at all, stays as it is.
     """
     assert mesh.face_splat is not None
     result = points.copy()
     with np.errstate(all="ignore"):
-        picture = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy)
+        projected = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy)
         nearness = 1 / points[:, 2]
     for splat in np.unique(mesh.face_splat):
         faces = mesh.faces[mesh.face_splat == splat]
         if not (points[faces, 2] >= camera.near).all():
             continue
         k = FILTER_SIDEWAYS * np.sqrt(camera.fx * camera.fy) * points[faces[0, 0], 2]
-        lifted = np.column_stack([picture, k * nearness])[faces]
+        lifted = np.column_stack([projected, k * nearness])[faces]
         area = np.linalg.norm(np.cross(lifted[:, 1] - lifted[:, 0], lifted[:, 2] - lifted[:, 0]), axis=1)
         if not area.sum() > 0:
             continue
-        corners = picture[faces]
+        corners = projected[faces]
         opacity = mesh.colors[faces, 3].astype(np.float64) + FILTER_FAINTEST
         position = np.concatenate([np.einsum("k,tkc->tc", at, corners) for at, _ in CUBATURE])
         share = np.concatenate([weight * area * (opacity @ at) for at, weight in CUBATURE])
@@ -251,7 +250,7 @@ def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) ->
         variances, axes = np.linalg.eigh(covariance + FILTER_NARROWEST * px2 * np.eye(2))
         spread = axes @ np.diag(np.sqrt((variances + px2) / variances)) @ axes.T
         own = np.unique(faces)
-        moved = mean + (picture[own] - mean) @ spread
+        moved = mean + (projected[own] - mean) @ spread
         result[own, :2] = moved / (camera.fx, camera.fy) * points[own, 2:]
     return result
 
@@ -331,8 +330,8 @@ def _share_depths(
     """Replaces 1/z, by which fragments are ordered, with that of the common plane in every depth group.
 
     The plane is that of the triangle with the largest area in the world, the first of them if equal. Its 1/z
-    is clamped to the range over the group's vertices, of which those nearer than ``near`` count as at that
-    depth. For a plane seen edge on, which has no depth on the picture, the nearest vertex stands.
+    is clamped to the range over the group's vertices; vertices nearer than ``near`` count as lying there. A
+    plane seen edge on has no depth in the image: the nearest vertex's is taken.
     """
     assert mesh.depth_group is not None
     corners = homogeneous[mesh.faces]
@@ -355,7 +354,7 @@ def _share_depths(
 def _front_to_back(
     sheet: _Fragments, alpha: np.ndarray, count: int, max_layers: int | None, min_transmittance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """T_k a_k of every fragment (0 where it is not blended), and the T left at each of ``count`` samples."""
+    """T_k a_k of every fragment (0 where it is not blended), and the final T of each of ``count`` samples."""
     share, transmittance = np.zeros(len(alpha)), np.ones(count)
     visible = np.flatnonzero(alpha > 0)
     sample = sheet.sample[visible]
@@ -377,7 +376,7 @@ def _front_to_back(
 def _facing_normals(
     mesh: SplatMesh, camera: Camera, sheet: _Fragments, x: np.ndarray, y: np.ndarray
 ) -> np.ndarray:
-    """(n, 3) unit normals in the world frame, turned to the camera; 0 where the mesh has none."""
+    """(n, 3) unit normals in the world frame that face the camera; 0 where the mesh has none."""
     corners = mesh.faces[sheet.face]
     if mesh.normals is not None:
         normals = np.einsum("nk,nkc->nc", sheet.weights, mesh.normals.astype(np.float64)[corners])
@@ -434,8 +433,8 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 def splat_colors(cloud: GaussianCloud, camera: Camera, degree: int) -> np.ndarray:
     """(n, 3) RGB of every splat seen from the camera: max(0, 0.5 + SH), direction camera centre to splat.
 
-    Degrees above the stored one are not there to be used. There is no upper limit, as in 3DGS, except that
-    degree 0 alone gives ``cloud.colors``, the colour that a vertex can carry, at most 1.
+    ``degree`` is limited to the stored one. As in 3DGS, there is no upper limit to colours, but for those of
+    degree 0 alone: they are ``cloud.colors``, at most 1, as a vertex can hold them.
     """
     degree = min(degree, cloud.sh_degree)
     directions = cloud.means.astype(np.float64) - camera.center
@@ -467,12 +466,12 @@ def _projected_falloff(
     dilation: float,
     kernel: str,
 ) -> np.ndarray:
-    """exp(-d^T cov^-1 d / 2) of one splat at all samples, with its covariance on the picture.
+    """exp(-d^T cov^-1 d / 2) of one splat at all samples, with its covariance in the image.
 
     The projection is linearised at the centre (EWA, Zwicker et al. 2001). Where that is far outside the
-    picture the Jacobian is taken at 1.3 times the half field of view, as in 3DGS; a principal point off the
-    middle moves these limits with it: 0.3 times the half field of view beyond each side of the picture. For
-    the kernel 'antialiased' the values are scaled to keep the integral that they had before the dilation.
+    image the Jacobian is taken at 1.3 times the half field of view, as in 3DGS; a principal point off the
+    middle moves these limits with it: 0.3 times the half field of view beyond each side of the image. For the
+    kernel 'antialiased' the values are scaled to keep the integral that they had before the dilation.
     """
     tan_x, tan_y = center[0] / center[2], center[1] / center[2]
     beyond_x, beyond_y = 0.3 * camera.width / (2 * camera.fx), 0.3 * camera.height / (2 * camera.fy)
@@ -483,7 +482,7 @@ def _projected_falloff(
     sharp = projected_axes @ projected_axes.T
     cov = sharp + dilation * np.eye(2)
     determinant = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
-    if determinant <= 0:  # seen edge on and not widened
+    if determinant <= 0:  # edge on and not widened
         return np.zeros_like(x)
     dx, dy = x - (camera.fx * tan_x + camera.cx), y - (camera.fy * tan_y + camera.cy)
     power = (cov[1, 1] * dx * dx - 2 * cov[0, 1] * dx * dy + cov[0, 0] * dy * dy) / determinant

@@ -1,7 +1,7 @@
 """The specification of :func:`meshsplats.rendering.autograd.rasterize`: torch in float64, slow, to be read.
 
-Which triangles a sample sees, and in which order, comes from :mod:`meshsplats.rendering.reference` and is
-constant; everything else is torch, differentiated by torch.
+The fragments of each sample and their order come from :mod:`meshsplats.rendering.reference` and are constant;
+everything else is torch, differentiated by torch.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ def rasterize(
     depth_group: np.ndarray | None = None,
     filter_px2: float = 0.0,
 ) -> Raster:
-    """What ``autograd.rasterize`` returns, in float64, with no limit to the layers that are blended.
+    """The result of ``autograd.rasterize`` in float64, without early termination.
 
-    Arguments are those of ``autograd.rasterize``; positions and colours may be float32 or float64, but order
-    and visibility are found from their float32 values.
+    Arguments are those of ``autograd.rasterize``; positions and colours may be float32 or float64, but the
+    order of fragments is that of their float32 values.
     """
     if isinstance(cameras, Camera):
         pose = None if world_to_camera is None else world_to_camera[None]
@@ -60,23 +60,21 @@ def rasterize(
         )
         return Raster(*(part[0] for part in batch))
     backdrop = torch.as_tensor(background).double()
-    pictures = []
+    images = []
     constant = dict(samples=samples, face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2)
-    for number, camera in enumerate(cameras):
+    for i, camera in enumerate(cameras):
         pose = (
             torch.from_numpy(camera.world_to_camera)
             if world_to_camera is None
-            else world_to_camera[number].double()
+            else world_to_camera[i].double()
         )
-        behind = backdrop[number] if backdrop.ndim == 4 else backdrop
-        pictures.append(
-            _picture(vertices.double(), faces, attributes.double(), camera, pose, behind, **constant)
-        )
-    return Raster(*(torch.stack(parts) for parts in zip(*pictures, strict=True)))
+        own = backdrop[i] if backdrop.ndim == 4 else backdrop
+        images.append(_image(vertices.double(), faces, attributes.double(), camera, pose, own, **constant))
+    return Raster(*(torch.stack(parts) for parts in zip(*images, strict=True)))
 
 
 def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
-    """``reference.filtered``: (v, 3) ``points`` in the camera's frame, spread with (v,) ``opacity``."""
+    """``reference.filtered``: (v, 3) ``points`` in the camera's frame, widened by their (v,) ``opacity``."""
     result = points.clone()
     focal = points.new_tensor([camera.fx, camera.fy])
     for splat in np.unique(face_splat):
@@ -84,9 +82,9 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
         z = points[corner][..., 2:]
         if not bool((z >= camera.near).all()):
             continue
-        picture = points[corner][..., :2] / z * focal
+        projected = points[corner][..., :2] / z * focal
         k = reference.FILTER_SIDEWAYS * focal.prod().sqrt() * z[0, 0]
-        a, b, c = torch.cat([picture, k / z], dim=2).unbind(1)
+        a, b, c = torch.cat([projected, k / z], dim=2).unbind(1)
         area = torch.linalg.cross(b - a, c - a).norm(dim=1)
         if not bool(area.sum() > 0):
             continue
@@ -96,7 +94,7 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
             points.new_tensor(shares) * area[:, None] * ((opacity[corner] + reference.FILTER_FAINTEST) @ at.T)
         )
         share = share / share.sum()
-        position = torch.einsum("nk,tkc->tnc", at, picture)
+        position = torch.einsum("nk,tkc->tnc", at, projected)
         mean = (share[..., None] * position).sum((0, 1))
         covariance = torch.einsum("tn,tni,tnj->ij", share, position - mean, position - mean)
         one = torch.eye(2, dtype=points.dtype)
@@ -110,15 +108,15 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
     return result
 
 
-def _picture(
+def _image(
     vertices, faces, attributes, camera, pose, background, *, samples, face_splat, depth_group, filter_px2
 ) -> Raster:
-    seen = replace(camera, world_to_camera=pose.detach().numpy())
+    posed = replace(camera, world_to_camera=pose.detach().numpy())
     x, y = reference._sample_positions(camera, samples)
     colors = np.zeros((len(vertices), 4))
-    colors[:, 3] = attributes[:, 3].detach().numpy()  # moves what a filter spreads; else they have no part
+    colors[:, 3] = attributes[:, 3].detach().numpy()  # read by the filter only
     mesh = SplatMesh(vertices.detach().numpy(), faces, colors, face_splat=face_splat, depth_group=depth_group)
-    sheet = reference._fragments(mesh, seen, x, y, filter_px2)
+    sheet = reference._fragments(mesh, posed, x, y, filter_px2)
     sample, face = torch.from_numpy(sheet.sample), torch.from_numpy(sheet.face)
 
     corner = torch.from_numpy(np.asarray(faces, np.int64))[face]

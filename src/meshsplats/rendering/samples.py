@@ -1,4 +1,4 @@
-"""How many samples a pixel a mesh needs at the size at which it is seen."""
+"""How many samples a mesh needs in each pixel at its size in the images."""
 
 from __future__ import annotations
 
@@ -6,38 +6,37 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from meshsplats._arrays import evenly
+from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import weighted_quantile
 from meshsplats.mesh import SplatMesh, splat_starts
 
 FEWEST, MOST = 2, 8
-"""Sides of the grid of samples in each pixel to choose from."""
+"""Least and greatest side of the grid of samples in each pixel."""
 
 SPAN = 8.0
-"""Samples along the side of a small fan. Of five real scenes, images are then within 46 to 57 dB of those of
+"""Samples along the side of a small fan. Images of five real scenes are then within 46 to 57 dB of those with
 12 x 12 samples; the error falls nearly with the square of the side of the grid."""
 
 SMALL = 0.1
-"""A small fan: this share of what shows, by opacity times area, lies on smaller ones."""
+"""A small fan: fans that are smaller have this share of the sum of opacity times area."""
 
 FANS = 20_000
-"""Fans that are looked at, evenly spread."""
+"""Largest number of fans to measure, evenly spread."""
 
 CAMERAS = 4
-"""Cameras that are looked at, evenly spread."""
+"""Largest number of cameras to measure in, evenly spread."""
 
 
 def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
-    """Side of the grid of samples in each pixel, 2 to 8, with which ``mesh`` shows no noise from the
-    placement of the samples in the images of ``cameras``; the same for all of them, so that animations do
-    not flicker.
+    """Side of the grid of samples in each pixel, 2 to 8, that keeps sampling noise out of the images of
+    ``mesh`` from ``cameras``. It is the same for all of them, so that animations do not flicker.
 
-    Fans are the triangles of one splat (``face_splat``); a mesh without gets 2, one with a filter of its own
-    (``filter_px2``) 1.
+    Fans are the triangles of one splat (``face_splat``); a mesh without them needs 2, one with a low-pass
+    filter (``filter_px2``) 1.
     """
     if mesh.filter_px2:
-        return 1  # as in the splats that it imitates, its filter is as wide as a pixel
+        return 1  # its filter is as wide as a pixel, as that of splats
     if mesh.face_splat is None or not len(mesh.faces):
         return FEWEST
     starts = splat_starts(mesh.face_splat)
@@ -50,7 +49,7 @@ def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
     opacity = mesh.colors[corners, 3].mean(axis=1)
     points = mesh.vertices[corners].astype(np.float64)
     sides = []
-    for camera in evenly(cameras, CAMERAS):
+    for camera in subsample(cameras, CAMERAS):
         x, y, z = np.moveaxis(points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3], 2, 0)
         depth = np.maximum(z, camera.near)
         u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy

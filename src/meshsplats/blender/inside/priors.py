@@ -22,19 +22,22 @@ PROBLEM = "meshsplats_problem"
 """Property of the splats' object: why it could not follow its base; empty if it could."""
 LIFT = "meshsplats_lift"
 """Property of the mesh data: distance between layers."""
-FACE, WEIGHTS, LAYER = "splat_base_face", "splat_base_weights", "splat_layer"
-"""Attributes of the vertices: the binding."""
+ATTRIBUTES = {"vertex_face": "splat_base_face", "weights": "splat_base_weights", "layers": "splat_layer"}
+"""Attributes of the vertices: the arrays of the binding."""
+FACE = ATTRIBUTES["vertex_face"]
+_FIELDS = [
+    (field, ATTRIBUTES[field.name], *(("FLOAT_VECTOR", "vector") if field.columns else ("INT", "value")))
+    for field in Binding.FIELDS
+    if field.per == "vertex"
+]
+"""Each array with the name, the type and the property of its attribute."""
 
 
 def store(data: Any, binding: Binding) -> None:
     """Stores ``binding`` with the bpy mesh ``data`` of its splats, except the base, which is an object."""
-    for name, kind, key, values in [
-        (FACE, "INT", "value", binding.vertex_face),
-        (WEIGHTS, "FLOAT_VECTOR", "vector", binding.weights),
-        (LAYER, "INT", "value", binding.layers),
-    ]:
+    for field, name, kind, key in _FIELDS:
         attribute = data.attributes.new(name, kind, "POINT")
-        attribute.data.foreach_set(key, np.ascontiguousarray(values).ravel())
+        attribute.data.foreach_set(key, getattr(binding, field.name).ravel())
     data[LIFT] = binding.lift
 
 
@@ -74,19 +77,15 @@ def binding_of(obj: Any) -> Binding:
     if base is None:
         raise ValueError("the object is bound to no base")
     data = obj.data
-    count = len(data.vertices)
-    face, layers = np.empty(count, np.int32), np.empty(count, np.int32)
-    weights = np.empty(3 * count, np.float32)
-    data.attributes[FACE].data.foreach_get("value", face)
-    data.attributes[LAYER].data.foreach_get("value", layers)
-    data.attributes[WEIGHTS].data.foreach_get("vector", weights)
+    arrays = {}
+    for field, name, _, key in _FIELDS:
+        arrays[field.name] = np.empty(field.shape({"vertex": len(data.vertices)}), field.dtype)
+        data.attributes[name].data.foreach_get(key, arrays[field.name].reshape(-1))
     corners = np.empty(len(base.data.loops), np.int32)
     base.data.loops.foreach_get("vertex_index", corners)
     if len(corners) != 3 * len(base.data.polygons):
         raise ValueError("the base has faces that are not triangles: undo that, or bind the splats anew")
-    return Binding(
-        _coordinates(base.data), corners.reshape(-1, 3), face, weights.reshape(-1, 3), layers, data[LIFT]
-    )
+    return Binding(_coordinates(base.data), corners.reshape(-1, 3), **arrays, lift=data[LIFT])
 
 
 def follow(objs: Iterable[Any], depsgraph: Any) -> int:

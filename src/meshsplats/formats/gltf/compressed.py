@@ -1,7 +1,7 @@
-"""Compressed `.glb` for the web, made by the program gltfpack of the meshoptimizer project (MIT licence).
+"""Compressed `.glb` for the web by the program gltfpack of the meshoptimizer project (MIT licence).
 
 The result needs the glTF extensions EXT_meshopt_compression and KHR_mesh_quantization. Web viewers with the
-meshopt decoder, such as three.js, read them; a program without it refuses the file.
+meshopt decoder, such as three.js, read them; programs without it refuse the file.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from meshsplats.mesh import SplatMesh
 Compression = Literal["meshopt"]
 
 _BITS = 16
-"""Bits of a coordinate, the most that gltfpack offers; its default of 14 moves a vertex in a scene of
-100 m by up to 3 mm."""
+"""Bits of a coordinate, the most that gltfpack has; its default of 14 moves the vertices of a scene of 100 m
+by up to 3 mm."""
 
 
 def write_compressed_glb(
@@ -36,9 +36,12 @@ def write_compressed_glb(
     """Writes ``mesh`` to ``path`` with positions and colours of 16 bits, compressed.
 
     Concretely, a coordinate is moved by at most 0.5 / 65535 of the longest side of the bounding box. The
-    arrays that only this project reads are left out, as triangles are put in another order. Raises
-    MissingDependencyError without gltfpack, ValueError as ``write_glb`` does and for ``color_type``
-    'float32', RuntimeError where gltfpack fails.
+    arrays that only this project reads are left out, as the order of triangles changes.
+
+    Raises:
+        MissingDependencyError: gltfpack is missing.
+        ValueError: as ``write_glb``, and for ``color_type`` 'float32'.
+        RuntimeError: gltfpack fails.
     """
     if compression not in get_args(Compression):
         raise ValueError(

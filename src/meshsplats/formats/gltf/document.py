@@ -1,8 +1,7 @@
-"""A glTF 2.0 file taken apart: its JSON, its buffers, its accessors. Everything is checked against what is
-there.
+"""Parser of glTF 2.0 files: JSON, buffers, accessors.
 
-Nothing is believed: every number that points somewhere is compared with the length of what it points into,
-and nothing is allocated that the file's own bytes do not back.
+Nothing is trusted: every index and offset is compared with the length of its target, and nothing is allocated
+beyond what the bytes of the file justify.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from meshsplats.formats._validation import Budget
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _MAX_JSON_TOKENS = 4_000_000
-"""Brackets and commas: what makes parsed JSON large. Real files have thousands."""
+"""Limit of brackets and commas, which make parsed JSON large. Real files have thousands."""
 _READABLE = {
     "KHR_materials_unlit",
     "KHR_mesh_quantization",
@@ -41,8 +40,11 @@ _COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mes
 
 
 class GltfDocument:
-    """``path`` is `.glb` or, beginning with a brace, `.gltf`; a file that requires an extension which is
-    neither known here nor among ``also_known`` is refused. Raises FileFormatError.
+    """A `.glb` file or, if it begins with a brace, a `.gltf` file.
+
+    Raises:
+        FileFormatError: the file is broken, or requires an extension that is neither known nor among
+            ``also_known``.
     """
 
     def __init__(self, path: Path, also_known: frozenset[str] = frozenset()) -> None:
@@ -52,7 +54,7 @@ class GltfDocument:
         self._chunk: memoryview | None = None
         with open(path, "rb") as file:
             data = memoryview(file.read())
-        self.json = self._parse(self._take_apart(data) if data[:4] == b"glTF" else data)
+        self.json = self._parse(self._json_chunk(data) if data[:4] == b"glTF" else data)
         asset = self.json.get("asset")
         version = asset.get("version") if isinstance(asset, dict) else None
         if not isinstance(version, str) or version.split(".")[0] != "2":
@@ -61,7 +63,7 @@ class GltfDocument:
         self._buffers: dict[int, memoryview] = {}
 
     def error(self, message: str) -> FileFormatError:
-        """An error about this file, to be raised."""
+        """An error about this file, for the caller to raise."""
         return FileFormatError(f"{self.path}: {message}")
 
     # -- structure
@@ -74,14 +76,14 @@ class GltfDocument:
         return found
 
     def item(self, kind: str, index: object, what: str) -> dict[str, Any]:
-        """Entry ``index`` of the top-level array ``kind``; ``what`` names the one who refers to it."""
+        """Entry ``index`` of the top-level array ``kind``; ``what`` names the object that refers to it."""
         found = self.items(kind)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
             raise self.error(f"{what} refers to number {str(index)[:20]} of {len(found)} {kind}")
         return found[index]
 
     def whole(self, owner: dict[str, Any], key: str, what: str, default: int | None = None) -> int:
-        """A whole number >= 0."""
+        """The integer >= 0 at ``key``."""
         value = owner.get(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 53:
             raise self.error(f"{what} needs a whole number {key!r}, got {str(value)[:20]}")
@@ -148,7 +150,7 @@ class GltfDocument:
         return np.ndarray((count, columns), dtype, data, offset if count else 0, strides)
 
     def floats(self, index: object, what: str) -> np.ndarray:
-        """As ``accessor``, float32, integers decoded: fractions of their largest value where
+        """As ``accessor``, as float32; integers become fractions of their largest value where
         ``normalized``."""
         values = self.accessor(index, what)
         self.budget.spend(4 * values.size, what)
@@ -160,8 +162,8 @@ class GltfDocument:
 
     # -- reading
 
-    def _take_apart(self, data: memoryview) -> memoryview:
-        """JSON chunk of a .glb; remembers the binary chunk."""
+    def _json_chunk(self, data: memoryview) -> memoryview:
+        """The JSON chunk of a .glb; keeps the binary chunk."""
         if len(data) < 20:
             raise self.error(f"truncated .glb file of {len(data)} bytes")
         _, version, total = struct.unpack_from("<4sII", data)
@@ -181,7 +183,7 @@ class GltfDocument:
                 self._chunk = body
             at += 8 + length
         if json_chunk is None:
-            raise self.error("a .glb file without JSON chunk")
+            raise self.error("a .glb file without a JSON chunk")
         return json_chunk
 
     def _parse(self, text: memoryview) -> dict[str, Any]:
@@ -215,7 +217,7 @@ class GltfDocument:
             raise self.error(f"needs the glTF extension {unknown[0]}, which is not supported")
 
     def compressed(self) -> FileFormatError:
-        """The error about compression that this reader does not undo."""
+        """The error for compression that this reader does not support."""
         return self.error(
             "compressed glTF (Draco or meshopt) is not supported; decompress it first:"
             " npx @gltf-transform/cli copy in.glb out.glb"
@@ -231,7 +233,7 @@ class GltfDocument:
                 raise self.error(f"buffer {index} has neither data nor URI")
             data = self._chunk
         elif not isinstance(uri, str):
-            raise self.error(f"the URI of buffer {index} must be a text")
+            raise self.error(f"the URI of buffer {index} must be a string")
         else:
             data = self.uri_bytes(uri, f"buffer {index}")
         length = self.whole(buffer, "byteLength", "a buffer")
@@ -241,7 +243,7 @@ class GltfDocument:
         return self._buffers[index]
 
     def uri_bytes(self, uri: str, what: str) -> memoryview:
-        """What a URI stands for: base64 data in itself, or a file beside this one."""
+        """The bytes of a URI: base64 data inside it, or a file beside this one."""
         if not uri.startswith("data:"):
             return self._beside(uri)
         head, _, body = uri.partition(",")

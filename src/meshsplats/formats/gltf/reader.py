@@ -1,8 +1,8 @@
-"""Reading meshes from glTF 2.0: the files of ``glb`` exactly, those of other programs as far as triangles and
-vertex colours go."""
+"""Reads meshes from glTF 2.0: our own files exactly, those of others as triangles and vertex colours."""
 
 from __future__ import annotations
 
+import math
 import warnings
 import zlib
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ import numpy as np
 from meshsplats.binding import Binding
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
-from meshsplats.formats._validation import checked_binding, checked_mesh, straight_colors
+from meshsplats.formats._validation import checked, straight_colors
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.scene import Placed, placed_meshes, rotation_matrix
-from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.formats.gltf.writer import camel_case, up_quaternion
 from meshsplats.mesh import Blending, SplatMesh
 
 POINTS_TO_LINES = (0, 1, 2, 3)
@@ -26,7 +26,7 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 @dataclass
 class _Piece:
-    """One primitive as placed by one node."""
+    """A primitive in the frame of the scene, as placed by a node."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -37,13 +37,15 @@ class _Piece:
 def read_gltf(path: Path) -> SplatMesh:
     """The mesh in a `.glb` or `.gltf` file.
 
-    A file of ours comes back as it was saved: positions and extra arrays exactly, colours within the
-    precision they were stored in. From other programs' files all triangles of the scene are joined in
-    its y-up frame; colours are COLOR_0 times the material's base colour, converted to display values;
-    textures are left out with a DataWarning. Buffers must be embedded or lie beside the file. Raises
-    FileFormatError, for Draco and meshopt compression and sparse accessors too.
+    Our own files give back positions and extra arrays exactly, and colours within their stored precision.
+    From other programs' files, all triangles of the scene are joined in its y-up frame; colours are COLOR_0
+    times the material's base colour, converted to display values; textures are left out with a DataWarning.
+    Buffers must be embedded or lie beside the file.
+
+    Raises:
+        FileFormatError: the file is broken, or has Draco or meshopt compression or sparse accessors.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers end in the check for finite values
+    with np.errstate(over="ignore", invalid="ignore"):  # SplatMesh refuses values that are not finite
         return _read(GltfDocument(path))
 
 
@@ -56,7 +58,7 @@ def _read(document: GltfDocument) -> SplatMesh:
     for place in placed:
         if note and _is_own_placement(place.matrix, note):
             place = place._replace(matrix=np.eye(4))
-        elif note:  # someone has moved the mesh in the scene
+        elif note:  # another program has moved the mesh in the scene
             note["up"] = [0.0, 1.0, 0.0]
         for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
             mode = primitive.get("mode", _TRIANGLES)
@@ -160,19 +162,19 @@ def _join(
     }
     if note and len(own["primitives"]) == 1:
         arrays |= _restore(document, own, note, len(arrays["faces"]), colors)
-        if arrays.get("binding") is not None and not _still_there(arrays["binding"], arrays["vertices"]):
+        if arrays.get("binding") is not None and not _matches(arrays["binding"], arrays["vertices"]):
             _warn(
                 f"{document.path}: another program has moved vertices, left out: the binding to a base mesh"
             )
             arrays["binding"] = None
-    return checked_mesh(document.path, **arrays)
+    return checked(document.path, SplatMesh, **arrays)
 
 
-# -- what our own files hold beyond glTF
+# -- contents of our own files beyond glTF
 
 
 def _our_note(mesh: dict[str, Any]) -> dict[str, Any]:
-    """The entry ``extras.meshsplats`` of a mesh where it is one of ours and in order, else an empty one."""
+    """The entry ``extras.meshsplats`` of a mesh if it is valid, else an empty one."""
     note = dict_or_empty(dict_or_empty(mesh.get("extras")).get("meshsplats"))
     up = note.get("up")
     good = (
@@ -184,7 +186,7 @@ def _our_note(mesh: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
-    """Whether the node still does what we wrote: turn the mesh's up direction to +y, nothing more."""
+    """Whether the node is still ours: it rotates the mesh's up direction to +y, nothing more."""
     wanted = rotation_matrix(up_quaternion(np.array(note["up"], np.float64)))
     return bool(np.abs(matrix - wanted).max() < 1e-5)
 
@@ -192,32 +194,25 @@ def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
 def _restore(
     document: GltfDocument, mesh: dict[str, Any], note: dict[str, Any], f: int, colors: np.ndarray
 ) -> dict[str, Any]:
-    """Constructor arguments from our note. What another program has dropped or renumbered is left out, with a
-    DataWarning: better no splat numbers than wrong ones."""
+    """Constructor arguments from our note. Arrays that another program has dropped or altered are left out,
+    with a DataWarning: better no splat indices than wrong ones."""
     result: dict[str, Any] = {"up": note["up"], "blending": note["blending"]}
     lost: list[str] = []
     v = len(colors)
-    for name in ("face_splat", "depth_group"):
-        if name in note:
-            values = _raw(document, dict_or_empty(note[name]), "<i4", f)
+    for field in SplatMesh.EXTRAS:
+        if field.name in note:
+            shape = field.shape({"vertex": v, "face": f})
+            values = _raw(document, dict_or_empty(note[field.name]), field.dtype, shape)
             if values is None:
-                lost.append(name)
+                lost.append(field.name)
             else:
-                result[name] = values
+                result[field.name] = values
     if "filter_px2" in note:
         variance = float(document.numbers([note["filter_px2"]], 1, "filter_px2")[0])
         if "face_splat" in result:
             result["filter_px2"] = variance
         else:
             lost.append("the filter of its splats")
-    if isinstance(note.get("alpha"), str):
-        true_alpha = _attribute(
-            document, mesh["primitives"][0]["attributes"], {"semantic": note["alpha"]}, v, 1
-        )
-        if true_alpha is None:
-            lost.append("opacities")
-        else:
-            result["colors"] = np.concatenate([colors[:, :3], np.clip(true_alpha, 0, 1)], axis=1)
     if "binding" in note:
         result["binding"] = _binding(document, dict_or_empty(note["binding"]), v)
         if result["binding"] is None:
@@ -239,30 +234,24 @@ def _restore(
 
 
 def _binding(document: GltfDocument, entry: dict[str, Any], v: int) -> Binding | None:
-    """The binding of a mesh prior's v vertices; None where an array of it is gone or another."""
-    n = document.whole(entry, "baseVertexCount", "a binding")
-    m = document.whole(entry, "baseFaceCount", "a binding")
-    lift = float(document.numbers([entry.get("lift")], 1, "lift of a binding")[0])
-    wanted = {
-        "base_vertices": ("baseVertices", "<f4", (n, 3)),
-        "base_faces": ("baseFaces", "<i4", (m, 3)),
-        "vertex_face": ("vertexFace", "<i4", (v,)),
-        "weights": ("weights", "<f4", (v, 3)),
-        "layers": ("layers", "<i4", (v,)),
+    """The binding of a mesh prior's v vertices; None if one of its arrays is missing or altered."""
+    counts = {
+        "vertex": v,
+        "base vertex": document.whole(entry, "baseVertexCount", "a binding"),
+        "base face": document.whole(entry, "baseFaceCount", "a binding"),
     }
-    parts = {}
-    for name, (key, dtype, shape) in wanted.items():
-        values = _raw(
-            document, dict_or_empty(entry.get(key)), dtype, shape[0] * (3 if len(shape) == 2 else 1)
-        )
+    parts = {"lift": document.numbers([entry.get("lift")], 1, "lift of a binding")[0]}
+    for field in Binding.FIELDS:
+        stored = dict_or_empty(entry.get(camel_case(field.name)))
+        values = _raw(document, stored, field.dtype, field.shape(counts))
         if values is None:
             return None
-        parts[name] = values.reshape(shape)
-    return checked_binding(document.path, lift=lift, **parts)
+        parts[field.name] = values
+    return checked(document.path, Binding.from_arrays, parts)
 
 
-def _still_there(binding: Binding, vertices: np.ndarray) -> bool:
-    """Whether the vertices are where the binding has them, but for rounding."""
+def _matches(binding: Binding, vertices: np.ndarray) -> bool:
+    """Whether the vertices are where the binding puts them, up to rounding."""
     size = float(np.abs(binding.base_vertices).max(initial=0))
     return bool((np.abs(binding.positions() - vertices) <= 1e-4 * size).all())
 
@@ -270,33 +259,34 @@ def _still_there(binding: Binding, vertices: np.ndarray) -> bool:
 def _attribute(
     document: GltfDocument, stored: dict[str, Any], entry: dict[str, Any], v: int, columns: int
 ) -> np.ndarray | None:
-    """(v, columns) values of one attribute, None where they are gone."""
+    """(v, columns) values of an attribute; None if they are missing."""
     if columns == 0:
         return np.empty((v, 0), np.float32)
     semantic = entry.get("semantic")
     if semantic is None:
-        values = _raw(document, entry, "<f4", v * columns)
-        return None if values is None else values.reshape(v, columns)
+        return _raw(document, entry, np.float32, (v, columns))
     if not isinstance(semantic, str) or semantic not in stored:
         return None
     values = document.floats(stored[semantic], semantic[:60])
     return values if values.shape == (v, columns) else None
 
 
-def _raw(document: GltfDocument, entry: dict[str, Any], dtype: str, count: int) -> np.ndarray | None:
-    """``count`` numbers of a buffer view that only our note refers to; None if the view is not the one
-    we wrote."""
+def _raw(
+    document: GltfDocument, entry: dict[str, Any], dtype: type[np.generic], shape: tuple[int, ...]
+) -> np.ndarray | None:
+    """Array of a buffer view that only our note refers to; None if the view is not the one we wrote."""
+    stored = np.dtype(dtype).newbyteorder("<")
     try:
         data, _ = document.view_bytes(entry.get("bufferView"), "meshsplats")
     except FileFormatError:
         return None
-    if len(data) != count * np.dtype(dtype).itemsize or zlib.crc32(data) != entry.get("crc32"):
+    if len(data) != math.prod(shape) * stored.itemsize or zlib.crc32(data) != entry.get("crc32"):
         return None
     document.budget.spend(len(data), "meshsplats")
-    return np.frombuffer(data, dtype).astype(np.dtype(dtype).newbyteorder("="))
+    return np.frombuffer(data, stored).astype(dtype).reshape(shape)
 
 
-# -- small change
+# -- helpers
 
 
 def material_of(document: GltfDocument, primitive: dict[str, Any]) -> dict[str, Any]:

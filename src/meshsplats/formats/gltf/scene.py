@@ -1,4 +1,4 @@
-"""Where the meshes of a glTF scene stand: nodes, instances and skins."""
+"""Placement of the meshes of a glTF scene: nodes, instances and skins."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._geometry import rotation_rows
 from meshsplats.formats.gltf.document import GltfDocument
 
 INSTANCING = "EXT_mesh_gpu_instancing"
 _AT_ONCE = 1 << 15
 _PLACE_BYTES = 512
-"""About what a matrix takes on the way."""
+"""Memory of a matrix and its intermediate results, estimated."""
 
 
 class Placed(NamedTuple):
-    """A mesh as the scene has it."""
+    """A mesh placed in the scene."""
 
     mesh: dict[str, Any]
     matrix: np.ndarray
     """(4, 4) from the mesh's frame to the scene's."""
     joints: Callable[[], np.ndarray] | None = None
-    """Gives (j, 4, 4), the same by joint of its skin, which take the place of ``matrix`` where a primitive
-    names joints and weights; None: it has no skin."""
+    """Returns (j, 4, 4), one for each joint of the skin, which replace ``matrix`` for primitives with joints
+    and weights; None without a skin."""
 
     def applied(
         self,
@@ -36,21 +37,20 @@ class Placed(NamedTuple):
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Vertices and normals (v, 3) float32 of a primitive in the scene's frame."""
         if self.joints is not None and {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
-            mixed = _Mix(document, attributes, self.joints(), len(vertices))
+            skinning = _Skinning(document, attributes, self.joints(), len(vertices))
         elif (self.matrix == np.eye(4)).all():
             return vertices, normals
         else:
-            mixed = None
+            skinning = None
         moved = np.empty_like(vertices)
         turned = None if normals is None else np.empty_like(normals)
         for start in range(0, len(vertices), _AT_ONCE):
             part = slice(start, start + _AT_ONCE)
-            matrices = self.matrix[None] if mixed is None else mixed.of(part)
+            matrices = self.matrix[None] if skinning is None else skinning.of(part)
             linear = matrices[:, :3, :3]
             moved[part] = np.einsum("nij,nj->ni", linear, vertices[part]) + matrices[:, :3, 3]
             if normals is not None and turned is not None:
-                # Normals follow the inverse transpose or, as its length does not matter, the matrix of
-                # cofactors.
+                # Normals follow the inverse transpose or, as their length does not matter, the cofactors.
                 a, b, c = np.moveaxis(linear, 2, 0)
                 cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
                 sides = np.einsum("nij,nj->ni", cofactors, normals[part])
@@ -59,8 +59,8 @@ class Placed(NamedTuple):
         return moved, turned
 
 
-class _Mix:
-    """The matrices of a skin's joints, mixed by each vertex' weights."""
+class _Skinning:
+    """Linear blend skinning: the matrices of a skin's joints, blended by the weights of each vertex."""
 
     def __init__(
         self, document: GltfDocument, attributes: dict[str, Any], joints: np.ndarray, v: int
@@ -75,30 +75,30 @@ class _Mix:
             weights = document.floats(attributes[weights_name], weights_name)
             if numbers.shape != (v, 4) or weights.shape != (v, 4) or numbers.dtype.kind != "u":
                 raise document.error(
-                    f"{name} and {weights_name} must be {v:,} times 4 whole numbers and weights, got shapes"
+                    f"{name} and {weights_name} must be {v:,} times 4 integers and weights, got shapes"
                     f" {numbers.shape} and {weights.shape}"
                 )
-            used = np.where(weights != 0, numbers, 0)  # what has no weight may be any number
+            used = np.where(weights != 0, numbers, 0)  # an index without weight may be arbitrary
             if v and used.max() >= len(joints):
                 raise document.error(f"{name} runs up to {used.max()}, the skin has {len(joints)} joints")
             self._sets.append((used, weights))
 
     def of(self, part: slice) -> np.ndarray:
-        """(n, 4, 4) for these vertices; weights are scaled to a sum of 1, without any the first joint
+        """(n, 4, 4) for these vertices. Weights are scaled to a sum of 1; without any, the first joint
         counts."""
         numbers = np.concatenate([numbers[part] for numbers, _ in self._sets], axis=1)
         weights = np.concatenate([weights[part] for _, weights in self._sets], axis=1).astype(np.float64)
         total = weights.sum(axis=1)
         weights[total <= 0] = np.eye(1, weights.shape[1])
         weights /= np.where(total > 0, total, 1)[:, None]
-        mixed = np.zeros((len(numbers), 4, 4))
+        blended = np.zeros((len(numbers), 4, 4))
         for k in range(numbers.shape[1]):
-            mixed += weights[:, k, None, None] * self._joints[numbers[:, k]]
-        return mixed
+            blended += weights[:, k, None, None] * self._joints[numbers[:, k]]
+        return blended
 
 
 def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
-    """Each mesh of the scene as often as it stands there."""
+    """Each mesh of the scene, once for each of its nodes and instances."""
     nodes, scenes = document.items("nodes"), document.items("scenes")
     if not scenes and not nodes:
         yield from (Placed(mesh, np.eye(4)) for mesh in document.items("meshes"))
@@ -107,14 +107,14 @@ def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
         scene = document.item("scenes", document.json.get("scene", 0), "the file")
         roots = _numbers(document, scene.get("nodes", []), "nodes of a scene")
     else:
-        roots = _nodes_below_none(document)
+        roots = _root_nodes(document)
     matrices = _world_matrices(document, roots)
     for index, matrix in matrices.items():
         node = nodes[index]
         if "mesh" not in node:
             continue
         mesh = document.item("meshes", node["mesh"], f"node {index}")
-        # Primitives share it, and whoever looks at other things of the scene never needs it.
+        # Computed once for all primitives, and only if one needs it.
         joints = cache(partial(_joints, document, node["skin"], matrices)) if "skin" in node else None
         extensions = node.get("extensions")
         if isinstance(extensions, dict) and INSTANCING in extensions:
@@ -124,8 +124,8 @@ def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
 
 
 def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray]) -> np.ndarray:
-    """(j, 4, 4) from the frame of a skinned mesh to the scene's. The node that holds the mesh has no part in
-    it (glTF 2.0, 3.7.3.3)."""
+    """(j, 4, 4) from the frame of a skinned mesh to the scene's. The transform of the mesh's own node is
+    ignored (glTF 2.0, 3.7.3.3)."""
     skin = document.item("skins", index, "a node")
     numbers = _numbers(document, skin.get("joints"), "joints of a skin")
     if not numbers:
@@ -140,18 +140,17 @@ def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray])
             )
         bound = bound[: len(numbers)].reshape(-1, 4, 4).transpose(0, 2, 1)
     outside = set(numbers) - matrices.keys()
-    if outside:  # of another scene, or of none
-        matrices = matrices | _world_matrices(document, _nodes_below_none(document))
+    if outside:  # in another scene, or in none
+        matrices = matrices | _world_matrices(document, _root_nodes(document))
         for n in outside:
             document.item("nodes", n, "a skin or node")
             if n not in matrices:
-                raise document.error(f"node {n} is above itself")
+                raise document.error(f"a cycle in the node hierarchy at node {n}")
     return np.stack([matrices[n] for n in numbers]) @ bound
 
 
 def _world_matrices(document: GltfDocument, roots: Sequence[int]) -> dict[int, np.ndarray]:
-    """(4, 4) from the frame of each node at or below ``roots`` to the world's, in the order of the file's
-    tree."""
+    """(4, 4) from the frame of each node at or below ``roots`` to the world's, depth first."""
     matrices: dict[int, np.ndarray] = {}
     stack = [(root, np.eye(4)) for root in reversed(roots)]
     while stack:
@@ -165,7 +164,7 @@ def _world_matrices(document: GltfDocument, roots: Sequence[int]) -> dict[int, n
     return matrices
 
 
-def _nodes_below_none(document: GltfDocument) -> list[int]:
+def _root_nodes(document: GltfDocument) -> list[int]:
     nodes = document.items("nodes")
     below = {c for n in nodes for c in _numbers(document, n.get("children", []), "children of a node")}
     return [i for i in range(len(nodes)) if i not in below]
@@ -185,13 +184,13 @@ def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:
                     f"{name} of instances must have {columns} columns, got {rows[name].shape}"
                 )
     counts = {len(values) for values in rows.values()}
-    if not rows:  # attributes of the application alone, one of each for an instance
+    if not rows:  # only the application's own attributes, with one value per instance
         counts = {
             document.whole(document.item("accessors", i, INSTANCING), "count", INSTANCING)
             for i in attributes.values()
         }
     if len(counts) != 1:
-        raise document.error(f"{INSTANCING} needs as many of each attribute, got {sorted(counts)}")
+        raise document.error(f"{INSTANCING} needs equal counts of all attributes, got {sorted(counts)}")
     number = counts.pop()
     document.budget.spend(_PLACE_BYTES * number, f"{number:,} instances")
     for i in range(number):
@@ -210,7 +209,7 @@ def _local_matrix(document: GltfDocument, node: dict[str, Any]) -> np.ndarray:
 def _matrix(
     translation: np.ndarray | None, rotation: np.ndarray | None, scale: np.ndarray | None
 ) -> np.ndarray:
-    """(4, 4): scaled, turned, moved."""
+    """(4, 4): scale, then rotation, then translation."""
     matrix = np.eye(4) if rotation is None else rotation_matrix(rotation)
     if scale is not None:
         matrix[:3, :3] *= scale
@@ -223,11 +222,7 @@ def rotation_matrix(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
     """(4, 4) matrix of a unit quaternion x, y, z, w."""
     x, y, z, w = quaternion
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = list(rotation_rows(w, x, y, z))
     return matrix
 
 

@@ -1,6 +1,6 @@
-"""glTF and GLB with splats: the extension KHR_gaussian_splatting, plain or holding SPZ.
+"""glTF and GLB with splats: the extension KHR_gaussian_splatting, plain or with SPZ inside.
 
-A primitive of points is a cloud of splats; its attributes are activated already and nodes place it. glTF
+A primitive of points is a cloud of splats; its attributes are already activated, and nodes place it. glTF
 scenes have x to the left, y up and z forward. Drafts of the extension stored log scales, recognised by
 negative values.
 """
@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from meshsplats.errors import DataWarning
-from meshsplats.formats._orientation import transformed
+from meshsplats.formats._orientation import HALF_TURN_Z, transformed
 from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.reader import objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined
 from meshsplats.formats.splats.spz import read_spz
@@ -29,13 +30,12 @@ _COMPRESSED = (
     "KHR_spz_gaussian_splats_compression",
     "KHR_spz_compression",
 )
-_TO_Y_DOWN = np.diag([-1.0, -1.0, 1.0])
-"""From glTF's x left, y up, z forward to x right, y down, z forward; its own inverse."""
+_EXTENSIONS = frozenset({EXTENSION, *_COMPRESSED})
 
 
 def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
     """The splats of all nodes of a glTF scene, in its frame; errors as ``load_gaussians``."""
-    document = GltfDocument(path, also_known=frozenset({EXTENSION, *_COMPRESSED}))
+    document = GltfDocument(path, also_known=_EXTENSIONS)
     clouds = []
     for place in placed_meshes(document):
         for primitive in _splat_primitives(document, place.mesh):
@@ -53,17 +53,14 @@ def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
 
 def has_splats(path: Path) -> bool:
     """Whether a glTF file names the extension; a broken file raises FileFormatError."""
-    document = GltfDocument(path, also_known=frozenset({EXTENSION, *_COMPRESSED}))
+    document = GltfDocument(path, also_known=_EXTENSIONS)
     used = document.json.get("extensionsUsed", [])
-    return isinstance(used, list) and any(name in used for name in (EXTENSION, *_COMPRESSED))
+    return isinstance(used, list) and any(name in used for name in _EXTENSIONS)
 
 
 def _splat_primitives(document: GltfDocument, mesh: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    primitives = mesh.get("primitives")
-    if not isinstance(primitives, list) or not all(isinstance(p, dict) for p in primitives):
-        raise document.error("the primitives of a mesh must be an array of objects")
-    for primitive in primitives:
-        if {EXTENSION, *_COMPRESSED} & _object(document, primitive, "extensions").keys():
+    for primitive in objects_in(document, mesh.get("primitives"), "primitives of a mesh"):
+        if _EXTENSIONS & _object(document, primitive, "extensions").keys():
             yield primitive
 
 
@@ -76,12 +73,11 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
             view = _object(document, nested, name).get("bufferView")
             data, _ = document.view_bytes(view, name)
             spz = read_spz(data, document.path, document.budget, strict=strict)
-            return transformed(spz.cloud, _TO_Y_DOWN @ spz.to_y_down)
+            return transformed(spz.cloud, HALF_TURN_Z @ spz.to_y_down)
     if splatting.get("colorSpace") == "lin_rec709_display":
         warnings.warn(
             f"{document.path}: these splats were trained in linear colours, which are taken as display"
-            " colours here;"
-            " the picture will be darker than it should",
+            " colours here; images will be darker than they should",
             DataWarning,
             stacklevel=5,
         )

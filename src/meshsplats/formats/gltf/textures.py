@@ -25,19 +25,19 @@ from meshsplats.formats.gltf.scene import placed_meshes
 
 _WRAPS: dict[object, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 _SOURCES = ("EXT_texture_webp",)
-"""Extensions that name another picture in place of a texture's own, and that Pillow can read."""
+"""Extensions that name an alternative image of a texture, of a format that Pillow can read."""
 
 
 def gltf_textures(
-    path: Path, read: Callable[[Path, bytes], np.ndarray], laid: Texture | None = None
+    path: Path, read: Callable[[Path, bytes], np.ndarray], override: Texture | None = None
 ) -> tuple[np.ndarray, np.ndarray, tuple[Texture, ...]] | None:
-    """Texture coordinates (m, 3, 2) float32, v down, and texture (m,) int32, -1 for none, of each triangle in
-    the order of ``read_gltf``; the textures. None where no triangle has any.
+    """Texture coordinates (m, 3, 2) float32, v down, and texture index (m,) int32, -1 for none, of each
+    triangle in the order of ``read_gltf``; and the textures. None if no triangle has any.
 
-    ``laid``: a texture for all triangles that have coordinates. Raises FileFormatError.
+    ``override`` is a texture for all triangles that have coordinates. Raises FileFormatError.
     """
     document = GltfDocument(path)
-    shelf = _Shelf(document, read)
+    found = _Textures(document, read)
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     for place in placed_meshes(document):
         for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
@@ -50,29 +50,29 @@ def gltf_textures(
             faces = primitive_faces(document, primitive, v)
             material = material_of(document, primitive)
             info = dict_or_empty(pbr_of(material).get("baseColorTexture"))
-            uv = _coordinates(document, attributes, info, v) if info or laid is not None else None
+            uv = _coordinates(document, attributes, info, v) if info or override is not None else None
             number = -1
             if uv is not None:
-                number = 0 if laid is not None else shelf.number(material, info)
+                number = 0 if override is not None else found.number(material, info)
                 document.budget.spend(24 * len(faces), "texture coordinates")
             corners = np.zeros((len(faces), 3, 2), np.float32) if uv is None else uv[faces]
             parts.append((corners, np.full(len(faces), number, np.int32)))
-    if shelf.unread:
+    if found.unread:
         warnings.warn(
-            f"{path}: {shelf.unread} textures are of a kind that is not read; their faces have none",
+            f"{path}: {found.unread} textures are of a kind that is not read; their faces have none",
             DataWarning,
             stacklevel=4,
         )
     if not parts or all((number < 0).all() for _, number in parts):
         return None
-    textures = tuple(shelf.textures) if laid is None else (laid,)
+    textures = tuple(found.textures) if override is None else (override,)
     return np.concatenate([c for c, _ in parts]), np.concatenate([n for _, n in parts]), textures
 
 
 def _coordinates(
     document: GltfDocument, attributes: dict[str, Any], info: dict[str, Any], v: int
 ) -> np.ndarray | None:
-    """(v, 2) float32, with KHR_texture_transform done; None where there are none."""
+    """(v, 2) float32 after KHR_texture_transform; None if there are none."""
     transform = dict_or_empty(dict_or_empty(info.get("extensions")).get("KHR_texture_transform"))
     chosen = document.whole(transform if "texCoord" in transform else info, "texCoord", "a texture", 0)
     name = f"TEXCOORD_{chosen}"
@@ -91,23 +91,23 @@ def _coordinates(
             moved = np.stack([cos * u + sin * w, cos * w - sin * u], axis=1) + offset
             uv = moved.astype(np.float32)
         if not np.isfinite(uv).all():
-            raise document.error("the transform of a texture leads beyond all numbers")
+            raise document.error("the transform of a texture leads to infinite coordinates")
     return uv
 
 
 @dataclass
-class _Shelf:
-    """The textures that were needed so far."""
+class _Textures:
+    """The textures that have been used so far."""
 
     document: GltfDocument
     read: Callable[[Path, bytes], np.ndarray]
     textures: list[Texture] = field(default_factory=list)
     unread: int = 0
     _numbers: dict[tuple, int] = field(default_factory=dict)
-    _pictures: dict[int, np.ndarray] = field(default_factory=dict)
+    _images: dict[int, np.ndarray] = field(default_factory=dict)
 
     def number(self, material: dict[str, Any], info: dict[str, Any]) -> int:
-        """Number of the base-colour texture ``info`` of ``material``; -1 where it is of an unknown kind."""
+        """Index of the base-colour texture ``info`` of ``material``; -1 if it is of an unknown kind."""
         document = self.document
         texture = document.item("textures", info.get("index"), "baseColorTexture")
         source = texture.get("source")
@@ -127,7 +127,7 @@ class _Shelf:
         cutoff = float(document.numbers([material.get("alphaCutoff", 0.5)], 1, "alphaCutoff")[0])
         key = (source, *wraps, *factor, mode, cutoff)
         if key not in self._numbers:
-            pixels = self._picture(source)
+            pixels = self._image(source)
             if mode != "BLEND":
                 pixels = pixels.copy()
                 shown = pixels[..., 3] * (factor[3] / 255) >= cutoff
@@ -137,18 +137,18 @@ class _Shelf:
             self.textures.append(Texture(pixels, (wraps[0], wraps[1]), tuple(factor)))  # type: ignore[arg-type]
         return self._numbers[key]
 
-    def _picture(self, source: object) -> np.ndarray:
+    def _image(self, source: object) -> np.ndarray:
         document = self.document
         image = document.item("images", source, "a texture")
         assert isinstance(source, int)
-        if source not in self._pictures:
+        if source not in self._images:
             if "bufferView" in image:
-                data = bytes(document.view_bytes(image["bufferView"], "a picture")[0])
+                data = bytes(document.view_bytes(image["bufferView"], "an image")[0])
             elif isinstance(image.get("uri"), str):
-                data = bytes(document.uri_bytes(image["uri"], f"picture {source}"))
+                data = bytes(document.uri_bytes(image["uri"], f"image {source}"))
             else:
-                raise document.error(f"picture {source} has neither data nor URI")
+                raise document.error(f"image {source} has neither data nor URI")
             pixels = self.read(document.path, data)
-            document.budget.spend(pixels.nbytes, "a picture")
-            self._pictures[source] = pixels
-        return self._pictures[source]
+            document.budget.spend(pixels.nbytes, "an image")
+            self._images[source] = pixels
+        return self._images[source]

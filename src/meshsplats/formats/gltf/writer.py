@@ -1,9 +1,9 @@
-"""Meshes as binary glTF 2.0 (`.glb`), the form that viewers, engines and Blender open directly.
+"""Writes meshes as binary glTF 2.0 (`.glb`), which viewers, engines and Blender open directly.
 
-Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one primitive, drawn
-from both sides, coloured by COLOR_0 (linear RGBA). glTF is y-up: the node carries a pure rotation from the
-mesh's own frame to a frame whose +y is the mesh's ``up``; vertices are stored untouched. What glTF has no
-place for stands in the mesh's ``extras.meshsplats``. The reader is ``gltf_reader``.
+Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one double-sided
+primitive, coloured by COLOR_0 (linear RGBA). glTF is y-up: the node has a pure rotation from the mesh's own
+frame to a frame whose +y is the mesh's ``up``; vertices are stored unchanged. All else is in the mesh's
+``extras.meshsplats``.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from meshsplats._geometry import vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.mesh import SplatMesh
 
 ColorType = Literal["uint16", "float32"]
-Alpha = Literal["blend", "mask", "hash-friendly"]
+Alpha = Literal["blend", "mask"]
 
 MASK_CUTOFF = 0.2
-"""Opacity from which ``alpha='mask'`` draws. Of 0.05 to 0.5 the best compromise over an opaque figure, a
+"""Least opacity that ``alpha='mask'`` renders: of 0.05 to 0.5 the best compromise over an opaque figure, a
 furry one and an outdoor scene in three.js (docs/viewers.md)."""
 
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
@@ -47,26 +48,26 @@ def write_glb(
 ) -> None:
     """Writes ``mesh`` to ``path``.
 
-    The material is unlit (KHR_materials_unlit): its colours are shown as they are. ``lit`` makes it a rough
-    dielectric that scene lights shade, with the mesh's normals or, where it has none, area-weighted vertex
-    normals. ``color_type`` 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
+    Colours of a mesh for display blending are converted to linear; those of a mesh for linear blending are
+    stored unchanged.
 
-    ``alpha`` is how viewers are told to treat opacity. 'blend' is the truth, for viewers that sort or blend
-    well enough without. The two others are drawn solid, with the depth buffer, and need no order: 'mask'
-    draws what is at least ``MASK_CUTOFF`` opaque; 'hash-friendly' gives each splat a cutoff of its own, so
-    that among many layers each counts as often as its opacity says: right on average, and grainy.
-    docs/viewers.md compares them.
+    Args:
+        mesh: the mesh.
+        path: the file.
+        lit: the material is a rough dielectric that scene lights shade, with the mesh's normals or else
+            area-weighted vertex normals; False: it is unlit (KHR_materials_unlit).
+        color_type: 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
+        alpha: how viewers treat opacity. 'blend' is exact in viewers that sort, and good enough in many that
+            do not. 'mask' needs no order: opacities of at least ``MASK_CUTOFF`` are rendered solid, with the
+            depth buffer. docs/viewers.md compares them.
+        extras: False leaves out the arrays that only this project reads.
 
-    Colours of a mesh made for display blending are converted to linear; those of one made for linear
-    blending are stored as they are. ``extras`` False leaves out the arrays that only this project reads.
-    Raises ValueError for a mesh without triangles (glTF has no empty arrays), for normals that are not
-    of unit length, for 'hash-friendly' without ``face_splat`` and for a file beyond the 4 GiB that the
-    format can hold.
+    Raises:
+        ValueError: the mesh has no triangles (glTF has no empty arrays), its normals are not of unit
+            length, or it needs more than the 4 GiB that the format can hold.
     """
     if alpha not in get_args(Alpha):
         raise ValueError(f"alpha must be one of {', '.join(get_args(Alpha))}, got {alpha!r}")
-    if alpha == "hash-friendly" and mesh.face_splat is None:
-        raise ValueError("alpha 'hash-friendly' needs a mesh that knows its splats (face_splat); use 'mask'")
     if color_type not in get_args(ColorType):
         raise ValueError(f"color_type must be one of {', '.join(get_args(ColorType))}, got {color_type!r}")
     if not len(mesh.faces):
@@ -92,7 +93,7 @@ def write_glb(
 
 
 class _Buffer:
-    """The binary chunk under construction: arrays in order, each from a multiple of 4 bytes on."""
+    """Builder of the binary chunk: arrays in order, each aligned to 4 bytes."""
 
     def __init__(self) -> None:
         self.parts: list[np.ndarray] = []
@@ -101,7 +102,7 @@ class _Buffer:
         self.length = 0
 
     def view(self, array: np.ndarray, target: int | None = None) -> int:
-        """Appends ``array``; number of its buffer view."""
+        """Appends ``array``; returns the index of its buffer view."""
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self.length, "byteLength": little.nbytes}
         if target is not None:
@@ -112,7 +113,7 @@ class _Buffer:
         return len(self.views) - 1
 
     def accessor(self, array: np.ndarray, component: int, target: int, **more: Any) -> int:
-        """Appends an array of numbers (n,) or (n, 1..4); number of its accessor."""
+        """Appends an array of numbers (n,) or (n, 1..4); returns the index of its accessor."""
         columns = 1 if array.ndim == 1 else array.shape[1]
         accessor = {
             "bufferView": self.view(array, target),
@@ -152,17 +153,11 @@ def _document(
     if normals is not None:
         _check_unit(normals)
     elif lit:
-        normals = vertex_normals(mesh)
+        normals = computed_normals(mesh)
         extras["normals"] = "computed"
     if normals is not None:
         attributes["NORMAL"] = buffer.accessor(normals, _FLOAT, _ARRAY_BUFFER)
     colors = linear_colors(mesh, color_type)
-    if alpha == "hash-friendly":
-        shown = _splat_cutoffs(mesh)
-        colors[:, 3] = shown if color_type == "float32" else shown * np.float32(65535) + np.float32(0.5)
-        if with_extras:
-            extras["alpha"] = "_ALPHA"
-            attributes["_ALPHA"] = buffer.accessor(mesh.colors[:, 3], _FLOAT, _ARRAY_BUFFER)
     if color_type == "uint16":
         attributes["COLOR_0"] = buffer.accessor(colors, _UINT16, _ARRAY_BUFFER, normalized=True)
     else:
@@ -171,10 +166,8 @@ def _document(
     small = len(mesh.vertices) <= 0xFFFF
     indices = mesh.faces.reshape(-1).astype(np.uint16) if small else mesh.faces.reshape(-1).view(np.uint32)
     index_accessor = buffer.accessor(indices, _UINT16 if small else _UINT32, _ELEMENT_ARRAY_BUFFER)
-    for name in ("face_splat", "depth_group") if with_extras else ():
-        values = getattr(mesh, name)
-        if values is not None:
-            extras[name] = _raw(buffer, values)
+    if with_extras:
+        extras |= {field.name: _raw(buffer, values) for field, values in mesh.extras().items()}
     for name, values in mesh.attributes.items() if with_extras else ():
         columns = None if values.ndim == 1 else values.shape[1]
         entry: dict[str, Any] = {"name": name, "columns": columns}
@@ -193,8 +186,8 @@ def _document(
         "alphaMode": "BLEND" if alpha == "blend" else "MASK",
         "doubleSided": True,
     }
-    if alpha != "blend":
-        material["alphaCutoff"] = MASK_CUTOFF if alpha == "mask" else 0.5
+    if alpha == "mask":
+        material["alphaCutoff"] = MASK_CUTOFF
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
         "scene": 0,
@@ -218,47 +211,30 @@ def _document(
     return document, buffer.parts
 
 
-def _splat_cutoffs(mesh: SplatMesh) -> np.ndarray:
-    """(v,) float32 opacities that, cut at 0.5, show splat s where its true opacity is at least its own
-    cutoff.
-
-    Concretely 0.5 + (opacity - cutoff) / 2, which is linear in the opacity and so crosses 0.5 at the
-    same place inside a triangle. Multiples of the golden ratio spread the cutoffs of successive splats
-    evenly over [0, 1).
-    """
-    assert mesh.face_splat is not None
-    cutoffs = np.zeros(len(mesh.vertices), np.float32)
-    cutoffs[mesh.faces] = (mesh.face_splat * ((5**0.5 - 1) / 2) % 1)[:, None]
-    return np.float32(0.5) + (mesh.colors[:, 3] - cutoffs) / 2
-
-
 def _raw(buffer: _Buffer, values: np.ndarray) -> dict[str, Any]:
-    """Values that no glTF attribute can hold, as a plain buffer view. The check sum tells a reader that a
-    program in between has renumbered or dropped the views."""
+    """Values that no glTF attribute can hold, as a plain buffer view. The checksum shows a reader whether
+    another program has renumbered or dropped the views."""
     view = buffer.view(values)
     return {"bufferView": view, "crc32": zlib.crc32(buffer.parts[view].data)}
 
 
 def _binding(buffer: _Buffer, binding: Binding) -> dict[str, Any]:
-    """What puts the vertices on another pose of the base, each array as it is in ``Binding``."""
+    """The entry of a binding in our note."""
     entry: dict[str, Any] = {
         "lift": binding.lift,
         "baseVertexCount": len(binding.base_vertices),
         "baseFaceCount": len(binding.base_faces),
     }
-    for key, values in [
-        ("baseVertices", binding.base_vertices),
-        ("baseFaces", binding.base_faces),
-        ("vertexFace", binding.vertex_face),
-        ("weights", binding.weights),
-        ("layers", binding.layers),
-    ]:
-        entry[key] = _raw(buffer, values)
-    return entry
+    return entry | {camel_case(f.name): _raw(buffer, getattr(binding, f.name)) for f in binding.FIELDS}
+
+
+def camel_case(name: str) -> str:
+    """``name`` as glTF writes its keys."""
+    return re.sub("_(.)", lambda match: match[1].upper(), name)
 
 
 def _semantic(name: str, taken: dict[str, int]) -> str:
-    """A free name for an application's own attribute: glTF wants a leading underscore."""
+    """An unused name of an application's own attribute: glTF requires a leading underscore."""
     plain = "_" + re.sub(r"[^A-Z0-9_]", "_", name.upper())[:60]
     candidate, number = plain, 2
     while candidate in taken:
@@ -269,8 +245,8 @@ def _semantic(name: str, taken: dict[str, int]) -> str:
 def up_quaternion(up: np.ndarray) -> list[float]:
     """Unit quaternion x, y, z, w of the shortest rotation that takes the unit vector ``up`` to +y.
 
-    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is the half turn about x,
-    which leaves x to the right and lets a camera that looked along +z look along -z, as glTF's do.
+    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is the half turn about x: x
+    stays right, and a camera that looked along +z looks along -z, as glTF's do.
     """
     x, y, z = (float(u) for u in np.asarray(up, np.float64) / np.linalg.norm(np.asarray(up, np.float64)))
     if y < -1 + 1e-9:
@@ -294,19 +270,10 @@ def linear_colors(mesh: SplatMesh, color_type: ColorType) -> np.ndarray:
     return result
 
 
-def vertex_normals(mesh: SplatMesh) -> np.ndarray:
-    """(v, 3) float32 unit normals, the area-weighted means of the normals of the triangles round each vertex.
-    A vertex without area round it gets the mesh's up direction."""
-    corners = [mesh.faces[:, k] for k in range(3)]
-    x, y, z = np.ascontiguousarray(mesh.vertices.T)
-    edges = [[p[corners[k]] - p[corners[0]] for p in (x, y, z)] for k in (1, 2)]
-    sums = np.empty(mesh.vertices.shape, np.float64)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        weighted = edges[0][i] * edges[1][j] - edges[0][j] * edges[1][i]  # twice the area times the normal
-        sums[:, axis] = sum(np.bincount(corner, weighted, minlength=len(sums)) for corner in corners)
-    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))[:, None]
-    return np.where(length > 0, sums / np.where(length > 0, length, 1), mesh.up).astype(np.float32)
+def computed_normals(mesh: SplatMesh) -> np.ndarray:
+    """(v, 3) float32 unit normals, area-weighted means of the triangles' normals around each vertex; where
+    these have no area, the mesh's up direction."""
+    return vertex_normals(mesh.vertices, mesh.faces, fallback=mesh.up).astype(np.float32)
 
 
 def _check_unit(normals: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Wavefront `.obj` meshes: vertices, polygons, and colours behind the positions as many programs write
+"""Wavefront `.obj` meshes: vertices, polygons, and colours after the positions, as many programs write
 them."""
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import checked_mesh, straight_colors
+from meshsplats.formats._validation import checked, straight_colors
 from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import SplatMesh
 
@@ -22,14 +22,12 @@ _ROWS = 1 << 14
 
 
 def write_obj(mesh: SplatMesh, path: Path) -> None:
-    """Writes positions, display colours behind them and triangles as text; nine digits keep float32
-    exactly.
+    """Writes positions, display colours after them and triangles as text; nine digits keep float32 exactly.
 
-    The format has no opacity: a mesh that is not opaque is written with a DataWarning that counts its
-    vertices. Positions stay in the mesh's own frame; the up direction stands in a comment, which
-    ``load_mesh`` reads and other programs ignore.
+    The format has no opacity: a DataWarning counts translucent vertices. Positions stay in the mesh's own
+    frame; the up direction is in a comment, which ``load_mesh`` reads and other programs ignore.
     """
-    lost = [n for n in ("face_splat", "depth_group") if getattr(mesh, n) is not None] + list(mesh.attributes)
+    lost = [f.name for f in mesh.extras()] + list(mesh.attributes)
     translucent = int((mesh.colors[:, 3] < 1).sum())
     if translucent:
         more = f"; also left out: {', '.join(n[:40] for n in lost[:8])}" if lost else ""
@@ -53,7 +51,7 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
 
 
 def _write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: int = 0) -> None:
-    """Writes the (n, c) arrays ``columns`` side by side, each row by the pattern ``line``, ``plus`` added."""
+    """Writes the (n, c) arrays ``columns`` side by side, ``plus`` added, each row by the pattern ``line``."""
     for start in range(0, len(columns[0]), _ROWS):
         rows = np.concatenate([c[start : start + _ROWS] for c in columns], axis=1)
         if plus:
@@ -64,10 +62,10 @@ def _write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: int = 0) 
 def read_obj(path: Path) -> SplatMesh:
     """The polygons of all objects and groups as one opaque mesh, cut into triangles.
 
-    Up is +y, the custom of these files, unless a comment of ours says otherwise. Colours are taken from
-    lines ``v x y z r g b``, display values in [0, 1], if all vertices have them; else the mesh is grey,
-    with a DataWarning. Texture coordinates, normals and materials are left out. Raises FileFormatError
-    naming the line.
+    Up is +y, as usual for these files, unless a comment of ours says otherwise. Colours are those of lines
+    ``v x y z r g b``, display values in [0, 1], if all vertices have them; else the mesh is grey, with a
+    DataWarning. Texture coordinates, normals and materials are ignored. Raises FileFormatError that names the
+    line.
     """
     up = np.array([0.0, 1.0, 0.0])
     positions, colors, lengths, corners = array("d"), array("d"), array("q"), array("q")
@@ -93,8 +91,9 @@ def read_obj(path: Path) -> SplatMesh:
     faces, _ = cut_polygons(np.array(lengths), np.array(corners), {})
     vertices = np.array(positions).reshape(-1, 3)
     stored = np.array(colors).reshape(-1, 3)
-    return checked_mesh(
+    return checked(
         path,
+        SplatMesh,
         vertices=vertices,
         faces=faces,
         colors=straight_colors(
@@ -118,8 +117,7 @@ def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
 
 
 def _corner(word: bytes, count: int) -> int:
-    """Vertex number, from 0, of ``v``, ``v/vt`` or ``v/vt/vn``; stored from 1, or negative from the
-    latest back."""
+    """0-based vertex index of ``v``, ``v/vt`` or ``v/vt/vn``, which count from 1, or from -1 back."""
     number = int(word.partition(b"/")[0])
     number = number - 1 if number > 0 else number + count
     if word[:1] == b"0" or number < 0:

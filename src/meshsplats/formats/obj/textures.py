@@ -1,4 +1,4 @@
-"""Texture coordinates of Wavefront `.obj` files, and the pictures that their material libraries name."""
+"""Texture coordinates of Wavefront `.obj` files, and the images that their material libraries name."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from meshsplats.formats.ply.faces import cut_polygons
 MAX_LIBRARY_BYTES = 16 << 20
 """A larger file of materials is refused."""
 _NUMBERS_AFTER = {b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3}
-"""Options of a texture with so many numbers at most; others have one word."""
+"""Most numbers that follow an option of a texture; other options have one word."""
 
 
 def obj_coordinates(path: Path) -> tuple[np.ndarray, np.ndarray, list[bytes], list[bytes]] | None:
-    """Of each triangle, in the order of ``read_obj``: texture coordinates (m, 3, 2) float32, v down; whether
+    """For each triangle, in the order of ``read_obj``: texture coordinates (m, 3, 2) float32, v down; whether
     all its corners have them (m,); the name of its material. And the names of material libraries.
 
-    None for a file without texture coordinates. Raises FileFormatError naming the line.
+    None for a file without texture coordinates. Raises FileFormatError that names the line.
     """
     coordinates, lengths, corners, materials = array("d"), array("q"), array("q"), array("q")
     names: dict[bytes, int] = {b"": 0}
@@ -67,7 +67,7 @@ def obj_coordinates(path: Path) -> tuple[np.ndarray, np.ndarray, list[bytes], li
 
 
 def _coordinate(word: bytes, count: int) -> int:
-    """Number, from 0, of the texture coordinate in ``v/vt`` or ``v/vt/vn``; -1 where there is none."""
+    """0-based index of the texture coordinate in ``v/vt`` or ``v/vt/vn``; -1 without one."""
     parts = word.split(b"/")
     if len(parts) < 2 or not parts[1]:
         return -1
@@ -80,9 +80,9 @@ def _coordinate(word: bytes, count: int) -> int:
 def obj_textures(
     path: Path, libraries: list[bytes], materials: list[bytes], read: Callable[[Path], np.ndarray]
 ) -> tuple[np.ndarray, tuple[Texture, ...]]:
-    """(m,) int32 number of the texture of each face, -1 for none, and the textures.
+    """(m,) int32 texture index of each face, -1 for none, and the textures.
 
-    ``materials`` has the material of each face. Missing libraries and pictures are counted in a DataWarning;
+    ``materials`` has the material of each face. A DataWarning names missing libraries and images.
     FileFormatError for a name that leads out of the folder of ``path``, and for broken files.
     """
     maps: dict[bytes, tuple[bytes, Wrap]] = {}
@@ -94,25 +94,25 @@ def obj_textures(
         else:
             missing.append(_shown(name))
     textures: list[Texture] = []
-    numbers: dict[tuple[bytes, Wrap], int] = {}
+    indices: dict[tuple[bytes, Wrap], int] = {}
     of_material: dict[bytes, int] = {}
     for material in dict.fromkeys(materials):
         entry = maps.get(material)
         of_material[material] = -1
         if entry is None:
             continue
-        if entry not in numbers:
-            picture = _beside(path, entry[0])
-            if not picture.is_file():
+        if entry not in indices:
+            image = _beside(path, entry[0])
+            if not image.is_file():
                 missing.append(_shown(entry[0]))
-                numbers[entry] = -1
+                indices[entry] = -1
             else:
-                numbers[entry] = len(textures)
-                textures.append(Texture(read(picture), (entry[1], entry[1])))
-        of_material[material] = numbers[entry]
+                indices[entry] = len(textures)
+                textures.append(Texture(read(image), (entry[1], entry[1])))
+        of_material[material] = indices[entry]
     if missing:
         warnings.warn(
-            f"{path}: not there: {', '.join(missing[:5])}; faces that need it have no texture",
+            f"{path}: missing: {', '.join(missing[:5])}; faces that need it have no texture",
             DataWarning,
             stacklevel=4,
         )
@@ -120,7 +120,7 @@ def obj_textures(
 
 
 def _diffuse_maps(library: Path) -> dict[bytes, tuple[bytes, Wrap]]:
-    """Picture and what lies beyond its edges for each material that has a ``map_Kd``."""
+    """Image and wrapping for each material that has a ``map_Kd``."""
     if library.stat().st_size > MAX_LIBRARY_BYTES:
         raise FileFormatError(f"{library}: a material library of over {MAX_LIBRARY_BYTES >> 20} MiB; refused")
     maps: dict[bytes, tuple[bytes, Wrap]] = {}
@@ -140,7 +140,7 @@ def _diffuse_maps(library: Path) -> dict[bytes, tuple[bytes, Wrap]]:
                         wrap = "clamp"
                     rest = rest[taken:]
                 if not rest:
-                    raise FileFormatError(f"{library}: line {number:,}: map_Kd names no picture")
+                    raise FileFormatError(f"{library}: line {number:,}: map_Kd names no image")
                 maps[material] = (b" ".join(rest), wrap)  # type: ignore[assignment]
     return maps
 

@@ -1,1 +1,1 @@
-"""PLY files: splats, meshes, and the header and tables that both have."""
+"""PLY files: splats, meshes, and the header and tables of both."""

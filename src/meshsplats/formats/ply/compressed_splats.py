@@ -1,8 +1,8 @@
-"""PlayCanvas compressed .ply: 16 bytes a splat, in chunks of 256 that share the range of their values.
+"""PlayCanvas compressed .ply: 16 bytes per splat, in chunks of 256 that share the range of their values.
 
-Element ``chunk`` holds the ranges, ``vertex`` four 32-bit words a splat, ``sh`` (optional) one byte for each
-f_rest coefficient. Positions and log scales have 11, 10, 11 bits, rotations 2 + 3 x 10, colours and opacity
-8. Specification: developer.playcanvas.com, "Compressed PLY".
+Element ``chunk`` holds the ranges, ``vertex`` four 32-bit words per splat, ``sh`` (optional) one byte for
+each f_rest coefficient. Positions and log scales have 11, 10, 11 bits, rotations 2 + 3 x 10, colours and
+opacity 8. Specification: developer.playcanvas.com, "Compressed PLY".
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats.ply.header import Element, PlyHeader
 from meshsplats.formats.ply.splats import kernel_of_comments
 from meshsplats.formats.ply.table import RowReader
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, fill_smallest_three
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, decode_smallest_three
 from meshsplats.gaussians import SH_C0, GaussianCloud
 
 _SHARED = 256
@@ -24,7 +24,7 @@ _SHARED = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _CHUNKS_AT_ONCE = 128
 _TYPES = {"u4": "uint", "f4": "float", "u1": "uchar"}
-# A byte of a spherical harmonic stands for the middle of its step of 1/32 in [-4, 4], the ends for the ends.
+# A byte of a spherical harmonic means the middle of its step of 1/32 in [-4, 4]; 0 and 255 mean the ends.
 _COEFFICIENTS = (np.concatenate([[0], (np.arange(1, 255) + 0.5) / 256, [1]]) * 8 - 4).astype(np.float32)
 
 
@@ -85,7 +85,7 @@ def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object, *, str
         rows.opacities[:] = color[:, 3]
         turns = packed["packed_rotation"]
         small = (_unpacked(turns << np.uint32(2), (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))
-        fill_smallest_three(rows.quaternions, small, turns >> np.uint32(30))
+        decode_smallest_three(rows.quaternions, small, turns >> np.uint32(30))
         if rest:
             table = readers["sh"].rows(start, m)
             stored = np.stack([table[f"f_rest_{i}"] for i in range(rest)], axis=1)

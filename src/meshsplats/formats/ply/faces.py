@@ -1,5 +1,4 @@
-"""The faces of a PLY file as triangles. Files of triangles only, the rule, are read without a loop over
-faces."""
+"""The faces of a PLY file as triangles. Files of triangles alone, the usual case, need no loop over faces."""
 
 from __future__ import annotations
 
@@ -21,9 +20,12 @@ _INDEX_NAMES = ("vertex_indices", "vertex_index")
 def read_faces(
     file: BinaryIO, header: PlyHeader, face: Element, numbers: tuple[str, ...], budget: Budget, path: Path
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Triangles (f, 3) of the element ``face``, and those of the integer properties ``numbers`` that it
-    has, (f,) int64, one value a triangle. Polygons become fans of triangles round their first corner;
-    points and lines vanish. Raises FileFormatError."""
+    """Triangles (f, 3) of the element ``face``, and its integer properties among ``numbers``, each (f,)
+    int64.
+
+    Polygons become fans of triangles around their first corner; points and lines are dropped. Raises
+    FileFormatError.
+    """
     index = next((p for p in face.properties if p.name in _INDEX_NAMES and p.is_list), None)
     if face.count == 0:
         return np.empty((0, 3), np.int64), {}
@@ -33,7 +35,7 @@ def read_faces(
     size = file.seek(0, io.SEEK_END) - header.data_offset
     if face.count > max(size, 0):
         raise FileFormatError(f"{path}: {face.count:,} faces do not fit {max(size, 0):,} bytes (truncated)")
-    # Positions, lengths and corners of polygons that are not all triangles take 8 bytes a value.
+    # Offsets, lengths and corners of mixed polygons take 8 bytes per value.
     budget.spend(size * 8 + 64 * face.count, "the faces")
     file.seek(header.data_offset)
     data = file.read()
@@ -45,7 +47,7 @@ def read_faces(
 def cut_polygons(
     lengths: np.ndarray, corners: np.ndarray, numbers: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Polygons of ``lengths`` (n,) corners each, ``corners`` one after the other, cut into triangles."""
+    """Triangles of polygons of ``lengths`` (n,), concatenated in ``corners``; and their ``numbers``."""
     if (lengths == 3).all():
         return corners.reshape(-1, 3), numbers
     per_face = np.maximum(lengths - 2, 0)
@@ -62,7 +64,7 @@ def cut_polygons(
 def _binary(
     data: bytes, header: PlyHeader, face: Element, index: Property, keep: list[Property], path: Path
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Length of each polygon, all corners one after the other, and the values of ``keep``."""
+    """Length of each polygon, all corners concatenated, and the values of ``keep``."""
     at = 0
     order = "<" if header.encoding == "binary_little_endian" else ">"
     for element in header.elements:
@@ -101,12 +103,12 @@ def _binary(
 
 
 def _gather(raw: np.ndarray, places: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """(n, 1) values of ``dtype`` that begin at the bytes ``places``."""
+    """(n, 1) values of ``dtype`` at the byte offsets ``places``."""
     return raw[places[:, None] + np.arange(dtype.itemsize)].view(dtype)
 
 
 def _uniform(data: bytes, element: Element, at: int) -> np.dtype | None:
-    """Row type where every row has lists of the lengths of the first one; None where rows differ or data
+    """Row type if the lists of all rows have the lengths of the first row's; None if rows differ or data
     end."""
     fields: list[tuple] = []
     offset = at
@@ -132,7 +134,7 @@ def _uniform(data: bytes, element: Element, at: int) -> np.dtype | None:
 
 
 def _rows(data: bytes, element: Element, at: int, order: str, path: Path) -> Iterator[int]:
-    """Byte at which each row of ``element`` begins, then the byte after the last one."""
+    """Byte offset of each row of ``element``, then the offset after the last one."""
     codes = {("i", 1): "b", ("u", 1): "B", ("i", 2): "h", ("u", 2): "H", ("i", 4): "i", ("u", 4): "I"}
     codes |= {("i", 8): "q", ("u", 8): "Q"}
     steps: list[tuple[int, struct.Struct | None, int]] = []
@@ -166,7 +168,7 @@ def _rows(data: bytes, element: Element, at: int, order: str, path: Path) -> Ite
 def _ascii(
     data: bytes, header: PlyHeader, face: Element, index: Property, keep: list[Property], path: Path
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """As ``_binary``. One face a line, blank lines do not count."""
+    """As ``_binary``: one face per line; blank lines are skipped."""
     lines = [x for x in data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n") if x.strip()]
     before = header.elements[: header.elements.index(face)]
     first = sum(e.count for e in before)

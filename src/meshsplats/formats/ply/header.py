@@ -1,7 +1,7 @@
-"""The header of a PLY file: which elements follow, how each row is laid out, where the data begin.
+"""The header of a PLY file: its elements, the layout of their rows, and where the data begin.
 
 PLY is "The Polygon File Format" of Greg Turk, Stanford 1994. Lines end in LF, CR LF or CR; `comment` and
-`obj_info` lines may stand anywhere. Nothing is allocated from a count that the header claims.
+`obj_info` lines may stand anywhere. Nothing is allocated by a count in the header.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 MAX_HEADER_BYTES = 1 << 20
 """A header longer than this is refused; real ones have a few kilobytes."""
 MAX_PROPERTIES = 4096
-"""The most properties that one element may declare."""
+"""Most properties of an element."""
 MAX_ELEMENTS = 256
 MAX_COUNT_DIGITS = 15
-"""A count of more digits is nonsense for any file that exists."""
+"""No real file has a count of more digits."""
 
 _DTYPES = {
     "char": "i1",
@@ -93,7 +93,7 @@ class Element:
 
     @property
     def minimum_row_bytes(self) -> int:
-        """Bytes that a binary row takes at least, with every list empty."""
+        """Bytes of a binary row whose lists are all empty."""
         return sum(
             p.dtype.itemsize if p.count_dtype is None else p.count_dtype.itemsize for p in self.properties
         )
@@ -101,13 +101,13 @@ class Element:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What the header says; the data begin at byte ``data_offset`` in the order of ``elements``."""
+    """A parsed header; the data begin at byte ``data_offset``, in the order of ``elements``."""
 
     encoding: Encoding
     elements: tuple[Element, ...]
     data_offset: int
     lines: int
-    """Number of header lines, so that the first line of ASCII data is ``lines + 1``."""
+    """Count of header lines: the first line of ASCII data is ``lines + 1``."""
     comments: tuple[str, ...]
     obj_info: tuple[str, ...]
 
@@ -207,13 +207,13 @@ class _Draft:
 
 
 def _line_end(head: bytes) -> bytes:
-    """The line end in use, by the first line. CR LF counts as LF: the CR is stripped with the blanks."""
+    """The line end of the first line. CR LF counts as LF: the CR is stripped with the blanks."""
     first = min(i for i in (head.find(b"\n"), head.find(b"\r")) if i >= 0)
     return b"\n" if head[first : first + 1] == b"\n" or head[first : first + 2] == b"\r\n" else b"\r"
 
 
 def _quote(text: str) -> str:
-    """Text of a stranger's file for a message: short and printable."""
+    """Text of an untrusted file for a message: short and printable."""
     return repr(text if len(text) <= 60 else text[:57] + "...")
 
 

@@ -1,6 +1,6 @@
-"""Meshes as `.ply`: ours (binary, float RGBA, nothing lost) and those of other programs.
+"""Meshes as `.ply`: our own files (binary, float RGBA, lossless) and those of other programs.
 
-A file of ours is little endian. Element ``vertex``: float x y z, nx ny nz where the mesh has normals,
+Our own files are little endian. Element ``vertex``: float x y z, nx ny nz where the mesh has normals,
 red green blue alpha (straight, as the mesh holds them, 0 to 1), then ``attribute_NAME`` or
 ``attribute_NAME:COLUMN`` with the name in percent encoding. Element ``face``: ``list uchar int
 vertex_indices``, then int ``face_splat`` and ``depth_group`` where the mesh has them. Comments that
@@ -17,7 +17,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import Budget, check_attribute_names, checked_mesh, straight_colors
+from meshsplats.formats._validation import Budget, check_attribute_names, checked, straight_colors
 from meshsplats.formats.ply.faces import read_faces
 from meshsplats.formats.ply.header import MAX_PROPERTIES, Element, PlyHeader, read_header
 from meshsplats.formats.ply.table import FloatTable
@@ -32,8 +32,7 @@ _COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diff
 
 
 def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
-    """Writes ``mesh`` to ``path``, every array exactly. Raises ValueError for more attribute columns
-    than a PLY reader should be asked to take."""
+    """Writes ``mesh`` to ``path`` exactly. ValueError for more than ``MAX_PROPERTIES`` columns per vertex."""
     check_attribute_names(mesh)
     up = " ".join(repr(float(u)) for u in mesh.up)
     header = [
@@ -52,28 +51,23 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
         names += ["nx", "ny", "nz"]
     columns.append(mesh.colors)
     names += ["red", "green", "blue", "alpha"]
+    extras = mesh.extras().items()
+    tables = {field.name: values for field, values in extras if field.per == "vertex"}
     for name, values in mesh.attributes.items():
-        property_name = _ATTRIBUTE + quote(name, safe="")
-        if values.ndim == 1:
-            names.append(property_name)
-            columns.append(values[:, None])
-        else:
-            names += [f"{property_name}:{i}" for i in range(values.shape[1])]
-            columns.append(values)
-        width = "-" if values.ndim == 1 else values.shape[1]
-        header.append(f"comment meshsplats attribute {property_name} {width}")
+        stored = _ATTRIBUTE + quote(name, safe="")
+        tables[stored] = values
+        header.append(f"comment meshsplats attribute {stored} {'-' if values.ndim == 1 else values.shape[1]}")
+    for stored, values in tables.items():
+        names += _properties(stored, None if values.ndim == 1 else values.shape[1])
+        columns.append(values.reshape(len(values), -1) if values.size else values.reshape(len(values), 0))
     if len(names) > MAX_PROPERTIES:
-        raise ValueError(f"{len(names)} columns a vertex are more than {MAX_PROPERTIES}; save as .npz")
+        raise ValueError(f"{len(names)} columns per vertex are more than {MAX_PROPERTIES}; save as .npz")
     header.append(f"element vertex {len(mesh.vertices)}")
     header += [f"property float {name}" for name in names]
     header.append(f"element face {len(mesh.faces)}")
     header.append("property list uchar int vertex_indices")
     fields: list[tuple] = [("n", "u1"), ("corners", "<i4", 3)]
-    numbers = {
-        name: values
-        for name, values in (("face_splat", mesh.face_splat), ("depth_group", mesh.depth_group))
-        if values is not None
-    }
+    numbers = {field.name: values for field, values in extras if field.per == "face"}
     for name in numbers:
         header.append(f"property int {name}")
         fields.append((name, "<i4"))
@@ -91,6 +85,11 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
             for name, values in numbers.items():
                 faces[name] = values[part]
             file.write(faces.data)
+
+
+def _properties(name: str, columns: int | None) -> tuple[str, ...]:
+    """Names of the properties that hold an array of ``columns``, None for (v,)."""
+    return (name,) if columns is None else tuple(f"{name}:{i}" for i in range(columns))
 
 
 # -- reading
@@ -121,6 +120,9 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
     groups: dict[str, tuple[str, ...]] = {"vertices": ("x", "y", "z"), "colors": (*rgb, *alpha)}
     if all(n in vertex.names for n in ("nx", "ny", "nz")):
         groups["normals"] = ("nx", "ny", "nz")
+    columns_of = {f: _properties(f.name, f.columns) for f in SplatMesh.EXTRAS if f.per == "vertex"}
+    extras = [f for f, columns in columns_of.items() if all(n in vertex.names for n in columns)]
+    groups |= {f.name: columns_of[f] for f in extras}
     attributes, settings = _notes(header, vertex, path)
     for name, (_, columns) in attributes.items():
         groups[f"attribute {name}"] = columns
@@ -141,9 +143,10 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
         if types[name].kind == "u":
             arrays["colors"][:, i] /= np.float32(np.iinfo(types[name]).max)
         elif types[name].kind == "i" and arrays["colors"][:, i].max(initial=0) > 1:
-            # Bytes in a wider type: no program has the largest signed number for white.
+            # Bytes in a wider type: no program writes white as the largest signed integer.
             arrays["colors"][:, i] /= np.float32(255)
-    faces, numbers = read_faces(file, header, face, ("face_splat", "depth_group"), budget, path)
+    of_faces = tuple(field.name for field in SplatMesh.EXTRAS if field.per == "face")
+    faces, numbers = read_faces(file, header, face, of_faces, budget, path)
     if settings.get("filter_px2") and "face_splat" not in numbers:
         del settings["filter_px2"]
         warnings.warn(
@@ -151,8 +154,9 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
             DataWarning,
             stacklevel=3,
         )
-    return checked_mesh(
+    return checked(
         path,
+        SplatMesh,
         vertices=arrays["vertices"],
         faces=faces,
         colors=straight_colors(arrays["colors"], path),
@@ -161,6 +165,7 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
             name: arrays[f"attribute {name}"][:, 0] if flat else arrays[f"attribute {name}"]
             for name, (flat, _) in attributes.items()
         },
+        **{f.name: arrays[f.name].reshape(f.shape({"vertex": v})) for f in extras},
         **settings,
         **numbers,
     )
@@ -169,7 +174,7 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
 def _notes(
     header: PlyHeader, vertex: Element, path: Path
 ) -> tuple[dict[str, tuple[bool, tuple[str, ...]]], dict[str, Any]]:
-    """What our comments say: each attribute's (whether it is (v,), its properties), and settings."""
+    """Contents of our comments: for each attribute (whether it is (v,), its properties), and settings."""
     attributes: dict[str, tuple[bool, tuple[str, ...]]] = {}
     settings: dict[str, Any] = {}
     for comment in header.comments:
@@ -192,13 +197,12 @@ def _notes(
                 except ValueError:
                     raise FileFormatError(f"{path}: filter_px2 must be a number: {comment[:60]}") from None
             case ["attribute", name, width]:
-                names: tuple[str, ...] = (name,)
-                if width.isascii() and width.isdecimal() and len(width) <= 4:
-                    names = tuple(f"{name}:{i}" for i in range(int(width)))
+                counted = width.isascii() and width.isdecimal() and len(width) <= 4
+                names = _properties(name, int(width) if counted else None)
                 missing = [n for n in names if n not in vertex.names]
                 if missing:
                     raise FileFormatError(f"{path}: property {missing[0][:60]!r} of an attribute is missing")
                 attributes[unquote(name.removeprefix(_ATTRIBUTE))] = (width == "-", names)
             case _:
-                pass  # a later version's, or the version itself
+                pass  # the version, or a note of a later version
     return attributes, settings

@@ -2,10 +2,9 @@
 
 Each row of element ``vertex`` is a splat: ``x y z``, ``f_dc_0..2`` and ``f_rest_*`` (spherical harmonics,
 channel by channel), ``opacity`` (logit), ``scale_*`` (logarithms) and ``rot_0..3`` (quaternion w x y z of any
-length). 2DGS files have two scales, the flat axis being the third; Mip-Splatting files have ``filter_3D``,
-the width of a smoothing filter that belongs to scales and opacities. Properties are found by name. How splats
-are to be drawn is said by a comment, if at all: ``SplatRenderMode: mip`` (Brush), ``antialiased 1``
-(Postshot).
+length). 2DGS files have two scales; the third axis is flat. Mip-Splatting files have ``filter_3D``, the width
+of a smoothing filter that applies to scales and opacities. Properties are found by name. A comment may name
+the kernel: ``SplatRenderMode: mip`` (Brush), ``antialiased 1`` (Postshot).
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
 _FILTER = "filter_3D"
 _REST_COUNTS = {0: 1, 9: 4, 24: 9, 45: 16}
-"""Number of f_rest properties: coefficients a channel."""
+"""Coefficients per channel by the count of f_rest properties."""
 
 MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
 """Stored for a scale of 0, whose logarithm is not finite: -87.3."""
 MIN_LOGIT, MAX_LOGIT = -30.0, 20.0
-"""Stored for opacities 0 and 1; a float32 sigmoid of the latter is exactly 1."""
+"""Stored for opacities of 0 and 1; the float32 sigmoid of 20 is exactly 1."""
 
 
 class _Columns:
-    """Which properties hold what, and what they mean. Raises FileFormatError if some are missing."""
+    """The properties of splats and their meaning. Raises FileFormatError if some are missing."""
 
     def __init__(self, element: Element, header: PlyHeader, where: object) -> None:
         names = set(element.names)
@@ -50,8 +49,7 @@ class _Columns:
             mesh = f"a mesh with {faces.count:,} faces" if faces and faces.count else "a plain point cloud"
             raise FileFormatError(
                 f"{where}: not splats but {mesh}: element 'vertex' has no opacity, scale_0.., rot_0.."
-                " properties"
-                f" (it has {_listed(element.names)}); load_mesh reads meshes"
+                f" properties (it has {_listed(element.names)}); load_mesh reads meshes"
             )
         self.color = _DC if names.issuperset(_DC) else _RGB
         if not names.issuperset(self.color):
@@ -72,7 +70,7 @@ class _Columns:
             )
         self.coefficients = _REST_COUNTS[len(rest)]
         self.filter = (_FILTER,) if _FILTER in names else ()
-        # In the order of sh[i] in memory, coefficient by coefficient; files go channel by channel.
+        # Ordered by coefficient, as sh in memory; files are ordered by channel.
         b = self.coefficients - 1
         self.sh = (*self.color, *(f"f_rest_{c * b + j}" for j in range(b) for c in range(3)))
         self.color_span: np.ndarray | None = None

@@ -1,7 +1,7 @@
-"""Rows of one PLY element, as they are or as float32 tables, in chunks that fit the processor's cache.
+"""Rows of one PLY element, as stored or as float32 tables, in chunks that fit the processor's cache.
 
-Reading goes through a small buffer and not through a memory map: the file's pages then never count as memory
-of the process, and a file that shrinks meanwhile is an error instead of a bus error.
+Reading uses a small buffer, no memory map: the pages of the file do not count as memory of the process, and a
+file that shrinks meanwhile causes a Python error instead of a bus error.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ MAX_LINE_BYTES = 1 << 18
 class RowReader:
     """The rows of ``element``, whose properties must all be single values.
 
-    The constructor finds where the rows begin and compares the count with the size of the file; nothing is
-    allocated before that. Raises FileFormatError, naming byte, line or row.
+    The constructor finds the first row and compares the count with the size of the file before anything is
+    allocated. Raises FileFormatError that names the byte, line or row.
     """
 
     def __init__(self, file: BinaryIO, header: PlyHeader, element: Element, where: object) -> None:
@@ -61,24 +61,24 @@ class RowReader:
             done += got
 
     def _check_minimum(self) -> None:
-        """Refuses a count that no file of this size can hold, whatever its lists contain."""
+        """Refuses a count that no file of this size can hold, even if all lists are empty."""
         ascii_ = self._header.encoding == "ascii"
         left = self._size - self._header.data_offset
         for e in self._header.elements:
-            # An ASCII value takes a digit and a blank or line end; the last line end may be missing.
+            # An ASCII value is a digit and a blank or line end; the last line end may be missing.
             least = e.count * (2 * len(e.properties) if ascii_ else e.minimum_row_bytes)
             if least > left + ascii_:
                 raise FileFormatError(
                     f"{self._where}: the header claims {e.count:,} rows of element {e.name!r}, at least"
-                    f" {least:,} bytes,"
-                    f" but {max(left, 0):,} bytes are left for them (file truncated or count wrong)"
+                    f" {least:,} bytes, but {max(left, 0):,} bytes are left for them (file truncated or count"
+                    " wrong)"
                 )
             left -= least
             if e is self._element and e.count and not e.properties:
                 raise FileFormatError(f"{self._where}: element {e.name!r} has no properties")
 
     def _find_rows(self) -> int:
-        """Byte at which the element's rows begin; elements with lists before it are walked through."""
+        """Byte offset of the first row; walks through the rows of earlier elements with lists."""
         offset = self._header.data_offset
         for e in self._header.elements:
             if e is self._element:
@@ -96,9 +96,8 @@ class RowReader:
         if here > left:
             raise FileFormatError(
                 f"{self._where}: element {e.name!r} should hold {e.count:,} rows of {row} bytes from byte"
-                f" {self._offset:,},"
-                f" {here:,} bytes, but the file ends after {max(left, 0):,} of them (truncated or count"
-                " wrong)"
+                f" {self._offset:,}, {here:,} bytes, but the file ends after {max(left, 0):,} of them"
+                " (truncated or count wrong)"
             )
         after = self._header.elements[self._header.elements.index(e) + 1 :]
         rest = left - here - sum(a.count * a.minimum_row_bytes for a in after)
@@ -112,8 +111,7 @@ class RowReader:
             if rest > 16 or self._file.read(rest).strip():
                 raise FileFormatError(
                     f"{self._where}: {rest:,} bytes follow the last row that the header declares (rows of"
-                    f" {e.name!r}"
-                    f" have {row} bytes); its counts or properties do not fit the data"
+                    f" {e.name!r} have {row} bytes); its counts or properties do not fit the data"
                 )
 
 
@@ -133,7 +131,7 @@ class FloatTable(RowReader):
         self.names: tuple[str, ...] = element.names if uniform else tuple(wanted)
 
     def chunks(self) -> Iterator[np.ndarray]:
-        """(m, len(names)) float32 tables, all rows in order; each is valid until the next one is asked for.
+        """(m, len(names)) float32 tables of all rows in order; each is valid until the next one is requested.
 
         Values beyond the range of float32 become infinite.
         """
@@ -188,12 +186,11 @@ class FloatTable(RowReader):
     def _stop_short(self, element: Element, rows: int) -> None:
         raise FileFormatError(
             f"{self._where}: the file ends after {rows:,} of {element.count:,} rows of element"
-            f" {element.name!r}"
-            " (truncated or count wrong)"
+            f" {element.name!r} (truncated or count wrong)"
         )
 
     def _parse(self, batch: list[tuple[int, str]], width: int) -> np.ndarray:
-        """One row a line. Only when that fails are lines looked at one by one, to name the culprit."""
+        """Parses one row per line; checks line by line only on failure, to name the bad one."""
         try:
             table = np.loadtxt([line for _, line in batch], np.float64, comments=None, ndmin=2)
         except ValueError:
@@ -215,7 +212,7 @@ class FloatTable(RowReader):
 
 
 def _data_lines(file: BinaryIO, header: PlyHeader, where: object) -> Iterator[tuple[int, str]]:
-    """Numbered lines after the header that are not blank, whatever their line ends."""
+    """Numbered lines after the header that are not blank, with any line ends."""
     file.seek(header.data_offset)
     number, rest = header.lines, b""
     while True:
@@ -240,8 +237,8 @@ def _data_lines(file: BinaryIO, header: PlyHeader, where: object) -> Iterator[tu
 def _skip_list_rows(file: BinaryIO, element: Element, offset: int, where: object) -> int:
     """Byte after the rows of an element with list properties that begin at ``offset``.
 
-    Rows are walked in windows of the file. Where an element has a single list, runs of rows of equal length
-    (the rule for faces) are recognised together.
+    Walks the rows in windows of the file. If the element has a single list, runs of rows of equal length (the
+    usual case for faces) are skipped together.
     """
     size = file.seek(0, io.SEEK_END)
     window, base, done = b"", offset, 0
@@ -255,8 +252,7 @@ def _skip_list_rows(file: BinaryIO, element: Element, offset: int, where: object
         if length is None or offset + length > size:
             raise FileFormatError(
                 f"{where}: row {done:,} of element {element.name!r} at byte {offset:,} runs past the end of"
-                " the file"
-                " (truncated, or a wrong list length)"
+                " the file (truncated, or a wrong list length)"
             )
         run = _equal_rows(element, window, offset - base, length, element.count - done)
         offset, done = offset + run * length, done + run
@@ -297,7 +293,7 @@ def _long_row_bytes(file: BinaryIO, element: Element, offset: int, size: int) ->
 
 
 def _equal_rows(element: Element, window: bytes, at: int, length: int, most: int) -> int:
-    """How many rows from ``at`` on have the first one's list length; 1 if the element has several lists."""
+    """Count of rows from ``at`` on that share a list length; 1 if the element has several lists."""
     counts = [(i, p.count_dtype) for i, p in enumerate(element.properties) if p.count_dtype is not None]
     most = min(most, (len(window) - at) // length)
     if len(counts) != 1 or most <= 1:
@@ -306,7 +302,7 @@ def _equal_rows(element: Element, window: bytes, at: int, length: int, most: int
     before = sum(p.dtype.itemsize for p in element.properties[:index])
     first = np.frombuffer(window, np.uint8, dtype.itemsize, at + before)
     run = 1
-    while run < most:  # look further only as long as it pays
+    while run < most:  # in doubling steps
         step = min(max(16, run), most - run)
         rows = np.frombuffer(window, np.uint8, step * length, at + run * length).reshape(step, length)
         same = (rows[:, before : before + dtype.itemsize] == first).all(axis=1)

@@ -1,1 +1,1 @@
-"""Splat formats of their own: SPZ, SOG and .splat."""
+"""Formats for splats alone: SPZ, SOG and .splat."""

@@ -1,4 +1,4 @@
-"""Collects the splats of a file into a GaussianCloud and leaves out those that are not usable."""
+"""Collects the splats of a file into a GaussianCloud and drops unusable ones."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class SplatRows(NamedTuple):
 class CloudBuilder:
     """The arrays of a cloud, filled in chunks: ``rows = builder.next(m)``, fill them, ``builder.keep(rows)``.
 
-    A row is dropped and counted if a value is not finite after activation or its quaternion is zero. Later
-    rows take its place, so that no array is ever copied.
+    A row is dropped and counted if a value is not finite after activation or if its quaternion is zero. Later
+    rows take its place, so that no array is copied.
     """
 
     def __init__(self, count: int, coefficients: int, where: object) -> None:
@@ -41,8 +41,7 @@ class CloudBuilder:
             np.empty(count, np.float32),
             np.empty((count, coefficients, 3), np.float32),
         )
-        self._kept = 0
-        self._not_finite = self._zero_quaternions = 0
+        self._kept = self._not_finite = self._zero_quaternions = 0
         self._first_bad: int | None = None
 
     def next(self, m: int) -> SplatRows:
@@ -50,11 +49,11 @@ class CloudBuilder:
         return SplatRows(*(a[self._kept : self._kept + m] for a in self._arrays))
 
     def keep(self, rows: SplatRows) -> None:
-        """Takes the rows that ``next`` gave, normalises their quaternions and drops unusable ones."""
+        """Keeps the rows from ``next``: normalises their quaternions and drops unusable ones."""
         m = len(rows.means)
         finite = np.ones(m, bool)
         for array in rows:
-            # A sum is not finite if any term is not; only then look value by value.
+            # A sum is not finite if any term is not: only then check each value.
             with np.errstate(invalid="ignore", over="ignore"):
                 suspicious = not np.isfinite(array.sum())
             if suspicious:
@@ -63,20 +62,20 @@ class CloudBuilder:
             q = rows.quaternions.astype(np.float64)  # squares of float32 neither overflow nor vanish
             norm = np.sqrt(np.einsum("ij,ij->i", q, q))
             rows.quaternions[:] = q / norm[:, None]
-        turned = norm > 0
-        good = finite & turned
+        has_rotation = norm > 0
+        good = finite & has_rotation
         if not good.all():
             if self._first_bad is None:
                 self._first_bad = self._kept + int(good.argmin())
             self._not_finite += int((~finite).sum())
-            self._zero_quaternions += int((finite & ~turned).sum())
+            self._zero_quaternions += int((finite & ~has_rotation).sum())
             m = int(good.sum())
             for array in rows:
                 array[:m] = array[good]
         self._kept += m
 
     def finish(self, kernel: Kernel, *, strict: bool) -> GaussianCloud:
-        """The cloud. Dropped splats are a DataWarning; a FileFormatError if ``strict`` or if none is left."""
+        """The cloud. Dropped splats give a DataWarning; an error if ``strict`` or if none is left."""
         dropped = self._not_finite + self._zero_quaternions
         if dropped:
             reasons = []
@@ -98,8 +97,7 @@ class CloudBuilder:
 
 
 def joined(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCloud:
-    """All clouds in one, of at least one; missing harmonics are zero, and the kernel is that of all or
-    '3dgs'."""
+    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one."""
     if len(clouds) == 1:
         return clouds[0]
     count, width = sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds)
@@ -120,7 +118,7 @@ def joined(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCloud:
     )
 
 
-def fill_smallest_three(out: np.ndarray, small: np.ndarray, largest: np.ndarray) -> None:
+def decode_smallest_three(out: np.ndarray, small: np.ndarray, largest: np.ndarray) -> None:
     """Writes quaternions ``out`` (m, 4) from three components (m, 3) and the index (m,) of the omitted one.
 
     Of a unit quaternion the component that is largest in magnitude is omitted and taken as positive; the

@@ -1,8 +1,8 @@
 """.splat: 32 bytes a splat and nothing else, the format of the first web viewer (antimatter15/splat, MIT).
 
 Each record holds position and scales (6 float32), colour and opacity (4 bytes of 255ths), and the rotation
-(4 bytes, w x y z, 128 + 128 times the component, cut off). There is no header, so a file is recognised by its
-rotations, which must have length 1.
+(4 bytes, w x y z, 128 + 128 times the component, truncated). There is no header, so a file is recognised by
+its rotations, which must have length 1.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _AT_ONCE = 1 << 16
 
 
 def is_dot_splat(file: BinaryIO) -> bool:
-    """Whether the file can be `.splat`: whole records, nine in ten of those looked at with unit rotations."""
+    """Whether the file can be `.splat`: whole records, and nine in ten of a sample have unit rotations."""
     size = file.seek(0, io.SEEK_END)
     if size == 0 or size % _RECORD.itemsize:
         return False
@@ -57,5 +57,5 @@ def read_dot_splat(file: BinaryIO, where: object, *, strict: bool) -> GaussianCl
 
 
 def _rotations(records: np.ndarray) -> np.ndarray:
-    # Writers cut 128 + 128 q off to a whole number: the middle of the step is half a unit further.
+    # Writers truncate 128 + 128 q to an integer: the middle of that step lies half a unit higher.
     return (records["rotation"] - np.float32(127.5)) / np.float32(127.5)

@@ -1,4 +1,4 @@
-"""SOG: splats as pictures. A folder or a zip archive with ``meta.json`` and one lossless WebP for each
+"""SOG: splats as images. A folder or a zip archive with ``meta.json`` and one lossless WebP for each
 attribute.
 
 Pixel i (row by row) belongs to splat i. Version 2 looks bytes up in codebooks, version 1 (no version number)
@@ -22,7 +22,8 @@ import numpy as np
 
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, SplatRows, fill_smallest_three
+from meshsplats.formats.sniff import Content
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, SplatRows, decode_smallest_three
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 _MAX_META_BYTES = 4 << 20
@@ -30,19 +31,18 @@ _MAX_SPLATS = 1 << 28
 _AT_ONCE = 1 << 16
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 _PALETTE_COLUMNS = 64
-"""Entries of the palette of harmonics in a row of its picture."""
+"""Palette entries of harmonics in each row of their image."""
 
 
 def read_sog(
     path: Path, budget: Budget, *, strict: bool, ranges: Sequence[tuple[int, int]] | None = None
 ) -> GaussianCloud:
-    """The splats of a `.sog` archive, or of the folder that holds the meta.json ``path``; errors as
-    ``load_gaussians``. ``ranges``: first and end of the splats that are wanted, any number of times; None:
-    all.
+    """The splats of a `.sog` archive, or of the folder of the meta.json ``path``; errors as
+    ``load_gaussians``.
+
+    ``ranges`` selects splats by first and end; ranges may overlap. None selects all.
     """
-    with open(path, "rb") as file:
-        zipped = file.read(2) == b"PK"
-    if not zipped:
+    if Content(path).container != "zip":
         return _Reader(_Folder(path.parent, path, budget), path, budget).read(ranges, strict=strict)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -52,8 +52,11 @@ def read_sog(
 
 
 def json_object(raw: bytes, most: int, what: str, where: Path) -> dict[str, Any]:
-    """What ``what``, a JSON file of at most ``most`` bytes, holds. FileFormatError, which begins with
-    ``where``, if it is longer or no object."""
+    """The object in the JSON file ``what`` of at most ``most`` bytes.
+
+    Raises:
+        FileFormatError: it is longer, or no object; the message begins with ``where``.
+    """
     if len(raw) > most:
         raise FileFormatError(f"{where}: {what} is longer than {most:,} bytes")
     try:
@@ -96,7 +99,7 @@ class _Archive:
                 f"{path}: a zip archive without meta.json is no SOG file (it holds {listed})"
             )
         self._meta = min(metas, key=lambda n: (n.count("/"), n))
-        # Pictures are compressed already: more than this is a decompression bomb.
+        # Images are compressed already: more than this is a decompression bomb.
         self._limit = (16 << 20) + 4 * os.stat(path).st_size
 
     def read_meta(self) -> bytes:
@@ -199,18 +202,18 @@ class _Reader:
         small = (turns[:, :3] / np.float32(127.5) - 1) / np.float32(np.sqrt(2))
         # The fourth byte is 252 + the index of the largest component; other values leave the quaternion zero.
         rows.quaternions[:] = 0
-        fill_smallest_three(rows.quaternions, small, turns[:, 3].astype(np.int32) - 252)
+        decode_smallest_three(rows.quaternions, small, turns[:, 3].astype(np.int32) - 252)
 
     def _chosen(
         self, ranges: Sequence[tuple[int, int]] | None, stored: int
     ) -> tuple[np.ndarray | slice, int]:
-        """What picks the splats of ``ranges`` from the rows of all, and their number."""
+        """Index of the splats of ``ranges`` among all rows, and their count."""
         if ranges is None:
             return slice(None), stored
-        edges = np.zeros(stored + 1, np.int64)  # ranges may overlap, any number of times
+        edges = np.zeros(stored + 1, np.int64)  # ranges may overlap
         for first, end in ranges:
             if end > stored:
-                raise self._error(f"the splats {first:,} to {end:,} are asked for, but it has {stored:,}")
+                raise self._error(f"splats {first:,} to {end:,} are requested, but it has {stored:,}")
             edges[first] += 1
             edges[end] -= 1
         chosen = np.cumsum(edges[:-1]) > 0
@@ -268,7 +271,7 @@ class _Reader:
     def _codebook(self, section: str) -> np.ndarray:
         book = self._section(section).get("codebook")
         if isinstance(book, list) and len(book) == 256 and book[0] is None:
-            # Some writers left the first entry empty; it follows from the others as PlayCanvas has it.
+            # Some writers left the first entry empty; PlayCanvas extrapolates it from the others.
             rest = self._checked(book[1:], section, "codebook", (255,))
             numbers = np.concatenate([rest[:1] + (rest[0] - rest[-1]) / 255, rest])
         else:
@@ -281,40 +284,40 @@ class _Reader:
             return "antialiased"
         return known.get(str(self._meta.get("model")), "3dgs")
 
-    # -- pictures
+    # -- images
 
     def _palette(self, data: bytes, section: dict[str, Any], version: int | None) -> np.ndarray:
         """(p, k - 1, 3) harmonics that labels refer to."""
-        picture = self._picture(data, "shN centroids", 1 << 24)
-        n = next((c for c in _COEFFICIENTS.values() if c * _PALETTE_COLUMNS == picture.shape[1]), 0)
-        bands = section.get("bands")  # neither they nor the count are in files of the first days of version 2
+        image = self._image(data, "shN centroids", 1 << 24)
+        n = next((c for c in _COEFFICIENTS.values() if c * _PALETTE_COLUMNS == image.shape[1]), 0)
+        bands = section.get("bands")  # early files of version 2 have neither bands nor count
         stated = version == 2 and bands is not None
         if not n or (stated and (not isinstance(bands, int) or _COEFFICIENTS.get(bands) != n)):
             raise self._error(
-                f"the picture of harmonics is {picture.shape[1]} pixels wide, which does not fit"
+                f"the image of harmonics is {image.shape[1]} pixels wide, which does not fit"
                 f" {str(bands)[:20]} bands (192, 512, 960 pixels for 1, 2, 3)"
             )
-        entries = picture[..., :3].reshape(-1, n, 3)
+        entries = image[..., :3].reshape(-1, n, 3)
         if version is None:
             least, most = self._range("shN", 1)
             return (least + (most - least) * (entries / np.float64(255))).astype(np.float32)
         size = section.get("count", len(entries))
         if not isinstance(size, int) or not 0 <= size <= len(entries):
-            raise self._error(f"a palette of {str(size)[:20]} harmonics in a picture of {len(entries):,}")
+            raise self._error(f"a palette of {str(size)[:20]} harmonics in an image of {len(entries):,}")
         return self._codebook("shN")[entries[:size]]
 
     def _pixels(self, data: bytes, name: str, count: int) -> np.ndarray:
         """(count, 4) bytes of the first ``count`` pixels."""
-        picture = self._picture(data, name, 2 * count + (1 << 16))
-        if picture.shape[0] * picture.shape[1] < count:
+        image = self._image(data, name, 2 * count + (1 << 16))
+        if image.shape[0] * image.shape[1] < count:
             raise self._error(
-                f"the picture of {name} has {picture.shape[1]} x {picture.shape[0]} pixels, too few for"
+                f"the image of {name} has {image.shape[1]} x {image.shape[0]} pixels, too few for"
                 f" {count:,} splats"
             )
-        return picture.reshape(-1, 4)[:count]
+        return image.reshape(-1, 4)[:count]
 
-    def _picture(self, data: bytes, name: str, most: int) -> np.ndarray:
-        """(height, width, 4) RGBA; refuses pictures of more than ``most`` pixels before unpacking them."""
+    def _image(self, data: bytes, name: str, most: int) -> np.ndarray:
+        """(height, width, 4) RGBA; refuses images of more than ``most`` pixels before unpacking them."""
         from PIL import Image, features
 
         if data[:4] == b"RIFF" and not features.check("webp"):
@@ -322,18 +325,18 @@ class _Reader:
                 f"{self._where}: this Pillow was built without WebP, which SOG needs"
             )
         try:
-            with warnings.catch_warnings(), Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as image:
-                warnings.simplefilter("ignore")  # Pillow warns of large pictures; the limit below is narrower
-                width, height = image.size
+            with warnings.catch_warnings(), Image.open(io.BytesIO(data), formats=["WEBP", "PNG"]) as opened:
+                warnings.simplefilter("ignore")  # Pillow warns of large images; the limit below is narrower
+                width, height = opened.size
                 if width * height > most:
                     raise self._error(
-                        f"the picture of {name} has {width} x {height} pixels, expected at most {most:,}"
+                        f"the image of {name} has {width} x {height} pixels, expected at most {most:,}"
                     )
-                self._budget.spend(12 * width * height, f"the picture of {name}")
-                return np.asarray(image.convert("RGBA"))
+                self._budget.spend(12 * width * height, f"the image of {name}")
+                return np.asarray(opened.convert("RGBA"))
         except FileFormatError:
             raise
-        except Exception as error:  # Pillow's decoders raise whatever their parts do
+        except Exception as error:  # Pillow's decoders raise errors of any type
             raise self._error(
-                f"the picture of {name} cannot be read: {type(error).__name__} {str(error)[:100]}"
+                f"the image of {name} cannot be read: {type(error).__name__} {str(error)[:100]}"
             ) from None

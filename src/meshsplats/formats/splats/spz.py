@@ -18,19 +18,19 @@ import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, fill_smallest_three
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, decode_smallest_three
 from meshsplats.gaussians import GaussianCloud
 
 MAGIC = b"NGSP"
 _COLOR_SCALE = 0.15
 """Colours are stored as 0.5 + 0.15 f_dc, which leaves room beyond [0, 1]."""
 _REST = (0, 3, 8, 15, 24)
-"""Coefficients a channel beyond the first, by degree."""
+"""Coefficients per channel beyond the first, by degree."""
 _ANTIALIASED, _EXTENDED, _TREE = 1, 2, 128
 _COORDINATE_SYSTEM = 0xADBE0003
 _SYSTEMS = ["RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"]
 _SYSTEMS += ["LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
-"""Where x, y, z point, by the number in the extension; 0 leaves the rule of the format."""
+"""Directions of x, y and z by the code in the extension; 0 keeps the default of the format."""
 _DIRECTIONS = {
     "R": (1, 0, 0),
     "L": (-1, 0, 0),
@@ -81,13 +81,13 @@ def is_spz(head: bytes) -> bool:
 def read_spz(data: bytes | memoryview, where: object, budget: Budget, *, strict: bool) -> SpzSplats:
     """The splats of a whole SPZ file in memory; errors as ``load_gaussians``."""
     if bytes(data[:4]) == MAGIC:
-        header, extensions, streams = _take_apart(data, where, budget)
+        header, extensions, streams = _parse_streams(data, where, budget)
     else:
-        header, extensions, streams = _inflate(data, where, budget)
+        header, extensions, streams = _parse_gzip(data, where, budget)
     degree = min(header.degree, 3)
     if header.degree > 3:
         warnings.warn(
-            f"{where}: spherical harmonics of degree {header.degree}; what goes beyond degree 3 is left out",
+            f"{where}: spherical harmonics of degree {header.degree}; those beyond degree 3 are left out",
             DataWarning,
             stacklevel=4,
         )
@@ -132,10 +132,10 @@ def _spend(header: _Header, where: object, budget: Budget) -> None:
     budget.spend(sum(header.sizes().values()) + header.splats * memory, f"its {header.splats:,} splats")
 
 
-def _inflate(
+def _parse_gzip(
     data: bytes | memoryview, where: object, budget: Budget
 ) -> tuple[_Header, bytes, dict[str, np.ndarray]]:
-    """Versions 1 to 3. No more is unpacked than the header promises."""
+    """Parses versions 1 to 3. Unpacks no more than the header promises."""
     stream = zlib.decompressobj(31)
     try:
         raw = stream.decompress(data, 16)
@@ -165,10 +165,10 @@ def _inflate(
     return header, extensions, streams
 
 
-def _take_apart(
+def _parse_streams(
     data: bytes | memoryview, where: object, budget: Budget
 ) -> tuple[_Header, bytes, dict[str, np.ndarray]]:
-    """Version 4."""
+    """Parses version 4."""
     if len(data) < 32:
         raise FileFormatError(f"{where}: truncated SPZ header of {len(data)} bytes")
     header = _header(bytes(data[:16]), range(4, 5), where)
@@ -233,7 +233,7 @@ def _positions(stored: np.ndarray, header: _Header) -> np.ndarray:
         return np.ascontiguousarray(stored).view("<f2").astype(np.float32)
     words = np.zeros((len(stored), 3, 4), np.uint8)
     words[..., 1:] = stored.reshape(-1, 3, 3)
-    fixed = words.view("<i4")[..., 0] >> 8  # in the upper bytes first, for the sign
+    fixed = words.view("<i4")[..., 0] >> 8  # shifted down from the upper bytes, which extends the sign
     return (fixed * 2.0**-header.fraction_bits).astype(np.float32)
 
 
@@ -253,7 +253,7 @@ def _fill_rotations(out: np.ndarray, stored: np.ndarray) -> None:
         small[:, i] = (field & 511) / np.float32(511 * np.sqrt(2))
         np.negative(small[:, i], out=small[:, i], where=(field & 512) > 0)
     xyzw = np.empty((len(words), 4), np.float32)
-    fill_smallest_three(xyzw, small, words >> np.uint32(30))
+    decode_smallest_three(xyzw, small, words >> np.uint32(30))
     out[:] = xyzw[:, [3, 0, 1, 2]]
 
 

@@ -1,7 +1,7 @@
 """Streamed SOG: a folder of SOG parts in several levels of detail, with the index ``lod-meta.json``.
 
-The index has a tree of places; each leaf names, level by level, which splats of which part it shows. Level 0
-has the most detail. Specification: developer.playcanvas.com, "The Streamed SOG Format".
+The index is a tree. Each leaf names, level by level, a range of the splats of a part. Level 0 has the most
+detail. Specification: developer.playcanvas.com, "The Streamed SOG Format".
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _PATH = re.compile(r"[^/\\:\0]{1,255}(/[^/\\:\0]{1,255}){0,7}")
 
 
 def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
-    """The splats of the index ``path`` in the finest level that each place has, and those of its environment;
-    errors as ``load_gaussians``."""
+    """The splats of the index ``path`` at the finest level of each leaf, and those of its environment; errors
+    as ``load_gaussians``."""
     index = _Index(path)
     budget = Budget(path)
     parts = []
@@ -31,7 +31,7 @@ def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
         part = path.parent / name
         if not part.is_file():
             raise FileFormatError(f"{path}: the part {name!r} that it names is missing")
-        # What reading a part takes is given back after it; the splats stay.
+        # Only the splats stay in memory after a part has been read.
         own = Budget(part)
         cloud = read_sog(part, own, strict=strict, ranges=ranges)
         budget.extend(own.file_bytes)
@@ -46,7 +46,7 @@ def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
 
 
 class _Index:
-    """lod-meta.json, checked as far as it is read."""
+    """lod-meta.json; only what is read is checked."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -58,7 +58,7 @@ class _Index:
             raise self._error(f"streamed SOG of version {str(version)[:20]}, known is 1")
 
     def parts(self) -> dict[str, list[tuple[int, int]] | None]:
-        """First and end of the splats to read by part, as paths beside the index; None: all of them."""
+        """Ranges of splats to read (first, end), None for all, by the part's path beside the index."""
         names = self._document.get("filenames")
         if not isinstance(names, list):
             raise self._error(f"'filenames' must be a list, got {str(names)[:60]}")
@@ -68,25 +68,25 @@ class _Index:
                 raise self._error(f"its tree names part {number}, but there are {len(names)}")
             if end > first:
                 ranges = found.setdefault(self._checked(names[number]), [])
-                assert ranges is not None  # only the environment's are
+                assert ranges is not None  # only the environment has none
                 ranges.append((first, end))
         if (environment := self._document.get("environment")) is not None:
             found[self._checked(environment)] = None
         return found
 
     def _finest(self) -> list[tuple[int, int, int]]:
-        """Number of the part, first and end of its splats, leaf by leaf."""
+        """Index of the part, first and end of its splats, leaf by leaf."""
         found = []
-        waiting: list[tuple[Any, int]] = [(self._document.get("tree"), 0)]
-        while waiting:
-            node, depth = waiting.pop()
+        stack: list[tuple[Any, int]] = [(self._document.get("tree"), 0)]
+        while stack:
+            node, depth = stack.pop()
             levels, children = (node.get("lods"), node.get("children")) if isinstance(node, dict) else (0, 0)
             if isinstance(levels, dict) and levels:
                 found.append(self._entry(levels))
             elif isinstance(children, list) and depth < _MAX_DEPTH:
-                waiting += [(child, depth + 1) for child in reversed(children)]
+                stack += [(child, depth + 1) for child in reversed(children)]
             else:
-                raise self._error(f"a place in its tree has neither 'lods' nor 'children': {str(node)[:60]}")
+                raise self._error(f"a node of its tree has neither 'lods' nor 'children': {str(node)[:60]}")
         return found
 
     def _entry(self, levels: dict[str, Any]) -> tuple[int, int, int]:
@@ -106,7 +106,7 @@ class _Index:
         return number("file"), first, first + number("count")
 
     def _checked(self, name: Any) -> str:
-        """A path that leads down from the index's folder, on any system."""
+        """``name`` if it is a path below the folder of the index, on any system; else FileFormatError."""
         plain = isinstance(name, str) and _PATH.fullmatch(name)
         if not plain or any(step in (".", "..") for step in name.split("/")):
             raise self._error(f"it refers to {str(name)[:80]!r}, which is no path below its folder; refused")

@@ -1,14 +1,15 @@
-"""The part of reading USD that runs in a process of its own, started by ``usd_reader``.
+"""The part of reading USD that runs in a process of its own, which ``reader`` starts.
 
     python -m meshsplats.formats.usd.extraction FILE RESULT
 
-writes the arrays of all meshes of FILE to RESULT (.npz) and prints a line of JSON: {"error": text}, or what
-goes beside the arrays.
+writes the arrays of all meshes of FILE to RESULT (.npz) and prints a line of JSON: {"error": text}, or a
+report with the other contents.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Iterator
@@ -21,11 +22,11 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.ply.faces import cut_polygons
-from meshsplats.mesh import Blending
+from meshsplats.mesh import Blending, SplatMesh
 
 _LIBRARY_BYTES = 2 << 30
 _FACTOR = 256
-"""Address space: ``_LIBRARY_BYTES`` above what is taken at the start, and so many times the file's size."""
+"""Limit of address space: that at the start, ``_LIBRARY_BYTES``, and ``_FACTOR`` times the file's size."""
 
 
 def main(file: Path, result: Path) -> None:
@@ -33,14 +34,14 @@ def main(file: Path, result: Path) -> None:
 
     _limit_memory(file.stat().st_size)
     try:
-        told = extract(file, result)
+        report = extract(file, result)
     except FileFormatError as error:
-        told = {"error": str(error).removeprefix(f"{file}: ")}
+        report = {"error": str(error).removeprefix(f"{file}: ")}
     except MemoryError:
-        told = {
+        report = {
             "error": "its data would take more memory than a file of this size may (a decompression bomb?)"
         }
-    print(json.dumps(told))
+    print(json.dumps(report))
 
 
 def _limit_memory(file_bytes: int) -> None:
@@ -55,19 +56,19 @@ def _limit_memory(file_bytes: int) -> None:
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]
     try:
         resource.setrlimit(resource.RLIMIT_AS, (limit if hard < 0 else min(limit, hard), hard))
-    except (ValueError, OSError):  # macOS knows the limit, but does not take it
+    except (ValueError, OSError):  # macOS has the limit, but refuses to set it
         return
 
 
 def extract(file: Path, result: Path) -> dict[str, Any]:
-    """Writes the arrays; returns warnings, up direction, blending and the names of the attributes.
-    Raises FileFormatError."""
+    """Writes the arrays; returns warnings, up direction, blending and names of attributes. Raises
+    FileFormatError."""
     try:
         return _extract(file, result)
-    except RuntimeError as error:  # the library's own among them
+    except RuntimeError as error:  # including the library's own errors
         try:
             lines = str(error).split("\n")
-        except UnicodeDecodeError:  # it quotes the file
+        except UnicodeDecodeError:  # the message quotes the file
             lines = []
         reason = next((line.strip() for line in lines if line.strip()), "no reason given")
         raise FileFormatError(f"not readable as USD: {reason.rpartition(' : ')[2][:300]}") from None
@@ -78,7 +79,7 @@ def extract(file: Path, result: Path) -> dict[str, Any]:
 def _extract(file: Path, result: Path) -> dict[str, Any]:
     from pxr import Sdf, Usd, UsdGeom
 
-    layer = Sdf.Layer.OpenAsAnonymous(str(file))  # this file alone; nothing that it refers to
+    layer = Sdf.Layer.OpenAsAnonymous(str(file))  # this file alone, without its references
     if layer is None:
         raise FileFormatError("not readable as USD")
     _refuse_references(layer)
@@ -88,9 +89,9 @@ def _extract(file: Path, result: Path) -> dict[str, Any]:
         raise FileFormatError(
             "the stage holds no visible mesh" + (f", but {others:,} other shapes" if others else "")
         )
-    told: dict[str, Any] = {"warnings": [], "attributes": [], "blending": "display"}
+    report: dict[str, Any] = {"warnings": [], "attributes": [], "blending": "display"}
     if others:
-        told["warnings"].append(f"{others:,} shapes that are no meshes were left out")
+        report["warnings"].append(f"{others:,} shapes that are no meshes were left out")
     budget = Budget(file)
     note = _our_note(shapes[0]) if len(shapes) == 1 else {}
     places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
@@ -98,22 +99,22 @@ def _extract(file: Path, result: Path) -> dict[str, Any]:
     for shape in shapes:
         matrix = np.array(places.GetLocalToWorldTransform(shape.GetPrim()))
         if note and np.abs(matrix - _own_placement(note["up"])).max() < 1e-6:
-            told["up"] = note["up"]
+            report["up"] = note["up"]
             matrix = np.eye(4)
         pieces.append(_piece(shape, matrix, budget, exact=bool(note)))
-    told.setdefault("up", [0, 0, 1] if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else [0, 1, 0])
+    report.setdefault("up", [0, 0, 1] if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else [0, 1, 0])
     arrays = _joined(pieces)
     if note:
-        told["blending"] = note["blending"]
-        arrays |= _restored(shapes[0], note, arrays, told)
+        report["blending"] = note["blending"]
+        arrays |= _restored(shapes[0], note, arrays, report)
     if note.get("normals") == "computed":
         arrays.pop("normals", None)
     np.savez(result, **arrays)  # type: ignore[arg-type]
-    return told
+    return report
 
 
 def _refuse_references(layer: Any) -> None:
-    """FileFormatError if the file would pull in others."""
+    """FileFormatError if the file refers to others."""
     others = [str(p) for p in layer.GetCompositionAssetDependencies() if p]  # '': a reference within the file
     clips: list[str] = []
     layer.Traverse("/", lambda at: clips.append(str(at)) if _has_clips(layer, at) else None)
@@ -130,16 +131,16 @@ def _has_clips(layer: Any, at: Any) -> bool:
 
 
 def _visible(stage: Any) -> tuple[list[Any], int]:
-    """The meshes that are drawn, and how many drawn things are something else."""
+    """The visible meshes, and the count of other visible shapes."""
     from pxr import Usd, UsdGeom
 
     meshes, others = [], 0
     time = Usd.TimeCode.EarliestTime()
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
-        thing = UsdGeom.Imageable(prim)
-        if not thing or thing.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
+        imageable = UsdGeom.Imageable(prim)
+        if not imageable or imageable.ComputePurpose() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy):
             continue
-        if thing.ComputeVisibility(time) == UsdGeom.Tokens.invisible:
+        if imageable.ComputeVisibility(time) == UsdGeom.Tokens.invisible:
             continue
         if prim.IsA(UsdGeom.Mesh):
             meshes.append(UsdGeom.Mesh(prim))
@@ -170,7 +171,7 @@ def _piece(shape: Any, matrix: np.ndarray, budget: Budget, *, exact: bool) -> di
         normals = None
     of_corner = np.repeat(np.arange(n), lengths)
     if "uniform" in (color_kind, opacity_kind) or "faceVarying" in (color_kind, opacity_kind):
-        # Colours that change within a vertex: each corner gets a vertex of its own.
+        # Colours differ between corners of a vertex: each corner becomes a vertex of its own.
         budget.spend(64 * len(corners), f"mesh {at}")
         points, normals = points[corners], None if normals is None else normals[corners]
         spread = {"uniform": of_corner, "vertex": corners, "varying": corners}
@@ -204,8 +205,7 @@ def _piece(shape: Any, matrix: np.ndarray, budget: Budget, *, exact: bool) -> di
 def _primvar(
     shape: Any, name: str, columns: int, v: int, n: int, corners: int, at: str
 ) -> tuple[np.ndarray | None, str]:
-    """Values (k, columns) of a primvar, its own or inherited, and its interpolation; (None, '') if there are
-    none."""
+    """Values (k, columns) of a primvar, own or inherited, and its interpolation; (None, '') without any."""
     from pxr import Usd, UsdGeom
 
     primvar = UsdGeom.PrimvarsAPI(shape).FindPrimvarWithInheritance(name)
@@ -221,7 +221,7 @@ def _primvar(
     try:
         values = np.asarray(stored, np.float32).reshape(-1, columns)
     except (ValueError, TypeError):
-        raise FileFormatError(f"mesh {at}: {name} does not hold {columns} numbers a value") from None
+        raise FileFormatError(f"mesh {at}: {name} does not hold {columns} numbers per value") from None
     wanted = {"constant": 1, "uniform": n, "vertex": v, "varying": v, "faceVarying": corners}.get(kind)
     if len(values) != wanted:
         raise FileFormatError(
@@ -256,11 +256,11 @@ def _joined(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return joined
 
 
-# -- what our own files hold beyond the schemas
+# -- contents of our own files beyond the schemas
 
 
 def _our_note(shape: Any) -> dict[str, Any]:
-    """The custom data of a mesh that ``usd`` wrote, where it is in order; else nothing."""
+    """Our custom data of a mesh if it is valid, else an empty dictionary."""
     note = shape.GetPrim().GetCustomDataByKey("meshsplats")
     if not isinstance(note, dict):
         return {}
@@ -273,7 +273,7 @@ def _our_note(shape: Any) -> dict[str, Any]:
 
 
 def _own_placement(up: list[float]) -> np.ndarray:
-    """The matrix (of row vectors) that ``usd`` gave the node."""
+    """The matrix (for row vectors) that our writer gives the node."""
     from pxr import Gf
 
     x, y, z, w = up_quaternion(np.array(up))
@@ -281,10 +281,10 @@ def _own_placement(up: list[float]) -> np.ndarray:
 
 
 def _restored(
-    shape: Any, note: dict[str, Any], arrays: dict[str, np.ndarray], told: dict[str, Any]
+    shape: Any, note: dict[str, Any], arrays: dict[str, np.ndarray], report: dict[str, Any]
 ) -> dict[str, np.ndarray]:
-    """Splat numbers, depth groups, attributes and the filter. What another program has dropped or altered is
-    left out, with a warning: better no splat numbers than wrong ones."""
+    """Extra arrays, attributes and the filter. Arrays that another program has dropped or altered are left
+    out, with a warning: better no splat indices than wrong ones."""
     from pxr import UsdGeom
 
     def stored(name: str, dtype: type) -> np.ndarray:
@@ -293,37 +293,41 @@ def _restored(
 
     restored: dict[str, np.ndarray] = {}
     lost: list[str] = []
-    for name in ("face_splat", "depth_group"):
-        if note.get(name) is True:
-            values = stored(name, np.int32)
-            sorted_ = name != "face_splat" or not (values[1:] < values[:-1]).any()
-            if len(values) == len(arrays["faces"]) and sorted_:
-                restored[name] = values
+    v = len(arrays["vertices"])
+    for field in SplatMesh.EXTRAS:
+        if note.get(field.name) is True:
+            values = stored(field.name, field.dtype)
+            wanted = field.shape({"vertex": v, "face": len(arrays["faces"])})
+            sorted_ = field.name != "face_splat" or not (values[1:] < values[:-1]).any()
+            if values.size == math.prod(wanted) and sorted_:
+                restored[field.name] = values.reshape(wanted)
             else:
-                lost.append(name)
+                lost.append(field.name)
     if "filter_px2" in note:
         variance = note["filter_px2"]
         if not isinstance(variance, (int, float)):
             raise FileFormatError(f"filter_px2 must be a number, got {str(variance)[:60]}")
         if "face_splat" in restored:
-            told["filter_px2"] = float(variance)
+            report["filter_px2"] = float(variance)
         else:
             lost.append("the filter of its splats")
     for name, plain, columns in _attributes_of(note):
-        v, wide = len(arrays["vertices"]), abs(columns)
+        wide = abs(columns)
         values = stored(plain, np.float32) if wide else np.empty(0, np.float32)
         if values.size != v * wide:
             lost.append(name)
             continue
-        restored[f"attribute_{len(told['attributes'])}"] = values.reshape((v,) if columns < 0 else (v, wide))
-        told["attributes"].append(name)
+        restored[f"attribute_{len(report['attributes'])}"] = values.reshape(
+            (v,) if columns < 0 else (v, wide)
+        )
+        report["attributes"].append(name)
     if lost:
-        told["warnings"].append(f"another program has altered the file, left out: {', '.join(lost)[:300]}")
+        report["warnings"].append(f"another program has altered the file, left out: {', '.join(lost)[:300]}")
     return restored
 
 
 def _attributes_of(note: dict[str, Any]) -> Iterator[tuple[str, str, int]]:
-    """Name, primvar and columns (-1: one number a vertex) of the attributes in our note."""
+    """Name, primvar and columns (-1: one number per vertex) of the attributes in our note."""
     try:
         rows = zip(
             list(note.get("attributes", [])),

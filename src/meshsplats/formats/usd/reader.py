@@ -1,9 +1,9 @@
-"""Reading meshes from Universal Scene Description: the files of ``usd`` exactly, those of other programs as
-far as triangles and vertex colours go.
+"""Reads meshes from Universal Scene Description: our own files exactly, triangles and vertex colours from
+other programs' files.
 
-Needs the optional package usd-core. That library was not written for files from strangers, so it runs in a
-process of its own (``usd_extraction``), with limits on memory and time: broken files do crash it, and the
-caller gets an error.
+Needs the optional package usd-core. That library was not written for untrusted files: broken ones crash it.
+So it runs in a process of its own (``extraction``), with limits on memory and time, and a crash becomes an
+error.
 """
 
 from __future__ import annotations
@@ -22,68 +22,65 @@ import numpy as np
 
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
-from meshsplats.formats._validation import Budget, checked_mesh, straight_colors
+from meshsplats.formats._validation import Budget, checked, straight_colors
 from meshsplats.mesh import SplatMesh
 
 _SECONDS = 60
 _BYTES_A_SECOND = 1 << 20
-"""A file is given up after ``_SECONDS`` and a second for each of these; it takes a fiftieth of that."""
-
-
-def is_usd(head: bytes) -> bool:
-    """Whether a file that begins with ``head`` is USD, binary or text."""
-    return head[:8] == b"PXR-USDC" or head[:5] == b"#usda"
+"""Reading is stopped after ``_SECONDS`` and a second for each of these; it takes a fiftieth of that."""
 
 
 def read_usd(path: Path) -> SplatMesh:
     """The mesh in a `.usdc`, `.usda` or `.usd` file.
 
-    A file of ours comes back as it was saved: positions and extra arrays exactly, colours within 1e-6. From
-    other programs' files all visible meshes are joined, in the units and the frame of the stage, at the
-    first time that they have values for: polygons are cut into triangles round their first corner,
-    subdivision surfaces are taken as their cage, colours are displayColor (linear) and displayOpacity;
-    materials and textures are not looked at. What is no mesh is left out with a counted DataWarning.
+    Our own files give back positions and extra arrays exactly, and colours within 1e-6. From other programs'
+    files, all visible meshes are joined, in the units and the frame of the stage, at the first time that has
+    values: polygons are cut into triangles around their first corner, subdivision surfaces become their
+    control cage, colours are displayColor (linear) and displayOpacity; materials and textures are ignored. A
+    DataWarning counts other shapes, which are left out.
 
-    Raises MissingDependencyError without usd-core and FileFormatError, also for a file that refers to others,
-    which are not opened.
+    Raises:
+        MissingDependencyError: usd-core is missing.
+        FileFormatError: the file is broken, or refers to other files, which are not opened.
     """
     if importlib.util.find_spec("pxr") is None:
         raise MissingDependencyError(f"{path}: reading USD needs the extra 'usd': pip install usd-core")
     budget = Budget(path)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         result = Path(folder) / "mesh.npz"
-        told = _extract(path.resolve(), path, result)
+        report = _extract(path.resolve(), path, result)
         budget.spend(result.stat().st_size, "its meshes")
         with np.load(result, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    for message in told["warnings"]:
+    for message in report["warnings"]:
         warnings.warn(f"{path}: {message}", DataWarning, stacklevel=3)
     colors = straight_colors(arrays.pop("linear"), path)
-    if told["blending"] != "linear":
+    if report["blending"] != "linear":
         colors[:, :3] = linear_to_srgb(colors[:, :3])
-    attributes = {name: arrays.pop(f"attribute_{i}") for i, name in enumerate(told["attributes"])}
-    return checked_mesh(
+    attributes = {name: arrays.pop(f"attribute_{i}") for i, name in enumerate(report["attributes"])}
+    return checked(
         path,
+        SplatMesh,
         vertices=arrays.pop("vertices"),
         faces=arrays.pop("faces"),
         colors=colors,
-        up=told["up"],
-        blending=told["blending"],
-        filter_px2=told.get("filter_px2", 0.0),
+        up=report["up"],
+        blending=report["blending"],
+        filter_px2=report.get("filter_px2", 0.0),
         attributes=attributes,
         **arrays,
     )
 
 
 def _extract(file: Path, path: Path, result: Path) -> dict[str, Any]:
-    """Runs ``usd_extraction``: its arrays are in ``result`` then; returns what else it tells."""
+    """Runs ``extraction``, which writes arrays to ``result``; returns the rest of its report."""
     size = file.stat().st_size
     command = [sys.executable, "-m", "meshsplats.formats.usd.extraction", str(file), str(result)]
     places = os.pathsep.join(os.path.abspath(place) for place in sys.path if place)
     try:
         done = subprocess.run(
             command,
-            cwd=result.parent,  # an own place: python -m looks for modules in the current folder first
+            cwd=result.parent,  # an empty folder: python -m imports from the current folder first
             env={**os.environ, "PYTHONPATH": places, "TMPDIR": str(result.parent)},  # for reports of crashes
             stdin=subprocess.DEVNULL,
             capture_output=True,
@@ -91,13 +88,13 @@ def _extract(file: Path, path: Path, result: Path) -> dict[str, Any]:
         )
     except subprocess.TimeoutExpired as expired:
         raise FileFormatError(
-            f"{path}: the USD library was given up after {expired.timeout:.0f} s with this file"
+            f"{path}: the USD library was stopped after {expired.timeout:.0f} s with this file"
         ) from None
     if done.returncode:
         lines = done.stderr.decode(errors="replace").strip().splitlines() or [f"status {done.returncode}"]
         reason = f"it crashed, signal {-done.returncode}" if done.returncode < 0 else lines[-1][-300:]
         raise FileFormatError(f"{path}: the USD library does not read this file: {reason}")
-    told = json.loads(done.stdout)
-    if "error" in told:
-        raise FileFormatError(f"{path}: {told['error']}")
-    return told
+    report = json.loads(done.stdout)
+    if "error" in report:
+        raise FileFormatError(f"{path}: {report['error']}")
+    return report

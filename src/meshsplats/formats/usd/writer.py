@@ -1,12 +1,11 @@
-"""Meshes as Universal Scene Description (`.usdc`, `.usda`, `.usd`), for film tools, Omniverse and
+"""Writes meshes as Universal Scene Description (`.usdc`, `.usda`, `.usd`), for film tools, Omniverse and
 Blender.
 
-Needs the optional package usd-core. One Mesh under an Xform that turns the mesh's up direction to the
-stage's +y; points are stored untouched, metersPerUnit is 1. Colour and opacity stand in the primvars
-displayColor (linear) and displayOpacity, one value a vertex, and a UsdPreviewSurface material reads them
-from there. Schemas: https://openusd.org/release/api/usd_geom_page_front.html and
-spec_usdpreviewsurface.html there. What the schemas have no place for stands in the mesh's custom data. The
-reader is ``usd_reader``.
+Needs the optional package usd-core. One Mesh under an Xform that rotates the mesh's up direction to the
+stage's +y; points are stored unchanged, metersPerUnit is 1. Colour and opacity are the primvars displayColor
+(linear) and displayOpacity, one value per vertex, and a UsdPreviewSurface material reads them. All else is in
+the mesh's custom data. Schemas: https://openusd.org/release/api/usd_geom_page_front.html and
+spec_usdpreviewsurface.html there.
 """
 
 from __future__ import annotations
@@ -18,17 +17,17 @@ import numpy as np
 
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._validation import check_attribute_names
-from meshsplats.formats.gltf.writer import linear_colors, up_quaternion, vertex_normals
+from meshsplats.formats.gltf.writer import computed_normals, linear_colors, up_quaternion
 from meshsplats.mesh import SplatMesh
 
 
 def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     """Writes ``mesh`` to ``path``: text for `.usda`, binary for `.usdc` and `.usd`.
 
-    The material emits the colours as they are; ``lit`` makes it a rough surface that scene lights shade,
-    with the mesh's normals or, where it has none, area-weighted vertex normals. Splat numbers, depth
-    groups and further attributes become primvars of the same names (characters that USD forbids become
-    underscores). Raises MissingDependencyError without usd-core.
+    The material emits the colours; ``lit`` makes it a rough surface that scene lights shade, with the mesh's
+    normals or else area-weighted vertex normals. Splat indices, depth groups and attributes become primvars
+    of the same names (characters that USD forbids become underscores). Raises MissingDependencyError without
+    usd-core.
     """
     try:
         from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, Vt
@@ -52,7 +51,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     if len(mesh.vertices):
         corners = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
         shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
-    normals = vertex_normals(mesh) if lit and mesh.normals is None else mesh.normals
+    normals = computed_normals(mesh) if lit and mesh.normals is None else mesh.normals
     if normals is not None:
         shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
         shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
@@ -63,19 +62,24 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     opacities.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(linear[:, 3])))
     _add_material(stage, shape, lit)
     primvars = UsdGeom.PrimvarsAPI(shape)
-    for name in ("face_splat", "depth_group"):
-        values = getattr(mesh, name)
-        if values is not None:
-            new = primvars.CreatePrimvar(name, Sdf.ValueTypeNames.IntArray, UsdGeom.Tokens.uniform)
-            new.Set(Vt.IntArray.FromNumpy(values))
+    types = {
+        np.int32: (Sdf.ValueTypeNames.IntArray, Vt.IntArray),
+        np.float32: (Sdf.ValueTypeNames.FloatArray, Vt.FloatArray),
+    }
+    extras = mesh.extras()
+    for field, values in extras.items():
+        kind, array = types[field.dtype]
+        per = UsdGeom.Tokens.uniform if field.per == "face" else UsdGeom.Tokens.vertex
+        new = primvars.CreatePrimvar(field.name, kind, per, field.columns or -1)
+        new.Set(array.FromNumpy(values.reshape(-1)))
     up = Gf.Vec3d(*(float(u) for u in mesh.up))
     note: dict[str, Any] = {"version": 1, "blending": mesh.blending, "up": up}
-    note |= {name: True for name in ("face_splat", "depth_group") if getattr(mesh, name) is not None}
+    note |= {field.name: True for field in extras}
     if lit and mesh.normals is None:
         note["normals"] = "computed"
     if mesh.filter_px2:
         note["filter_px2"] = mesh.filter_px2
-    taken = {"displayColor", "displayOpacity", "normals", "face_splat", "depth_group"}
+    taken = {"displayColor", "displayOpacity", "normals", *(field.name for field in mesh.EXTRAS)}
     stored: list[tuple[str, str, int]] = []
     for name, values in mesh.attributes.items():
         columns = 1 if values.ndim == 1 else values.shape[1]
@@ -91,7 +95,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     if stored:
         names, plain_names, widths = zip(*stored, strict=True)
         note |= {"attributes": Vt.StringArray(names), "primvars": Vt.StringArray(plain_names)}
-        note["columns"] = Vt.IntArray(widths)  # -1: one number a vertex, not a table of one column
+        note["columns"] = Vt.IntArray(widths)  # -1: one number per vertex, not a table of one column
     shape.GetPrim().SetCustomData({"meshsplats": note})
     if not stage.GetRootLayer().Export(str(path)):
         raise OSError(f"usd-core could not write {path}")
@@ -120,7 +124,7 @@ def _add_material(stage: Any, shape: Any, lit: bool) -> None:
         surface.CreateInput("diffuseColor", types.Color3f).Set((0, 0, 0))
     surface.CreateInput("opacity", types.Float).ConnectToSource(opacity)
     surface.CreateInput("roughness", types.Float).Set(1.0)
-    # The specular workflow with black leaves out reflections, which a glow should not have.
+    # The specular workflow with black has no reflections, which an emissive surface should not show.
     surface.CreateInput("useSpecularWorkflow", types.Int).Set(0 if lit else 1)
     if not lit:
         surface.CreateInput("specularColor", types.Color3f).Set((0, 0, 0))

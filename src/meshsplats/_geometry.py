@@ -1,0 +1,119 @@
+"""Geometry that several rooms share: rotations, directions, vertex normals, the spacing of points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+_SPACING_LEVELS = 20
+"""Halvings of the extent down to the smallest cell for ``spacing``."""
+
+
+def rotation_rows(w: Any, x: Any, y: Any, z: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """The three rows of the rotation matrix of unit quaternions w, x, y, z, one after the other.
+
+    Args:
+        w, x, y, z: numbers, or arrays of one shape and float type; so are the entries of the rows.
+    """
+    yield 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    yield 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    yield 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+
+
+def direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
+    """(3,) unit vector at ``azimuth`` and ``elevation`` in degrees, from a subject outwards.
+
+    Azimuth 0 is in front of the subject, 90 at its right-hand side; elevation 90 is above it.
+
+    Args:
+        axes: (3, 3) rows right, up, forward of someone who stands in front (``framing.front_axes``).
+    """
+    a, e = np.radians(azimuth), np.radians(elevation)
+    right, up, forward = axes
+    return np.cos(e) * (np.sin(a) * right - np.cos(a) * forward) + np.sin(e) * up
+
+
+def vertex_normals(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    same_place: np.ndarray | None = None,
+    fallback: Sequence[float] | np.ndarray = (0, 0, 1),
+) -> np.ndarray:
+    """(n, 3) float64 unit normals at the vertices of a mesh: area-weighted means of the triangles' normals.
+
+    Args:
+        vertices: (n, 3); the triangles' normals are computed in their float type.
+        faces: (m, 3) vertex indices.
+        same_place: (n,) index of a place for each vertex; vertices of one place share a normal. By default,
+            each vertex is a place of its own.
+        fallback: (3,) unit vector where the triangles around a vertex have no area.
+    """
+    place = np.arange(len(vertices)) if same_place is None else same_place
+    count = int(place.max()) + 1 if len(place) else 0
+    corners = [faces[:, k] for k in range(3)]
+    coordinates = np.ascontiguousarray(vertices.T)
+    edges = [[p[corners[k]] - p[corners[0]] for p in coordinates] for k in (1, 2)]
+    if same_place is not None:
+        corners = [place[corner] for corner in corners]
+    sums = np.empty((count, 3))
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        doubled = edges[0][i] * edges[1][j] - edges[0][j] * edges[1][i]  # twice the area times the normal
+        sums[:, axis] = sum(np.bincount(corner, doubled, minlength=count) for corner in corners)
+    length = np.sqrt(np.einsum("ij,ij->i", sums, sums))
+    sums[length == 0] = fallback
+    return (sums / np.where(length > 0, length, 1)[:, None])[place]
+
+
+def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
+    """(n,) float32 spacing of ``points`` (n, 3) around each of them, in their units.
+
+    Concretely, the points are sorted into an octree of cubic cells; a point's spacing is ``side /
+    sqrt(count)`` of the smallest cell around it that holds at least ``share`` points, as if these lay on a
+    surface. Points in one spot have the spacing of the smallest cell, 2^-20 of the extent.
+    """
+    levels = _SPACING_LEVELS
+    low = points.min(axis=0).astype(np.float64)
+    extent = float((points.max(axis=0) - low).max())
+    n = len(points)
+    if n == 1 or extent == 0:
+        return np.zeros(n, np.float32)
+    cells = ((points - low) * ((1 << levels) * (1 - 1e-9) / extent)).astype(np.uint64)
+    code = np.zeros(n, np.uint64)  # Morton order: cells of every level are runs of points
+    for axis in range(3):
+        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
+    order = np.argsort(code)  # points of one cell get one spacing: their order does not matter
+    code = code[order]
+    found = np.full(n, extent / np.sqrt(n), np.float32)
+    settled = np.zeros(n, bool)
+    for level in range(levels + 1):
+        parent = code >> np.uint64(3 * level)
+        starts = np.flatnonzero(np.concatenate([[True], parent[1:] != parent[:-1]]))
+        counts = np.diff(np.append(starts, n))
+        enough = np.repeat(counts >= share, counts) & ~settled
+        if enough.any():
+            side = extent / (1 << (levels - level))
+            found[enough] = np.repeat(side / np.sqrt(counts), counts)[enough]
+            settled |= enough
+            if settled.all():
+                break
+    result = np.empty(n, np.float32)
+    result[order] = found
+    return result
+
+
+def _every_third_bit(values: np.ndarray) -> np.ndarray:
+    """21-bit numbers with two zero bits after each bit."""
+    v = values.astype(np.uint64)
+    for shift, mask in [
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ]:
+        v = (v | (v << np.uint64(shift))) & np.uint64(mask)
+    return v

@@ -1,0 +1,103 @@
+"""What every command says: errors, exit codes, one line on standard error."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import sys
+from typing import Any
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Error numbers of a full disk, as in ``_files.atomic``."""
+OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
+"""Exit codes. FAILED: the input, or a path that was named, is wrong. LACKING: a library, a program or memory
+is missing. Ended by signal n: 128 + n."""
+KINDS = {FAILED: "input", USAGE: "usage", EXISTS: "exists", NO_SPACE: "space", LACKING: "missing"}
+"""Names of the exit codes in JSON."""
+ENDINGS = {signal.SIGINT: "interrupted"} | {
+    getattr(signal, name): f"ended by {name}" for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
+}
+"""Message for each signal that ends a command."""
+
+_standard_input: str | None = None
+"""The temporary file that holds standard input, if the input is -."""
+
+
+class UsageError(Exception):
+    """Options that contradict each other: exit code 2."""
+
+
+class Terminated(BaseException):
+    """A signal asks the process to end; ``number`` is the signal's."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def exit_code(error: BaseException) -> int:
+    """The exit code for ``error``."""
+    if isinstance(error, UsageError):
+        return USAGE
+    if isinstance(error, FileExistsError):
+        return EXISTS
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        return NO_SPACE
+    return LACKING if isinstance(error, (ImportError, MemoryError)) else FAILED
+
+
+def error_record(error: BaseException) -> dict[str, Any]:
+    """``error`` for JSON."""
+    path = os.fsdecode(error.filename) if isinstance(error, OSError) and error.filename else None
+    code = exit_code(error)
+    named = {"kind": KINDS[code], "code": code, "message": one_line(error), "path": path}
+    return named | {"type": type(error).__name__}
+
+
+def print_json_error(error: BaseException) -> None:
+    """Prints ``error`` as JSON on standard output."""
+    try:
+        print(json.dumps({"error": error_record(error)}), flush=True)
+    except OSError:  # the message is on standard error, too
+        close_output()
+
+
+def close_output() -> None:
+    """Keeps Python from failing again, when it ends, to print the rest."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def read_from_standard_input(path: str | None) -> None:
+    """Messages name the file at ``path`` "standard input" until the next command."""
+    global _standard_input
+    _standard_input = path
+
+
+def shown_path(path: str | os.PathLike[str]) -> str:
+    """``path`` as the user gave it: - for standard input."""
+    return "-" if _standard_input is not None and os.fspath(path) == _standard_input else os.fspath(path)
+
+
+def one_line(error: object) -> str:
+    """Message of ``error`` in one line, with the path of the file that it is about."""
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        text = f"{os.fsdecode(error.filename)}: {error.strerror}"
+    else:
+        text = str(error)
+    if isinstance(error, MemoryError) and not text:
+        text = "out of memory"
+    if _standard_input is not None:
+        text = text.replace(_standard_input, "standard input")
+    return " ".join(text.split()) or type(error).__name__
+
+
+def say(text: str) -> None:
+    """Prints a line on standard error."""
+    print(f"meshsplats: {text}", file=sys.stderr, flush=True)
+
+
+def flag(name: str) -> str:
+    """The option of a field: ``max_splats`` is ``--max-splats``."""
+    return "--" + name.replace("_", "-")

@@ -1,0 +1,76 @@
+"""Files beside a result: names, and the configuration of the run that made it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from meshsplats.cli import toml
+from meshsplats.cli.arguments import INVOCATION, Command, options_of, relative_to
+from meshsplats.cli.messages import UsageError, shown_path
+
+CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
+"""Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
+
+
+def beside(output: Path, record: str) -> Path:
+    """Name of a record of the file ``output``: with the whole name of that, so that records of ``mesh.glb``
+    and ``mesh.png`` are different files."""
+    return output.with_name(f"{output.name}.{record}")
+
+
+def write_configuration(
+    path: Path, name: str, command: Command, result: Mapping[str, Any] | None = None
+) -> None:
+    """Writes the options of the command ``name`` to ``path``, from which --config repeats the run.
+    ``result``: findings of the run."""
+    from meshsplats._files.atomic import write_text
+
+    write_text(path, toml.dumps(configuration(name, command, path.parent, result)))
+
+
+def configuration(
+    name: str, command: Command, folder: Path, result: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """The content of a configuration file in ``folder``."""
+    import meshsplats
+
+    values = {key: option.value(command) for key, option in options_of(type(command)).items()}
+    plain = {key: _plain(value, folder) for key, value in values.items()}
+    resolved = {key: _plain(value, folder) for key, value in command.resolved().items()}
+    return {
+        "command": name,
+        "version": meshsplats.__version__,
+        "invocation": {key: plain[key] for key in INVOCATION if key in plain},
+        "options": {key: value for key, value in plain.items() if key not in INVOCATION},
+        "resolved": resolved,
+        "result": dict(result or {}),
+    }
+
+
+def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | None:
+    """The options in the configuration file at ``path``; None if there is none, or of another command than
+    ``name``."""
+    try:
+        record = toml.load(path)
+        return dict(record["options"]) if name in (None, record["command"]) else None
+    except (OSError, UsageError, ValueError, KeyError, TypeError):
+        return None
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Writes ``content`` whole or not at all; infinities and NaN, which JSON lacks, are a ValueError."""
+    from meshsplats._files.atomic import write_text
+
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value: Any, folder: Path) -> Any:
+    """An option's value for TOML, which knows no paths."""
+    if isinstance(value, (tuple, list)):
+        return [_plain(part, folder) for part in value]
+    if not isinstance(value, Path):
+        return value
+    return "-" if shown_path(value) == "-" else relative_to(value, folder)
