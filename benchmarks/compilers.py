@@ -4,8 +4,8 @@
 
 Each argument names a folder with libraries of the core. Prints a Markdown table of milliseconds, minimum and
 median, with one thread: an image of a mesh of 160,000 triangles, the same with a tape, its backward pass, and
-an image of our own scene of 20,000 splats, all of 400 x 400 pixels. The last column is the second compiler's minimum by the
-first's.
+an image of our own scene of 20,000 splats, all of 400 x 400 pixels. The last column is the second compiler's
+minimum by the first's.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from rendering import SCENES, random_fans
 from meshsplats import demo_scene, orbit, render, render_splats
 from meshsplats._core import library
 from meshsplats.rendering.backward import TapedRendering
-
 
 LOAD_CORE = library.load_core.__wrapped__
 
@@ -75,7 +74,7 @@ def main() -> None:
                 clock(
                     "backward",
                     name,
-                    lambda tape=tape: tape.back(gradient, None, None, vertices=points, colors=colors),
+                    lambda tape=tape: tape.backward(gradient, None, None, vertices=points, colors=colors),
                 )
                 del tape
                 clock("splats", name, lambda: render_splats(cloud, view, threads=1))

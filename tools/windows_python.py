@@ -2,9 +2,9 @@
 
     python tools/windows_python.py build/windows dist/meshsplats-*-win_amd64.whl
 
-The interpreter is that of python.org as the wheel of panda3d carries it (python311.dll and its modules); a few
-lines of C, compiled by zig, start it. The standard library is that of the Python that runs this script, which
-must be 3.11. Packages come from the package index, for Windows. Needs ``tools/requirements.txt``.
+The interpreter is that of python.org as the wheel of panda3d carries it (python311.dll and its modules); a
+few lines of C, compiled by zig, start it. The standard library is that of the Python that runs this script,
+which must be 3.11. Packages come from the package index, for Windows. Needs ``tools/requirements.txt``.
 """
 
 from __future__ import annotations
