@@ -1,7 +1,7 @@
 """Builds and checks wheels of MeshSplats for all platforms on one machine; ``make wheels`` runs it.
 
 The core is compiled by Clang as the package ``ziglang`` brings it, with the headers and libraries of every
-platform. Each library is compiled once: its name in the cache is a hash of what it is made from. The Python
+platform. Each variant is compiled once: its name in the cache is a hash of what it is made from. The Python
 files and the metadata come from one wheel that the build backend packs without the core.
 
     python tools/wheels.py -o dist                       # all platforms
@@ -84,7 +84,6 @@ def zig_spelling(option: str) -> str:
 def source_hash() -> str:
     """Of the core's sources and of the compiler's version."""
     total = hashlib.sha256(f"ziglang {metadata.version('ziglang')}".encode())
-    # Options and exports are hashed for each library.
     for path in sorted([*SOURCES.glob("*.h"), *SOURCES.glob("*.cpp")]):
         # Lines that are comments make no difference.
         content = re.sub(rb"(?m)^ *//.*\n", b"", path.read_bytes())
@@ -93,42 +92,44 @@ def source_hash() -> str:
 
 
 def zig(*arguments: str) -> None:
-    command = [sys.executable, "-m", "ziglang", "c++", *arguments]
+    command = [sys.executable, "-m", "ziglang", *arguments]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode or "warning:" in done.stderr:  # the core compiles without a warning
         raise SystemExit(f"{' '.join(command)}\n{done.stdout}{done.stderr}")
 
 
-def core_library(platform: Platform, variant: str, options: list[str]) -> Path:
-    """The compiled core, from the cache where it is there."""
-    exports = {"linux": "exports.map", "macos": "exports.macos"}.get(platform.system)
+def compiled_core(platform: Platform, variant: str, options: list[str]) -> Path:
+    """The core's object file, from the cache where it is there."""
+    options = ["-target", platform.target, *options, f'-DMS_VARIANT="{variant}"']
+    key = hashlib.sha256("\n".join([source_hash(), *options]).encode()).hexdigest()[:16]
+    compiled = CACHE / f"{platform.tag}-{variant}-{key}.o"
+    if not compiled.is_file():
+        started = time.monotonic()
+        CACHE.mkdir(parents=True, exist_ok=True)
+        temporary = compiled.with_suffix(".part.o")
+        zig("c++", *options, "-c", str(SOURCES / "api.cpp"), "-o", str(temporary))
+        temporary.replace(compiled)
+        print(f"  {variant}: compiled in {time.monotonic() - started:.0f} s", flush=True)
+    return compiled
+
+
+def linked_core(platform: Platform, variant: str, options: list[str]) -> bytes:
+    """The core's library."""
     # Windows exports what is declared so, and nothing else.
-    exports_option = {
+    exports = {
         "linux": [f"-Wl,--version-script={SOURCES / 'exports.map'}"],
         "macos": [f"-Wl,-exported_symbols_list,{SOURCES / 'exports.macos'}"],
     }.get(platform.system, [])
-    # Both steps name -O3: zig builds its runtime libraries for it, and without it in debug mode. The link
-    # step must not name a processor: the runtimes would be built again for it.
-    compile_options = ["-target", platform.target, *options, f'-DMS_VARIANT="{variant}"']
-    link_options = ["-target", platform.target, "-O3", "-s", "-shared"]
-    exports_text = (SOURCES / exports).read_text(encoding="utf-8") if exports else ""
-    made_from = [source_hash(), *compile_options, *link_options, exports_text]
-    key = hashlib.sha256("\n".join(made_from).encode())
-    folder = CACHE / "libraries" / f"{platform.target}-{key.hexdigest()[:16]}"
-    library = folder / f"meshsplats_{variant}{platform.suffix}"
-    if library.is_file():
-        return library
-    started = time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        compiled = Path(scratch) / "core.o"
-        linked = Path(scratch) / library.name  # macOS writes this name into the library
-        zig(*compile_options, "-c", str(SOURCES / "api.cpp"), "-o", str(compiled))
-        zig(*link_options, *exports_option, str(compiled), "-o", str(linked))
-        linked.replace(library)
-    seconds = time.monotonic() - started
-    print(f"  {platform.target} {variant}: {library.stat().st_size:,} bytes, {seconds:.0f} s", flush=True)
-    return library
+    # -O3, in every step: zig builds its runtime libraries for it, and without it in debug mode. No processor
+    # when linking: the runtimes would be built again for it.
+    optimized = ["-target", platform.target, "-O3"]
+    with tempfile.TemporaryDirectory() as scratch:
+        library = Path(scratch) / f"meshsplats_{variant}{platform.suffix}"  # macOS writes its name into it
+        demangler = Path(scratch) / "no_demangler.o"
+        zig("cc", *optimized, "-c", str(Path(__file__).with_name("no_demangler.c")), "-o", str(demangler))
+        objects = [str(compiled_core(platform, variant, options)), str(demangler)]
+        zig("c++", *optimized, "-s", "-shared", *exports, *objects, "-o", str(library))
+        return library.read_bytes()
 
 
 # Packing
@@ -149,8 +150,8 @@ def pack(platform: Platform, files: dict[str, bytes], output: Path) -> Path:
     files = dict(files)
     info = next(name.split("/")[0] for name in files if name.endswith(".dist-info/WHEEL"))
     for variant, options in variant_options(platform.machine).items():
-        library = core_library(platform, variant, options)
-        files[f"meshsplats/_core/{library.name}"] = library.read_bytes()
+        name = f"meshsplats/_core/meshsplats_{variant}{platform.suffix}"
+        files[name] = linked_core(platform, variant, options)
     tag = f"py3-none-{platform.tag}"
     wheel = files[f"{info}/WHEEL"].decode()
     wheel = re.sub(r"(?m)^Root-Is-Purelib: .*$", "Root-Is-Purelib: false", wheel)
