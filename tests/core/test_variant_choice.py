@@ -53,10 +53,7 @@ def test_the_best_variant_is_that_of_the_flags_that_linux_lists():
         ("SandyBridge", "baseline"),  # AVX, but not AVX2
         ("Haswell", "v3"),
         # One extension less than x86-64-v3 wants. Not bmi1, which glibc uses wherever there is avx2.
-        *(
-            (f"Haswell,-{name}", "baseline")
-            for name in ["abm", "movbe", "f16c", "bmi2", "fma", "avx2"]
-        ),
+        *((f"Haswell,-{name}", "baseline") for name in ["abm", "movbe", "f16c", "bmi2", "fma", "avx2"]),
         ("Haswell,-xsave", "baseline"),  # the operating system does not save the wide registers
     ],
 )

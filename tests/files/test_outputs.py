@@ -310,9 +310,13 @@ def test_standard_output_that_is_full(tmp_path):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
     with open("/dev/full", "wb") as full:
         done = subprocess.run(
-            [*COMMAND, "info", "scene.ply", "--json"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE
+            [*COMMAND, "info", "scene.ply", "--json"],
+            cwd=tmp_path,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
         )
-    assert done.stderr == b"meshsplats: error: standard output: No space left on device\n"
+    assert done.stderr == "meshsplats: error: standard output: No space left on device\n"
     assert done.returncode == 4
 
 
