@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import zipfile
 from functools import cached_property
@@ -48,8 +50,13 @@ class Content:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with open(path, "rb") as file:
-            self.head = file.read(4096)
+        try:
+            with open(path, "rb") as file:
+                self.head = file.read(4096)
+        except PermissionError:
+            if path.is_dir():  # on Windows
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path)) from None
+            raise
         matching = (name for name, pattern in _SIGNATURES.items() if pattern.match(self.head))
         self.container: Container | None = next(matching, None)
 
