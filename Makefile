@@ -161,11 +161,12 @@ wheels: $(WHEELS_VENV)/installed
 	$(WHEELS_BIN)/python tools/wheels.py -o dist
 
 # The tests compare their images with this digest of the machine at hand.
-digest = MESHSPLATS_DIGEST=$$(cd tests/rendering && PYTHONPATH=.. ../../$(BIN)/python -c \
+digest = MESHSPLATS_DIGEST=$$(cd tests/rendering && PYTHONPATH=.. $(abspath $(BIN))/python -c \
 	'import test_rendering_variants as t; print(t.digest())')
 
 # wine wants a file as standard input and a pipe as output.
 test-windows: $(VENV)/installed-dev $(WHEELS_VENV)/installed
+	@rm -rf $(WINDOWS)/wheel
 	$(WHEELS_BIN)/python tools/wheels.py -o $(WINDOWS)/wheel --only win_amd64
 	$(WHEELS_BIN)/python tools/windows_python.py $(WINDOWS)/python $(WINDOWS)/wheel/*.whl
 	bash -o pipefail -c "$(digest) WINEPREFIX=$(CURDIR)/$(WINDOWS)/prefix WINEDEBUG=-all WINEARCH=win64 \
@@ -173,6 +174,7 @@ test-windows: $(VENV)/installed-dev $(WHEELS_VENV)/installed
 
 # Processes that a test starts would need qemu in the kernel (binfmt_misc): such tests are left out.
 test-arm64: $(VENV)/installed-dev $(WHEELS_VENV)/installed
+	@rm -rf $(ARM64)/wheel
 	$(WHEELS_BIN)/python tools/wheels.py -o $(ARM64)/wheel --only manylinux_2_17_aarch64
 	$(WHEELS_BIN)/python tools/arm64_python.py $(ARM64)/root $(ARM64)/wheel/*.whl
 	$(digest) qemu-aarch64-static -L $(ARM64)/root $(ARM64)/root/usr/bin/python3.11 -m pytest -p no:cacheprovider \
