@@ -157,7 +157,7 @@ def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
         )
     message = [c_char_p, c_int]
     mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
-    signatures: dict[str, list] = {
+    signatures: dict[str, list[type]] = {
         "ms_render_mesh": [*mesh_and_camera, POINTER(ImageStruct)],
         "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(ImageStruct)],
         "ms_rasterize": [*mesh_and_camera, POINTER(ImageStruct), c_int64, POINTER(c_void_p)],
@@ -177,7 +177,7 @@ def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
     return library
 
 
-def call(name: str, *arguments) -> None:
+def call(name: str, *arguments: object) -> None:
     """Runs a function of the core. Raises MemoryError, RuntimeError or, for splats that share vertices and
     cannot be filtered, ValueError, with the core's message."""
     message = ctypes.create_string_buffer(256)

@@ -128,7 +128,7 @@ def as_cli_options(
         kind = _alternatives(hint)[0]
         values[name] = None
         if name in without:
-            hints[name] = tyro.conf.Suppress[object]  # type: ignore[misc]
+            hints[name] = tyro.conf.Suppress[object]
         elif kind is bool and flags:
             hints[name], values[name] = bool, False
         else:

@@ -30,7 +30,6 @@ from meshsplats.cli.common import (
     Text,
     cameras_beside,
     draw_preview,
-    identify,
     parse_up,
     plural,
     size_of,
@@ -54,6 +53,7 @@ from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 

@@ -122,7 +122,10 @@ def _shapes(
         (n, 3) means, (n, 3, 3) principal axes as columns, and (n, 3) variances along them.
     """
     counts = np.diff(np.append(starts, len(faces)))
-    total = lambda values: np.add.reduceat(values, starts)  # noqa: E731
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(values, starts)
+
     corners = mesh.vertices[faces].astype(np.float64)
     origin = corners[starts, 0]
     corners -= np.repeat(origin, counts, axis=0)[:, None]

@@ -64,7 +64,7 @@ def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
     # Exact zeros on the axes: there the ellipses meet.
     cos[np.abs(cos) < 1e-12] = 0
     sin[np.abs(sin) < 1e-12] = 0
-    index: dict[tuple, int] = {}
+    index: dict[tuple[float, ...], int] = {}
     directions = [np.zeros(axes)]
     level = [0]
 

@@ -54,7 +54,7 @@ class Comparison:
     def ssim(self) -> float:
         return float(np.mean([view.ssim for view in self.views]))
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
         """All scores, for JSON. JSON has no infinity: the PSNR of equal images is null."""
         rows = [asdict(view) for view in self.views] + [{"psnr": self.psnr, "ssim": self.ssim}]
         for row in rows:

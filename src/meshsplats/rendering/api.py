@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from ctypes import c_double
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -226,14 +227,18 @@ class Pointers:
 
 
 def camera_struct(camera: Camera) -> library.CameraStruct:
-    rows = (library.c_double * 12)(*camera.world_to_camera[:3].ravel())
+    rows = (c_double * 12)(*camera.world_to_camera[:3].ravel())
     return library.CameraStruct(
         rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height
     )
 
 
 def checked_options(
-    keep: Pointers, camera: Camera, background, samples: int, threads: int | None
+    keep: Pointers,
+    camera: Camera,
+    background: Sequence[float] | np.ndarray,
+    samples: int,
+    threads: int | None,
 ) -> library.OptionsStruct:
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")

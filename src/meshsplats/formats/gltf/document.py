@@ -54,7 +54,7 @@ class GltfDocument:
         self._chunk: memoryview | None = None
         with open(path, "rb") as file:
             data = memoryview(file.read())
-        self.json = self._parse(self._json_chunk(data) if data[:4] == b"glTF" else data)
+        self.json = self._parse(self._json_chunk(data) if bytes(data[:4]) == b"glTF" else data)
         asset = self.json.get("asset")
         version = asset.get("version") if isinstance(asset, dict) else None
         if not isinstance(version, str) or version.split(".")[0] != "2":

@@ -103,7 +103,7 @@ class _Textures:
     read: Callable[[Path, bytes], np.ndarray]
     textures: list[Texture] = field(default_factory=list)
     unread: int = 0
-    _numbers: dict[tuple, int] = field(default_factory=dict)
+    _numbers: dict[tuple[Any, ...], int] = field(default_factory=dict)
     _images: dict[int, np.ndarray] = field(default_factory=dict)
 
     def number(self, material: dict[str, Any], info: dict[str, Any]) -> int:

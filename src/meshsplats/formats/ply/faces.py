@@ -6,13 +6,16 @@ import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.ply.header import Element, PlyHeader, Property
+
+if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
 
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
 
@@ -110,7 +113,7 @@ def _gather(raw: np.ndarray, places: np.ndarray, dtype: np.dtype) -> np.ndarray:
 def _uniform(data: bytes, element: Element, at: int) -> np.dtype | None:
     """Row type if the lists of all rows have the lengths of the first row's; None if rows differ or data
     end."""
-    fields: list[tuple] = []
+    fields: list[tuple[str, DTypeLike]] = []
     offset = at
     for i, p in enumerate(element.properties):
         if p.count_dtype is None:
