@@ -70,7 +70,7 @@ def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
 
 def test_help_names_options_by_their_flags(capsys):
     text = " ".join(printed_help("convert", "--help", capsys).replace("│", " ").split())
-    assert "see --budget. In mode 'flat', unless --sides, --rings, --rim-radius or --center-opacity is" in text
+    assert "see --budget. In mode 'flat', unless --sides, --rings, --rim-radius or --center-opacity" in text
 
 
 def test_the_help_of_finetune_fits_a_screen(capsys):

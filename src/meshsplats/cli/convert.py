@@ -92,7 +92,9 @@ class Convert(Command):
     EXCLUSIVE = (("cameras", "data"),)
     CONFIGURABLE = True
 
-    input: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]]
+    input: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
+    ]
     """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
     input."""
     output: Output

@@ -94,8 +94,9 @@ class ConversionOptions:
     ``rim_radius`` or ``center_opacity`` is given, splats first get fewer triangles each, at least 4."""
     budget: Budget | None = None
     """How to keep to ``max_splats`` and ``max_triangles``. merge: merge similar splats. drop: keep only the
-    most important ones, by opacity times area in the images of the cameras (splats that no camera sees count as at
-    the median distance), or in scene units without cameras; this tears holes. Default and paper: merge."""
+    most important ones, by opacity times area in the images of the cameras (splats that no camera sees count
+    as at the median distance), or in scene units without cameras; this tears holes. Default and paper:
+    merge."""
     colors: Colors | None = None
     """degree0: the view-independent part of the colour. cameras: where splats have spherical harmonics, the
     mean of the colours that the cameras see. Default and paper: degree0."""
