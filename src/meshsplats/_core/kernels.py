@@ -64,8 +64,8 @@ class Comparison(NamedTuple):
     l1: float
     ssim: float
     gradient: np.ndarray | None
-    """(b, h, w, c) float32: of ``l1_rate * l1 + ssim_rate * ssim`` with respect to the images, 0 at pixels that
-    do not count."""
+    """(b, h, w, c) float32: of ``l1_rate * l1 + ssim_rate * ssim`` with respect to the images, 0 at pixels
+    that do not count."""
 
 
 def compare_images(

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 else:
     RuleOptions = as_cli_options(
         CleaningRules,
-        f"Rules: remove splats with any of these properties. Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
+        "Rules: splats with any of these properties are removed."
+        f" Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
 

@@ -33,8 +33,8 @@ class ConversionOptions:
     rim_radius: float | None = None
     """Radius of the rim in standard deviations, 0.1 to 10. Default: calibrated; paper: 2.7."""
     sides: int | None = None
-    """Sides of an ellipse; with one ring, also the triangles of its fan: 3 to 64 (3d: a multiple of 4; crossed:
-    even). Default: 8 for flat, else 4; paper: 8."""
+    """Sides of an ellipse; with one ring, also the triangles of its fan: 3 to 64 (3d: a multiple of 4;
+    crossed: even). Default: 8 for flat, else 4; paper: 8."""
     rim_opacity: float | None = None
     """Opacity of the rim as a fraction of the splat's, 0 to 1. Default: 0; paper: 0.2."""
     center_opacity: float | None = None

@@ -293,7 +293,8 @@ class FanFilter {
         }
     }
 
-    // The gradients of the vertices for constant A and c. Returns the gradient of the density through A and c.
+    // The gradients of the vertices for constant A and c. Returns the gradient of the density through A and
+    // c.
     DensityGradient backward_positions(const Fan &fan, const float *grad, FanVertexGradient *vertices,
                                        int count) const {
         const double *a = fan.a, unit_x = 1 / projection_.fx, unit_y = 1 / projection_.fy;

@@ -56,7 +56,8 @@ class GradientTile {
           visible_(CHUNK),
           depths_(attribute_channels_ ? CHUNK : 0),
           slot_of_step_(CHUNK) {
-        // FanFilter::backward takes position gradients in camera space; all others are rotated to world space.
+        // FanFilter::backward takes position gradients in camera space; all others are rotated to world
+        // space.
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
                 rotation_[3 * i + j] =

@@ -99,7 +99,7 @@ class _Bytes:
         return values
 
     def count(self, least_bytes: int, what: str) -> int:
-        """A count of records of which each takes at least ``least_bytes``, checked against the remaining bytes."""
+        """A count of records of at least ``least_bytes`` each, checked against the remaining bytes."""
         (count,) = self.unpack(struct.Struct("<Q"), f"the number of {what}")
         left = len(self._data) - self._at
         if count * least_bytes > left:
