@@ -150,8 +150,8 @@ def _draw(
 
 
 def _image(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
-    from meshsplats.evaluation.report import image_of
     from meshsplats.rendering import render_splats
+    from meshsplats.rendering.looks import image_of
 
     white: Sequence[float] = (1.0, 1.0, 1.0)
     if isinstance(scene, SplatMesh):

@@ -397,9 +397,9 @@ def plural(count: int, noun: str) -> str:
 
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
     """Saves an image of ``scene``."""
-    from meshsplats.evaluation.report import image_of
     from meshsplats.images.writing import save_image
     from meshsplats.rendering import render_splats
+    from meshsplats.rendering.looks import image_of
     from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
