@@ -44,10 +44,10 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
     np.testing.assert_array_equal(mesh.faces, expected.faces)
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
     with Image.open(tmp_path / f"mesh.{suffix}.preview.png") as image:
-        picture = np.asarray(image)
-    assert picture.shape == (800, 800, 3)
-    assert (picture[0] == 255).all()
-    assert picture[200:600, 200:600].mean() < 240
+        pixels = np.asarray(image)
+    assert pixels.shape == (800, 800, 3)
+    assert (pixels[0] == 255).all()
+    assert pixels[200:600, 200:600].mean() < 240
     record = toml.load(tmp_path / f"mesh.{suffix}.config.toml")
     assert record["options"]["preset"] == "paper"
     assert (record["resolved"]["sides"], record["resolved"]["rim_radius"]) == (8, 2.7)

@@ -211,12 +211,12 @@ def test_the_command_on_a_mesh_in_json(tmp_path, capsys):
     save_mesh(convert(scene()[0]), tmp_path / "scene.npz")
     arguments = ["clean", str(tmp_path / "scene.npz"), "-o", str(tmp_path / "clean.glb"), "--json"]
     assert main([*arguments, "--max-distance", "1.8", "--preview-only"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["output"] is None
+    result = json.loads(capsys.readouterr().out)
+    assert result["output"] is None
     assert not (tmp_path / "clean.glb").exists()
     assert main([*arguments, "--max-distance", "1.8", "--force"]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["removed"] == told["removed"]
+    assert again["removed"] == result["removed"]
     mesh = load_mesh(tmp_path / "clean.glb")
     assert len(np.unique(mesh.face_splat)) == again["kept"] < 2017
     np.testing.assert_allclose(again["upper"], mesh.vertices.max(axis=0), atol=1e-3)

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 else:
     RuleOptions = as_cli_options(
         CleaningRules,
-        f"Rules. Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
+        "Rules: splats with any of these properties are removed."
+        f" Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
 
@@ -61,7 +62,7 @@ class Clean(Command):
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh."""
     output: Output
-    """The rest: splats as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
+    """The remaining splats: as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
     rules: RuleOptions = field(default_factory=RuleOptions)
     preview_only: bool = False
     """Print and draw what would be removed, but write no result."""

@@ -92,13 +92,18 @@ class Convert(Command):
     EXCLUSIVE = (("cameras", "data"),)
     CONFIGURABLE = True
 
-    input: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...")]]
+    input: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
+    ]
     """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
     input."""
     output: Output
     """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or a
     folder, for files named like the inputs."""
-    formats: tuple[Literal["glb", "npz", "ply", "usdc", "usda", "usd", "obj"], ...] = ()
+    formats: Annotated[
+        tuple[Literal["glb", "npz", "ply", "usdc", "usda", "usd", "obj"], ...],
+        tyro.conf.arg(help_behavior_hint=""),
+    ] = ()
     """With a folder: formats to write. Default: glb."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""

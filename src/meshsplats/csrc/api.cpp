@@ -1,5 +1,5 @@
 // The plain C interface of the core. Callers validate arguments and own the memory of results: see
-// rendering/core.py.
+// _core/library.py.
 #include <cstdio>
 #include <memory>
 #include <new>
@@ -65,7 +65,7 @@ int64_t render_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera
         });
 }
 
-// What the backward pass needs of the forward pass.
+// The results of the forward pass that the backward pass needs.
 struct ForwardRecord {
     ms::Tape tape;
     std::unique_ptr<ms::FanFilter> filter;  // or null
@@ -207,7 +207,7 @@ int guarded(char *message, int size, Body body) {
 
 extern "C" {
 
-// To be raised with every change of a structure or function.
+// Raise it with every change of a structure or function.
 MS_EXPORT int ms_interface_version() { return 4; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }

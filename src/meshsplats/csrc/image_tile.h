@@ -95,7 +95,7 @@ class ImageTile {
         });
     }
 
-    // Averages the samples of each pixel and writes the pixels. Without an image, nothing.
+    // Averages the samples of each pixel and writes the pixels. Does nothing without an image.
     void resolve() {
         if (!image_.color) return;
         int s = grid_.samples;

@@ -1,4 +1,4 @@
-// Structures of the C interface, mirrored in rendering/core.py.
+// Structures of the C interface, mirrored in _core/library.py.
 #pragma once
 
 #include <cstdint>

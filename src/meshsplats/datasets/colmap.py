@@ -60,7 +60,7 @@ def read_model(model: Path, images: str) -> list[Frame]:
 
 
 def count_points(model: Path) -> int | None:
-    """Number of points of a sparse model; None if it has none, or no file that could hold so many."""
+    """Number of points of a sparse model; None if it has none, or if the file is too short for it."""
     binary, text = model / "points3D.bin", model / "points3D.txt"
     if binary.is_file():
         with open(binary, "rb") as file:
@@ -99,7 +99,7 @@ class _Bytes:
         return values
 
     def count(self, least_bytes: int, what: str) -> int:
-        """A count of records of which each takes at least ``least_bytes``, checked against what is left."""
+        """A count of records of at least ``least_bytes`` each, checked against the remaining bytes."""
         (count,) = self.unpack(struct.Struct("<Q"), f"the number of {what}")
         left = len(self._data) - self._at
         if count * least_bytes > left:

@@ -155,7 +155,7 @@ def _focals(values: dict[str, Any], width: int, height: int, where: str) -> tupl
         raise FileFormatError(f"{where}: needs a focal length 'fl_x' or a viewing angle 'camera_angle_x'")
     if min(focals) <= 0:
         raise FileFormatError(f"{where}: focal lengths must be positive, got {min(focals):g}")
-    # One of them stands for both: pixels are square unless two are given.
+    # One of them serves both axes: pixels are square unless two are given.
     return focals[0], focals[-1]
 
 

@@ -71,7 +71,7 @@ def main(job_path: str) -> None:
         sys.exit(1)
 
     from meshsplats._files.atomic import atomic_path
-    from meshsplats.blender.inside import meshes, pictures, stage, versions
+    from meshsplats.blender.inside import meshes, rendering, stage, versions
     from meshsplats.blender.inside.scene import Subject, build
     from meshsplats.blender.options import LightOptions, SceneOptions
     from meshsplats.camera import Camera
@@ -122,7 +122,7 @@ def main(job_path: str) -> None:
         start, processor = time.perf_counter(), time.process_time()
         name = str(target)
         with atomic_path(target, temporary=Path(temporary[name]), new=name in new) as path:
-            pictures.render_to(built.scene, path, factor, scratch=Path(job_path).parent)
+            rendering.render_to(built.scene, path, factor, scratch=Path(job_path).parent)
         report(
             image=str(target),
             seconds=round(time.perf_counter() - start, 3),
