@@ -8,8 +8,9 @@ PYTHON ?= $(shell for name in python3 python python3.14 python3.13 python3.12 py
 
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
-CORE_SOURCES := $(wildcard src/meshsplats/csrc/*)
-BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(CORE_SOURCES)
+CORE_SOURCES := $(wildcard src/meshsplats/csrc/*.h src/meshsplats/csrc/*.cpp)
+BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(CORE_SOURCES) \
+	$(wildcard src/meshsplats/csrc/options.txt src/meshsplats/csrc/exports.*)
 
 # Blender's Python module exists for one version of Python only, and each version of it lives in a place of its own.
 BLENDER_VENV ?= .venv-blender
@@ -24,6 +25,15 @@ LOWEST_PYTHON ?= $(shell for name in python3.10 $(wildcard $(HOME)/.pyenv/versio
 	python; do $$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] not in ((3, 10), (3, 11)))' \
 	2>/dev/null && echo $$name && break; done)
 
+# Wheels for all platforms, and machines on which to test them. The standard library of Python 3.11 becomes part of the
+# Python for Windows.
+WHEELS_VENV ?= .venv-wheels
+WHEELS_PYTHON ?= $(or $(BLENDER_PYTHON),$(PYTHON))
+WHEELS_BIN := $(WHEELS_VENV)/bin
+OTHER_TESTS ?= tests
+WINDOWS := build/windows
+ARM64 := build/arm64
+
 # The sanitizers' run-time libraries are found by the names that GCC gives them.
 SANITIZED := build/sanitizers
 SANITIZER_CXX ?= g++
@@ -35,7 +45,8 @@ CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help demo test test-lowest test-blender test-sanitizers lint format clean
+.PHONY: help demo test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
+	release lint format clean
 .DEFAULT_GOAL := help
 
 help:
@@ -44,6 +55,9 @@ help:
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make test-sanitizers   those of the compiled core, with GCC'"'"'s sanitizers and with assertions'
+	@echo 'make wheels  wheels for Linux, Windows and macOS, in dist/'
+	@echo 'make test-windows, test-arm64   the tests with the wheels for Windows, under wine, and for arm64, under qemu'
+	@echo 'make release   all that a release consists of, in dist/ (docs/releasing.md)'
 	@echo 'make lint    ruff, mypy and clang-format (make format tidies the source)'
 	@echo 'make clean   removes everything that these made'
 
@@ -137,6 +151,36 @@ test-sanitizers: $(VENV)/installed-dev $(SANITIZED)/address.so $(SANITIZED)/thre
 	$(call sanitized,libasan.so,address)
 	$(call sanitized,libtsan.so,thread) -k 'threads'
 
+$(WHEELS_VENV)/installed: tools/requirements.txt
+	@echo 'Making $(WHEELS_VENV) with $(WHEELS_PYTHON)'
+	@test -x $(WHEELS_BIN)/python || $(WHEELS_PYTHON) -m venv $(WHEELS_VENV)
+	@$(WHEELS_BIN)/python -m pip --disable-pip-version-check --quiet install --requirement $<
+	@touch $@
+
+wheels: $(WHEELS_VENV)/installed
+	$(WHEELS_BIN)/python tools/wheels.py -o dist
+
+# The tests compare their images with this digest of the machine at hand.
+digest = MESHSPLATS_DIGEST=$$(cd tests/rendering && PYTHONPATH=.. ../../$(BIN)/python -c \
+	'import test_rendering_variants as t; print(t.digest())')
+
+# wine wants a file as standard input and a pipe as output.
+test-windows: $(VENV)/installed-dev $(WHEELS_VENV)/installed
+	$(WHEELS_BIN)/python tools/wheels.py -o $(WINDOWS)/wheel --only win_amd64
+	$(WHEELS_BIN)/python tools/windows_python.py $(WINDOWS)/python $(WINDOWS)/wheel/*.whl
+	bash -o pipefail -c "$(digest) WINEPREFIX=$(CURDIR)/$(WINDOWS)/prefix WINEDEBUG=-all WINEARCH=win64 \
+	  wine $(WINDOWS)/python/python.exe -m pytest -p no:cacheprovider $(OTHER_TESTS) < /dev/null 2>&1 | cat"
+
+# Processes that a test starts would need qemu in the kernel (binfmt_misc): such tests are left out.
+test-arm64: $(VENV)/installed-dev $(WHEELS_VENV)/installed
+	$(WHEELS_BIN)/python tools/wheels.py -o $(ARM64)/wheel --only manylinux_2_17_aarch64
+	$(WHEELS_BIN)/python tools/arm64_python.py $(ARM64)/root $(ARM64)/wheel/*.whl
+	$(digest) qemu-aarch64-static -L $(ARM64)/root $(ARM64)/root/usr/bin/python3.11 -m pytest -p no:cacheprovider \
+	  -k 'not variants_do_not_change and not memory_stays_bounded' tests/rendering tests/conversion
+
+release: $(WHEELS_VENV)/installed
+	$(WHEELS_BIN)/python tools/release.py -o dist
+
 lint: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
@@ -148,5 +192,5 @@ format: $(VENV)/installed-dev
 	$(BIN)/clang-format -i $(CORE_SOURCES)
 
 clean:
-	rm -rf $(VENV) $(LOWEST_VENV) $(BLENDER_VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST_VENV) $(BLENDER_VENV) $(WHEELS_VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests examples benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

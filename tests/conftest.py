@@ -20,3 +20,13 @@ def shared_data(path: str) -> Path:
     if not found.exists():
         pytest.skip(f"real data not here: {found} (set MESHSPLATS_SHARED_DATA to its folder)")
     return found
+
+
+def make_link(link: Path, target: Path) -> None:
+    """Makes a symbolic link; skips where this process may not, as on Windows by default."""
+    try:
+        link.symlink_to(target)
+    except (OSError, NotImplementedError) as error:
+        pytest.skip(f"no symbolic links here: {error}")
+    if not link.is_symlink():
+        pytest.skip("symbolic links are not recognised here")

@@ -32,6 +32,7 @@ SCRIPT = Path(__file__).with_name("_extension_session.py")
 def packed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("extension")
     command = [sys.executable, str(ROOT / "blender_extension" / "build.py"), "-o", str(folder)]
+    command += ["--blender", "4.2"]
     if "MESHSPLATS_WHEEL" in os.environ:  # built already
         command += ["--wheel", os.environ["MESHSPLATS_WHEEL"]]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -56,6 +57,7 @@ def test_package_holds_the_wheels_of_one_platform(packed):
     assert [wheel.split("/")[1].split("-")[0] for wheel in wheels] == ["meshsplats", "pillow"]
     assert f'wheels = ["./{wheels[0]}", "./{wheels[1]}"]' in manifest
     assert 'license = ["SPDX:GPL-3.0-or-later"]' in manifest
+    assert 'blender_version_min = "4.2.0"\nblender_version_max = "5.1.0"\n' in manifest
     assert {"__init__.py", "LICENSE", "blender_manifest.toml"} <= set(names)
     assert "build.py" not in names
 
@@ -66,6 +68,7 @@ def test_platform_names():
     spec.loader.exec_module(build)
     assert build.platform_of("meshsplats-0.1.0-py3-none-manylinux_2_28_x86_64.whl") == "linux-x64"
     assert build.platform_of("meshsplats-0.1.0-py3-none-macosx_11_0_arm64.whl") == "macos-arm64"
+    assert build.platform_of("meshsplats-0.1.0-py3-none-win_arm64.whl") == "windows-arm64"
     with pytest.raises(ValueError, match="not a wheel of a platform"):
         build.platform_of("meshsplats-0.1.0-py3-none-any.whl")
     different = [
@@ -73,7 +76,7 @@ def test_platform_names():
         Path("pillow-1-cp311-cp311-linux_x86_64.whl"),
     ]
     with pytest.raises(ValueError, match="different platforms: linux-x64, windows-x64"):
-        build.pack(different, Path("nowhere"))
+        build.pack(different, Path("nowhere"), "4.2")
 
 
 def test_a_whole_session(packed, tmp_path):

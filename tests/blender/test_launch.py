@@ -32,6 +32,8 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="process
 @pytest.fixture
 def program(tmp_path):
     """Makes an executable that answers --version with a text, and else runs a line of shell."""
+    if sys.platform == "win32":
+        pytest.skip("a shell script stands in for the program")
 
     def make(version: str, line: str = "exit 0"):
         path = tmp_path / "blender"
@@ -126,9 +128,10 @@ def _killed(process: subprocess.Popen) -> Iterator[subprocess.Popen]:
 
 
 @linux
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT], ids=lambda n: n.name)
-def test_blender_ends_with_the_command_and_leaves_nothing(program, tmp_path, number):
-    notes, place, scratch = (tmp_path / name for name in ("notes", "place", "scratch"))
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGINT"])
+def test_blender_ends_with_the_command_and_leaves_nothing(program, tmp_path, name):
+    number = signal.Signals[name]
+    notes, place, scratch = (tmp_path / folder for folder in ("notes", "place", "scratch"))
     for folder in (notes, place, scratch):
         folder.mkdir()
     save_mesh(random_mesh(3), tmp_path / "mesh.npz")
@@ -142,13 +145,13 @@ def test_blender_ends_with_the_command_and_leaves_nothing(program, tmp_path, num
     with _killed(
         subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, preexec_fn=heed)
     ) as process:
-        assert _until(lambda: all((notes / name).exists() for name in ("child", "parent")), 300)
-        assert _until(lambda: all((notes / name).read_text() for name in ("child", "parent")))
+        assert _until(lambda: all((notes / role).exists() for role in ("child", "parent")), 300)
+        assert _until(lambda: all((notes / role).read_text() for role in ("child", "parent")))
         assert len(os.listdir(place)) == len(os.listdir(scratch)) == 1
         process.send_signal(number)
         process.communicate(timeout=30)
     assert process.returncode == (-number if number == signal.SIGKILL else 128 + number)
-    running = [int((notes / name).read_text()) for name in ("child", "parent")]
+    running = [int((notes / role).read_text()) for role in ("child", "parent")]
     assert _until(lambda: not any(map(_alive, running)))
     assert _until(lambda: not os.listdir(place) + os.listdir(scratch))
 

@@ -286,7 +286,7 @@ def test_bad_steps_change_nothing():
     gradient = np.ones((5, 3), np.float32)
     for rows, error, match in [
         ([0, 1], TypeError, "rows must be a bool mask or int32 indices, got list"),
-        (np.array([0, 1]), TypeError, "got int64"),
+        (np.array([0, 1], np.int64), TypeError, "got int64"),
         (np.ones(5, np.uint8), TypeError, "got uint8"),
         (np.zeros(4, bool), ValueError, r"shape \(5,\), got \(4,\)"),
         (np.zeros((1, 1), np.int32), ValueError, r"shape \(n,\), got \(1, 1\)"),

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _datasets import save, simple_colmap, write_colmap
-from conftest import shared_data
+from conftest import make_link, shared_data
 from PIL import Image
 
 import meshsplats as ms
@@ -200,13 +200,13 @@ def test_links_out_of_the_folder_are_refused(tmp_path):
     folder = simple_colmap(tmp_path / "set", 2)
     save(tmp_path / "outside.png", np.zeros((8, 12, 3), np.uint8))
     (folder / "images/p01.png").unlink()
-    (folder / "images/p01.png").symlink_to(tmp_path / "outside.png")
+    make_link(folder / "images/p01.png", tmp_path / "outside.png")
     with pytest.raises(FileFormatError, match="a link that leads out"):
         load_dataset(folder)
     (folder / "images/p01.png").unlink()
-    (folder / "images/p01.png").symlink_to(folder / "images/p00.png")
+    make_link(folder / "images/p01.png", folder / "images/p00.png")
     assert len(load_dataset(folder).views) == 2
-    (tmp_path / "link").symlink_to(folder)  # the data set itself may be behind a link
+    make_link(tmp_path / "link", folder)  # the data set itself may be behind a link
     assert len(load_dataset(tmp_path / "link").views) == 2
 
 

@@ -255,8 +255,9 @@ sys.exit(meshsplats.cli.main(["hang"]))
 
 
 @posix
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT], ids=lambda n: n.name)
-def test_signals_leave_nothing(tmp_path, number):
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_signals_leave_nothing(tmp_path, name):
+    number = signal.Signals[name]
     command = [sys.executable, "-c", _HANGING, str(tmp_path / "mesh.glb")]
     # Where the tests run in the background of a shell, it may have signals ignored.
     heed = partial(signal.signal, number, signal.SIG_DFL)
@@ -309,9 +310,13 @@ def test_standard_output_that_is_full(tmp_path):
     save_gaussians(few_splats(), tmp_path / "scene.ply")
     with open("/dev/full", "wb") as full:
         done = subprocess.run(
-            [*COMMAND, "info", "scene.ply", "--json"], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE
+            [*COMMAND, "info", "scene.ply", "--json"],
+            cwd=tmp_path,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
         )
-    assert done.stderr == b"meshsplats: error: standard output: No space left on device\n"
+    assert done.stderr == "meshsplats: error: standard output: No space left on device\n"
     assert done.returncode == 4
 
 

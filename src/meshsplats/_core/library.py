@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_int32, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,9 @@ import numpy as np
 
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
+
+SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
+"""Of the cores' file names on this system."""
 
 INTERFACE_VERSION = 4
 
@@ -105,7 +109,7 @@ def library_path(variant: str) -> Path | None:
 
     # An editable install keeps the compiled files in another folder of the package's path.
     for folder in meshsplats._core.__path__:
-        path = Path(folder) / f"meshsplats_{variant}.so"
+        path = Path(folder) / f"meshsplats_{variant}{SUFFIX}"
         if path.is_file():
             return path
     return None

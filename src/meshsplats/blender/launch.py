@@ -259,7 +259,7 @@ def _post_mortem(status: int, said: Sequence[str], options: SceneOptions) -> str
     words = " / ".join(line for line in list(said)[-6:] if line) or "nothing"
     how = f"with exit code {status}" if status >= 0 else f"by signal {signal.Signals(-status).name}"
     advice = ""
-    if status == -signal.SIGKILL:
+    if sys.platform != "win32" and status == -signal.SIGKILL:
         advice = " The system ends programs that need more memory than there is: use fewer triangles."
     elif options.engine == "eevee":
         advice = (

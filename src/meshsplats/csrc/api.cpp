@@ -5,7 +5,9 @@
 #include <new>
 
 #include "adam.h"
+#include "cpu.h"
 #include "gradient.h"
+#include "hidden_new.h"
 #include "merging.h"
 #include "mesh_tile.h"
 #include "splats.h"
@@ -215,14 +217,8 @@ MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 // The best variant that this processor runs.
 MS_EXPORT const char *ms_best_variant() {
 #if defined(__x86_64__)
-    __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-        __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
-        __builtin_cpu_supports("avx512vl"))
-        return "v4";
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
-        __builtin_cpu_supports("bmi2"))
-        return "v3";
+    const int level = ms::x86_64_level();
+    if (level >= 3) return level >= 4 ? "v4" : "v3";
 #endif
     return "baseline";
 }
