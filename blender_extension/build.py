@@ -36,7 +36,7 @@ PIP_PLATFORMS = {
     "macos-x64": ["macosx_10_13_x86_64", "macosx_10_10_x86_64"],
     "windows-x64": ["win_amd64"],
 }
-"""What pip calls Blender's platforms."""
+"""Pip's names for Blender's platforms."""
 
 
 def platform_of(wheel: str) -> str:

@@ -80,7 +80,7 @@ class Prior(TrainingCommand):
     output: Output
     """The result with its binding to the base: .npz, which keeps everything, or .glb."""
     splats: File = None
-    """Splats to learn from, in place of --data: a file or a model folder."""
+    """Splats whose images are the targets, in place of --data: a file or a model folder."""
     laying: LayOptions = field(default_factory=LayOptions)
     tuning: PriorTuningOptions = field(default_factory=PriorTuningOptions)
 

@@ -83,7 +83,7 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
         if not bool((z >= camera.near).all()):
             continue
         projected = points[corner][..., :2] / z * focal
-        k = reference.FILTER_SIDEWAYS * focal.prod().sqrt() * z[0, 0]
+        k = reference.FILTER_DEPTH_SHARE * focal.prod().sqrt() * z[0, 0]
         a, b, c = torch.cat([projected, k / z], dim=2).unbind(1)
         area = torch.linalg.cross(b - a, c - a).norm(dim=1)
         if not bool(area.sum() > 0):
@@ -91,14 +91,16 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
         weights, shares = zip(*reference.CUBATURE, strict=True)
         at = points.new_tensor(np.array(weights))
         share = (
-            points.new_tensor(shares) * area[:, None] * ((opacity[corner] + reference.FILTER_FAINTEST) @ at.T)
+            points.new_tensor(shares)
+            * area[:, None]
+            * ((opacity[corner] + reference.FILTER_OPACITY_BIAS) @ at.T)
         )
         share = share / share.sum()
         position = torch.einsum("nk,tkc->tnc", at, projected)
         mean = (share[..., None] * position).sum((0, 1))
         covariance = torch.einsum("tn,tni,tnj->ij", share, position - mean, position - mean)
         one = torch.eye(2, dtype=points.dtype)
-        square = one + px2 * torch.linalg.inv(covariance + reference.FILTER_NARROWEST * px2 * one)
+        square = one + px2 * torch.linalg.inv(covariance + reference.FILTER_MIN_VARIANCE * px2 * one)
         root = torch.linalg.det(square).sqrt()
         spread = (square + root * one) / (torch.trace(square) + 2 * root).sqrt()  # its square root
         own = torch.unique(corner)
