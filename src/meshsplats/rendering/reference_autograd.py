@@ -90,11 +90,8 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
             continue
         weights, shares = zip(*reference.CUBATURE, strict=True)
         at = points.new_tensor(np.array(weights))
-        share = (
-            points.new_tensor(shares)
-            * area[:, None]
-            * ((opacity[corner] + reference.FILTER_OPACITY_BIAS) @ at.T)
-        )
+        opacities = opacity[corner] + reference.FILTER_OPACITY_BIAS
+        share = points.new_tensor(shares) * area[:, None] * (opacities @ at.T)
         share = share / share.sum()
         position = torch.einsum("nk,tkc->tnc", at, projected)
         mean = (share[..., None] * position).sum((0, 1))
