@@ -27,7 +27,7 @@ INVOCATION = ("executable", "force", "json", "resume")
 """Options for the command line only: a configuration file from a stranger must neither overwrite files nor
 run programs, and --json and --resume belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
-"""What a configuration file may hold. Only ``options`` is read."""
+"""Tables and keys of a configuration file. Only ``options`` is read."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 

@@ -25,7 +25,7 @@ from meshsplats.cli.common import (
 )
 from meshsplats.cli.messages import UsageError, shown_path
 from meshsplats.cli.records import PREVIEW, beside
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, take_away
+from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -87,7 +87,7 @@ class Clean(Command):
         if isinstance(scene, GaussianCloud) and self.output.suffix.lower() != ".ply":
             raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
         found = find(scene, rules)
-        left = take_away(scene, found)
+        left = remove(scene, found)
         if not self.preview_only:
             if isinstance(left, SplatMesh):
                 save_mesh(left, self.output)

@@ -84,7 +84,7 @@ class ViewOptions:
     dome: Count = None
     """N views spread evenly over the upper half of a sphere around the subject."""
     look_around: Count = None
-    """N views from the middle of the scene, a room say, in one full turn."""
+    """N views from the middle of the scene, such as a room, in one full turn."""
     cameras: File = None
     """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder that has
     one."""

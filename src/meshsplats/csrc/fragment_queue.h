@@ -123,7 +123,7 @@ class FragmentQueue {
         int32_t face;
         uint32_t first_mask, mask_count, tape_index;
     };
-    // What is still to be emitted of an entry.
+    // The lanes of an entry that are still to be emitted.
     struct Pending {
         int entry;
         LaneMask lanes;

@@ -31,7 +31,7 @@ _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 @dataclass(frozen=True)
 class Transforms:
-    """What such a file holds."""
+    """The content of such a file."""
 
     frames: list[Frame]
     """In file order."""

@@ -263,9 +263,9 @@ def checked_options(
 
 
 def compact_groups(depth_group: np.ndarray | None) -> np.ndarray | None:
-    """The same groups, numbered without gaps, so that tables over them are no larger than the mesh."""
+    """The same groups, indexed without gaps, so that tables over them are no larger than the mesh."""
     if depth_group is None or not len(depth_group) or depth_group.max() < len(depth_group):
         return depth_group
-    values, numbers = np.unique(depth_group, return_inverse=True)
+    values, indices = np.unique(depth_group, return_inverse=True)
     shift = int(values[0] == -1)
-    return np.ascontiguousarray(numbers.reshape(-1) - shift, np.int32)
+    return np.ascontiguousarray(indices.reshape(-1) - shift, np.int32)

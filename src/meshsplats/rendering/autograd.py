@@ -270,10 +270,10 @@ def _faces(faces: torch.Tensor | np.ndarray, vertices: int) -> np.ndarray:
     return array.astype(np.int32, copy=False)
 
 
-def _per_face(name: str, numbers: torch.Tensor | np.ndarray | None, faces: int) -> np.ndarray | None:
-    if numbers is None:
+def _per_face(name: str, indices: torch.Tensor | np.ndarray | None, faces: int) -> np.ndarray | None:
+    if indices is None:
         return None
-    array = np.ascontiguousarray(numbers.numpy() if isinstance(numbers, torch.Tensor) else numbers)
+    array = np.ascontiguousarray(indices.numpy() if isinstance(indices, torch.Tensor) else indices)
     if array.shape != (faces,) or not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"{name} must be ({faces},) int32, got {array.shape} {array.dtype}")
     return array.astype(np.int32, copy=False)

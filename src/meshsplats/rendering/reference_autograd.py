@@ -93,22 +93,21 @@ def filtered(
         if not bool((z >= camera.near).all()):
             continue
         projected = points[corner][..., :2] / z * focal
-        k = reference.FILTER_SIDEWAYS * focal.prod().sqrt() * z[0, 0]
+        k = reference.FILTER_DEPTH_SHARE * focal.prod().sqrt() * z[0, 0]
         a, b, c = torch.cat([projected, k / z], dim=2).unbind(1)
         area = torch.linalg.cross(b - a, c - a).norm(dim=1)
         if not bool(area.sum() > 0):
             continue
         weights, shares = zip(*reference.CUBATURE, strict=True)
         at = points.new_tensor(np.array(weights))
-        share = (
-            points.new_tensor(shares) * area[:, None] * ((opacity[corner] + reference.FILTER_FAINTEST) @ at.T)
-        )
+        opacities = opacity[corner] + reference.FILTER_OPACITY_BIAS
+        share = points.new_tensor(shares) * area[:, None] * (opacities @ at.T)
         share = share / share.sum()
         position = torch.einsum("nk,tkc->tnc", at, projected)
         mean = (share[..., None] * position).sum((0, 1))
         covariance = torch.einsum("tn,tni,tnj->ij", share, position - mean, position - mean)
         one = torch.eye(2, dtype=points.dtype)
-        square = one + px2 * torch.linalg.inv(covariance + reference.FILTER_NARROWEST * px2 * one)
+        square = one + px2 * torch.linalg.inv(covariance + reference.FILTER_MIN_VARIANCE * px2 * one)
         root = torch.linalg.det(square).sqrt()
         spread = (square + root * one) / (torch.trace(square) + 2 * root).sqrt()  # its square root
         own = torch.unique(corner)

@@ -79,7 +79,7 @@ class GltfDocument:
         """Entry ``index`` of the top-level array ``kind``; ``what`` names the object that refers to it."""
         found = self.items(kind)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
-            raise self.error(f"{what} refers to number {str(index)[:20]} of {len(found)} {kind}")
+            raise self.error(f"{what} refers to index {str(index)[:20]} of {len(found)} {kind}")
         return found[index]
 
     def whole(self, owner: dict[str, Any], key: str, what: str, default: int | None = None) -> int:
