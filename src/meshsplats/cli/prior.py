@@ -98,7 +98,7 @@ class Prior(TrainingCommand):
         if self.splats is not None and self.target.data is not None:
             raise UsageError("give --data or --splats, not both")
         if self.splats is None and self.target.data is None:
-            raise UsageError("give the targets: photographs with --data, or splats with --splats")
+            raise UsageError("give photographs with --data, or splats with --splats, as targets")
         if self.laying.texture is not None and self.laying.colors not in ("auto", "texture"):
             raise UsageError(f"--texture has no effect with --colors {self.laying.colors}")
         if self.laying.spacing and self.laying.layers == 1:
