@@ -13,7 +13,7 @@ import numpy as np
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
 
-INTERFACE_VERSION = 4
+INTERFACE_VERSION = 5
 
 
 class CameraStruct(ctypes.Structure):
@@ -37,6 +37,7 @@ class OptionsStruct(ctypes.Structure):
         ("min_transmittance", c_float),
         ("background", c_void_p),
         ("background_per_pixel", c_int32),
+        ("cutoff", c_float),
     ]
 
 
