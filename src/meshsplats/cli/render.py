@@ -17,6 +17,7 @@ from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     DrawOptions,
+    Number,
     Output,
     PartOptions,
     SplatOptions,
@@ -82,7 +83,7 @@ class Render(Command):
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
-    cutoff: float | None = None
+    cutoff: Number = None
     """Draw a mesh as a depth buffer does: opaque where its opacity is at least this, nothing elsewhere. 0 to
     1; default: blended."""
     transparent: bool = False
