@@ -291,4 +291,17 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
-    assert "--alpha and --compression are for .glb" in capsys.readouterr().err
+    assert "--alpha mask and --compression are for .glb" in capsys.readouterr().err
+
+
+def test_opaque_triangles_in_every_format(splats, tmp_path, capsys):
+    for name in ("m.glb", "m.ply"):
+        out = tmp_path / name
+        assert run(splats, "-o", out, "--alpha", "opaque", "--cutoff", "0.3", "--no-preview") == 0
+        assert (load_mesh(out).colors[:, 3] == 1).all()
+        assert f"{len(load_mesh(out).faces):,} triangles" in capsys.readouterr().out
+    assert run(tmp_path / "m.ply", "-o", tmp_path / "a.npz", "--alpha", "opaque", "--no-preview") == 0
+    assert len(load_mesh(tmp_path / "a.npz").faces) == len(load_mesh(tmp_path / "m.ply").faces)
+    capsys.readouterr()
+    assert run(splats, "-o", tmp_path / "b.glb", "--cutoff", "0.3") == 2
+    assert "--cutoff is for --alpha opaque or mask" in capsys.readouterr().err

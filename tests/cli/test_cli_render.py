@@ -265,3 +265,25 @@ def test_aim_and_lens(splats, tmp_path):
     for mistake in (["--fov", "30"], ["--look-around", "3"]):
         assert run(splats, "-o", tmp_path / "b", *aimed, *mistake) == 2
     assert run(splats, "-o", tmp_path / "b.png", "--focal-length", 0) == 1
+
+
+def test_a_cutoff_draws_solid_triangles_or_none(triangle, tmp_path):
+    out = tmp_path / "a.png"
+    options = ("--cameras", tmp_path / "one.json", "--background", "0,0,1", "--force")
+    assert run(triangle, "-o", out, "--cutoff", "0.5", *options) == 0
+    assert (picture(out) == (255, 0, 0)).all()
+    assert run(triangle, "-o", out, "--cutoff", "0.6", *options) == 0
+    assert (picture(out) == (0, 0, 255)).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--cutoff", "1.5"), "cutoff must be an opacity from 0 to 1"),
+        (("--cutoff", "0.5", "--max-layers", "3"), "--max-layers has no effect with --cutoff"),
+        (("--cutoff", "0.5", "--as-splats"), "--cutoff is for a mesh"),
+    ],
+)
+def test_a_cutoff_that_says_nothing_is_refused(splats, tmp_path, capsys, options, message):
+    assert run(splats, "-o", tmp_path / "a.png", *options) != 0
+    assert message in capsys.readouterr().err

@@ -17,7 +17,7 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 4
+INTERFACE_VERSION = 5
 
 
 class CameraStruct(ctypes.Structure):
@@ -41,6 +41,7 @@ class OptionsStruct(ctypes.Structure):
         ("min_transmittance", c_float),
         ("background", c_void_p),
         ("background_per_pixel", c_int32),
+        ("cutoff", c_float),
     ]
 
 

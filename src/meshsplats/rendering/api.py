@@ -64,6 +64,7 @@ def render(
     normals: bool = False,
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
+    cutoff: float | None = None,
     threads: int | None = None,
 ) -> Rendering:
     """The image of a mesh of translucent triangles, exact at every sample.
@@ -81,6 +82,10 @@ def render(
     variance of s / 10,000: a splat seen exactly edge on has no triangle to widen. Splats that reach nearer
     than the near plane stay as they are. The variance is in square pixels for any ``samples``.
 
+    With a ``cutoff`` c, fragments are opaque where the interpolated opacity is at least c, and are not drawn
+    elsewhere: each sample has the colour of the nearest opaque fragment, or of the background. This is the
+    image of a depth buffer with an alpha test, or with triangles that were cut at the level set of c.
+
     Args:
         mesh: the triangles.
         camera: viewpoint, lens and size of the image.
@@ -91,6 +96,7 @@ def render(
         min_transmittance: early termination of samples with less transmittance than this; 0: none.
         depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
         filter_px2: overrides ``mesh.filter_px2``; 0 draws the triangles as they are.
+        cutoff: least opacity that is drawn, as opaque; 0 to 1. None: blended with the opacity.
         threads: at most this many; all processors by default. The result does not depend on it.
 
     Raises:
@@ -107,6 +113,8 @@ def render(
     if not 0 <= min_transmittance < 1:
         raise ValueError(f"min_transmittance must lie in [0, 1), got {min_transmittance}")
     options.max_layers = int(max_layers or 0)
+    if cutoff is not None:
+        options.cutoff = checked_cutoff(cutoff)
     options.min_transmittance = min_transmittance
 
     px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
@@ -214,6 +222,13 @@ def render_splats(
     return Rendering(color, alpha, fragments=int(image.fragments))
 
 
+def checked_cutoff(cutoff: float) -> float:
+    """``cutoff`` as the least opacity that is drawn as opaque. Raises ValueError unless it lies in [0, 1]."""
+    if not 0 <= cutoff <= 1:
+        raise ValueError(f"cutoff must be an opacity from 0 to 1, got {cutoff}")
+    return float(cutoff)
+
+
 class Pointers:
     """Gives the core pointers to arrays, and keeps the arrays alive as long as itself."""
 
@@ -259,6 +274,7 @@ def checked_options(
         min_transmittance=0,
         background=keep(backdrop),
         background_per_pixel=backdrop.ndim == 3,
+        cutoff=-1,
     )
 
 

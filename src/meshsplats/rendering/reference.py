@@ -15,7 +15,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, checked_filter
-from meshsplats.rendering.api import Rendering
+from meshsplats.rendering.api import Rendering, checked_cutoff
 
 SPLAT_MIN_ALPHA = 1 / 255
 """Splats fainter than this at a sample are left out there, as in 3DGS."""
@@ -49,6 +49,7 @@ def render(
     normals: bool = False,
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
+    cutoff: float | None = None,
 ) -> Rendering:
     """The image of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
 
@@ -59,6 +60,8 @@ def render(
     T is below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
 
     ``filter_px2``, by default the mesh's, widens the fan of each splat first (see :func:`filtered`).
+
+    With a ``cutoff``, in [0, 1], a becomes 1 where it is at least the cutoff, else 0.
 
     ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
 
@@ -82,6 +85,9 @@ def render(
         return np.clip(mixed, at_corners.min(axis=1), at_corners.max(axis=1))
 
     rgba = interpolated(mesh.colors)
+    if cutoff is not None:
+        # The core compares float32 values: so does this with the cutoff.
+        rgba[:, 3] = rgba[:, 3] >= np.float32(checked_cutoff(cutoff))
     share, transmittance = _front_to_back(sheet, rgba[:, 3], len(x), max_layers, min_transmittance)
 
     def blended(values: np.ndarray) -> np.ndarray:
