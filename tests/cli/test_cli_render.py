@@ -271,9 +271,9 @@ def test_a_cutoff_draws_solid_triangles_or_none(triangle, tmp_path):
     out = tmp_path / "a.png"
     options = ("--cameras", tmp_path / "one.json", "--background", "0,0,1", "--force")
     assert run(triangle, "-o", out, "--cutoff", "0.5", *options) == 0
-    assert (picture(out) == (255, 0, 0)).all()
+    assert (pixels(out) == (255, 0, 0)).all()
     assert run(triangle, "-o", out, "--cutoff", "0.6", *options) == 0
-    assert (picture(out) == (0, 0, 255)).all()
+    assert (pixels(out) == (0, 0, 255)).all()
 
 
 @pytest.mark.parametrize(
