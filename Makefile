@@ -50,7 +50,7 @@ CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 .DEFAULT_GOAL := help
 
 help:
-	@echo 'make demo    splats to mesh, GLB, pictures and a comparison, in $(DEMO)/'
+	@echo 'make demo    splats to mesh, GLB, images and a comparison, in $(DEMO)/'
 	@echo 'make test    the tests'
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'

@@ -26,7 +26,7 @@ import numpy as np
 from meshsplats import DataWarning, convert, load_cameras, load_gaussians, load_mesh, render
 from meshsplats.blender import SceneOptions, draw
 from meshsplats.blender.inside.host import bpy
-from meshsplats.blender.inside.pictures import read_pixels
+from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.colors import linear_to_srgb
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.images.reading import load_image

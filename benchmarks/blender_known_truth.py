@@ -21,7 +21,7 @@ from PIL import Image
 
 from meshsplats import GaussianCloud, convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import meshes, pictures, scene, versions
+from meshsplats.blender.inside import meshes, rendering, scene, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.colors import linear_to_srgb
 from meshsplats.evaluation.metrics import psnr
@@ -124,8 +124,8 @@ def main() -> None:
 
     def shot(made) -> np.ndarray:
         with tempfile.TemporaryDirectory() as scratch:
-            pictures.render_to(made.scene, Path(scratch) / "image.exr")
-            return pictures.read_pixels(Path(scratch) / "image.exr")[..., :3]
+            rendering.render_to(made.scene, Path(scratch) / "image.exr")
+            return rendering.read_pixels(Path(scratch) / "image.exr")[..., :3]
 
     def display(image: np.ndarray) -> np.ndarray:
         return linear_to_srgb(np.clip(image, 0, 1))

@@ -18,7 +18,7 @@ import numpy as np
 from meshsplats import GaussianCloud, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside.host import bpy
-from meshsplats.blender.inside.pictures import read_pixels
+from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.cameras.trajectories import look_at
 
 COUNT = 3000

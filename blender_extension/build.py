@@ -39,7 +39,7 @@ PIP_PLATFORMS = {
     "windows-x64": ["win_amd64"],
     "windows-arm64": ["win_arm64"],
 }
-"""What pip calls Blender's platforms."""
+"""Pip's names for Blender's platforms."""
 
 
 def platform_of(wheel: str) -> str:

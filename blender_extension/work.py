@@ -18,7 +18,7 @@ class Result:
     path: str
     name: str
     prepared: tuple
-    """What ``objects.add`` takes; of a chain, for each level, the finest first."""
+    """Arguments of ``objects.add``; of a chain, for each level, the finest first."""
     level_paths: tuple = ()
     """Of a chain: the file of each level."""
     screen_sizes: tuple = ()
@@ -95,7 +95,7 @@ class Work:
         return Result(path, chain.name, prepared, files, tuple(level.screen_size for level in chain.levels))
 
     def _prepared(self, path, begin, share):
-        """What ``objects.add`` takes. Progress, in files, goes from ``begin`` on by ``share``."""
+        """Arguments of ``objects.add``. Progress, in files, goes from ``begin`` on by ``share``."""
         from pathlib import Path
 
         from meshsplats.blender.inside import objects
@@ -130,7 +130,7 @@ class Modal:
     """Mix-in for operators that wait for ``Work`` while Blender stays responsive; Escape cancels."""
 
     def begin(self, context, work):
-        """What ``execute`` returns."""
+        """Return value of ``execute``."""
         self._work = work
         if bpy_background():
             work.run()

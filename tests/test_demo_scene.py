@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from numpy.polynomial.legendre import legval
@@ -34,6 +37,12 @@ def test_has_as_many_splats_as_asked(count):
 def test_too_few_splats_are_an_error():
     with pytest.raises(ValueError, match="at least 200"):
         demo_scene.make_scene(199)
+
+
+def test_runs_as_a_module(tmp_path):
+    command = [sys.executable, "-m", "meshsplats.demo_scene", "scene.ply", "200"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    assert len(load_gaussians(tmp_path / "scene.ply")) == 200
 
 
 def test_the_seed_decides(scene):

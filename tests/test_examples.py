@@ -29,11 +29,11 @@ def test_example_runs(example, tmp_path, monkeypatch, capsys):
         if error.name != "torch":
             raise
         pytest.skip(f"{example.name} needs torch")
-    told = capsys.readouterr().out
-    assert told, "an example says what it did"
+    printed = capsys.readouterr().out
+    assert printed, "an example prints its results"
     for written in (tmp_path / "example-output").glob("*"):
         assert written.stat().st_size > 0
-        assert written.name in told
+        assert written.name in printed
 
 
 def test_examples_are_here():

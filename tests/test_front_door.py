@@ -141,10 +141,10 @@ def test_mistakes_are_refused(tmp_path):
 
 def test_values_have_their_types(tmp_path):
     text = BEGIN + (
-        "picture = ms.render(mesh, ms.orbit(mesh)[0])\n"
+        "image = ms.render(mesh, ms.orbit(mesh)[0])\n"
         "reveal_type(ms.convert)\n"
-        "reveal_type(picture)\n"
-        "reveal_type(ms.psnr(picture.color, picture.color))\n"
+        "reveal_type(image)\n"
+        "reveal_type(ms.psnr(image.color, image.color))\n"
     )
     said = check(tmp_path, {"hints": text})
     assert "Any" not in re.sub(r"ndarray\[.*?\]\]\]?", "", said)

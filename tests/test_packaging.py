@@ -164,7 +164,7 @@ def scene_file(tmp_path_factory) -> Path:
 
 
 def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
-    """One after the other in one folder, on a small scene and with small pictures."""
+    """One after the other in one folder, on a small scene and with small images."""
     pytest.importorskip("skimage", reason="base needs its extra: pip install 'meshsplats[base]'")
     lines = "".join(code_blocks(ROOT / "README.md", "sh")).replace("\\\n", " ").splitlines()
     commands = [shlex.split(line, comments=True) for line in lines if line.startswith("meshsplats ")]

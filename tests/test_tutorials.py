@@ -37,7 +37,7 @@ def commands(path: Path) -> list[list[str]]:
 
 
 def small(command: list[str]) -> list[str]:
-    """The same command with fewer steps and smaller pictures."""
+    """The same command with fewer steps and smaller images."""
     short: list[str] = []
     rest = iter(command)
     for word in rest:

@@ -66,7 +66,7 @@ window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
   if (hash) Object.assign(mesh.material, { alphaHash: true, transparent: false, depthWrite: true, needsUpdate: true });
   if (sorted) mesh.material.forceSinglePass = true;  // else back faces are drawn before front faces
   const order = mesh.geometry.index.array.slice();
-  const pictures = [];
+  const images = [];
   for (const k of cameras) {
     renderer.setSize(k.width, k.height, false);
     const camera = new THREE.PerspectiveCamera();
@@ -79,9 +79,9 @@ window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
       sortTriangles(mesh.geometry, order, camera.matrixWorldInverse.clone().multiply(mesh.matrixWorld));
     }
     renderer.render(scene, camera);
-    pictures.push(canvas.toDataURL('image/png'));
+    images.push(canvas.toDataURL('image/png'));
   }
-  return pictures;
+  return images;
 };
 window.version = 'three.js r' + THREE.REVISION;
 </script>`;
@@ -104,7 +104,7 @@ window.draw = async (url, cameras, near, far) => {
   mesh.alwaysSelectAsActiveMesh = true;
   await scene.whenReadyAsync();
   const back = mesh.computeWorldMatrix(true).clone().invert();
-  const pictures = [];
+  const images = [];
   for (const k of cameras) {
     // Babylon writes matrices for row vectors: its array of a product reads left to right.
     const matrix = back.multiply(BABYLON.Matrix.FromArray(view(k)));
@@ -112,10 +112,10 @@ window.draw = async (url, cameras, near, far) => {
     camera._computedViewMatrix = matrix;
     camera.freezeProjectionMatrix(BABYLON.Matrix.FromArray(projection(k, near, far)));
     scene.render();
-    pictures.push(canvas.toDataURL('image/png'));
+    images.push(canvas.toDataURL('image/png'));
   }
   engine.dispose();
-  return pictures;
+  return images;
 };
 window.version = 'Babylon.js ' + BABYLON.Engine.Version;
 </script>`;
@@ -151,10 +151,10 @@ for (const [i, job] of jobs.entries()) {
   await page.waitForFunction('window.version');
   console.log(job.viewer + '=' + await page.evaluate('window.version'));
   const cameras = JSON.parse(fs.readFileSync(job.cameras));
-  const pictures = await page.evaluate(
+  const images = await page.evaluate(
     (...args) => window.draw(...args), home + '/glb/' + i, cameras, job.near, job.far, job.hash, Boolean(job.sorted), Boolean(job.antialias));
   fs.mkdirSync(job.out, { recursive: true });
-  pictures.forEach((p, n) => fs.writeFileSync(
+  images.forEach((p, n) => fs.writeFileSync(
     path.join(job.out, n + '.png'), Buffer.from(p.split(',')[1], 'base64')));
   await page.close();
 }

@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("splats", type=Path)
     parser.add_argument("cameras", type=Path)
     parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
-    parser.add_argument("--views", type=int, default=4, help="the first so many cameras")
+    parser.add_argument("--views", type=int, default=4, help="number of cameras, the first ones of the file")
     parser.add_argument("--keep", type=Path, help="keep files and images here")
     args = parser.parse_args()
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         starting_mesh,
     )
     from meshsplats.formats.base_meshes import load_base
+    from meshsplats.formats.cutting import cut_mesh
     from meshsplats.formats.gaussians import load_gaussians, save_gaussians
     from meshsplats.formats.meshes import load_mesh, save_mesh
     from meshsplats.gaussians import GaussianCloud
@@ -71,6 +72,7 @@ _HOME = {
         *("finetune", "make_config", "starting_mesh"),
     ),
     "meshsplats.formats.base_meshes": ("load_base",),
+    "meshsplats.formats.cutting": ("cut_mesh",),
     "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussians"),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh"),
     "meshsplats.gaussians": ("GaussianCloud",),
@@ -112,6 +114,7 @@ __all__ = [
     "bind",
     "compare",
     "convert",
+    "cut_mesh",
     "dome",
     "draw_splats",
     "evaluate",

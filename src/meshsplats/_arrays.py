@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeVar, overload
+
 import numpy as np
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, DTypeLike
 
-def subsample(items, most: int):
+T = TypeVar("T")
+
+
+@overload
+def subsample(items: np.ndarray, most: int) -> np.ndarray: ...
+@overload
+def subsample(items: tuple[T, ...], most: int) -> tuple[T, ...]: ...
+@overload
+def subsample(items: Sequence[T], most: int) -> Sequence[T]: ...
+def subsample(items: Sequence[T] | np.ndarray, most: int) -> Sequence[T] | np.ndarray:
     """Every k-th of ``items``, a sequence or array, with the least k that leaves at most ``most``."""
     return items[:: max(1, -(-len(items) // most))]
 
@@ -15,7 +29,7 @@ def spread_indices(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
-def checked_array(name: str, value, dtype, shape: tuple[int | None, ...]) -> np.ndarray:
+def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[int | None, ...]) -> np.ndarray:
     """``value`` as a C-contiguous array of ``dtype``; ``None`` in ``shape`` admits any length.
 
     An array that already is one is returned itself, after one pass over its values where they are floats.
@@ -33,7 +47,7 @@ def checked_array(name: str, value, dtype, shape: tuple[int | None, ...]) -> np.
     if np.dtype(dtype).kind == "i":
         if given.dtype.kind == "f":
             raise TypeError(f"{name} must hold integers, got dtype {given.dtype}")
-        limits = np.iinfo(dtype)
+        limits = np.iinfo(np.dtype(dtype))
         fits = np.can_cast(given.dtype, dtype)
         if not fits and given.size and (given.min() < limits.min or given.max() > limits.max):
             raise ValueError(

@@ -22,6 +22,23 @@ def rotation_rows(w: Any, x: Any, y: Any, z: Any) -> Iterator[tuple[Any, Any, An
     yield 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
 
 
+def quaternions_of(rotations: np.ndarray) -> np.ndarray:
+    """(n, 4) unit quaternions w, x, y, z of proper rotation matrices (n, 3, 3)."""
+    r = rotations
+    trace = np.trace(r, axis1=1, axis2=2)
+    # 4 q q^T: each row is a multiple of q, and the row with the largest diagonal is the most exact.
+    k = np.empty((len(r), 4, 4))
+    k[:, 0, 0] = 1 + trace
+    for i in range(3):
+        j, m = (i + 1) % 3, (i + 2) % 3
+        k[:, 0, i + 1] = k[:, i + 1, 0] = r[:, m, j] - r[:, j, m]
+        k[:, i + 1, i + 1] = 1 - trace + 2 * r[:, i, i]
+        k[:, i + 1, j + 1] = k[:, j + 1, i + 1] = r[:, i, j] + r[:, j, i]
+    best = np.diagonal(k, axis1=1, axis2=2).argmax(axis=1)
+    q = k[np.arange(len(r)), best]
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
 def direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
     """(3,) unit vector at ``azimuth`` and ``elevation`` in degrees, from a subject outwards.
 

@@ -57,7 +57,7 @@ def check_names(owner: str, given: Iterable[str], known: Collection[str]) -> Non
     """TypeError for the first of the ``given`` names that is not ``known``, with the closest one that is.
 
     Args:
-        owner: what has the options, for the message.
+        owner: name of the owner of the options, for the message.
     """
     for name in given:
         if name not in known:

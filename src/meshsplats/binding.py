@@ -23,7 +23,7 @@ class ArrayField(NamedTuple):
     name: str
     dtype: type[np.generic]
     per: Literal["vertex", "face", "mesh", "base vertex", "base face"]
-    """What each row belongs to; "mesh": the array has no rows."""
+    """The element that each row belongs to; "mesh": the array has no rows."""
     columns: int | None = None
     """Length of a row; None for a single number."""
     optional: bool = False

@@ -76,7 +76,10 @@ class SplatMesh:
         if v and (self.colors.min() < 0 or self.colors.max() > 1):
             low, high = self.colors.min(), self.colors.max()
             raise ValueError(f"colors must lie in [0, 1], got {low:.4g} to {high:.4g}")
-        set_ = lambda name, value: object.__setattr__(self, name, value)  # noqa: E731
+
+        def set_(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
         splat, group = self.face_splat, self.depth_group
         if splat is not None and f and (splat[0] < 0 or (splat[1:] < splat[:-1]).any()):
             raise ValueError("face_splat must be ascending indices >= 0")

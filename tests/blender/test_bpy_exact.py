@@ -16,7 +16,7 @@ from conftest import shared_data
 
 from meshsplats import convert, load_gaussians, orbit, render
 from meshsplats.blender import SceneOptions, draw
-from meshsplats.blender.inside.pictures import read_pixels
+from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.metrics import psnr

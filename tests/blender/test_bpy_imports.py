@@ -13,7 +13,7 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 from _blender_scenes import ball_splats, cameras, random_mesh
 
 from meshsplats import convert, render, save_mesh
-from meshsplats.blender.inside import foreign, frame, meshes, objects, pictures, stage, versions
+from meshsplats.blender.inside import foreign, frame, meshes, objects, rendering, stage, versions
 from meshsplats.colors import srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
 
@@ -77,10 +77,10 @@ def shot(view, path):
         view, "camera", frame.to_blender(np.array(UP)), 100, stage.collection("Cameras")
     )
     stage.even_world((1, 1, 1))
-    pictures.exact_settings(scene, "cycles")
+    rendering.exact_settings(scene, "cycles")
     stage.aim(scene, view, camera)
-    pictures.render_to(scene, path)
-    return np.clip(pictures.read_pixels(path)[..., :3], 0, 1)
+    rendering.render_to(scene, path)
+    return np.clip(rendering.read_pixels(path)[..., :3], 0, 1)
 
 
 @pytest.mark.parametrize(("suffix", "least"), [(".glb", 50), (".ply", 60), (".usda", 60)])

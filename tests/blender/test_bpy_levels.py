@@ -14,7 +14,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, save_mesh
 from meshsplats.blender import LevelMeshes, LightOptions, SceneOptions, draw, subject
-from meshsplats.blender.inside import levels, meshes, objects, pictures, stage, versions
+from meshsplats.blender.inside import levels, meshes, objects, rendering, stage, versions
 from meshsplats.blender.inside import scene as build_scene
 from meshsplats.cameras.trajectories import dome, orbit
 from meshsplats.cli import main
@@ -79,7 +79,7 @@ def test_a_saved_file_shows_the_finest_and_switches_to_the_others(tmp_path, chai
     for i, mesh in enumerate(chain.meshes):
         draw(mesh, views, blend=tmp_path / f"{i}.blend", options=options)
         bpy.ops.wm.open_mainfile(filepath=str(tmp_path / f"{i}.blend"))
-        pictures.render_to(bpy.context.scene, tmp_path / "a.png")
+        rendering.render_to(bpy.context.scene, tmp_path / "a.png")
         alone.append(load_image(tmp_path / "a.png"))
     result = draw(chain, views, blend=tmp_path / "chain.blend", options=options)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "chain.blend"))
@@ -95,7 +95,7 @@ def test_a_saved_file_shows_the_finest_and_switches_to_the_others(tmp_path, chai
         levels.show(found, i)
         assert levels.visible_level(found) == i
         assert visible(scene) == ([names[i]], [names[i]])
-        pictures.render_to(scene, tmp_path / "b.png")
+        rendering.render_to(scene, tmp_path / "b.png")
         off = np.abs(load_image(tmp_path / "b.png").astype(int) - alone[i])
         assert off.max() <= (0 if light is None else 2)
     assert any(np.abs(alone[i].astype(int) - alone[i - 1]).max() > 20 for i in (1, 2)), "levels differ"

@@ -14,7 +14,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import materials, meshes, pictures, scene, stage, versions
+from meshsplats.blender.inside import materials, meshes, rendering, scene, stage, versions
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
@@ -28,8 +28,8 @@ def built(mesh, view, options):
 
 def shot(made, view, path):
     stage.aim(made.scene, view, made.cameras[0])
-    pictures.render_to(made.scene, path)
-    return pictures.read_pixels(path)[..., :3]
+    rendering.render_to(made.scene, path)
+    return rendering.read_pixels(path)[..., :3]
 
 
 def display(values):
@@ -115,10 +115,10 @@ def test_light_follows_the_smoothed_normal_only(tmp_path, tilt, side):
         for way in (-1, 1):
             direction = np.array([way * np.cos(np.radians(height)), 0, np.sin(np.radians(height))])
             sun = stage.add_sun(direction, np.pi, 0, 0.01, home)
-            pictures.lit_settings(bpy.context.scene, "cycles", samples=1, limit=64, bounces=0)
+            rendering.lit_settings(bpy.context.scene, "cycles", samples=1, limit=64, bounces=0)
             stage.aim(bpy.context.scene, view, camera)
-            pictures.render_to(bpy.context.scene, tmp_path / "a.exr")
-            found = pictures.read_pixels(tmp_path / "a.exr")[4, 4, 0]
+            rendering.render_to(bpy.context.scene, tmp_path / "a.exr")
+            found = rendering.read_pixels(tmp_path / "a.exr")[4, 4, 0]
             assert np.isclose(found, 0.5 * direction[2], atol=2e-3)
             bpy.data.objects.remove(sun)
 
@@ -132,15 +132,15 @@ def test_eevee_draws_in_order_and_casts_a_shadow(tmp_path):
     from meshsplats.blender import draw
 
     draw(mesh, [view], images=[tmp_path / "plain.exr"], options=SceneOptions(engine="eevee"))
-    plain = pictures.read_pixels(tmp_path / "plain.exr")[..., :3]
+    plain = rendering.read_pixels(tmp_path / "plain.exr")[..., :3]
     assert psnr(np.clip(plain, 0, 1), render(mesh, view).color) > 30
     light = LightOptions(sun=(100, 40), sky=0.2)
     options = SceneOptions(light=light, engine="eevee", samples=2)
     draw(mesh, [view], images=[tmp_path / "lit.exr"], options=options)
     bare = replace(options, light=replace(light, sun_strength=0.0))
-    lit = pictures.read_pixels(tmp_path / "lit.exr").mean(axis=2)
+    lit = rendering.read_pixels(tmp_path / "lit.exr").mean(axis=2)
     draw(mesh, [view], images=[tmp_path / "bare.exr"], options=bare)
-    dark = pictures.read_pixels(tmp_path / "bare.exr").mean(axis=2)
+    dark = rendering.read_pixels(tmp_path / "bare.exr").mean(axis=2)
     floor = (render(mesh, view).alpha < 0.01) & (np.arange(48) > 30)[:, None]
     sun = (lit - dark)[floor]
     assert sun.max() > 0.2, "the sun shines on the ground"

@@ -17,7 +17,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, orbit, render, save_cameras, save_mesh
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import materials, pictures, scene, stage
+from meshsplats.blender.inside import materials, rendering, scene, stage
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "mitsuba" / "render.py"
 SAMPLES = 48
@@ -57,8 +57,8 @@ def test_mitsuba_and_cycles_agree(tmp_path):
     ground.data.materials[0] = materials.plain("Plain ground", stage.GREY)
     built.scene.cycles.pixel_filter_type = "BOX"
     built.scene.cycles.filter_width = 1.0
-    pictures.render_to(built.scene, tmp_path / "cycles.exr")
-    cycles = coarse(pictures.read_pixels(tmp_path / "cycles.exr")[..., :3])
+    rendering.render_to(built.scene, tmp_path / "cycles.exr")
+    cycles = coarse(rendering.read_pixels(tmp_path / "cycles.exr")[..., :3])
 
     save_mesh(mesh, tmp_path / "mesh.npz")
     save_cameras([view], tmp_path / "camera.json")

@@ -16,7 +16,7 @@ from _blender_scenes import ball_splats, cameras, random_mesh
 
 from meshsplats import convert, save_cameras, save_gaussians, save_mesh
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import meshes, pictures
+from meshsplats.blender.inside import meshes, rendering
 from meshsplats.cli import main
 from meshsplats.images.reading import load_image
 
@@ -44,7 +44,7 @@ def test_unlit_file_renders_the_image_again(tmp_path):
     assert scene.camera.name == "wide"
     assert [marker.camera.name for marker in scene.timeline_markers] == ["wide", "tall"]
     assert (scene.frame_start, scene.frame_end) == (0, 1)
-    pictures.render_to(scene, tmp_path / "again.png")
+    rendering.render_to(scene, tmp_path / "again.png")
     assert (load_image(tmp_path / "again.png") == load_image(targets[0])).all()
 
 

@@ -15,7 +15,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import SplatMesh, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside import objects, pictures, setting, versions
+from meshsplats.blender.inside import objects, rendering, setting, versions
 from meshsplats.blender.options import LIGHTS
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.images.reading import load_image
@@ -131,7 +131,7 @@ def test_values_of_light_do_not_change_with_exposure(tmp_path):
     for exposure in (0.0, 2.0):
         options = SceneOptions(light=LightOptions(exposure=exposure), samples=4)
         draw(mesh, [camera], images=[tmp_path / "a.exr"], options=options)
-        values.append(pictures.read_pixels(tmp_path / "a.exr"))
+        values.append(rendering.read_pixels(tmp_path / "a.exr"))
     np.testing.assert_array_equal(*values)
 
 
@@ -141,11 +141,11 @@ def test_a_truncated_image_is_an_error(tmp_path, monkeypatch, suffix):
     mesh, camera = plate(0.5)
     path = tmp_path / f"a.{suffix}"
     draw(mesh, [camera], images=[path])
-    pictures._check_written(path, 48 * 36)
+    rendering._check_written(path, 48 * 36)
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(OSError, match="wrote no image"):
-        pictures._check_written(path, 48 * 36)
+        rendering._check_written(path, 48 * 36)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 0))
     with pytest.raises(OSError) as caught:
-        pictures._check_written(path, 48 * 36)
+        rendering._check_written(path, 48 * 36)
     assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(path))

@@ -58,6 +58,7 @@ def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
         return {flag(option) for option in names if option not in positional}
 
     whole = printed_help(name, "--help-all", capsys)
+    assert "``" not in whole
     assert flags_in(whole) == flags(every)
     short = printed_help(name, "--help", capsys)
     assert flags_in(short) == flags(common or every)
@@ -65,6 +66,11 @@ def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
     hidden = len(every - common) if common else 0
     assert (f"{hidden} more options: --help-all." in last) == bool(hidden)
     assert ("--config FILE" in last) == kind.CONFIGURABLE
+
+
+def test_help_names_options_by_their_flags(capsys):
+    text = " ".join(printed_help("convert", "--help", capsys).replace("│", " ").split())
+    assert "see --budget. In mode 'flat', unless --sides, --rings, --rim-radius or --center-opacity" in text
 
 
 def test_the_help_of_finetune_fits_a_screen(capsys):

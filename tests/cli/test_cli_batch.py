@@ -43,7 +43,7 @@ def scans(tmp_path, monkeypatch):
     model.mkdir(parents=True)
     save_gaussians(cloud.select(np.arange(20)), model / "point_cloud.ply")
     (folder / "broken.ply").write_bytes((folder / "a.ply").read_bytes()[:700])
-    (folder / "notes.txt").write_text("not looked at")
+    (folder / "notes.txt").write_text("ignored")
     (folder / ".hidden.ply").write_bytes(b"")
     (folder / "empty").mkdir()
     return folder

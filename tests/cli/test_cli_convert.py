@@ -46,10 +46,10 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
     np.testing.assert_array_equal(mesh.faces, expected.faces)
     np.testing.assert_array_equal(mesh.vertices, expected.vertices)
     with Image.open(tmp_path / f"mesh.{suffix}.preview.png") as image:
-        picture = np.asarray(image)
-    assert picture.shape == (800, 800, 3)
-    assert (picture[0] == 255).all()
-    assert picture[200:600, 200:600].mean() < 240
+        pixels = np.asarray(image)
+    assert pixels.shape == (800, 800, 3)
+    assert (pixels[0] == 255).all()
+    assert pixels[200:600, 200:600].mean() < 240
     record = toml.load(tmp_path / f"mesh.{suffix}.config.toml")
     assert record["options"]["preset"] == "paper"
     assert (record["resolved"]["sides"], record["resolved"]["rim_radius"]) == (8, 2.7)
@@ -292,4 +292,17 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
-    assert "--alpha and --compression are for .glb" in capsys.readouterr().err
+    assert "--alpha mask and --compression are for .glb" in capsys.readouterr().err
+
+
+def test_opaque_triangles_in_every_format(splats, tmp_path, capsys):
+    for name in ("m.glb", "m.ply"):
+        out = tmp_path / name
+        assert run(splats, "-o", out, "--alpha", "opaque", "--cutoff", "0.3", "--no-preview") == 0
+        assert (load_mesh(out).colors[:, 3] == 1).all()
+        assert f"{len(load_mesh(out).faces):,} triangles" in capsys.readouterr().out
+    assert run(tmp_path / "m.ply", "-o", tmp_path / "a.npz", "--alpha", "opaque", "--no-preview") == 0
+    assert len(load_mesh(tmp_path / "a.npz").faces) == len(load_mesh(tmp_path / "m.ply").faces)
+    capsys.readouterr()
+    assert run(splats, "-o", tmp_path / "b.glb", "--cutoff", "0.3") == 2
+    assert "--cutoff is for --alpha opaque or mask" in capsys.readouterr().err

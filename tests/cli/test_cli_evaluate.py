@@ -35,9 +35,9 @@ def scene(tmp_path_factory):
     save_cameras(cameras, folder / "cameras.json")
     mesh = convert(cloud, cameras=cameras)
     save_mesh(mesh, folder / "mesh.npz")
-    (folder / "pictures").mkdir()
+    (folder / "rendered").mkdir()
     for camera in cameras:
-        save_image(folder / "pictures" / f"{camera.name}.png", render(mesh, camera).color)
+        save_image(folder / "rendered" / f"{camera.name}.png", render(mesh, camera).color)
     return folder
 
 
@@ -49,8 +49,8 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     out = tmp_path / "out"
     splats = ("--splats", scene / "scene.ply", "--cameras", scene / "cameras.json", "--sh-degree", "0")
     before = ("--before", scene / "mesh.npz")
-    pictures = ("--images", scene / "pictures")
-    options = (*splats, *before, *pictures, "--strips", "2", "--fit-exposure", "--samples", "1", "--json")
+    images = ("--images", scene / "rendered")
+    options = (*splats, *before, *images, "--strips", "2", "--fit-exposure", "--samples", "1", "--json")
     assert run(scene / "mesh.npz", "-o", out, *options) == 0
     printed = json.loads(capsys.readouterr().out)["scenes"][0]
     results = json.loads((out / "results.json").read_text())

@@ -93,8 +93,8 @@ def printed_score(out: str, capsys) -> tuple[float, float]:
 def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_path, capsys, options):
     cloud = make_scene(300)
     cameras = orbit(cloud, 9, width=64, height=64)
-    pictures = [render_splats(cloud, c, background=(0.2, 0.5, 0.7)).color for c in cameras]
-    data = write_photographs(tmp_path / "photos here", cameras, pictures)
+    images = [render_splats(cloud, c, background=(0.2, 0.5, 0.7)).color for c in cameras]
+    data = write_photographs(tmp_path / "photos here", cameras, images)
     out = tmp_path / "tuned.npz"
     assert run(splats, "--data", data, "-o", out, "--steps", "4", *options) == 0
     printed, scored = printed_score(capsys.readouterr().out, capsys)
@@ -129,7 +129,7 @@ def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):
     out = tmp_path / "part.npz"
     assert run(splats, "-o", out, *SMALL, "--steps", "20", "--json", *box) == 0
     scores = json.loads(capsys.readouterr().out)["held_out_psnr"]
-    assert min(scores.values()) > 20  # the whole scene's pictures give 8
+    assert min(scores.values()) > 20  # the whole scene's images give 8
     assert (load_mesh(out).vertices[:, 0] > middle[0] - 1).all()
     camera = orbit(cloud, 1, width=24, height=16)[0]
     data = write_photographs(tmp_path / "photos", [camera], [render_splats(cloud, camera).color])

@@ -212,8 +212,8 @@ def test_info_on_data_sets(tmp_path, capsys):
     assert printed(colmap)["split"] == "the data set's own"
 
     cameras = orbit(make_scene(200), 3, width=16, height=16)
-    pictures = [np.concatenate([np.zeros((16, 16, 3)), np.full((16, 16, 1), 0.5)], axis=2)] * 3
-    folder = write_photographs(tmp_path / "studio", cameras, pictures)
+    images = [np.concatenate([np.zeros((16, 16, 3)), np.full((16, 16, 1), 0.5)], axis=2)] * 3
+    folder = write_photographs(tmp_path / "studio", cameras, images)
     for path in (folder, folder / "transforms.json"):
         found = printed(path)
         assert (found["layout"], found["with_alpha"], found["with_masks"]) == ("nerfstudio", 3, 0)

@@ -50,7 +50,7 @@ def run(*arguments) -> int:
     return main(["render", *map(str, arguments)])
 
 
-def picture(path) -> np.ndarray:
+def pixels(path) -> np.ndarray:
     with Image.open(path) as image:
         return np.asarray(image)
 
@@ -58,7 +58,7 @@ def picture(path) -> np.ndarray:
 def test_one_picture_of_a_mesh(triangle, tmp_path, capsys):
     out = tmp_path / "a.png"
     assert run(triangle, "-o", out, "--cameras", tmp_path / "one.json", "--background", "0,0,1") == 0
-    np.testing.assert_array_equal(picture(out), np.full((8, 12, 3), (128, 0, 128)))
+    np.testing.assert_array_equal(pixels(out), np.full((8, 12, 3), (128, 0, 128)))
     assert "1 image of 12 x 8" in capsys.readouterr().out
     config = toml.load(tmp_path / "a.png.config.toml")
     assert config["command"] == "render"
@@ -81,21 +81,21 @@ def test_linear_meshes_are_blended_in_linear_light_and_encoded(triangle, tmp_pat
     out = tmp_path / "a.png"
     assert run(tmp_path / "l.npz", "-o", out, *places, "--background", "0,0,1") == 0
     # Half of red 0.5 and half of blue 1: linear light 0.25 and 0.5, which sRGB encodes as 0.5371 and 0.7354.
-    np.testing.assert_array_equal(picture(out), np.full((8, 12, 3), (137, 0, 188)))
+    np.testing.assert_array_equal(pixels(out), np.full((8, 12, 3), (137, 0, 188)))
     assert run(tmp_path / "l.npz", "-o", tmp_path / "t.png", *places, "--transparent") == 0
-    np.testing.assert_array_equal(picture(tmp_path / "t.png"), np.full((8, 12, 4), (188, 0, 0, 128)))
+    np.testing.assert_array_equal(pixels(tmp_path / "t.png"), np.full((8, 12, 4), (188, 0, 0, 128)))
 
 
 def test_transparent_and_depth(triangle, tmp_path):
     out = tmp_path / "a.png"
     cameras = ("--cameras", tmp_path / "one.json", "--width", "24")
     assert run(triangle, "-o", out, *cameras, "--transparent", "--depth", "npy") == 0
-    np.testing.assert_array_equal(picture(out), np.full((16, 24, 4), (255, 0, 0, 128)))
+    np.testing.assert_array_equal(pixels(out), np.full((16, 24, 4), (255, 0, 0, 128)))
     depth = np.load(tmp_path / "a.depth.npy", allow_pickle=False)
     np.testing.assert_allclose(depth, np.full((16, 24), 4.0), rtol=1e-5)
     assert run(triangle, "-o", out, *cameras, "--transparent", "--depth", "png", "--force") == 0
     unit = toml.load(tmp_path / "a.png.config.toml")["result"]["depth_unit"]
-    np.testing.assert_allclose(picture(tmp_path / "a.depth.png") * unit, np.full((16, 24), 4.0), atol=unit)
+    np.testing.assert_allclose(pixels(tmp_path / "a.depth.png") * unit, np.full((16, 24), 4.0), atol=unit)
 
 
 def test_orbit_of_splats(splats, tmp_path, capsys):
@@ -104,20 +104,20 @@ def test_orbit_of_splats(splats, tmp_path, capsys):
     size = ("--width", "20", "--height", "16", "--elevation", "30", "--up", "-z", "--samples", "1")
     assert run(splats, "-o", out, "--as-splats", "--orbit", "3", *size, "--sh-degree", "0", "--json") == 0
     result = json.loads(capsys.readouterr().out)
-    pictures = [f"view_000{i}.png" for i in range(3)]
+    views = [f"view_000{i}.png" for i in range(3)]
     assert sorted(p.name for p in out.iterdir()) == [
         "cameras.json",
         "config.toml",
         "turntable.webp",
-        *pictures,
+        *views,
     ]
-    assert result["images"] == [str(out / name) for name in pictures]
+    assert result["images"] == [str(out / name) for name in views]
     cloud = load_gaussians(splats)
     expected = orbit(cloud, 3, elevation=30, up=(0, 0, -1), width=20, height=16)
-    for name, camera, wanted in zip(pictures, load_cameras(out / "cameras.json"), expected, strict=True):
+    for name, camera, wanted in zip(views, load_cameras(out / "cameras.json"), expected, strict=True):
         np.testing.assert_array_equal(camera.world_to_camera, wanted.world_to_camera)
         drawn = render_splats(cloud, camera, sh_degree=0)
-        np.testing.assert_array_equal(picture(out / name), to_bytes(drawn.color))
+        np.testing.assert_array_equal(pixels(out / name), to_bytes(drawn.color))
     with Image.open(out / "turntable.webp") as image:
         assert (image.n_frames, image.size) == (3, (20, 16))
 
@@ -139,7 +139,7 @@ def test_splats_become_a_mesh_unless_asked(splats, tmp_path):
     assert run(splats, "-o", tmp_path / "a.png", "--width", "20", "--samples", "1") == 0
     (camera,) = load_cameras(tmp_path / "a.png.cameras.json")
     drawn = render(convert(load_gaussians(splats)), camera)
-    np.testing.assert_array_equal(picture(tmp_path / "a.png"), to_bytes(drawn.color))
+    np.testing.assert_array_equal(pixels(tmp_path / "a.png"), to_bytes(drawn.color))
 
 
 @pytest.mark.parametrize(
@@ -265,3 +265,25 @@ def test_aim_and_lens(splats, tmp_path):
     for mistake in (["--fov", "30"], ["--look-around", "3"]):
         assert run(splats, "-o", tmp_path / "b", *aimed, *mistake) == 2
     assert run(splats, "-o", tmp_path / "b.png", "--focal-length", 0) == 1
+
+
+def test_a_cutoff_draws_solid_triangles_or_none(triangle, tmp_path):
+    out = tmp_path / "a.png"
+    options = ("--cameras", tmp_path / "one.json", "--background", "0,0,1", "--force")
+    assert run(triangle, "-o", out, "--cutoff", "0.5", *options) == 0
+    assert (pixels(out) == (255, 0, 0)).all()
+    assert run(triangle, "-o", out, "--cutoff", "0.6", *options) == 0
+    assert (pixels(out) == (0, 0, 255)).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--cutoff", "1.5"), "cutoff must be an opacity from 0 to 1"),
+        (("--cutoff", "0.5", "--max-layers", "3"), "--max-layers has no effect with --cutoff"),
+        (("--cutoff", "0.5", "--as-splats"), "--cutoff is for a mesh"),
+    ],
+)
+def test_a_cutoff_that_says_nothing_is_refused(splats, tmp_path, capsys, options, message):
+    assert run(splats, "-o", tmp_path / "a.png", *options) != 0
+    assert message in capsys.readouterr().err

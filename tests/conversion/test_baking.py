@@ -127,6 +127,6 @@ def test_blender_gets_it_baked(tmp_path, monkeypatch):
     monkeypatch.setattr(launch, "command", lambda executable: [])
     monkeypatch.setattr(launch, "run_job", lambda arrays, *_, **__: jobs.append(arrays) or {})
     blender.draw(mesh, [view], images=[tmp_path / "p.png"])
-    np.testing.assert_array_equal(jobs[0][0]["vertices"], bake_filter(mesh, [view]).vertices)
+    np.testing.assert_array_equal(jobs[0][0][0]["vertices"], bake_filter(mesh, [view]).vertices)
     with pytest.warns(DataWarning, match="bake_filter"):
         save_mesh(mesh, tmp_path / "m.glb")

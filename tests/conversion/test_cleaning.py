@@ -15,7 +15,7 @@ from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
 from meshsplats.conversion import convert
-from meshsplats.conversion.cleaning import CleaningRules, cropped, find, take_away
+from meshsplats.conversion.cleaning import CleaningRules, cropped, find, remove
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.gaussians import GaussianCloud
@@ -60,7 +60,7 @@ def test_floaters_go_and_the_rest_stays():
     counts = found.counts()
     assert counts["all"]["splats"] == 17
     assert counts["all"]["opacity"] == pytest.approx(17 / 2017)
-    assert len(take_away(cloud, found)) == 2000
+    assert len(remove(cloud, found)) == 2000
 
 
 def test_the_mesh_of_the_splats_loses_the_same():
@@ -68,7 +68,7 @@ def test_the_mesh_of_the_splats_loses_the_same():
     mesh = convert(cloud)
     found = find(mesh)
     np.testing.assert_array_equal(found.kept, subject)
-    left = take_away(mesh, found)
+    left = remove(mesh, found)
     np.testing.assert_array_equal(np.unique(left.face_splat), np.flatnonzero(subject))
     assert left.vertices[:, 2].max() < 0.5
 
@@ -78,7 +78,7 @@ def test_a_mesh_without_splats_counts_triangles():
     mesh = replace(convert(cloud, mode="flat"), face_splat=None)
     found = find(mesh, CleaningRules(max_distance=1.5))
     assert len(found.opacities) == len(mesh.faces)
-    assert abs(take_away(mesh, found).vertices[:, 2]).max() < 1.6
+    assert abs(remove(mesh, found).vertices[:, 2]).max() < 1.6
 
 
 def test_each_rule_by_itself():
@@ -211,12 +211,12 @@ def test_the_command_on_a_mesh_in_json(tmp_path, capsys):
     save_mesh(convert(scene()[0]), tmp_path / "scene.npz")
     arguments = ["clean", str(tmp_path / "scene.npz"), "-o", str(tmp_path / "clean.glb"), "--json"]
     assert main([*arguments, "--max-distance", "1.8", "--preview-only"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["output"] is None
+    result = json.loads(capsys.readouterr().out)
+    assert result["output"] is None
     assert not (tmp_path / "clean.glb").exists()
     assert main([*arguments, "--max-distance", "1.8", "--force"]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["removed"] == told["removed"]
+    assert again["removed"] == result["removed"]
     mesh = load_mesh(tmp_path / "clean.glb")
     assert len(np.unique(mesh.face_splat)) == again["kept"] < 2017
     np.testing.assert_allclose(again["upper"], mesh.vertices.max(axis=0), atol=1e-3)

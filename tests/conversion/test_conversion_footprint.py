@@ -221,8 +221,8 @@ class TestFraming:
             cloud, module.FRAMING_VIEWS, width=module.FRAMING_PIXELS, height=module.FRAMING_PIXELS
         )
         framed = reaches(convert(cloud, footprint_px2=1, **FLAT), cloud)
-        told = reaches(convert(cloud, footprint_px2=1, cameras=cameras, **FLAT), cloud)
-        np.testing.assert_allclose(framed, told, rtol=1e-5)
+        given = reaches(convert(cloud, footprint_px2=1, cameras=cameras, **FLAT), cloud)
+        np.testing.assert_allclose(framed, given, rtol=1e-5)
         # 16 units on 1000 pixels, and some room round them.
         assert 0.016 < np.median(framed) < 0.04
 

@@ -21,18 +21,18 @@ from meshsplats.finetuning.losses import l1, photometric_loss, ssim  # noqa: E40
 def pair(seed: int, *shape: int, white: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
     """An image and a noisy version, with equal pixels and a white part whose variance is small."""
     rng = np.random.default_rng(seed)
-    truth = rng.random(shape)
+    target = rng.random(shape)
     rows = shape[-3]
     if white:
-        truth[..., rows // 2 :, :, :] = 1 - 0.01 * truth[..., rows // 2 :, :, :]
-    picture = np.clip(truth + rng.normal(0, 0.1, shape), 0, 1)
-    picture[..., : rows // 4, :, :] = truth[..., : rows // 4, :, :]
-    return torch.tensor(picture, dtype=torch.float32), torch.tensor(truth, dtype=torch.float32)
+        target[..., rows // 2 :, :, :] = 1 - 0.01 * target[..., rows // 2 :, :, :]
+    image = np.clip(target + rng.normal(0, 0.1, shape), 0, 1)
+    image[..., : rows // 4, :, :] = target[..., : rows // 4, :, :]
+    return torch.tensor(image, dtype=torch.float32), torch.tensor(target, dtype=torch.float32)
 
 
-def twin_sums(picture, truth, mask=None):
+def twin_sums(image, target, mask=None):
     """Sums of |x - y| and of SSIM by their definitions, in the precision of the arguments; (b, h, w, c)."""
-    x, y = picture.permute(0, 3, 1, 2), truth.permute(0, 3, 1, 2)
+    x, y = image.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2)
     inside = torch.ones_like(x[:, :1]) if mask is None else mask[:, None].to(x.dtype)
     x, y = x * inside, y * inside
     line = torch.exp(-0.5 * (torch.arange(-5, 6, dtype=x.dtype) / 1.5) ** 2)
@@ -48,10 +48,10 @@ def twin_sums(picture, truth, mask=None):
     return (x - y).abs().sum(), (values * inside).sum()
 
 
-def twin(name, picture, truth, mask=None):
-    absolute, similarity = twin_sums(picture, truth, mask)
-    pixels = picture[..., 0].numel() if mask is None else int(mask.sum())
-    count = pixels * picture.shape[-1]
+def twin(name, image, target, mask=None):
+    absolute, similarity = twin_sums(image, target, mask)
+    pixels = image[..., 0].numel() if mask is None else int(mask.sum())
+    count = pixels * image.shape[-1]
     if name == "l1":
         return absolute / count
     if name == "ssim":
@@ -75,17 +75,17 @@ def relative(a, b) -> float:
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("name", LOSSES)
 def test_value_and_gradients_are_those_of_the_twin(name, shape, masked, white, tolerance):
-    picture, truth = pair(len(shape) + shape[1], *shape, white=white)
+    image, target = pair(len(shape) + shape[1], *shape, white=white)
     if shape[1:3] == (1, 1):
-        picture = picture * 0.5
+        image = image * 0.5
     mask = torch.rand(shape[:3], generator=torch.Generator().manual_seed(0)) < 0.7
     mask[:, 0, 0] = True
     mask = mask if masked else None
-    x, y = picture.clone().requires_grad_(), truth.clone().requires_grad_()
+    x, y = image.clone().requires_grad_(), target.clone().requires_grad_()
     value = LOSSES[name](x, y, mask=mask)
     cotangent = torch.tensor(-1.7)
     value.backward(cotangent)
-    x64, y64 = picture.double().requires_grad_(), truth.double().requires_grad_()
+    x64, y64 = image.double().requires_grad_(), target.double().requires_grad_()
     expected = twin(name, x64, y64, mask)
     expected.backward(cotangent.double())
     assert value.dtype == torch.float32
@@ -99,76 +99,76 @@ def test_value_and_gradients_are_those_of_the_twin(name, shape, masked, white, t
 
 
 def test_the_twin_has_the_gradient_of_its_value():
-    picture, truth = (t.double() for t in pair(3, 1, 6, 7, 2))
+    image, target = (t.double() for t in pair(3, 1, 6, 7, 2))
     mask = torch.rand(1, 6, 7, generator=torch.Generator().manual_seed(1)) < 0.8
-    picture += 0.01  # away from equal values, where |x - y| has no derivative
+    image += 0.01  # away from equal values, where |x - y| has no derivative
     for name in LOSSES:
         assert torch.autograd.gradcheck(
             lambda x, y, name=name: twin(name, x, y, mask),
-            (picture.clone().requires_grad_(), truth.clone().requires_grad_()),
+            (image.clone().requires_grad_(), target.clone().requires_grad_()),
             fast_mode=True,
         )
 
 
 def test_finite_differences_of_the_kernel():
     # Large enough steps for float32, small enough for a curve: one part in a hundred.
-    picture, truth = pair(4, 30, 30, 3)
-    x = picture.clone().requires_grad_()
-    ssim(x, truth).backward()
-    direction = torch.randn(picture.shape, generator=torch.Generator().manual_seed(2))
-    ends = [ssim(picture + step * direction, truth).item() for step in (1e-3, -1e-3)]
+    image, target = pair(4, 30, 30, 3)
+    x = image.clone().requires_grad_()
+    ssim(x, target).backward()
+    direction = torch.randn(image.shape, generator=torch.Generator().manual_seed(2))
+    ends = [ssim(image + step * direction, target).item() for step in (1e-3, -1e-3)]
     assert (ends[0] - ends[1]) / 2e-3 == pytest.approx((x.grad * direction).sum().item(), rel=1e-2)
 
 
 @pytest.mark.parametrize("shape", [(40, 50, 3), (200, 300, 3), (5, 9, 1)])
 def test_ssim_is_the_metric(shape):
-    picture, truth = pair(5, *shape)
-    expected = metrics.ssim(picture.numpy(), truth.numpy(), convention="3dgs")
-    assert ssim(picture, truth).item() == pytest.approx(expected, abs=2e-7)
-    nearly = truth + (picture - truth) * 1e-3
-    expected = metrics.ssim(nearly.numpy(), truth.numpy(), convention="3dgs")
+    image, target = pair(5, *shape)
+    expected = metrics.ssim(image.numpy(), target.numpy(), convention="3dgs")
+    assert ssim(image, target).item() == pytest.approx(expected, abs=2e-7)
+    nearly = target + (image - target) * 1e-3
+    expected = metrics.ssim(nearly.numpy(), target.numpy(), convention="3dgs")
     # Better than the last digit of 1: errors are relative to 1 - SSIM.
-    assert 1 - ssim(nearly, truth).item() == pytest.approx(1 - expected, abs=6e-8)
+    assert 1 - ssim(nearly, target).item() == pytest.approx(1 - expected, abs=6e-8)
 
 
 def test_l1_and_the_loss_by_hand():
-    picture, truth = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
-    picture[0, 1, 2], picture[1, 0, 0] = 0.5, -0.25
-    picture.requires_grad_()
-    value = l1(picture, truth)
+    image, target = torch.zeros(2, 2, 3), torch.zeros(2, 2, 3)
+    image[0, 1, 2], image[1, 0, 0] = 0.5, -0.25
+    image.requires_grad_()
+    value = l1(image, target)
     assert value.item() == pytest.approx(0.75 / 12, abs=1e-9)
     value.backward()
     expected = torch.zeros(2, 2, 3)
     expected[0, 1, 2], expected[1, 0, 0] = 1 / 12, -1 / 12
-    assert torch.equal(picture.grad, expected)
+    assert torch.equal(image.grad, expected)
     for weight in (0, 0.2, 1):
-        mixed = photometric_loss(picture, truth, ssim_weight=weight).item()
-        parts = (1 - weight) * value.item() + weight * (1 - ssim(picture, truth).item())
+        mixed = photometric_loss(image, target, ssim_weight=weight).item()
+        parts = (1 - weight) * value.item() + weight * (1 - ssim(image, target).item())
         assert mixed == pytest.approx(parts, abs=1e-7)
-    assert photometric_loss(picture, truth).item() == pytest.approx(
-        0.6 * value.item() + 0.4 * (1 - ssim(picture, truth).item()), abs=1e-7
+    assert photometric_loss(image, target).item() == pytest.approx(
+        0.6 * value.item() + 0.4 * (1 - ssim(image, target).item()), abs=1e-7
     )
 
 
 @settings(max_examples=15)
 @given(seed=st.integers(0, 1000), height=st.integers(1, 30), width=st.integers(1, 30))
 def test_laws(seed, height, width):
-    picture, truth = pair(seed, height, width, 3)
-    assert ssim(truth, truth).item() == 1
-    assert photometric_loss(truth, truth).item() == 0
-    assert ssim(picture, truth).item() == ssim(truth, picture).item()
+    image, target = pair(seed, height, width, 3)
+    assert ssim(target, target).item() == 1
+    assert photometric_loss(target, target).item() == 0
+    assert ssim(image, target).item() == ssim(target, image).item()
     for turned in (
         lambda t: t.flip(0),
         lambda t: t.flip(1),
         lambda t: t.transpose(0, 1),
         lambda t: t.flip(2),
     ):
-        assert ssim(turned(picture), turned(truth)).item() == pytest.approx(
-            ssim(picture, truth).item(), abs=3e-7
+        assert ssim(turned(image), turned(target)).item() == pytest.approx(
+            ssim(image, target).item(), abs=3e-7
         )
-    equal = truth.clone().requires_grad_()
-    photometric_loss(equal, truth).backward()
-    assert torch.equal(equal.grad, torch.zeros_like(truth))
+    equal = target.clone().requires_grad_()
+    photometric_loss(equal, target).backward()
+    assert torch.equal(equal.grad, torch.zeros_like(target))
 
 
 @settings(max_examples=15)
@@ -180,12 +180,12 @@ def test_laws(seed, height, width):
     width=st.integers(1, 20),
 )
 def test_a_rectangular_mask_crops(seed, top, left, height, width):
-    picture, truth = pair(seed, 40, 40, 3)
+    image, target = pair(seed, 40, 40, 3)
     window = (slice(top, top + height), slice(left, left + width))
     mask = torch.zeros(40, 40, dtype=torch.bool)
     mask[window] = True
-    x, cropped = picture.clone().requires_grad_(), picture[window].clone().requires_grad_()
-    value, expected = photometric_loss(x, truth, mask=mask), photometric_loss(cropped, truth[window])
+    x, cropped = image.clone().requires_grad_(), image[window].clone().requires_grad_()
+    value, expected = photometric_loss(x, target, mask=mask), photometric_loss(cropped, target[window])
     assert value.item() == pytest.approx(expected.item(), abs=1e-7)
     value.backward()
     expected.backward()
@@ -194,11 +194,11 @@ def test_a_rectangular_mask_crops(seed, top, left, height, width):
 
 
 def test_values_under_the_mask_do_not_matter():
-    picture, truth = pair(6, 2, 30, 40, 3)
+    image, target = pair(6, 2, 30, 40, 3)
     mask = torch.rand(2, 30, 40, generator=torch.Generator().manual_seed(3)) < 0.6
     results = []
     for filler in (0.3, float("nan"), float("inf")):
-        x, y = picture.clone(), truth.clone()
+        x, y = image.clone(), target.clone()
         x[~mask], y[~mask] = filler, -filler
         x.requires_grad_(), y.requires_grad_()
         value = photometric_loss(x, y, mask=mask)
@@ -213,30 +213,30 @@ def test_values_under_the_mask_do_not_matter():
 
 
 def test_a_batch_is_the_mean_of_its_images():
-    picture, truth = pair(7, 3, 25, 31, 3)
-    x = picture.clone().requires_grad_()
-    value = photometric_loss(x, truth)
+    image, target = pair(7, 3, 25, 31, 3)
+    x = image.clone().requires_grad_()
+    value = photometric_loss(x, target)
     value.backward()
-    singles = [p.clone().requires_grad_() for p in picture]
-    values = [photometric_loss(p, t) for p, t in zip(singles, truth, strict=True)]
+    singles = [p.clone().requires_grad_() for p in image]
+    values = [photometric_loss(p, t) for p, t in zip(singles, target, strict=True)]
     (sum(values) / 3).backward()
     assert value.item() == pytest.approx(sum(v.item() for v in values) / 3, abs=1e-7)
     assert torch.allclose(x.grad, torch.stack([p.grad for p in singles]), rtol=1e-5, atol=1e-9)
     # With masks, each pixel that counts weighs the same.
     mask = torch.zeros(3, 25, 31, dtype=torch.bool)
     mask[0, :5], mask[1, :20] = True, True
-    parts = [l1(picture[i], truth[i], mask=mask[i]).item() for i in range(2)]
-    assert l1(picture, truth, mask=mask).item() == pytest.approx((parts[0] + 4 * parts[1]) / 5, abs=1e-7)
+    parts = [l1(image[i], target[i], mask=mask[i]).item() for i in range(2)]
+    assert l1(image, target, mask=mask).item() == pytest.approx((parts[0] + 4 * parts[1]) / 5, abs=1e-7)
 
 
 def digest(threads: int | None) -> str:
     total = hashlib.sha256()
     for shape in ((2, 300, 290, 3), (1, 17, 19, 1)):
-        picture, truth = pair(8, *shape)
+        image, target = pair(8, *shape)
         mask = torch.rand(shape[:3], generator=torch.Generator().manual_seed(4)) < 0.9
         for given_mask in (None, mask):
-            x = picture.clone().requires_grad_()
-            value = photometric_loss(x, truth, mask=given_mask, threads=threads)
+            x = image.clone().requires_grad_()
+            value = photometric_loss(x, target, mask=given_mask, threads=threads)
             value.backward()
             total.update(value.detach().numpy().tobytes() + x.grad.numpy().tobytes())
     return total.hexdigest()
@@ -256,25 +256,25 @@ def test_threads_and_variants_do_not_change_a_bit():
 
 
 def test_gradients_as_torch_needs_them():
-    picture, truth = pair(9, 20, 20, 3)
+    image, target = pair(9, 20, 20, 3)
     with torch.no_grad():
-        assert not ssim(picture.clone().requires_grad_(), truth).requires_grad
-    assert not ssim(picture, truth).requires_grad
+        assert not ssim(image.clone().requires_grad_(), target).requires_grad
+    assert not ssim(image, target).requires_grad
     # Twice through one graph: gradients add up and what is kept is not changed.
-    x = picture.clone().requires_grad_()
-    value = ssim(x, truth)
+    x = image.clone().requires_grad_()
+    value = ssim(x, target)
     value.backward(retain_graph=True)
     once = x.grad.clone()
     x.grad *= 3
     value.backward()
     assert torch.allclose(x.grad, 4 * once)
     # An image that is a view with other strides, and part of a longer computation.
-    wide = picture.permute(2, 0, 1).contiguous().requires_grad_()
-    (2 * ssim(wide.permute(1, 2, 0), truth)).backward()
+    wide = image.permute(2, 0, 1).contiguous().requires_grad_()
+    (2 * ssim(wide.permute(1, 2, 0), target)).backward()
     assert torch.allclose(wide.grad.permute(1, 2, 0), 2 * once)
-    x = picture.clone().requires_grad_()
+    x = image.clone().requires_grad_()
     with pytest.raises(RuntimeError, match="no second derivative"):
-        torch.autograd.grad(ssim(x, truth), x, create_graph=True)
+        torch.autograd.grad(ssim(x, target), x, create_graph=True)
 
 
 def test_gradients_are_made_only_where_they_are_wanted(monkeypatch):
@@ -285,21 +285,21 @@ def test_gradients_are_made_only_where_they_are_wanted(monkeypatch):
         return compare_images(*arrays, gradient=gradient, **options)
 
     monkeypatch.setattr(losses, "compare_images", spy)
-    picture, truth = pair(9, 20, 20, 3)
-    x = picture.clone().requires_grad_()
+    image, target = pair(9, 20, 20, 3)
+    x = image.clone().requires_grad_()
     with torch.no_grad():
-        ssim(x, truth)
-    ssim(picture, truth)
+        ssim(x, target)
+    ssim(image, target)
     assert made == [False, False]
-    ssim(x, truth)
+    ssim(x, target)
     assert made == [False, False, True]
 
 
 def test_not_a_number_is_not_hidden():
-    picture, truth = pair(10, 20, 20, 3)
-    picture[3, 4, 1] = float("nan")
+    image, target = pair(10, 20, 20, 3)
+    image[3, 4, 1] = float("nan")
     for loss in LOSSES.values():
-        assert np.isnan(loss(picture, truth).item())
+        assert np.isnan(loss(image, target).item())
 
 
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES.keys())

@@ -171,7 +171,7 @@ def png_claiming(width: int, height: int) -> bytes:
     ("content", "message"),
     [
         (b"", "not an image of a known format"),
-        (b"no picture", "not an image of a known format"),
+        (b"no image", "not an image of a known format"),
         (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not an image of a known format"),
         (png_claiming(9_000, 8_000), "9000 x 8000 pixels; up to 67,108,864 pixels"),
         (png_claiming(60_000, 40_000), "not an image of a known format|up to 67,108,864 pixels"),

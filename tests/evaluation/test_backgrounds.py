@@ -19,10 +19,10 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import find_background, model_background, warn_of_other_worlds
 from meshsplats.evaluation.metrics import psnr
-from meshsplats.evaluation.report import image_of
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.rendering import render_splats
+from meshsplats.rendering.looks import image_of
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -37,10 +37,10 @@ def photographs(scene, color, count=3) -> Dataset:
     views = []
     for camera in orbit(scene, count, width=32, height=32):
         if hasattr(scene, "faces"):
-            picture = image_of(scene, camera, color)[0]
+            image = image_of(scene, camera, color)[0]
         else:
-            picture = render_splats(scene, camera, background=color).color
-        views.append(View(camera, ViewImage(np.clip(picture, 0, 1).astype(np.float32))))
+            image = render_splats(scene, camera, background=color).color
+        views.append(View(camera, ViewImage(np.clip(image, 0, 1).astype(np.float32))))
     return Dataset(tuple(views))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
-from meshsplats.evaluation.comparison import Comparison, ViewScore, compare, compare_views
+from meshsplats.evaluation.comparison import Comparison, ViewSimilarity, compare, compare_views
 from meshsplats.evaluation.metrics import ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -75,7 +75,7 @@ def test_options_reach_the_images():
 
 def test_equal_images_in_json():
     """JSON has no infinity; a mean over views of which one is perfect has no figure either."""
-    result = Comparison((ViewScore("a", float("inf"), 1.0), ViewScore("b", 30.0, 0.5)))
+    result = Comparison((ViewSimilarity("a", float("inf"), 1.0), ViewSimilarity("b", 30.0, 0.5)))
     assert json.loads(json.dumps(result.to_dict(), allow_nan=False)) == {
         "views": [{"name": "a", "psnr": None, "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.5}],
         "mean": {"psnr": None, "ssim": 0.75},

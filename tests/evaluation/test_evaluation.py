@@ -45,8 +45,8 @@ def quad(color, *, half=0.5, blending="display") -> SplatMesh:
 
 def view(color, alpha=None, mask=None, camera=CAMERA, background=(1.0, 1.0, 1.0)) -> View:
     shape = (camera.height, camera.width)
-    picture = np.broadcast_to(np.asarray(color, np.float32), (*shape, 3)).copy()
-    return View(camera, ViewImage(picture, alpha, mask), background)
+    image = np.broadcast_to(np.asarray(color, np.float32), (*shape, 3)).copy()
+    return View(camera, ViewImage(image, alpha, mask), background)
 
 
 def test_psnr_by_hand_and_on_the_views_background():
@@ -100,14 +100,14 @@ def test_floaters_are_counted_away_from_the_subject():
 
 def test_exposure_fit_undoes_gain_and_offset():
     rng = np.random.default_rng(1)
-    picture = rng.random((12, 9, 3)).astype(np.float32)
-    truth = picture * np.array([0.5, 0.7, 0.6], np.float32) + np.array([0.1, 0.2, 0.3], np.float32)
-    assert psnr(fit_exposure_to(picture, truth, None), truth) > 100
+    image = rng.random((12, 9, 3)).astype(np.float32)
+    truth = image * np.array([0.5, 0.7, 0.6], np.float32) + np.array([0.1, 0.2, 0.3], np.float32)
+    assert psnr(fit_exposure_to(image, truth, None), truth) > 100
     spoilt = truth.copy()
     spoilt[:6] = 0
     mask = np.zeros((12, 9), bool)
     mask[6:] = True
-    assert psnr(fit_exposure_to(picture, spoilt, mask), spoilt, mask=mask) > 100
+    assert psnr(fit_exposure_to(image, spoilt, mask), spoilt, mask=mask) > 100
     flat = np.full((4, 4, 3), 0.5, np.float32)
     assert np.allclose(fit_exposure_to(flat, flat * 0.5, None), 0.25)
 

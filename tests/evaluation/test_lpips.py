@@ -88,7 +88,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def pictures(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def image_pair(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(3)
     a = rng.random((height, width, 3)).astype(np.float32)
     return a, np.clip(a + rng.normal(0, 0.2, a.shape), 0, 1).astype(np.float32)
@@ -99,8 +99,8 @@ def by_formula(network: str, a: np.ndarray, b: np.ndarray) -> float:
     shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
     layers, weights = backbone(network).double().features, list(heads(network).values())
     maps = []
-    for picture in (a, b):
-        x = ((picture.astype(np.float64) * 2 - 1) - shift) / scale
+    for image in (a, b):
+        x = ((image.astype(np.float64) * 2 - 1) - shift) / scale
         x = torch.from_numpy(x).permute(2, 0, 1)[None]
         taken = []
         with torch.no_grad():
@@ -119,7 +119,7 @@ def by_formula(network: str, a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("size", [(31, 47), (64, 50)])
 @pytest.mark.parametrize("network", NETWORKS)
 def test_it_is_the_formula(folder, network, size):
-    a, b = pictures(*size)
+    a, b = image_pair(*size)
     distance = load_lpips(folder, network=network)
     expected = by_formula(network, a, b)
     assert expected > 0.01
@@ -146,7 +146,7 @@ def test_it_is_the_package_lpips(folder, network, monkeypatch, tmp_path):
     package = pytest.importorskip("lpips", reason="compared with the package lpips: pip install lpips")
     torch.save(heads(network), tmp_path / "heads.pth")
     model = package.LPIPS(net=network, model_path=str(tmp_path / "heads.pth"), verbose=False)
-    a, b = pictures(64, 70)
+    a, b = image_pair(64, 70)
     batch = [torch.from_numpy(p).permute(2, 0, 1)[None] for p in (a, b)]
     with torch.no_grad():
         expected = model(*batch, normalize=True).item()
@@ -158,7 +158,7 @@ def test_it_is_the_package_lpips(folder, network, monkeypatch, tmp_path):
 
 def test_files_can_be_named_and_be_safetensors(folder, tmp_path):
     safetensors = pytest.importorskip("safetensors.torch", reason="about safetensors files")
-    a, b = pictures(40, 40)
+    a, b = image_pair(40, 40)
     expected = load_lpips(folder, network="alex")(a, b)
     first, second = (folder / name for name in FILES["alex"])
     assert load_lpips([str(first), second], network="alex")(a, b) == expected
@@ -179,7 +179,7 @@ def test_names_of_a_whole_module_stored_once(folder, tmp_path):
     }
     whole |= {name.replace("lin", "lins."): tensor for name, tensor in second.items()}
     torch.save(whole, tmp_path / "whole.pth")
-    a, b = pictures(40, 40)
+    a, b = image_pair(40, 40)
     assert load_lpips(tmp_path / "whole.pth", network="alex")(a, b) == load_lpips(folder, network="alex")(
         a, b
     )
@@ -259,7 +259,7 @@ def test_broken_and_hostile_files(folder, tmp_path):
 def test_bad_images_are_refused(folder):
     for network, smallest in (("vgg", 16), ("alex", 31)):
         distance = load_lpips(folder, network=network)
-        a, b = pictures(smallest, smallest)
+        a, b = image_pair(smallest, smallest)
         assert np.isfinite(distance(a, b))
         with pytest.raises(
             ValueError, match=rf"at least {smallest} x {smallest} pixels, got {smallest - 1} x"
@@ -274,6 +274,6 @@ def test_bad_images_are_refused(folder):
 
 
 def test_gradients_are_left_alone(folder):
-    a, b = pictures(40, 40)
+    a, b = image_pair(40, 40)
     load_lpips(folder, network="alex")(a, b)
     assert torch.is_grad_enabled()

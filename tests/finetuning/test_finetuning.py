@@ -145,14 +145,14 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     exposure = torch.tensor([*gain, *offset], requires_grad=True)
     behind = srgb_to_linear(np.float32(background)) if blending == "linear" else np.float32(background)
     options = dict(face_splat=mesh.face_splat, min_transmittance=MIN_TRANSMITTANCE[blending], samples=2)
-    picture = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
+    rendered = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
     if blending == "linear":
-        curve = 1.055 * picture.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-        picture = torch.where(picture <= 0.0031308, 12.92 * picture, curve)
-    picture = picture * exposure[:3] + exposure[3:]
+        curve = 1.055 * rendered.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+        rendered = torch.where(rendered <= 0.0031308, 12.92 * rendered, curve)
+    rendered = rendered * exposure[:3] + exposure[3:]
     truth, inside = torch.from_numpy(image), None if mask is None else torch.from_numpy(mask)
-    square = (picture - truth).square()
-    expected = photometric_loss(picture, truth, ssim_weight=0.3, mask=inside)
+    square = (rendered - truth).square()
+    expected = photometric_loss(rendered, truth, ssim_weight=0.3, mask=inside)
     expected = expected + 7 * (square if mask is None else square[inside]).mean()
     expected.backward()
     assert loss == pytest.approx(float(expected.detach()), rel=1e-5)
@@ -196,10 +196,10 @@ def test_a_flat_wall_stays_as_even_as_the_splats_image():
     mesh = convert(wall, cameras=cameras)
     tuned = finetune(mesh, dataset, make_config(epochs=12))
 
-    def sigma(picture) -> float:
-        return float(picture[12:36, 12:36].std(axis=(0, 1)).mean())
+    def sigma(image) -> float:
+        return float(image[12:36, 12:36].std(axis=(0, 1)).mean())
 
-    from meshsplats.evaluation.report import image_of
+    from meshsplats.rendering.looks import image_of
 
     truth = sigma(views[-1].image)
     assert sigma(image_of(tuned, front, (1, 1, 1))[0]) < 1.2 * truth

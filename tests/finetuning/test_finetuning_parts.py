@@ -262,8 +262,8 @@ def test_each_preset_begins_with_its_conversion():
 
 def dataset(count: int, side: int = 8) -> Dataset:
     camera = Camera(np.eye(4), side, side, side / 2, side / 2, side, side)
-    picture = ViewImage(np.zeros((side, side, 3), np.uint8))
-    return Dataset(tuple(View(replace(camera, name=f"v{i}"), picture) for i in range(count)))
+    image = ViewImage(np.zeros((side, side, 3), np.uint8))
+    return Dataset(tuple(View(replace(camera, name=f"v{i}"), image) for i in range(count)))
 
 
 def test_memory_is_refused_with_advice(monkeypatch):
@@ -283,9 +283,9 @@ def test_splats_that_targets_are_drawn_from_count():
     mesh, cloud = convert(make_scene(200)), make_scene(4000)
     views = splat_views(cloud, [view.camera for view in dataset(2).train])
     arrays = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, cloud.sh)
-    pictures = 2 * 8 * 8 * (16 - 3)  # means and points, float16 with alpha, in place of bytes
+    images = 2 * 8 * 8 * (16 - 3)  # means and points, float16 with alpha, in place of bytes
     more = memory.estimate_memory(mesh, Dataset(views)) - memory.estimate_memory(mesh, dataset(2))
-    assert more == sum(array.nbytes for array in arrays) + pictures
+    assert more == sum(array.nbytes for array in arrays) + images
 
 
 def test_memory_grows_with_what_there_is():
@@ -390,9 +390,9 @@ def test_resuming_drops_what_came_after_the_checkpoint(tmp_path):
     journal.begin({"seed": 0})
     for step in (0, 3, 6):
         journal.log_metrics(step, loss=0.5)
-    picture = np.zeros((6, 6, 3), np.float32)
-    journal.save_preview(2, picture, picture)
-    journal.save_preview(4, picture, picture)
+    image = np.zeros((6, 6, 3), np.float32)
+    journal.save_preview(2, image, image)
+    journal.save_preview(4, image, image)
     journal.save(checkpoint(3))
     with open(tmp_path / "run" / METRICS, "a") as file:
         file.write('{"step": 7, "lo')  # a kill in the middle of a line

@@ -298,9 +298,9 @@ def test_gltf_without_a_texture_keeps_its_colours(tmp_path):
         ({"images": [{"uri": "t.png"}]}, "its file .t.png. is missing"),
         ({"images": [{"uri": "data:image/png;base64,AAAA"}]}, "not an image"),
         ({"images": [{}]}, "neither data nor URI"),
-        ({"images": []}, "refers to number 0 of 0 images"),
-        ({"textures": []}, "refers to number 0 of 0 textures"),
-        ({"samplers": []}, "refers to number 0 of 0 samplers"),
+        ({"images": []}, "refers to index 0 of 0 images"),
+        ({"textures": []}, "refers to index 0 of 0 textures"),
+        ({"samplers": []}, "refers to index 0 of 0 samplers"),
         ({"samplers": [{"wrapT": 7}]}, "unknown wrapping"),
     ],
 )

@@ -118,7 +118,7 @@ def test_true_opacities_come_back_from_masked_files(tmp_path):
 
 
 def test_what_alpha_refuses(tmp_path):
-    with pytest.raises(ValueError, match="alpha must be one of blend, mask, got 'add'"):
+    with pytest.raises(ValueError, match="alpha must be one of blend, mask, opaque, got 'add'"):
         save_mesh(SQUARE, tmp_path / "m.glb", alpha="add")
     with pytest.raises(ValueError, match=r"alpha applies to \.glb only"):
         save_mesh(SQUARE, tmp_path / "m.ply", alpha="mask")
@@ -278,7 +278,7 @@ def test_the_khronos_validator_is_content(tmp_path):
             for color_type in ("uint16", "float32"):
                 files.append(tmp_path / f"{extras}-{lit}-{color_type}.glb")
                 save_mesh(mesh, files[-1], lit=lit, color_type=color_type)
-    for alpha in ("blend", "mask"):
+    for alpha in ("blend", "mask", "opaque"):
         files.append(tmp_path / f"{alpha}.glb")
         save_mesh(SQUARE, files[-1], alpha=alpha)
     for file, issues in zip(files, validator_reports(tmp_path, files), strict=True):

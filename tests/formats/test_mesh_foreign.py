@@ -125,13 +125,13 @@ def test_gltf_skins_that_stand_apart(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["skins"][0].update(joints=[1, 9]), "a skin or node refers to number 9 of 3 nodes"),
+        (lambda d: d["skins"][0].update(joints=[1, 9]), "a skin or node refers to index 9 of 3 nodes"),
         (lambda d: d["skins"][0].update(joints=[]), "a skin needs joints"),
         (lambda d: d["skins"][0].update(joints="all"), "joints of a skin must be an array"),
         (lambda d: d["skins"][0].update(joints=[1]), "JOINTS_0 runs up to 1, the skin has 1 joints"),
         (lambda d: d["skins"][0].update(joints=[1, 2, 1]), "must be 3 matrices of 16 numbers"),
         (lambda d: d["skins"][0].update(inverseBindMatrices=3), "must be 2 matrices of 16 numbers"),
-        (lambda d: d["nodes"][0].update(skin=1), "refers to number 1 of 1 skins"),
+        (lambda d: d["nodes"][0].update(skin=1), "refers to index 1 of 1 skins"),
         (
             lambda d: d["meshes"][0]["primitives"][0]["attributes"].update(JOINTS_0=3),
             "must be 3 times 4 integers",

@@ -283,16 +283,16 @@ def put(*keys):
     ("change", "match"),
     [
         (put("asset", "version", "1.0"), "not a glTF 2 file"),
-        (put("scene", 7), "refers to number 7 of 1 scenes"),
-        (put("scene", -1), "refers to number -1"),
-        (put("nodes", 0, "mesh", 1), "refers to number 1 of 1 meshes"),
+        (put("scene", 7), "refers to index 7 of 1 scenes"),
+        (put("scene", -1), "refers to index -1"),
+        (put("nodes", 0, "mesh", 1), "refers to index 1 of 1 meshes"),
         (put("nodes", 0, "children", [0]), "node 0 has two parents"),
         (put("nodes", 0, "children", "all"), "must be an array of whole numbers"),
         (put("nodes", 0, "matrix", [1] * 15), "must be 16 numbers"),
         (put("nodes", 0, "rotation", [0, 0, 0, "1"]), "must be 4 numbers"),
         (put("nodes", 0, "scale", [1e40, 1e40, 1e40]), "vertices must be finite"),
         (put("nodes", 5), "nodes must be an array of objects"),
-        (put("accessors", 0, "bufferView", 9), "refers to number 9 of 2 bufferViews"),
+        (put("accessors", 0, "bufferView", 9), "refers to index 9 of 2 bufferViews"),
         (put("accessors", 0, "count", 10**12), "claims 1,000,000,000,000 elements"),
         (put("accessors", 0, "count", 4), "claims 4 elements of 12 bytes"),
         (put("accessors", 0, "count", -1), "needs a whole number 'count'"),
@@ -307,7 +307,7 @@ def put(*keys):
         (put("bufferViews", 0, "byteLength", 1000), "ends at byte 1,000"),
         (put("bufferViews", 0, "byteOffset", 2**60), "needs a whole number 'byteOffset'"),
         (put("bufferViews", 0, "byteStride", 2), "byteStride of buffer view 0 must be 4 to 252"),
-        (put("bufferViews", 0, "buffer", 1), "refers to number 1 of 1 buffers"),
+        (put("bufferViews", 0, "buffer", 1), "refers to index 1 of 1 buffers"),
         (put("bufferViews", 0, "extensions", {"EXT_meshopt_compression": {}}), "gltf-transform"),
         (put("buffers", 0, "byteLength", 1000), "should have 1,000 bytes, has 44"),
         (put("buffers", 0, "uri", "data:;base64,!"), "data URI of buffer 0 is broken|should have"),
@@ -320,7 +320,7 @@ def put(*keys):
         (put("meshes", 0, "primitives", 0, "mode", 9), "unknown primitive mode 9"),
         (put("meshes", 0, "primitives", 0, "attributes", {}), "has no POSITION"),
         (put("meshes", 0, "primitives", 0, "attributes", "COLOR_0", 1), "COLOR_0 must be 3 RGB"),
-        (put("meshes", 0, "primitives", 0, "material", 0), "refers to number 0 of 0 materials"),
+        (put("meshes", 0, "primitives", 0, "material", 0), "refers to index 0 of 0 materials"),
         (
             put("meshes", 0, "primitives", [{"mode": 0, "extensions": {"KHR_gaussian_splatting": {}}}]),
             "read it with load_gaussians",
@@ -374,7 +374,7 @@ def test_gltf_json_bombs(tmp_path):
     path.write_bytes(b'{"asset":{"version":"2.0"},"scene":NaN}')
     refused(path, "NaN is no JSON number")
     path.write_bytes(b'{"asset":{"version":"2.0"},"scene":' + b"9" * 10_000 + b"}")
-    refused(path, "cannot be read|refers to number")
+    refused(path, "cannot be read|refers to index")
 
 
 def test_a_small_gltf_that_repeats_one_mesh_for_ever(tmp_path, monkeypatch):

@@ -378,12 +378,12 @@ def test_layers_do_not_flicker():
     first = orbit(opaque, 1, width=64, height=64, elevation=25, azimuth=20)[0]
 
     def noise(mesh) -> float:
-        pictures = []
+        images = []
         for step in range(50):
             matrix = first.world_to_camera.copy()
             matrix[0, 3] += 1e-5 * step
-            pictures.append(render(mesh, replace(first, world_to_camera=matrix)).color)
-        return float(np.abs(np.diff(np.stack(pictures), axis=0)).mean())
+            images.append(render(mesh, replace(first, world_to_camera=matrix)).color)
+        return float(np.abs(np.diff(np.stack(images), axis=0)).mean())
 
     quiet, layered = noise(opaque), noise(stacked)
     assert layered < 1.1 * quiet

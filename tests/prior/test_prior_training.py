@@ -195,8 +195,8 @@ def test_training_brings_the_images_closer_and_moves_with_the_base(task, tmp_pat
     )
     moved = elsewhere.pose(base.vertices)
     camera = data.test[0].camera
-    pictures = [render(mesh, camera).color for mesh in (trained.mesh, moved)]
-    assert psnr(*pictures) > 25
+    images = [render(mesh, camera).color for mesh in (trained.mesh, moved)]
+    assert psnr(*images) > 25
 
 
 def test_stopped_and_resumed_to_the_same_bits(task, tmp_path):

@@ -190,7 +190,7 @@ def test_what_stays_as_it_is():
 
 
 def test_an_invisible_splat_has_a_shape():
-    """Its gradient tells what it would add, where its filter would have it."""
+    """Its gradient is that of its contribution, at the position that its filter gives it."""
     mesh, view = diamond((20, 18), (2.0, 2.0), alpha=0.0), plain_camera()
     options = {"face_splat": mesh.face_splat, "filter_px2": 8.0, "samples": 8}
     image = TapedRendering(mesh.vertices, mesh.faces, mesh.colors, None, view, **options)

@@ -179,7 +179,7 @@ def test_ties_where_planes_cross(count):
 @pytest.mark.parametrize("depths", ["apart", "the same", "nearly the same"])
 def test_five_thousand_layers(depths):
     rng = np.random.default_rng(2)
-    # Depths that float32 tells apart as 1 / z.
+    # Depths that float32 distinguishes as 1 / z.
     close = 2 - 2.0**-21 * rng.permutation(5000)
     z = {"apart": rng.uniform(1, 20, 5000), "the same": np.full(5000, 2.0), "nearly the same": close}[depths]
     image = assert_mesh_is_exact(layers(z, 0.001), camera(7, 5), tolerance=1e-5)

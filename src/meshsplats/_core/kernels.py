@@ -1,4 +1,4 @@
-"""The compiled core's part in fine-tuning, on NumPy arrays: losses of pictures and Adam on chosen rows.
+"""The compiled core's part in fine-tuning, on NumPy arrays: losses between images, and Adam on selected rows.
 
 Callers have checked their arrays: C-contiguous, of the types and shapes named here.
 """
@@ -64,13 +64,13 @@ class Comparison(NamedTuple):
     l1: float
     ssim: float
     gradient: np.ndarray | None
-    """(b, h, w, c) float32: of ``l1_rate * l1 + ssim_rate * ssim`` with respect to the pictures, 0 at pixels
+    """(b, h, w, c) float32: of ``l1_rate * l1 + ssim_rate * ssim`` with respect to the images, 0 at pixels
     that do not count."""
 
 
 def compare_images(
-    pictures: np.ndarray,
-    truths: np.ndarray,
+    images: np.ndarray,
+    targets: np.ndarray,
     mask: np.ndarray | None = None,
     *,
     l1_rate: float = 0,
@@ -78,22 +78,22 @@ def compare_images(
     gradient: bool = False,
     threads: int | None = None,
 ) -> Comparison:
-    """Sums of |picture - truth| and of SSIM, 3DGS convention, and the gradient of their weighted sum.
+    """Sums of |image - target| and of SSIM, 3DGS convention, and the gradient of their weighted sum.
 
-    ``pictures`` and ``truths`` are (b, h, w, c) float32, ``mask`` (b, h, w) bool. SSIM is not computed, and
+    ``images`` and ``targets`` are (b, h, w, c) float32, ``mask`` (b, h, w) bool. SSIM is not computed, and
     its sum is 0, where ``ssim_rate`` is 0. The result has the same bits with any number of ``threads`` (all
     processors by default) and on every instruction set.
     """
-    count, height, width, channels = pictures.shape
-    result = np.empty_like(pictures) if gradient else None
+    count, height, width, channels = images.shape
+    result = np.empty_like(images) if gradient else None
     comparison = ComparisonStruct(
         count=count,
         height=height,
         width=width,
         channels=channels,
         threads=threads or processors(),
-        image=pointer(pictures),
-        target=pointer(truths),
+        image=pointer(images),
+        target=pointer(targets),
         mask=pointer(mask),
         gradient=pointer(result),
         l1_rate=l1_rate,
@@ -119,10 +119,10 @@ def adam_rows(
 ) -> None:
     """Changes ``values`` and the moments ``mean`` and ``square`` in place, all (v, k) float32.
 
-    ``rows`` is an increasing int32 array of row numbers, a (v,) bool mask, or None for every row. ``step`` is
+    ``rows`` is an increasing int32 array of row indices, a (v,) bool mask, or None for every row. ``step`` is
     the learning rate with its bias corrections, ``scale`` (v,) float32 multiplies it row by row.
 
-    Raises ValueError, before anything changes, if row numbers are out of range or do not increase.
+    Raises ValueError, before anything changes, if row indices are out of range or do not increase.
     """
     mask = rows if rows is not None and rows.dtype == bool else None
     chosen = rows if mask is None else None

@@ -17,7 +17,7 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 4
+INTERFACE_VERSION = 5
 
 
 class CameraStruct(ctypes.Structure):
@@ -41,6 +41,7 @@ class OptionsStruct(ctypes.Structure):
         ("min_transmittance", c_float),
         ("background", c_void_p),
         ("background_per_pixel", c_int32),
+        ("cutoff", c_float),
     ]
 
 
@@ -161,7 +162,7 @@ def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
         )
     message = [c_char_p, c_int]
     mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
-    signatures: dict[str, list] = {
+    signatures: dict[str, list[type]] = {
         "ms_render_mesh": [*mesh_and_camera, POINTER(ImageStruct)],
         "ms_render_splats": [POINTER(SplatsStruct), *mesh_and_camera[1:], POINTER(ImageStruct)],
         "ms_rasterize": [*mesh_and_camera, POINTER(ImageStruct), c_int64, POINTER(c_void_p)],
@@ -181,7 +182,7 @@ def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
     return library
 
 
-def call(name: str, *arguments) -> None:
+def call(name: str, *arguments: object) -> None:
     """Runs a function of the core. Raises MemoryError, RuntimeError or, for splats that share vertices and
     cannot be filtered, ValueError, with the core's message."""
     message = ctypes.create_string_buffer(256)

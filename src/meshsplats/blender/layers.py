@@ -43,7 +43,7 @@ def most_layers(
     """The most layers along any ray from up to eight of the ``cameras`` and along ``directions``.
 
     ``directions`` are (3,) unit vectors in the world frame from the subject to a distant light. The scene's
-    six axis directions stand for indirect light.
+    six axis directions sample indirect light.
     """
     if len(mesh.faces) == 0:
         return 0

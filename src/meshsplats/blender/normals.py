@@ -8,7 +8,7 @@ which cameras around the scene see the splat.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -141,7 +141,7 @@ class _Neighbours:
         self.cells, self.cell_of = np.unique(self.keys, return_inverse=True)
         self.cell_of = self.cell_of.reshape(-1)
 
-    def sums(self, values: np.ndarray, width: float):
+    def sums(self, values: np.ndarray, width: float) -> Iterator[tuple[slice, np.ndarray]]:
         """Yields slices of points and (c, k) sums of ``values`` (n, k), weighted by a Gaussian of the
         distance to each cell's centre with standard deviation ``width`` cells."""
         count = len(self.cells)

@@ -27,13 +27,13 @@ class LightOptions:
     sun_size: float = 2.0
     """Degrees that the sun's disc spans: the larger, the softer shadows are."""
     sun_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
-    """Colour of sunlight: linear R G B, 0 to 1; --sun-strength is multiplied by it."""
+    """Colour of sunlight: linear R G B, 0 to 1; ``sun_strength`` is multiplied by it."""
     fill: float = 0.0
     """Irradiance of a second, soft sun that stands low on the other side, W/m^2. 0: there is none."""
     sky: float = 0.35
-    """Radiance of the even sky; not used with --hdri."""
+    """Radiance of the even sky; not used with ``hdri``."""
     sky_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
-    """Colour of that sky: linear R G B, 0 to 1; --sky is multiplied by it."""
+    """Colour of that sky: linear R G B, 0 to 1; ``sky`` is multiplied by it."""
     hdri: Path | None = None
     """Environment image (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
     hdri_strength: float = 1.0
@@ -51,7 +51,7 @@ class LightOptions:
     glass: bool = False
     """A glass ball beside the subject."""
     roughness: float = 1.0
-    """Roughness of the splats' surface, 0 to 1; visible with --specular."""
+    """Roughness of the splats' surface, 0 to 1; visible with ``specular``."""
     specular: float = 0.0
     """Highlights of the splats' surface, 0 to 1; 0.5 is plastic. Splats have highlights of their own baked
     in."""

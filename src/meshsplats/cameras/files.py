@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ MAX_FILE_BYTES = 16 << 20
 MAX_CAMERAS = 20_000
 
 
-def load_cameras(path: str | Path) -> list[Camera]:
+def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """Cameras of a JSON file, in file order.
 
     Two forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
@@ -61,7 +62,7 @@ def read_json(path: Path) -> Any:
         raise FileFormatError(f"{path}: not a JSON file ({str(error)[:120]})") from None
 
 
-def save_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
+def save_cameras(cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:
     """Writes the JSON list that ``load_cameras`` reads, to the last digit; replaces a file of that name."""
     entries = [
         {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
@@ -100,7 +101,7 @@ def _camera_from_json(entry: object, where: str) -> Camera:
         raise FileFormatError(f"{where}: {error}") from None
 
 
-def _numbers(entry: dict, key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
     """Field ``key`` as a float64 array of that shape, () for a single number."""
     if key not in entry:
         raise FileFormatError(f"{where}: field {key!r} is missing")

@@ -152,7 +152,7 @@ def _standard_input_as_file(arguments: list[str]) -> Iterator[list[str]]:
         yield arguments
         return
     if len(places) > 1:
-        raise UsageError("- stands for standard input, which can be read once")
+        raise UsageError("- is standard input, which can be read once")
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("- reads standard input: redirect a file there, < scene.ply say")
     import shutil

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
+import inspect
 import os
+import re
+import textwrap
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -22,7 +27,7 @@ INVOCATION = ("executable", "force", "json", "resume")
 """Options for the command line only: a configuration file from a stranger must neither overwrite files nor
 run programs, and --json and --resume belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
-"""What a configuration file may hold. Only ``options`` is read."""
+"""Tables and keys of a configuration file. Only ``options`` is read."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
 
@@ -128,7 +133,7 @@ def as_cli_options(
         kind = _alternatives(hint)[0]
         values[name] = None
         if name in without:
-            hints[name] = tyro.conf.Suppress[object]  # type: ignore[misc]
+            hints[name] = tyro.conf.Suppress[object]
         elif kind is bool and flags:
             hints[name], values[name] = bool, False
         else:
@@ -160,12 +165,12 @@ def _without_config(words: Sequence[str]) -> tuple[list[str], Path | None]:
 
 
 def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
-    names, common = set(options_of(command)), command.COMMON
-    shown = command if everything or not common else _only(command, common)
+    options, common = options_of(command), command.COMMON
+    hidden = [] if everything or not common else [name for name in options if name not in common]
+    shown = _described(command, [name for name in options if name not in hidden], options)
     with suppress(SystemExit):
         tyro.cli(shown, prog=prog, args=["--help"], config=_MARKERS)
-    hidden = len(names - set(common)) if common and not everything else 0
-    notes = [f"{hidden} more options: --help-all."] if hidden else []
+    notes = [f"{len(hidden)} more options: --help-all."] if hidden else []
     if command.CONFIGURABLE:
         notes.append("--config FILE takes options from the NAME.config.toml of an earlier run.")
         if everything:
@@ -174,24 +179,48 @@ def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
         print(" ".join(notes))
 
 
-def _only(command: type[T], names: Collection[str]) -> type[T]:
-    """``command`` with the other options hidden."""
+def _described(command: type[T], shown: Collection[str], options: Collection[str]) -> type[T]:
+    """``command`` with help for the options ``shown``; the others are hidden. ``options``: names of all."""
     hints: dict[str, Any] = {}
     values: dict[str, Any] = {}
+    texts = _docstrings(command)
     for name, hint in get_type_hints(command, include_extras=True).items():
         part = command.__dataclass_fields__.get(name)  # type: ignore[attr-defined]
         if part is None or get_origin(hint) is ClassVar:
             continue
         if is_dataclass(hint):
-            hint = _only(hint, names)  # type: ignore[arg-type]
-            values[name] = field(default_factory=hint)
-        elif part.default is not MISSING:
+            hints[name] = _described(hint, shown, options)  # type: ignore[arg-type]
+            values[name] = field(default_factory=hints[name])
+            continue
+        if part.default is not MISSING:
             values[name] = part.default
-        hints[name] = hint if name in names or is_dataclass(hint) else Annotated[hint, tyro.conf.Suppress]
+        help_ = tyro.conf.arg(help=_with_flags(texts.get(name, ""), options))
+        hints[name] = Annotated[hint, help_ if name in shown else tyro.conf.Suppress]
     made = type(
         command.__name__, (command,), {"__annotations__": hints, "__doc__": command.__doc__, **values}
     )
     return dataclass(frozen=True)(made)
+
+
+def _docstrings(kind: type) -> dict[str, str]:
+    """The docstrings of a dataclass' fields, each in one line. (Tyro keeps the line breaks of the source.)"""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        try:
+            source = textwrap.dedent(inspect.getsource(base))
+        except (OSError, TypeError):  # made at run time, or built in
+            continue
+        for node, text in pairwise(ast.parse(source).body[0].body):  # type: ignore[attr-defined]
+            if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
+                continue
+            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                found[node.target.id] = " ".join(str(text.value.value).split())
+    return found
+
+
+def _with_flags(text: str, options: Collection[str]) -> str:
+    """``text`` without double backquotes; the names of ``options`` in them become flags."""
+    return re.sub("``(.+?)``", lambda match: flag(match[1]) if match[1] in options else match[1], text)
 
 
 # ---- Configuration files

@@ -49,7 +49,7 @@ def sources(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_batch(paths: Sequence[Path]) -> bool:
-    """Whether ``paths`` may stand for more than one input."""
+    """Whether ``paths`` may name more than one input."""
     return len(paths) > 1 or any(path.is_dir() and not _is_splats(path) for path in paths)
 
 

@@ -207,7 +207,7 @@ class Blender(Command):
             light=self.named_light() if self.lit else None,
             engine=self.engine,
             samples=samples,
-            background=None if self.transparent else parse_color(self.background),  # type: ignore[arg-type]
+            background=None if self.transparent else parse_color(self.background),
             denoise=self.lit and self.engine == "cycles" and not self.no_denoise,
             threads=self.threads,
         )
@@ -239,7 +239,7 @@ class Blender(Command):
 
     def _print_result(
         self,
-        result: dict,
+        result: dict[str, Any],
         cameras: Sequence[Camera],
         images: Sequence[Path],
         triangles: int,

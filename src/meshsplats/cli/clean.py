@@ -25,7 +25,7 @@ from meshsplats.cli.common import (
 )
 from meshsplats.cli.messages import UsageError, shown_path
 from meshsplats.cli.records import PREVIEW, beside
-from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, take_away
+from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 else:
     RuleOptions = as_cli_options(
         CleaningRules,
-        f"Rules. Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
+        "Rules: splats with any of these properties are removed."
+        f" Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
 
@@ -61,7 +62,7 @@ class Clean(Command):
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh."""
     output: Output
-    """The rest: splats as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
+    """The remaining splats: as .ply; a mesh as .glb, .npz, .ply, .usdc, .obj."""
     rules: RuleOptions = field(default_factory=RuleOptions)
     preview_only: bool = False
     """Print and draw what would be removed, but write no result."""
@@ -86,7 +87,7 @@ class Clean(Command):
         if isinstance(scene, GaussianCloud) and self.output.suffix.lower() != ".ply":
             raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
         found = find(scene, rules)
-        left = take_away(scene, found)
+        left = remove(scene, found)
         if not self.preview_only:
             if isinstance(left, SplatMesh):
                 save_mesh(left, self.output)
@@ -149,8 +150,8 @@ def _draw(
 
 
 def _image(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
-    from meshsplats.evaluation.report import image_of
     from meshsplats.rendering import render_splats
+    from meshsplats.rendering.looks import image_of
 
     white: Sequence[float] = (1.0, 1.0, 1.0)
     if isinstance(scene, SplatMesh):

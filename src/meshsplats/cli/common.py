@@ -84,7 +84,7 @@ class ViewOptions:
     dome: Count = None
     """N views spread evenly over the upper half of a sphere around the subject."""
     look_around: Count = None
-    """N views from the middle of the scene, a room say, in one full turn."""
+    """N views from the middle of the scene, such as a room, in one full turn."""
     cameras: File = None
     """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder that has
     one."""
@@ -397,9 +397,9 @@ def plural(count: int, noun: str) -> str:
 
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
     """Saves an image of ``scene``."""
-    from meshsplats.evaluation.report import image_of
     from meshsplats.images.writing import save_image
     from meshsplats.rendering import render_splats
+    from meshsplats.rendering.looks import image_of
     from meshsplats.rendering.samples import needed_samples
 
     camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front

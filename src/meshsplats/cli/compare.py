@@ -21,7 +21,6 @@ from meshsplats.cli.common import (
     ViewOptions,
     check_outputs,
     chosen_background,
-    identify,
     parse_color,
     track,
     view_names,
@@ -29,6 +28,7 @@ from meshsplats.cli.common import (
 from meshsplats.cli.records import CAMERAS, CONFIGURATION, write_configuration, write_json
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.comparison import Comparison, compare_views
+from meshsplats.formats.sniff import identify
 from meshsplats.rendering.looks import mesh_samples
 
 LOOKS = {

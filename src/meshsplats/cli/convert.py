@@ -25,12 +25,12 @@ from meshsplats.cli.common import (
     Count,
     File,
     Folder,
+    Number,
     Output,
     SplatOptions,
     Text,
     cameras_beside,
     draw_preview,
-    identify,
     parse_up,
     plural,
     size_of,
@@ -54,6 +54,7 @@ from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -92,13 +93,18 @@ class Convert(Command):
     EXCLUSIVE = (("cameras", "data"),)
     CONFIGURABLE = True
 
-    input: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...")]]
+    input: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
+    ]
     """Splat file, the folder of a trained model, or a mesh; several of them; a folder of them; - for standard
     input."""
     output: Output
     """The mesh: .glb for engines, viewers and Blender; .npz or .ply, which keep everything; .usdc, .obj. Or a
     folder, for files named like the inputs."""
-    formats: tuple[Literal["glb", "npz", "ply", "usdc", "usda", "usd", "obj"], ...] = ()
+    formats: Annotated[
+        tuple[Literal["glb", "npz", "ply", "usdc", "usda", "usd", "obj"], ...],
+        tyro.conf.arg(help_behavior_hint=""),
+    ] = ()
     """With a folder: formats to write. Default: glb."""
     preset: Literal["default", "paper"] = "default"
     """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
@@ -113,9 +119,12 @@ class Convert(Command):
     """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
     color_type: Literal["uint16", "float32"] = "uint16"
     """.glb: storage of colours."""
-    alpha: Literal["blend", "mask"] = "blend"
-    """.glb: blend: true opacities. mask, for viewers that neither sort nor blend well: makes opaque what has
-    an opacity of 0.2 or more."""
+    alpha: Literal["blend", "mask", "opaque"] = "blend"
+    """blend: true opacities. For viewers and engines that neither sort nor blend well: opaque: solid
+    triangles, cut where the opacity is --cutoff; mask (.glb): the viewer draws as solid what has at least
+    that."""
+    cutoff: Number = None
+    """--alpha opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb: meshopt: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
@@ -182,8 +191,14 @@ class Convert(Command):
         glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
         if self.lit and not (glb or usd):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
-        if not glb and (self.color_type, self.alpha, self.compression) != ("uint16", "blend", "none"):
-            raise UsageError("--color-type, --alpha and --compression are for .glb files")
+        only_glb = self.color_type != "uint16" or self.alpha == "mask" or self.compression != "none"
+        if not glb and only_glb:
+            raise UsageError("--color-type, --alpha mask and --compression are for .glb files")
+        if self.cutoff is not None:
+            if self.alpha == "blend":
+                raise UsageError("--cutoff is for --alpha opaque or mask")
+            if not 0 <= self.cutoff <= 1:
+                raise ValueError(f"--cutoff must be an opacity from 0 to 1, got {self.cutoff}")
         if self.data is not None and self.cameras is not None:
             raise UsageError("give --cameras or --data, not both")
         if self.up is not None:
@@ -271,6 +286,7 @@ class Convert(Command):
         times.append(time.perf_counter())
         up = None if self.up is None else parse_up(self.up)
         mesh = convert(cloud, preset=self.preset, cameras=cameras, up=up, **asdict(self.conversion))
+        mesh = self._cut(mesh)
         times.append(time.perf_counter())
         self._write(mesh, job)
         times.append(time.perf_counter())
@@ -292,13 +308,23 @@ class Convert(Command):
         alone = replace(self, input=(job.source,), output=path, formats=())
         suffix = path.suffix.lower()
         if suffix != ".glb":
-            alone = replace(alone, color_type="uint16", alpha="blend", compression="none")
+            alone = replace(alone, color_type="uint16", compression="none")
+            if self.alpha == "mask":
+                alone = replace(alone, alpha="blend", cutoff=None)
         return alone if suffix == ".glb" or suffix.startswith(".usd") else replace(alone, lit=False)
 
     def _merges(self) -> bool:
         """Whether splats are merged to keep a limit."""
         limits = (self.conversion.max_splats, self.conversion.max_triangles)
         return self.conversion.budget != "drop" and any(limit is not None for limit in limits)
+
+    def _cut(self, mesh: SplatMesh) -> SplatMesh:
+        """``mesh``, or its solid part if that is asked for."""
+        from meshsplats.formats.cutting import CUTOFF, cut_mesh
+
+        if self.alpha != "opaque":
+            return mesh
+        return cut_mesh(mesh, CUTOFF if self.cutoff is None else self.cutoff)
 
     def _write(self, mesh: SplatMesh, job: Job) -> None:
         from meshsplats.formats.meshes import save_mesh
@@ -311,6 +337,7 @@ class Convert(Command):
                 lit=True if self.lit and (glb or path.suffix.lower().startswith(".usd")) else None,
                 color_type=self.color_type if glb and self.color_type != "uint16" else None,
                 alpha=self.alpha if glb and self.alpha != "blend" else None,
+                cutoff=self.cutoff if glb and self.alpha == "mask" else None,
                 compression=self.compression if glb and self.compression != "none" else None,
             )
 
@@ -344,6 +371,7 @@ class Convert(Command):
         mesh = load_mesh(job.source)
         if self.up is not None:
             mesh = replace(mesh, up=unit_up(parse_up(self.up)))
+        mesh = self._cut(mesh)
         times.append(time.perf_counter())
         self._write(mesh, job)
         times.append(time.perf_counter())

@@ -9,6 +9,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from importlib import metadata
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ class Doctor(Command):
         return 0 if findings["core"]["works"] else 1
 
 
-def examine() -> dict:
+def examine() -> dict[str, Any]:
     """The findings, ready for JSON."""
     import meshsplats
     from meshsplats._core.library import processors
@@ -57,11 +58,11 @@ def examine() -> dict:
     }
 
 
-def _core() -> dict:
+def _core() -> dict[str, Any]:
     """Variants of the compiled core, and whether the one in use draws a triangle."""
     from meshsplats._core import library
 
-    result: dict = {"works": False, "in_use": None, "available": [], "problem": None}
+    result: dict[str, Any] = {"works": False, "in_use": None, "available": [], "problem": None}
     try:
         result["available"] = library.available_variants()
         result["in_use"] = library.load_core().ms_variant().decode()
@@ -111,7 +112,7 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _text(findings: dict) -> str:
+def _text(findings: dict[str, Any]) -> str:
     core = findings["core"]
     lines = [
         f"MeshSplats {findings['meshsplats']}, Python {findings['python']}, {findings['platform']}",

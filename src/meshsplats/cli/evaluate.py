@@ -76,19 +76,19 @@ class Evaluate(Command):
     CONFIGURABLE = True
 
     mesh: tyro.conf.Positional[Files] = ()
-    """The mesh, or several to score side by side. With --protocol: a folder with a mesh, splats or a model
+    """The mesh, or several, to score side by side. With --protocol: a folder with a mesh, splats or a model
     folder for each scene, by its name."""
     output: Output = tyro.MISSING
     """Folder for the results."""
     data: Folder = None
     """Data set of photographs; with --protocol the folder of its scenes. Default: images of the splats."""
     before: File = None
-    """Another mesh to score, the one before fine-tuning say."""
+    """Another mesh to score, such as the one before fine-tuning."""
     splats: File = None
     """The splats. With --data: scored, too, at SH degree 0 and with all spherical harmonics. Without: their
     images are the ground truth (also scored at SH degree 0)."""
     images: Folder = None
-    """Images by other programs to score, Blender say: a file for each view, by its name or in order."""
+    """Images by other programs to score, such as Blender: a file for each view, by its name or in order."""
     cameras: File = None
     """Without --data: cameras. Default: those that finetune holds out."""
     look: Literal["area", "splats"] = "area"

@@ -13,15 +13,16 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, read_json
-from meshsplats.cameras.framing import guess_up, scene_bounds
+from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import SplatOptions, cameras_beside, identify
+from meshsplats.cli.common import SplatOptions, cameras_beside
 from meshsplats.cli.messages import shown_path
 from meshsplats.datasets.colmap import count_points
 from meshsplats.datasets.folder import Layout, find_layout, load_dataset
 from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import splat_file, splat_format
+from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -169,7 +170,7 @@ def _cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
     }
 
 
-def _extent(points: np.ndarray, bounds) -> dict[str, Any]:
+def _extent(points: np.ndarray, bounds: Bounds) -> dict[str, Any]:
     return {
         "lower": _rounded(points.min(axis=0)),
         "upper": _rounded(points.max(axis=0)),

@@ -21,7 +21,6 @@ from meshsplats.cli.common import (
     SplatOptions,
     Text,
     check_outputs,
-    identify,
     parse_up,
     size_of,
 )
@@ -36,6 +35,7 @@ from meshsplats.cli.records import (
 from meshsplats.cli.training import progress_display
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_config
+from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import Level, level_targets, likeness, make_level, plan_levels
 

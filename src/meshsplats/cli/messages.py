@@ -1,4 +1,4 @@
-"""What every command says: errors, exit codes, one line on standard error."""
+"""Messages of all commands: errors, exit codes, lines on standard error."""
 
 from __future__ import annotations
 

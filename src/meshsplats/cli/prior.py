@@ -80,7 +80,7 @@ class Prior(TrainingCommand):
     output: Output
     """The result with its binding to the base: .npz, which keeps everything, or .glb."""
     splats: File = None
-    """Splats to learn from, in place of --data: a file or a model folder."""
+    """Splats whose images are the targets, in place of --data: a file or a model folder."""
     laying: LayOptions = field(default_factory=LayOptions)
     tuning: PriorTuningOptions = field(default_factory=PriorTuningOptions)
 
@@ -98,7 +98,7 @@ class Prior(TrainingCommand):
         if self.splats is not None and self.target.data is not None:
             raise UsageError("give --data or --splats, not both")
         if self.splats is None and self.target.data is None:
-            raise UsageError("give photographs with --data, or splats with --splats, to learn from")
+            raise UsageError("give photographs with --data, or splats with --splats, as targets")
         if self.laying.texture is not None and self.laying.colors not in ("auto", "texture"):
             raise UsageError(f"--texture has no effect with --colors {self.laying.colors}")
         if self.laying.spacing and self.laying.layers == 1:

@@ -17,6 +17,7 @@ from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     DrawOptions,
+    Number,
     Output,
     PartOptions,
     SplatOptions,
@@ -82,6 +83,9 @@ class Render(Command):
     draw: DrawOptions = field(default_factory=DrawOptions)
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
+    cutoff: Number = None
+    """Draw a mesh as a depth buffer does: opaque where its opacity is at least this, nothing elsewhere. 0 to
+    1; default: blended."""
     transparent: bool = False
     """No background: images with an alpha channel."""
     depth: Literal["none", "png", "npy"] = "none"
@@ -168,6 +172,8 @@ class Render(Command):
         return _Files(images, depths, turntable, out / CAMERAS, out / CONFIGURATION)
 
     def _check(self, single: bool) -> None:
+        from meshsplats.rendering.api import checked_cutoff
+
         self.views.check()
         if self.draw.background is not None:
             parse_color(self.draw.background)
@@ -179,6 +185,14 @@ class Render(Command):
             raise UsageError("GIF has no translucency: use --animation webp, png or none with --transparent")
         if self.as_splats and self.depth != "none":
             raise UsageError("--depth is that of a mesh: leave out --as-splats")
+        if self.cutoff is not None:
+            checked_cutoff(self.cutoff)
+            if self.as_splats:
+                raise UsageError("--cutoff is for a mesh: leave out --as-splats")
+            if self.draw.max_layers is not None:
+                raise UsageError(
+                    "--max-layers has no effect with --cutoff, which draws one triangle a sample"
+                )
         if self.as_splats and self.draw.max_layers is not None:
             raise UsageError("--max-layers counts triangles: it has no effect with --as-splats")
 
@@ -218,7 +232,14 @@ class Render(Command):
             if isinstance(scene, GaussianCloud):
                 drawn = render_splats(scene, camera, sh_degree=degree, **options)
             else:
-                drawn = render(scene, camera, max_layers=layers, depth=bool(files.depths), **options)
+                drawn = render(
+                    scene,
+                    camera,
+                    max_layers=layers,
+                    depth=bool(files.depths),
+                    cutoff=self.cutoff,
+                    **options,
+                )
             if not files.images[i].parent.exists():
                 files.images[i].parent.mkdir()  # not before there is something to write
             image = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color

@@ -22,13 +22,13 @@ from meshsplats.cli.common import (
     cameras_beside,
     check_outputs,
     draw_preview,
-    identify,
     size_of,
 )
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import CONFIGURATION, PREVIEW, beside, write_configuration
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.sniff import identify
 
 
 @dataclass(frozen=True)

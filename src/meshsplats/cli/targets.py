@@ -107,7 +107,7 @@ class TargetOptions:
             if not dataset.train:
                 raise ValueError(
                     f"{self.data}: all its {len(dataset.test)} views are held out, so there is nothing to"
-                    " learn from; --test-every 0 holds none out"
+                    " train on; --test-every 0 holds none out"
                 )
             return dataset
         if not isinstance(scene, GaussianCloud):

@@ -166,7 +166,7 @@ class Plan:
     dataset: Dataset
     summary: str
     background: Background | None
-    """That of photographs, where it was looked for."""
+    """That of photographs; None without them."""
     optimise: Callable[[RunOptions, ShowProgress], Trained]
 
 

@@ -68,7 +68,7 @@ def convert(
         options: what to do otherwise than ``preset`` does; fields that are None are the preset's.
         preset: 'default' or 'paper'.
         cameras: where the mesh will be seen from. They give the size of a pixel at each splat
-            (``footprint``), the mean colour if asked for (``colors``) and what is up. Without them, pictures
+            (``footprint``), the mean colour if asked for (``colors``) and what is up. Without them, images
             of the whole subject are assumed.
         up: direction that points up, world frame; that of the cameras by default, else (0, -1, 0).
         changes: fields of ``ConversionOptions``, which says what they mean, in place of those of

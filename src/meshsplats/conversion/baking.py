@@ -13,11 +13,11 @@ from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, CameraCoverage
 from meshsplats.mesh import SplatMesh, checked_filter, splat_starts
 
-NARROWEST = 1e-4
+MIN_VARIANCE = 1e-4
 """Least variance of a splat as a share of the filter's, as in ``render``."""
-FAINTEST = 1e-6
+OPACITY_BIAS = 1e-6
 """Added to opacities, so that a splat with none has a shape, too."""
-FLATTEST = 1e-10
+FLAT_SHARE = 1e-10
 """A splat is flat along an axis with less than this share of its largest variance: that is rounding, and is
 not widened."""
 
@@ -84,8 +84,8 @@ def bake_filter(
     else:
         sizes = np.full(len(starts), float(pixel))  # type: ignore[arg-type]
     added = (variance * sizes**2)[:, None]
-    least = variances + NARROWEST * added
-    flat = variances <= FLATTEST * variances.max(axis=1, keepdims=True)
+    least = variances + MIN_VARIANCE * added
+    flat = variances <= FLAT_SHARE * variances.max(axis=1, keepdims=True)
     spread = np.where(flat, 1, np.sqrt((least + added) / least))
 
     vertices = mesh.vertices.copy()
@@ -122,11 +122,14 @@ def _shapes(
         (n, 3) means, (n, 3, 3) principal axes as columns, and (n, 3) variances along them.
     """
     counts = np.diff(np.append(starts, len(faces)))
-    total = lambda values: np.add.reduceat(values, starts)  # noqa: E731
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(values, starts)
+
     corners = mesh.vertices[faces].astype(np.float64)
     origin = corners[starts, 0]
     corners -= np.repeat(origin, counts, axis=0)[:, None]
-    opacity = mesh.colors[faces, 3].astype(np.float64) + FAINTEST
+    opacity = mesh.colors[faces, 3].astype(np.float64) + OPACITY_BIAS
     whole = opacity.sum(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)

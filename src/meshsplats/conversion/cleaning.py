@@ -125,7 +125,7 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
     return found
 
 
-def take_away(scene: Scene, found: Findings) -> Scene:
+def remove(scene: Scene, found: Findings) -> Scene:
     """``scene`` without the splats that ``find`` has found."""
     if isinstance(scene, SplatMesh):
         return scene.keep_faces(found.kept[found.owner])  # type: ignore[return-value]
@@ -139,7 +139,7 @@ def cropped(scene: Scene, box: Sequence[float] | None) -> Scene:
     """
     if box is None:
         return scene
-    return take_away(scene, find(scene, CleaningRules(crop=tuple(box))))  # type: ignore[arg-type]
+    return remove(scene, find(scene, CleaningRules(crop=tuple(box))))  # type: ignore[arg-type]
 
 
 def _neighbours(centers: np.ndarray, size: np.ndarray, cell: float) -> np.ndarray:

@@ -96,9 +96,9 @@ def visibility(
             filter_px2=mesh.filter_px2,
         )
         # Colours over black and alpha: then no background hides a difference.
-        truth = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples)
-        square = np.square(rendering.color - truth.color).sum(axis=2)
-        square += np.square(rendering.alpha - truth.alpha)
+        target = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples)
+        square = np.square(rendering.color - target.color).sum(axis=2)
+        square += np.square(rendering.alpha - target.alpha)
         sums = rendering.scatter_to_vertices(np.stack([np.ones_like(square), square], axis=2))
         own_pixels = own.width * own.height / (camera.width * camera.height)
         pixels += own_pixels * np.bincount(owner, sums[:, 0], n)

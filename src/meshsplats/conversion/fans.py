@@ -64,7 +64,7 @@ def pattern(sides: int, rings: int = 1, mode: str = "flat") -> Pattern:
     # Exact zeros on the axes: there the ellipses meet.
     cos[np.abs(cos) < 1e-12] = 0
     sin[np.abs(sin) < 1e-12] = 0
-    index: dict[tuple, int] = {}
+    index: dict[tuple[float, ...], int] = {}
     directions = [np.zeros(axes)]
     level = [0]
 
@@ -150,8 +150,8 @@ def build(
     recipes = [_recipe(shape) for shape in shapes]
 
     for part in chunks(n, CHUNK):
-        for number, (shape, (place, tint)) in enumerate(zip(shapes, recipes, strict=True)):
-            rows = np.flatnonzero(choice[part] == number)
+        for index, (shape, (place, tint)) in enumerate(zip(shapes, recipes, strict=True)):
+            rows = np.flatnonzero(choice[part] == index)
             if not len(rows):
                 continue
             own_first, own_first_face = first[part][rows], first_face[part][rows]
@@ -166,7 +166,7 @@ def build(
             paint = np.concatenate([own_rgb.T, np.minimum(levels[:, None] * own_opacity, np.float32(1))])
             _put(vertices, own_first, thin_product(parts.T, place))
             _put(colors, own_first, thin_product(paint.T, tint))
-            _put(faces, own_first_face, own_first.astype(np.int32)[:, None] + corners[number])
+            _put(faces, own_first_face, own_first.astype(np.int32)[:, None] + corners[index])
     return vertices, faces, colors
 
 

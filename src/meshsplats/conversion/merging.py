@@ -19,12 +19,12 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._core.library import pointer, processors, run
+from meshsplats._geometry import quaternions_of
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.formats._orientation import quaternions_of
 from meshsplats.gaussians import GaussianCloud
 
 NEIGHBOURS = 8
@@ -42,7 +42,7 @@ quarter and 1 differ by 0.2 dB."""
 FILTER_PX2 = 0.3
 """Variance in square pixels of the low-pass filter of splat renderers."""
 
-FAINTEST = 1 / 255
+MIN_OPACITY = 1 / 255
 """Opacity below which 3DGS draws nothing."""
 
 
@@ -128,7 +128,7 @@ def simplify(
         raise ValueError(f"low_pass must be one number >= 0, or one for each of the {n} splats")
     width = np.broadcast_to(width, (n,))
     area = mean_shadow(disc_areas(_drawn(cloud.scales, width, cloud.kernel)))
-    masses = np.where(cloud.opacities < FAINTEST, 0, optical_depth(cloud.opacities) * area)
+    masses = np.where(cloud.opacities < MIN_OPACITY, 0, optical_depth(cloud.opacities) * area)
     group = _groups(cloud, masses, width, int(count), threads or processors())
     return _merged(cloud, masses, width, group)
 
@@ -317,9 +317,9 @@ def _merged(
     changed = np.flatnonzero(sizes > 1)
     rows = np.flatnonzero(sizes[group] > 1)
     part = replace(cloud, sh=cloud.sh[:, :1]).select(rows)
-    number = np.zeros(len(sizes), np.int64)
-    number[changed] = np.arange(len(changed))
-    own = number[group[rows]]
+    index = np.zeros(len(sizes), np.int64)
+    index[changed] = np.arange(len(changed))
+    own = index[group[rows]]
     all_moments = _Moments(part.means.astype(np.float64), _covariances(part), masses[rows], part.colors)
     groups = _Groups(own, masses[rows])
     means, covariances, mass, _ = all_moments.together(groups)

@@ -33,8 +33,8 @@ class ConversionOptions:
     rim_radius: float | None = None
     """Radius of the rim in standard deviations, 0.1 to 10. Default: calibrated; paper: 2.7."""
     sides: int | None = None
-    """Sides of an ellipse, which is a fan of as many triangles around its centre: 3 to 64 (3d: a multiple of
-    4; crossed: even). Default: 8 for flat, else 4; paper: 8."""
+    """Sides of an ellipse; with one ring, also the triangles of its fan: 3 to 64 (3d: a multiple of 4;
+    crossed: even). Default: 8 for flat, else 4; paper: 8."""
     rim_opacity: float | None = None
     """Opacity of the rim as a fraction of the splat's, 0 to 1. Default: 0; paper: 0.2."""
     center_opacity: float | None = None
@@ -70,12 +70,12 @@ class ConversionOptions:
     none."""
     footprint_px2: float | None = None
     """Variance of that filter in square pixels, 0 to 100. Every standard deviation s becomes
-    sqrt(s^2 + footprint_px2 * pixel^2), or max(s, sqrt(footprint_px2) * pixel) for splats of kernel '2dgs'.
+    sqrt(s^2 + v * pixel^2), or max(s, sqrt(v) * pixel) for splats of kernel '2dgs', with v this variance.
     Default: 0.05 for the look 'area', against sampling noise; for 'splats' 0.5, or 0.4 for splats of kernel
-    'antialiased' and 0.3 for '2dgs'. With footprint = filter: ``filter_px2`` of the mesh, by default 0.3 as
-    in 3DGS."""
+    'antialiased' and 0.3 for '2dgs'. With ``footprint`` filter: ``SplatMesh.filter_px2``, by default 0.3
+    as in 3DGS."""
     viewing_distance: float | None = None
-    """Distance from which the mesh will be seen, scene units; for footprint = distance."""
+    """Distance from which the mesh will be seen, scene units; for ``footprint`` distance."""
     focal: float | None = None
     """Focal length, in pixels, of images from ``viewing_distance``. Default: 1000, which is 1000 pixels over
     53 degrees."""
@@ -93,9 +93,10 @@ class ConversionOptions:
     """Largest number of triangles: see ``budget``. In mode 'flat', unless ``sides``, ``rings``,
     ``rim_radius`` or ``center_opacity`` is given, splats first get fewer triangles each, at least 4."""
     budget: Budget | None = None
-    """How to keep to max_splats and max_triangles. merge: merge similar splats. drop: keep only the most
-    important ones, by opacity times area in the images of the cameras (splats that no camera sees count as at
-    the median distance), or in scene units without cameras; this tears holes. Default and paper: merge."""
+    """How to keep to ``max_splats`` and ``max_triangles``. merge: merge similar splats. drop: keep only the
+    most important ones, by opacity times area in the images of the cameras (splats that no camera sees count
+    as at the median distance), or in scene units without cameras; this tears holes. Default and paper:
+    merge."""
     colors: Colors | None = None
     """degree0: the view-independent part of the colour. cameras: where splats have spherical harmonics, the
     mean of the colours that the cameras see. Default and paper: degree0."""

@@ -67,7 +67,7 @@ int64_t render_mesh(const ms::Scene &scene, const ms::Grid &grid, const MsCamera
         });
 }
 
-// What the backward pass needs of the forward pass.
+// The results of the forward pass that the backward pass needs.
 struct ForwardRecord {
     ms::Tape tape;
     std::unique_ptr<ms::FanFilter> filter;  // or null
@@ -209,8 +209,8 @@ int guarded(char *message, int size, Body body) {
 
 extern "C" {
 
-// To be raised with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 4; }
+// Raise it with every change of a structure or function.
+MS_EXPORT int ms_interface_version() { return 5; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 

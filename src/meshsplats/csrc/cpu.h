@@ -1,6 +1,6 @@
-// Levels of the x86-64 instruction set that processor and operating system support, as the x86-64 psABI defines
-// them (section 3.1.1, "Processor Architecture"). The builtins of compilers are not used: some runtimes, zig's
-// for one, answer no to every question.
+// Levels of the x86-64 instruction set that processor and operating system support, as the x86-64 psABI
+// defines them (section 3.1.1, "Processor Architecture"). The builtins of compilers are not used: some
+// runtimes, zig's for one, answer no to every question.
 #pragma once
 
 #if defined(__x86_64__)

@@ -293,7 +293,7 @@ class FanFilter {
         }
     }
 
-    // The gradients of the vertices for constant A and c. Returns the gradient of the density by way of A and
+    // The gradients of the vertices for constant A and c. Returns the gradient of the density through A and
     // c.
     DensityGradient backward_positions(const Fan &fan, const float *grad, FanVertexGradient *vertices,
                                        int count) const {
@@ -330,7 +330,7 @@ class FanFilter {
         return density;
     }
 
-    // Adds the gradients by way of the density, whose moments determine A and c: the derivatives of the
+    // Adds the gradients through the density, whose moments determine A and c: the derivatives of the
     // integrals in the header with respect to opacities, positions and areas.
     void backward_density(int32_t fan_index, const DensityGradient &density, const int32_t *index,
                           FanVertexGradient *vertices) const {
@@ -388,7 +388,7 @@ class FanFilter {
             grad_k * fan.k * unfiltered_[vertices[0].vertex].w;  // k is proportional to its depth
     }
 
-    // Adds the gradients of the corners by way of the areas of the triangles, whose gradients are
+    // Adds the gradients of the corners through the areas of the triangles, whose gradients are
     // `grad_area`.
     static void add_area_gradient(const Batch &t, const Double8 &grad_area, Double8 grad[3][3]) {
         Double8 grad_n[3], grad_u[3], grad_v[3];
@@ -404,7 +404,7 @@ class FanFilter {
         }
     }
 
-    // Adds the gradient of a vertex, turned from camera to world space.
+    // Adds the gradient of a vertex, rotated from camera to world space.
     void add_position(int32_t v, double x, double y, double z, const MsVertexGradients &out) const {
         const double *m = projection_.m;
         for (int j = 0; j < 3; ++j)

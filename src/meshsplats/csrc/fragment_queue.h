@@ -123,7 +123,7 @@ class FragmentQueue {
         int32_t face;
         uint32_t first_mask, mask_count, tape_index;
     };
-    // What is still to be emitted of an entry.
+    // The lanes of an entry that are still to be emitted.
     struct Pending {
         int entry;
         LaneMask lanes;
@@ -153,7 +153,7 @@ class FragmentQueue {
         limit_ = std::max(MIN_DRAIN, 2 * count_);
     }
 
-    // Emits the first n pending entries by the method that suits their number.
+    // Emits the first n pending entries by the method that suits their count.
     template <class Emit>
     void emit_sorted(int n, const LaneMask &active, Emit &&emit) {
         MS_ASSERT(n <= (int)pending_.size());

@@ -56,7 +56,8 @@ class GradientTile {
           visible_(CHUNK),
           depths_(attribute_channels_ ? CHUNK : 0),
           slot_of_step_(CHUNK) {
-        // FanFilter::backward takes position gradients in camera space; all others are turned to world space.
+        // FanFilter::backward takes position gradients in camera space; all others are rotated to world
+        // space.
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
                 rotation_[3 * i + j] =
@@ -525,7 +526,7 @@ class GradientTile {
         for (int k = 0; k < 3; ++k) {
             store_transposed(dot(s[k], of_rgba[0]), dot(s[k], of_rgba[1]), dot(s[k], of_rgba[2]),
                              dot(s[k], of_rgba[3]), [&](int i) { return sums[k][i].rgba; });
-            // Row k of dL/dV, then by way of the camera's focal lengths and principal point to camera space.
+            // Row k of dL/dV, then through the camera's focal lengths and principal point to camera space.
             Lanes d[3] = {broadcast(0), broadcast(0), broadcast(0)};
             for (int i = 0; i < 3; ++i) {
                 const Lanes h = dot(g[i], s[k]);

@@ -161,8 +161,8 @@ class TileLists {
         entries_.resize(total);
         std::vector<int64_t> fill(start_.begin(), start_.end() - 1);
         const int threads = total < MIN_PARALLEL_ENTRIES ? 1 : threads_;
-        // Each thread goes through all items and fills the lists of its own tiles, about as many entries as
-        // others.
+        // Each thread goes through all items and fills the lists of its own tiles. Threads have about equal
+        // numbers of entries.
         on_threads(threads, [&](int thread) {
             const int64_t first = tile_at(total * thread / threads),
                           last = tile_at(total * (thread + 1) / threads);

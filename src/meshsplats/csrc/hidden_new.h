@@ -1,5 +1,5 @@
-// operator new and delete of our own on macOS, not exported. The static libc++ in a wheel would export its own,
-// and dyld would then share one definition among all libraries of the process.
+// operator new and delete of our own on macOS, not exported. The static libc++ in a wheel would export its
+// own, and dyld would then share one definition among all libraries of the process.
 #pragma once
 
 #if defined(__APPLE__)
@@ -23,7 +23,8 @@ void ms_delete_array_sized(void *memory, std::size_t) MS_HIDDEN("__ZdaPvm");
 void ms_delete_aligned(void *memory, std::size_t) MS_HIDDEN("__ZdlPvSt11align_val_t");
 void ms_delete_array_aligned(void *memory, std::size_t) MS_HIDDEN("__ZdaPvSt11align_val_t");
 void ms_delete_sized_aligned(void *memory, std::size_t, std::size_t) MS_HIDDEN("__ZdlPvmSt11align_val_t");
-void ms_delete_array_sized_aligned(void *memory, std::size_t, std::size_t) MS_HIDDEN("__ZdaPvmSt11align_val_t");
+void ms_delete_array_sized_aligned(void *memory, std::size_t, std::size_t)
+    MS_HIDDEN("__ZdaPvmSt11align_val_t");
 
 void *ms_new(std::size_t size) {
     void *memory = std::malloc(size ? size : 1);
@@ -39,7 +40,9 @@ void *ms_new_aligned(std::size_t size, std::size_t alignment) {
 }
 
 void *ms_new_array(std::size_t size) { return ms_new(size); }
-void *ms_new_array_aligned(std::size_t size, std::size_t alignment) { return ms_new_aligned(size, alignment); }
+void *ms_new_array_aligned(std::size_t size, std::size_t alignment) {
+    return ms_new_aligned(size, alignment);
+}
 void ms_delete(void *memory) { std::free(memory); }
 void ms_delete_array(void *memory) { std::free(memory); }
 void ms_delete_sized(void *memory, std::size_t) { std::free(memory); }

@@ -40,12 +40,18 @@ class ImageTile {
     // Records a tape of each tile from now on. Then transparent triangles count, too, and fragments behind
     // opaque ones are recorded as if the opaque ones transmitted some light: the gradient of an opacity of 1
     // depends on what lies behind it.
-    void record_tape() { tape_ = std::make_unique<TileTape>(); }
+    void record_tape() {
+        MS_ASSERT(!has_cutoff());
+        tape_ = std::make_unique<TileTape>();
+    }
     const TileTape &tape() const { return *tape_; }
 
     // Where to add the coverage masks of queue entries, or null if nothing needs them.
     TileCoverage *coverage() { return tape_ || extras_.any() ? &coverage_ : nullptr; }
     bool keeps_transparent() const { return tape_ != nullptr; }
+    // Whether fragments are opaque or not there at all.
+    bool has_cutoff() const { return options_.cutoff >= 0; }
+    float cutoff() const { return options_.cutoff; }
     bool needs_weights() const { return extras_.any(); }
     // Number of fragments blended so far, in all tiles.
     int64_t fragments() const { return fragments_; }
@@ -95,7 +101,7 @@ class ImageTile {
         });
     }
 
-    // Averages the samples of each pixel and writes the pixels. Without an image, nothing.
+    // Averages the samples of each pixel and writes the pixels. Does nothing without an image.
     void resolve() {
         if (!image_.color) return;
         int s = grid_.samples;

@@ -11,7 +11,7 @@ namespace ms {
 
 constexpr int LANES = 16, PARTS = LANES / W;
 
-// A set of lanes: bit i stands for lane i.
+// A set of lanes: bit i is lane i.
 using LaneMask = uint32_t;
 constexpr LaneMask ALL_LANES = (1u << LANES) - 1;
 

@@ -139,7 +139,7 @@ class MeshTile {
         }
         for (int end, begin = 0; begin < batch_size_; begin = end) {
             for (end = begin + 1; end < batch_size_ && group_[end] == group_[begin];) ++end;
-            if (clipped || mesh_.depth_group || image_.needs_weights())
+            if (clipped || mesh_.depth_group || image_.needs_weights() || image_.has_cutoff())
                 rasterize_group<true>(begin, end, clipped);
             else
                 rasterize_group<false>(begin, end, 0);
@@ -167,7 +167,7 @@ class MeshTile {
     };
 
     // Pushes the fragments of the triangles [begin, end) of the batch, all of one group, to the queues of the
-    // blocks that they touch. GENERAL: with clipped triangles, depth groups or extra outputs.
+    // blocks that they touch. GENERAL: with clipped triangles, depth groups, extra outputs or a cutoff.
     template <bool GENERAL>
     void rasterize_group(int begin, int end, unsigned clipped) {
         MS_ASSERT(begin < end && end <= batch_size_);
@@ -215,6 +215,7 @@ class MeshTile {
                     greater_equal(functions(BlockFunctions::EDGE + i, block), broadcast(t.threshold[i][k]));
             Lanes q = functions(BlockFunctions::Q, block);
             if (GENERAL && clipped >> k & 1) inside &= greater_equal(broadcast(t.q_max[k]), q);
+            if (GENERAL && image_.has_cutoff()) inside &= above_cutoff(k, block, q);
             if (!inside) continue;
             if (covered & inside) {
                 push();
@@ -232,6 +233,7 @@ class MeshTile {
                     select(written, clamp(value, broadcast(functions.low[c]), broadcast(functions.high[c])),
                            f->rgba[c]);
             }
+            if (GENERAL && image_.has_cutoff()) f->rgba[3] = broadcast(1);
             if (!covered) first_face = t.face[k];
             covered |= inside;
             if (coverage) {
@@ -243,6 +245,15 @@ class MeshTile {
         if (!covered) return;
         push();
         full_blocks_ |= (unsigned)queue.full() << block;
+    }
+
+    // The lanes where the opacity of triangle k reaches the cutoff. 1 / depth is q.
+    LaneMask above_cutoff(int k, int block, const Lanes &q) const {
+        const BlockFunctions &functions = functions_[k];
+        const Lanes z = broadcast(1) / clamp(q, broadcast(batch_.q_min[k]), broadcast(batch_.q_max[k]));
+        const Lanes alpha = clamp(functions(BlockFunctions::RGBA + 3, block) * z,
+                                  broadcast(functions.low[3]), broadcast(functions.high[3]));
+        return greater_equal(alpha, broadcast(image_.cutoff()));
     }
 
     // Depth and barycentric weights of triangle k in the lanes `inside`.
@@ -276,7 +287,9 @@ class MeshTile {
         const Batch &t = batch_;
         const f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
         const f4 high = max4(max4(c[0], c[1]), c[2]);
-        if (!(t.valid[k] > 0) || (!(high[3] > 0) && !image_.keeps_transparent())) return 0;
+        if (!(t.valid[k] > 0)) return 0;
+        if (image_.has_cutoff() ? high[3] < image_.cutoff() : !(high[3] > 0) && !image_.keeps_transparent())
+            return 0;
         BlockFunctions &functions = functions_[k];
         unsigned blocks = active_blocks_;
         for (int i = 0; i < 3; ++i) {

@@ -233,8 +233,8 @@ class ComparisonTile {
         }
     }
 
-    // SSIM of the windows centred in a row, with margins of RADIUS, and its derivatives with respect to x by
-    // way of p and G m (together), G d^2 and G m^2.
+    // SSIM of the windows centred in a row, with margins of RADIUS, and its derivatives with respect to x
+    // through p and G m (together), G d^2 and G m^2.
     void compute_ssim(int row) {
         const float *rows[TAPS];
         window_rows(ring_, row, rows);

@@ -1,4 +1,4 @@
-// Structures of the C interface, mirrored in rendering/core.py.
+// Structures of the C interface, mirrored in _core/library.py.
 #pragma once
 
 #include <cstdint>
@@ -19,6 +19,7 @@ struct MsOptions {
     float min_transmittance;  // early termination: a sample stops below this transmittance
     const float *background;  // RGB: 3 values, or (height, width, 3)
     int32_t background_per_pixel;
+    float cutoff;  // meshes: fragments of at least this opacity are opaque, others not drawn; negative: as is
 };
 
 struct MsMesh {

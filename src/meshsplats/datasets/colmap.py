@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -60,7 +60,7 @@ def read_model(model: Path, images: str) -> list[Frame]:
 
 
 def count_points(model: Path) -> int | None:
-    """Number of points of a sparse model; None if it has none, or no file that could hold so many."""
+    """Number of points of a sparse model; None if it has none, or if the file is too short for it."""
     binary, text = model / "points3D.bin", model / "points3D.txt"
     if binary.is_file():
         with open(binary, "rb") as file:
@@ -92,14 +92,14 @@ class _Bytes:
     def __init__(self, data: mmap.mmap, path: Path) -> None:
         self._data, self._path, self._at = data, path, 0
 
-    def unpack(self, layout: struct.Struct, what: str) -> tuple:
+    def unpack(self, layout: struct.Struct, what: str) -> tuple[Any, ...]:
         self._need(layout.size, what)
         values = layout.unpack_from(self._data, self._at)
         self._at += layout.size
         return values
 
     def count(self, least_bytes: int, what: str) -> int:
-        """A count of records of which each takes at least ``least_bytes``, checked against what is left."""
+        """A count of records of at least ``least_bytes`` each, checked against the remaining bytes."""
         (count,) = self.unpack(struct.Struct("<Q"), f"the number of {what}")
         left = len(self._data) - self._at
         if count * least_bytes > left:

@@ -150,7 +150,7 @@ def _taken(path: Path, album: Album) -> list[Taken]:
     return taken
 
 
-def _by_number(frame: Frame) -> tuple:
+def _by_number(frame: Frame) -> tuple[str, int, str]:
     """r_2 before r_10: these names are numbered without leading zeros."""
     stem = frame.name.rsplit(".", 1)[0]
     digits = len(stem) - len(stem.rstrip("0123456789"))

@@ -47,7 +47,7 @@ however it was trained."""
 ZOOMS = {"area": (1,), "splats": (1, 1, 2, 4)}
 """Zooms of the training views of each look, in turn: 1 is the whole image; 2 is a window of the same size of
 an image twice as large. The filter of splat viewers has another width in the scene at every image size, and
-a mesh that is drawn with it has to learn the unfiltered shape. Means over areas hold for all sizes."""
+a mesh that is drawn with it has to take the unfiltered shape. Means over areas hold for all sizes."""
 TRAINING_SAMPLES = 2
 """Side of the grid of samples in each pixel of training views, for the look 'area'."""
 CANDIDATES = 512

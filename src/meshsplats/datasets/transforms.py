@@ -31,7 +31,7 @@ _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 @dataclass(frozen=True)
 class Transforms:
-    """What such a file holds."""
+    """The content of such a file."""
 
     frames: list[Frame]
     """In file order."""
@@ -62,14 +62,14 @@ def read_transforms(path: Path) -> Transforms:
     return Transforms([_frame(path, common, f, i) for i, f in enumerate(frames)], splits)
 
 
-def _read_json(path: Path) -> dict:
+def _read_json(path: Path) -> dict[str, Any]:
     content = read_json(path)
     if not isinstance(content, dict):
         raise FileFormatError(f"{path}: must be a JSON object with 'frames'")
     return content
 
 
-def _frame(path: Path, common: dict, frame: object, i: int) -> Frame:
+def _frame(path: Path, common: dict[str, Any], frame: object, i: int) -> Frame:
     where = f"{path}: frame {i}"
     if not isinstance(frame, dict):
         raise FileFormatError(f"{where}: must be a JSON object")
@@ -84,7 +84,7 @@ def _frame(path: Path, common: dict, frame: object, i: int) -> Frame:
     return Frame(file.removeprefix("./"), file, lens, _world_to_camera(frame, where), mask)
 
 
-def _lens(folder: Path, values: dict, file: str, where: str) -> Lens | None:
+def _lens(folder: Path, values: dict[str, Any], file: str, where: str) -> Lens | None:
     size = _size(folder, values, file, where)
     if size is None:
         return None
@@ -123,7 +123,7 @@ def _lens(folder: Path, values: dict, file: str, where: str) -> Lens | None:
         raise FileFormatError(f"{where}: {error}") from None
 
 
-def _size(folder: Path, values: dict, file: str, where: str) -> tuple[int, int] | None:
+def _size(folder: Path, values: dict[str, Any], file: str, where: str) -> tuple[int, int] | None:
     """(width, height) that the intrinsics are meant for."""
     if "w" in values and "h" in values:
         sides = (_number(values, "w", where), _number(values, "h", where))
@@ -140,7 +140,7 @@ def _size(folder: Path, values: dict, file: str, where: str) -> tuple[int, int] 
     return header.width, header.height
 
 
-def _focals(values: dict, width: int, height: int, where: str) -> tuple[float, float]:
+def _focals(values: dict[str, Any], width: int, height: int, where: str) -> tuple[float, float]:
     focals = []
     for axis, side in (("x", width), ("y", height)):
         length, angle = f"fl_{axis}", f"camera_angle_{axis}"
@@ -155,11 +155,11 @@ def _focals(values: dict, width: int, height: int, where: str) -> tuple[float, f
         raise FileFormatError(f"{where}: needs a focal length 'fl_x' or a viewing angle 'camera_angle_x'")
     if min(focals) <= 0:
         raise FileFormatError(f"{where}: focal lengths must be positive, got {min(focals):g}")
-    # One of them stands for both: pixels are square unless two are given.
+    # One of them serves both axes: pixels are square unless two are given.
     return focals[0], focals[-1]
 
 
-def _world_to_camera(frame: dict, where: str) -> np.ndarray:
+def _world_to_camera(frame: dict[str, Any], where: str) -> np.ndarray:
     key = "transform_matrix"
     matrix = None
     try:

@@ -323,7 +323,3 @@ def main(arguments: list[str] | None = None) -> None:
     cloud = make_scene(*map(int, arguments[1:]))
     save_gaussians(cloud, path)
     print(f"{path}: {len(cloud):,} splats of our own still life")
-
-
-if __name__ == "__main__":
-    main()

@@ -79,7 +79,7 @@ def find_input(folder: Path, scene: str) -> Path | None:
 
 
 class Candidates(NamedTuple):
-    """What is scored on one scene."""
+    """The candidates that are scored on one scene."""
 
     mesh: SplatMesh
     splats: GaussianCloud | None = None

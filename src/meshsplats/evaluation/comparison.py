@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ViewScore:
+class ViewSimilarity:
     """Similarity of the two images of one view."""
 
     name: str
@@ -37,14 +37,14 @@ class ComparedView:
     """(h, w, 3) float32 display RGB in [0, 1]: the splats, in the requested look."""
     mesh: np.ndarray
     """(h, w, 3) float32 display RGB in [0, 1]: the mesh."""
-    score: ViewScore
+    score: ViewSimilarity
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Scores of all views. The mean PSNR is the mean of the PSNR of the views, as in papers."""
 
-    views: tuple[ViewScore, ...]
+    views: tuple[ViewSimilarity, ...]
 
     @property
     def psnr(self) -> float:
@@ -54,7 +54,7 @@ class Comparison:
     def ssim(self) -> float:
         return float(np.mean([view.ssim for view in self.views]))
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
         """All scores, for JSON. JSON has no infinity: the PSNR of equal images is null."""
         rows = [asdict(view) for view in self.views] + [{"psnr": self.psnr, "ssim": self.ssim}]
         for row in rows:
@@ -105,7 +105,8 @@ def compare_views(
         )
         a = np.clip(rendered.color, 0, 1)
         b = np.clip(image_of(mesh, camera, background, **options)[0], 0, 1)
-        yield ComparedView(camera, a, b, ViewScore(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b)))
+        score = ViewSimilarity(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b))
+        yield ComparedView(camera, a, b, score)
 
 
 def compare(

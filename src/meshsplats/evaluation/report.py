@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import numpy as np
 
@@ -66,7 +66,7 @@ class MethodScores:
         """Median of ``column`` over the views; None if a view lacks it."""
         return self._over(column, np.median)
 
-    def _over(self, column: str, statistic: Callable[[list], Any]) -> float | None:
+    def _over(self, column: str, statistic: Callable[[list[float]], SupportsFloat]) -> float | None:
         values = [getattr(view, column) for view in self.views]
         return None if None in values or not values else float(statistic(values))
 
@@ -262,7 +262,17 @@ def fit_exposure_to(image: np.ndarray, target: np.ndarray, mask: np.ndarray | No
     return np.clip(result, 0, 1)
 
 
-def _scores(name, image, alpha, target, mask, empty, lpips, fit_exposure, threads) -> ViewScores:
+def _scores(
+    name: str,
+    image: np.ndarray,
+    alpha: np.ndarray | None,
+    target: np.ndarray,
+    mask: np.ndarray | None,
+    empty: np.ndarray | None,
+    lpips: Lpips | None,
+    fit_exposure: bool,
+    threads: int | None,
+) -> ViewScores:
     floaters = None
     if empty is not None and alpha is not None:
         floaters = int((alpha[empty] > FLOATER_ALPHA).sum())

@@ -156,5 +156,5 @@ def score_table(
     ]
 
 
-def _natural(path: Path) -> list:
+def _natural(path: Path) -> list[int | str]:
     return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

@@ -45,8 +45,8 @@ class FinetuneConfig:
     position_rate: float = 0.02
     """Adam's learning rate of the vertex positions, in ``position_unit``. 0: positions are fixed."""
     position_unit: Unit = "splat"
-    """Unit of position_rate. splat: the size of the splat that a vertex belongs to. scene: scene units, as in
-    the paper."""
+    """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
+    as in the paper."""
     soft_edges: bool = True
     """Keep opacities of 0 on the boundary of the mesh, such as the rims of fans, at 0. Visible edges get no
     gradient that would move them back, and opacities, which are clamped at 0, would drift upwards there."""
@@ -78,7 +78,7 @@ class FinetuneConfig:
     exposure_rate: float = 0.002
     """Adam's learning rate of these gains and offsets."""
     prune_epochs: float = 5.0
-    """Epochs between two prunings of the mesh (prune_opacity, prune_importance). 0: no pruning."""
+    """Epochs between two prunings of the mesh (``prune_opacity``, ``prune_importance``). 0: no pruning."""
     prune_opacity: float = 1 / 255
     """Prune triangles whose corners all have less opacity than this, and the vertices that no triangle then
     uses."""

@@ -6,6 +6,10 @@ number of threads.
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
+
 from meshsplats._core.kernels import compare_images
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 
@@ -83,15 +87,24 @@ def photometric_loss(
     return _weighted(image, target, mask, 1 - ssim_weight, -ssim_weight, ssim_weight, threads)
 
 
-def _weighted(image, target, mask, l1_weight, ssim_weight, constant, threads):
+def _weighted(
+    image: torch.Tensor,
+    target: torch.Tensor,
+    mask: torch.Tensor | None,
+    l1_weight: float,
+    ssim_weight: float,
+    constant: float,
+    threads: int | None,
+) -> torch.Tensor:
     _check(image, target, mask)
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
-    # From the mask itself, which may be a view: the number of pixels is exact.
-    pixels = int(mask.sum()) if mask is not None else image.shape[:-1].numel()
-    if pixels == 0:
-        raise ValueError(f"mask must mark at least one pixel, got none of {mask.numel()}")
-    return _Weighted.apply(
+    pixels = image.shape[:-1].numel()
+    if mask is not None:
+        pixels = int(mask.sum())  # from the mask itself, which may be a view: the number of pixels is exact
+        if pixels == 0:
+            raise ValueError(f"mask must mark at least one pixel, got none of {mask.numel()}")
+    return _Weighted.apply(  # type: ignore[no-untyped-call]
         image,
         target,
         mask,
@@ -109,11 +122,22 @@ class _Weighted(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, image, target, mask, count, weights, threads, gradients):
+    def forward(
+        ctx: Any,
+        image: torch.Tensor,
+        target: torch.Tensor,
+        mask: torch.Tensor | None,
+        count: int,
+        weights: tuple[float, float, float],
+        threads: int | None,
+        gradients: bool,
+    ) -> torch.Tensor:
         x, y = (_batch(tensor, 4) for tensor in (image, target))
         inside = None if mask is None else _batch(mask, 3)
         l1_weight, ssim_weight, constant = weights
-        rates = dict(l1_rate=l1_weight / count, ssim_rate=ssim_weight / count, threads=threads)
+        rates: dict[str, Any] = dict(
+            l1_rate=l1_weight / count, ssim_rate=ssim_weight / count, threads=threads
+        )
         wanted = [needed and gradients for needed in ctx.needs_input_grad[:2]]
         result = compare_images(x, y, inside, gradient=wanted[0], **rates)
         # Both sums are symmetric, so the gradient of the target is that of the image with both exchanged.
@@ -128,7 +152,7 @@ class _Weighted(torch.autograd.Function):
         return image.new_tensor(value)
 
     @staticmethod
-    def backward(ctx, cotangent):
+    def backward(ctx: Any, cotangent: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         if torch.is_grad_enabled():
             # Otherwise a second derivative through the image would silently be missing.
             raise RuntimeError("losses have no second derivative: call backward without create_graph=True")
@@ -136,12 +160,12 @@ class _Weighted(torch.autograd.Function):
         return *gradients, None, None, None, None, None
 
 
-def _batch(tensor: torch.Tensor, dimensions: int):
+def _batch(tensor: torch.Tensor, dimensions: int) -> np.ndarray:
     tensor = tensor.detach()
     return (tensor if tensor.ndim == dimensions else tensor[None]).contiguous().numpy()
 
 
-def _check(image, target, mask) -> None:
+def _check(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> None:
     for name, tensor in (("image", image), ("target", target)):
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(
@@ -168,9 +192,9 @@ def _check(image, target, mask) -> None:
             raise TypeError(f"mask must be a boolean torch tensor, got {got}")
         if mask.shape != image.shape[:-1]:
             raise ValueError(f"mask must have shape {tuple(image.shape[:-1])}, got {tuple(mask.shape)}")
-    for tensor in (image, target, mask):
-        if tensor is not None and tensor.device.type != "cpu":
-            raise ValueError(f"images and mask must be on the CPU, got {tensor.device}; use .cpu()")
+    for part in (image, target, mask):
+        if part is not None and part.device.type != "cpu":
+            raise ValueError(f"images and mask must be on the CPU, got {part.device}; use .cpu()")
 
 
 MAX_CHANNELS = 64

@@ -128,7 +128,8 @@ def finetune(
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: no training view, an empty mesh. OtherRunError: the checkpoint is of another run.
+        ValueError: no training view, an empty mesh.
+        OtherRunError: the checkpoint is of another run.
         MemoryError: the estimated memory is not available; nothing was written.
         DivergenceError: the loss or a gradient is not finite; the message names the view.
         Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.

@@ -156,7 +156,7 @@ def loss_of(
 
 
 def make_step(state: State, views: Sequence[View], step: int, fraction: float) -> float | None:
-    """Takes step number ``step``, after ``fraction`` (0 to 1) of the run; returns its loss.
+    """Takes step ``step`` (from 0), after ``fraction`` (0 to 1) of the run; returns its loss.
 
     Returns None if no pixel of the view counts; the state has not changed then. Raises DivergenceError,
     before anything has changed, if the loss or a gradient is not finite.

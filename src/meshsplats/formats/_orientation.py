@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshsplats._geometry import quaternions_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.spherical_harmonics import sh_basis
 
@@ -100,20 +101,3 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     a, b, c, d = p
     left = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
     return q @ left.T
-
-
-def quaternions_of(rotations: np.ndarray) -> np.ndarray:
-    """(n, 4) unit quaternions w, x, y, z of proper rotation matrices (n, 3, 3)."""
-    r = rotations
-    trace = np.trace(r, axis1=1, axis2=2)
-    # 4 q q^T: each row is a multiple of q, and the row with the largest diagonal is the most exact.
-    k = np.empty((len(r), 4, 4))
-    k[:, 0, 0] = 1 + trace
-    for i in range(3):
-        j, m = (i + 1) % 3, (i + 2) % 3
-        k[:, 0, i + 1] = k[:, i + 1, 0] = r[:, m, j] - r[:, j, m]
-        k[:, i + 1, i + 1] = 1 - trace + 2 * r[:, i, i]
-        k[:, i + 1, j + 1] = k[:, j + 1, i + 1] = r[:, i, j] + r[:, j, i]
-    best = np.diagonal(k, axis1=1, axis2=2).argmax(axis=1)
-    q = k[np.arange(len(r)), best]
-    return q / np.linalg.norm(q, axis=1, keepdims=True)

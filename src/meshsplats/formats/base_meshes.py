@@ -14,6 +14,7 @@ from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
 from meshsplats.formats.sniff import Content
+from meshsplats.mesh import SplatMesh
 
 
 def load_base(
@@ -76,7 +77,7 @@ def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:
     return np.concatenate([pixels, opaque], axis=2)
 
 
-def _display(mesh) -> np.ndarray:
+def _display(mesh: SplatMesh) -> np.ndarray:
     """(n, 4) display RGBA of a SplatMesh."""
     from meshsplats.colors import linear_to_srgb
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
 from meshsplats.formats.gltf.reader import read_gltf
 from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
@@ -84,6 +85,7 @@ def save_mesh(
     lit: bool | None = None,
     color_type: ColorType | None = None,
     alpha: Alpha | None = None,
+    cutoff: float | None = None,
     compression: Compression | None = None,
 ) -> None:
     """Writes ``mesh`` in the format that the suffix of ``path`` names, whole or not at all.
@@ -105,8 +107,11 @@ def save_mesh(
         path: the file; its suffix decides the format.
         lit: (`.glb`, USD; default False) a material that scene lights shade, instead of an unlit one.
         color_type: (`.glb`; default 'uint16') 'float32' stores colours exactly, but larger.
-        alpha: (`.glb`; default 'blend') 'mask' for viewers that do not sort: rendered solid where the opacity
-            reaches a cutoff.
+        alpha: (default 'blend') 'opaque' cuts the triangles where their opacity crosses ``cutoff`` and writes
+            the rest as solid geometry, for programs with a depth buffer, in any format: see ``cut_mesh``.
+            'mask' (`.glb`) keeps the triangles and lets the viewer draw them solid where the opacity reaches
+            the cutoff; their edges stay jagged where 'opaque' ones are smooth.
+        cutoff: (with 'opaque' and 'mask'; default 0.2) least opacity that is drawn, 0 to 1.
         compression: (`.glb`) 'meshopt' makes files about a fifth as large, with the external program
             gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
             order of triangles changes a little; splat indices and attributes are left out. Such files are for
@@ -125,16 +130,28 @@ def save_mesh(
         raise ValueError(f"{target.name!r} does not name a mesh format; choose a name that ends in {known}")
     chosen = {"lit": lit, "color_type": color_type, "alpha": alpha, "compression": compression}
     options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
+    if cutoff is not None:
+        if alpha not in ("opaque", "mask"):
+            raise ValueError("the option cutoff needs alpha='opaque' or alpha='mask'")
+        if not 0 <= cutoff <= 1:
+            raise ValueError(f"cutoff must be an opacity from 0 to 1, got {cutoff}")
     for name in options:
-        if suffix not in _OPTION_SUFFIXES[name]:
+        if suffix not in _OPTION_SUFFIXES[name] and options[name] != "opaque":
             suffixes = ", ".join(_OPTION_SUFFIXES[name])
             raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
-    if mesh.binding is not None and (suffix not in BOUND_SUFFIXES or "compression" in options):
+    unbound = suffix not in BOUND_SUFFIXES or "compression" in options or alpha == "opaque"
+    if mesh.binding is not None and unbound:
         warnings.warn(
             f"{target.name}: the binding to a base mesh is left out; later poses need .npz or .glb",
             DataWarning,
             stacklevel=2,
         )
+    if alpha == "opaque":
+        mesh = cut_mesh(mesh, CUTOFF if cutoff is None else cutoff)
+        if suffix not in _GLB:
+            del options["alpha"]
+    elif cutoff is not None:
+        options["cutoff"] = float(cutoff)
     if mesh.filter_px2 and suffix in _UNFILTERED:
         warnings.warn(
             f"{target.name}: the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which"

@@ -10,7 +10,7 @@ import io
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -119,7 +119,11 @@ def save_animation(
     images = [_fitting(Image.fromarray(frame), max_side) for frame in frames]
     if not images:
         raise ValueError("an animation needs at least one frame")
-    options: dict = {".webp": {"quality": 85, "method": 4}, ".gif": {"disposal": 1}, ".png": {}}[suffix]
+    options: dict[str, dict[str, Any]] = {
+        ".webp": {"quality": 85, "method": 4},
+        ".gif": {"disposal": 1},
+        ".png": {},
+    }
     if suffix == ".gif":
         images = [_paletted(image) for image in images]
     _save(
@@ -130,7 +134,7 @@ def save_animation(
         append_images=images[1:],
         duration=round(1000 / fps),
         loop=0,
-        **options,
+        **options[suffix],
     )
 
 
@@ -175,17 +179,17 @@ def _text(captions: Sequence[str], step: int, width: int) -> np.ndarray:
     return np.asarray(line, np.float32) / 255
 
 
-def _fitting(image, max_side: int):
+def _fitting(image: Image.Image, max_side: int) -> Image.Image:
     from PIL import Image
 
     factor = max_side / max(image.size)
     if factor >= 1:
         return image
-    size = tuple(max(1, round(side * factor)) for side in image.size)
-    return image.resize(size, Image.Resampling.LANCZOS)
+    width, height = (max(1, round(side * factor)) for side in image.size)
+    return image.resize((width, height), Image.Resampling.LANCZOS)
 
 
-def _paletted(image):
+def _paletted(image: Image.Image) -> Image.Image:
     """256 colours chosen for this frame, dithered: smooth shades otherwise show bands."""
     from PIL import Image
 
@@ -195,7 +199,8 @@ def _paletted(image):
     indices = np.array(image.quantize(255, palette=palette, dither=Image.Dither.FLOYDSTEINBERG))
     # A plain background would be tinted by a mean of similar colours: the commonest colour gets an index of
     # its own.
-    commonest = max(image.getcolors(image.width * image.height))[1]
+    counts = cast("list[tuple[int, tuple[int, int, int]]]", image.getcolors(image.width * image.height))
+    commonest = max(counts)[1]
     indices[(np.asarray(image) == commonest).all(axis=2)] = 255
     colors = (palette.getpalette() or [])[: 255 * 3]
     result = Image.fromarray(indices)

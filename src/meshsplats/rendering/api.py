@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from ctypes import c_double
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,6 +64,7 @@ def render(
     normals: bool = False,
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
+    cutoff: float | None = None,
     threads: int | None = None,
 ) -> Rendering:
     """The image of a mesh of translucent triangles, exact at every sample.
@@ -80,6 +82,10 @@ def render(
     variance of s / 10,000: a splat seen exactly edge on has no triangle to widen. Splats that reach nearer
     than the near plane stay as they are. The variance is in square pixels for any ``samples``.
 
+    With a ``cutoff`` c, fragments are opaque where the interpolated opacity is at least c, and are not drawn
+    elsewhere: each sample has the colour of the nearest opaque fragment, or of the background. This is the
+    image of a depth buffer with an alpha test, or with triangles that were cut at the level set of c.
+
     Args:
         mesh: the triangles.
         camera: viewpoint, lens and size of the image.
@@ -90,6 +96,7 @@ def render(
         min_transmittance: early termination of samples with less transmittance than this; 0: none.
         depth, normals, attributes: further outputs; ``attributes`` names some of ``mesh.attributes``.
         filter_px2: overrides ``mesh.filter_px2``; 0 draws the triangles as they are.
+        cutoff: least opacity that is drawn, as opaque; 0 to 1. None: blended with the opacity.
         threads: at most this many; all processors by default. The result does not depend on it.
 
     Raises:
@@ -106,6 +113,8 @@ def render(
     if not 0 <= min_transmittance < 1:
         raise ValueError(f"min_transmittance must lie in [0, 1), got {min_transmittance}")
     options.max_layers = int(max_layers or 0)
+    if cutoff is not None:
+        options.cutoff = checked_cutoff(cutoff)
     options.min_transmittance = min_transmittance
 
     px2 = mesh.filter_px2 if filter_px2 is None else checked_filter(filter_px2, mesh.face_splat)
@@ -213,6 +222,13 @@ def render_splats(
     return Rendering(color, alpha, fragments=int(image.fragments))
 
 
+def checked_cutoff(cutoff: float) -> float:
+    """``cutoff`` as the least opacity that is drawn as opaque. Raises ValueError unless it lies in [0, 1]."""
+    if not 0 <= cutoff <= 1:
+        raise ValueError(f"cutoff must be an opacity from 0 to 1, got {cutoff}")
+    return float(cutoff)
+
+
 class Pointers:
     """Gives the core pointers to arrays, and keeps the arrays alive as long as itself."""
 
@@ -226,14 +242,18 @@ class Pointers:
 
 
 def camera_struct(camera: Camera) -> library.CameraStruct:
-    rows = (library.c_double * 12)(*camera.world_to_camera[:3].ravel())
+    rows = (c_double * 12)(*camera.world_to_camera[:3].ravel())
     return library.CameraStruct(
         rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height
     )
 
 
 def checked_options(
-    keep: Pointers, camera: Camera, background, samples: int, threads: int | None
+    keep: Pointers,
+    camera: Camera,
+    background: Sequence[float] | np.ndarray,
+    samples: int,
+    threads: int | None,
 ) -> library.OptionsStruct:
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
@@ -254,13 +274,14 @@ def checked_options(
         min_transmittance=0,
         background=keep(backdrop),
         background_per_pixel=backdrop.ndim == 3,
+        cutoff=-1,
     )
 
 
 def compact_groups(depth_group: np.ndarray | None) -> np.ndarray | None:
-    """The same groups, numbered without gaps, so that tables over them are no larger than the mesh."""
+    """The same groups, indexed without gaps, so that tables over them are no larger than the mesh."""
     if depth_group is None or not len(depth_group) or depth_group.max() < len(depth_group):
         return depth_group
-    values, numbers = np.unique(depth_group, return_inverse=True)
+    values, indices = np.unique(depth_group, return_inverse=True)
     shift = int(values[0] == -1)
-    return np.ascontiguousarray(numbers.reshape(-1) - shift, np.int32)
+    return np.ascontiguousarray(indices.reshape(-1) - shift, np.int32)

@@ -120,7 +120,7 @@ def rasterize(
     )
     inputs = (vertices, attributes, backdrop, poses)
     if torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in inputs):
-        images = _Rasterize.apply(*inputs, constant)
+        images = _Rasterize.apply(*inputs, constant)  # type: ignore[no-untyped-call]
     else:
         images = _forward(*inputs, constant, None)
     return Raster(*((part[0] for part in images) if single else images))
@@ -177,7 +177,14 @@ def _forward(
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, vertices, attributes, background, poses, constant):  # type: ignore[override]
+    def forward(
+        ctx: Any,
+        vertices: torch.Tensor,
+        attributes: torch.Tensor,
+        background: torch.Tensor,
+        poses: torch.Tensor | None,
+        constant: _Constant,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         ctx.tapes = []
         images = _forward(vertices, attributes, background, poses, constant, ctx.tapes)
         # The core reads these arrays again: torch checks that nobody has changed them in place.
@@ -187,7 +194,12 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, grad_color, grad_alpha, grad_extra):  # type: ignore[override]
+    def backward(
+        ctx: Any,
+        grad_color: torch.Tensor | None,
+        grad_alpha: torch.Tensor | None,
+        grad_extra: torch.Tensor | None,
+    ) -> tuple[torch.Tensor | None, ...]:
         vertices, attributes, background, poses, alpha = ctx.saved_tensors
         needs = ctx.needs_input_grad
         if grad_color is None:
@@ -258,10 +270,10 @@ def _faces(faces: torch.Tensor | np.ndarray, vertices: int) -> np.ndarray:
     return array.astype(np.int32, copy=False)
 
 
-def _per_face(name: str, numbers: torch.Tensor | np.ndarray | None, faces: int) -> np.ndarray | None:
-    if numbers is None:
+def _per_face(name: str, indices: torch.Tensor | np.ndarray | None, faces: int) -> np.ndarray | None:
+    if indices is None:
         return None
-    array = np.ascontiguousarray(numbers.numpy() if isinstance(numbers, torch.Tensor) else numbers)
+    array = np.ascontiguousarray(indices.numpy() if isinstance(indices, torch.Tensor) else indices)
     if array.shape != (faces,) or not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"{name} must be ({faces},) int32, got {array.shape} {array.dtype}")
     return array.astype(np.int32, copy=False)

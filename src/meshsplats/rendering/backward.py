@@ -63,7 +63,7 @@ class TapedRendering:
         self._options.min_transmittance = min_transmittance
         self._camera = camera_struct(camera)
         if world_to_camera is not None:
-            self._camera.world_to_camera = (library.c_double * 12)(*world_to_camera[:3].ravel())
+            self._camera.world_to_camera = (ctypes.c_double * 12)(*world_to_camera[:3].ravel())
         width = 0 if attributes is None else attributes.shape[1]
         self._mesh = library.MeshStruct(
             vertex_count=len(vertices),

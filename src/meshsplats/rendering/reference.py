@@ -15,7 +15,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, checked_filter
-from meshsplats.rendering.api import Rendering
+from meshsplats.rendering.api import Rendering, checked_cutoff
 
 SPLAT_MIN_ALPHA = 1 / 255
 """Splats fainter than this at a sample are left out there, as in 3DGS."""
@@ -24,11 +24,11 @@ SPLAT_MAX_ALPHA = 0.99
 SPLAT_MIN_TRANSMITTANCE = 1e-4
 """A sample terminates before the splat that would leave less transmittance than this, as in 3DGS."""
 
-FILTER_NARROWEST = 1e-4
+FILTER_MIN_VARIANCE = 1e-4
 """The filter takes no fan to have a smaller variance than this share of its own."""
-FILTER_SIDEWAYS = 0.1
+FILTER_DEPTH_SHARE = 0.1
 """Weight of a fan's extent in depth in the areas of its triangles."""
-FILTER_FAINTEST = 1e-6
+FILTER_OPACITY_BIAS = 1e-6
 """Added to opacities for the filter, so that a fan without any has a shape, too."""
 CUBATURE: list[tuple[np.ndarray, float]] = [
     (np.full(3, 1 / 3), -27 / 48),
@@ -49,6 +49,7 @@ def render(
     normals: bool = False,
     attributes: Sequence[str] = (),
     filter_px2: float | None = None,
+    cutoff: float | None = None,
 ) -> Rendering:
     """The image of a mesh. The arrays of the result are float64; see :class:`Rendering` for shapes.
 
@@ -59,6 +60,8 @@ def render(
     T is below ``min_transmittance`` (0: never). ``background`` is RGB, (3,) or (h, w, 3).
 
     ``filter_px2``, by default the mesh's, widens the fan of each splat first (see :func:`filtered`).
+
+    With a ``cutoff``, in [0, 1], a becomes 1 where it is at least the cutoff, else 0.
 
     ``depth``, ``normals`` and the named ``attributes`` are sums with the weights T_k a_k, without background.
 
@@ -82,6 +85,9 @@ def render(
         return np.clip(mixed, at_corners.min(axis=1), at_corners.max(axis=1))
 
     rgba = interpolated(mesh.colors)
+    if cutoff is not None:
+        # The core compares float32 values: so does this with the cutoff.
+        rgba[:, 3] = rgba[:, 3] >= np.float32(checked_cutoff(cutoff))
     share, transmittance = _front_to_back(sheet, rgba[:, 3], len(x), max_layers, min_transmittance)
 
     def blended(values: np.ndarray) -> np.ndarray:
@@ -221,8 +227,8 @@ def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) ->
 
     In the image, the opacity of a splat's triangles (linear inside each) is a density. With its mean c
     and covariance M, px^2, the projected vertices p move to c + A (p - c), A = (M + px2 I)^(1/2) M^(-1/2), at
-    their depth, so that the density has the covariance M + px2 I. M is widened by ``FILTER_NARROWEST`` px2
-    before. Areas are those of triangles in (x, y, k / z), with k = ``FILTER_SIDEWAYS`` f z_1 and z_1 the
+    their depth, so that the density has the covariance M + px2 I. M is widened by ``FILTER_MIN_VARIANCE`` px2
+    before. Areas are those of triangles in (x, y, k / z), with k = ``FILTER_DEPTH_SHARE`` f z_1 and z_1 the
     depth of the splat's first corner: triangles seen edge on keep some area. A splat that reaches
     nearer than the near plane, or has no area at all, stays as it is.
     """
@@ -235,19 +241,19 @@ def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) ->
         faces = mesh.faces[mesh.face_splat == splat]
         if not (points[faces, 2] >= camera.near).all():
             continue
-        k = FILTER_SIDEWAYS * np.sqrt(camera.fx * camera.fy) * points[faces[0, 0], 2]
+        k = FILTER_DEPTH_SHARE * np.sqrt(camera.fx * camera.fy) * points[faces[0, 0], 2]
         lifted = np.column_stack([projected, k * nearness])[faces]
         area = np.linalg.norm(np.cross(lifted[:, 1] - lifted[:, 0], lifted[:, 2] - lifted[:, 0]), axis=1)
         if not area.sum() > 0:
             continue
         corners = projected[faces]
-        opacity = mesh.colors[faces, 3].astype(np.float64) + FILTER_FAINTEST
+        opacity = mesh.colors[faces, 3].astype(np.float64) + FILTER_OPACITY_BIAS
         position = np.concatenate([np.einsum("k,tkc->tc", at, corners) for at, _ in CUBATURE])
         share = np.concatenate([weight * area * (opacity @ at) for at, weight in CUBATURE])
         share /= share.sum()
         mean = share @ position
         covariance = np.einsum("n,ni,nj->ij", share, position - mean, position - mean)
-        variances, axes = np.linalg.eigh(covariance + FILTER_NARROWEST * px2 * np.eye(2))
+        variances, axes = np.linalg.eigh(covariance + FILTER_MIN_VARIANCE * px2 * np.eye(2))
         spread = axes @ np.diag(np.sqrt((variances + px2) / variances)) @ axes.T
         own = np.unique(faces)
         moved = mean + (projected[own] - mean) @ spread

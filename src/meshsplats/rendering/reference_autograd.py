@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,9 @@ def rasterize(
         return Raster(*(part[0] for part in batch))
     backdrop = torch.as_tensor(background).double()
     images = []
-    constant = dict(samples=samples, face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2)
+    constant: dict[str, Any] = dict(
+        samples=samples, face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2
+    )
     for i, camera in enumerate(cameras):
         pose = (
             torch.from_numpy(camera.world_to_camera)
@@ -73,7 +76,14 @@ def rasterize(
     return Raster(*(torch.stack(parts) for parts in zip(*images, strict=True)))
 
 
-def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
+def filtered(
+    points: torch.Tensor,
+    faces: np.ndarray,
+    opacity: torch.Tensor,
+    camera: Camera,
+    face_splat: np.ndarray,
+    px2: float,
+) -> torch.Tensor:
     """``reference.filtered``: (v, 3) ``points`` in the camera's frame, widened by their (v,) ``opacity``."""
     result = points.clone()
     focal = points.new_tensor([camera.fx, camera.fy])
@@ -83,22 +93,21 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
         if not bool((z >= camera.near).all()):
             continue
         projected = points[corner][..., :2] / z * focal
-        k = reference.FILTER_SIDEWAYS * focal.prod().sqrt() * z[0, 0]
+        k = reference.FILTER_DEPTH_SHARE * focal.prod().sqrt() * z[0, 0]
         a, b, c = torch.cat([projected, k / z], dim=2).unbind(1)
         area = torch.linalg.cross(b - a, c - a).norm(dim=1)
         if not bool(area.sum() > 0):
             continue
         weights, shares = zip(*reference.CUBATURE, strict=True)
         at = points.new_tensor(np.array(weights))
-        share = (
-            points.new_tensor(shares) * area[:, None] * ((opacity[corner] + reference.FILTER_FAINTEST) @ at.T)
-        )
+        opacities = opacity[corner] + reference.FILTER_OPACITY_BIAS
+        share = points.new_tensor(shares) * area[:, None] * (opacities @ at.T)
         share = share / share.sum()
         position = torch.einsum("nk,tkc->tnc", at, projected)
         mean = (share[..., None] * position).sum((0, 1))
         covariance = torch.einsum("tn,tni,tnj->ij", share, position - mean, position - mean)
         one = torch.eye(2, dtype=points.dtype)
-        square = one + px2 * torch.linalg.inv(covariance + reference.FILTER_NARROWEST * px2 * one)
+        square = one + px2 * torch.linalg.inv(covariance + reference.FILTER_MIN_VARIANCE * px2 * one)
         root = torch.linalg.det(square).sqrt()
         spread = (square + root * one) / (torch.trace(square) + 2 * root).sqrt()  # its square root
         own = torch.unique(corner)
@@ -109,7 +118,17 @@ def filtered(points, faces, opacity, camera, face_splat, px2) -> torch.Tensor:
 
 
 def _image(
-    vertices, faces, attributes, camera, pose, background, *, samples, face_splat, depth_group, filter_px2
+    vertices: torch.Tensor,
+    faces: np.ndarray,
+    attributes: torch.Tensor,
+    camera: Camera,
+    pose: torch.Tensor,
+    background: torch.Tensor,
+    *,
+    samples: int,
+    face_splat: np.ndarray | None,
+    depth_group: np.ndarray | None,
+    filter_px2: float,
 ) -> Raster:
     posed = replace(camera, world_to_camera=pose.detach().numpy())
     x, y = reference._sample_positions(camera, samples)
@@ -123,6 +142,7 @@ def _image(
     # Weights of the corners at each fragment (reference._cover).
     in_camera = vertices @ pose[:3, :3].T + pose[:3, 3]
     if filter_px2:
+        assert face_splat is not None
         in_camera = filtered(in_camera, faces, attributes[:, 3], camera, face_splat, filter_px2)
     z = in_camera[:, 2]
     corners = torch.stack(
@@ -142,7 +162,8 @@ def _image(
     sizes = torch.bincount(layer).tolist()
     sums = torch.zeros(len(x), attributes.shape[1] - 1, dtype=torch.float64)
     through = torch.ones(len(x), 1, dtype=torch.float64)
-    for here, value in zip(sample[by_layer].split(sizes), values[by_layer].split(sizes), strict=True):
+    layers = zip(torch.split(sample[by_layer], sizes), torch.split(values[by_layer], sizes), strict=True)
+    for here, value in layers:
         opacity, channels = value[:, 3:4], torch.cat([value[:, :3], value[:, 4:]], dim=1)
         sums = sums.index_add(0, here, through[here] * opacity * channels)
         through = through.index_put((here,), through[here] * (1 - opacity))

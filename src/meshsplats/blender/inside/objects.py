@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import foreign, frame, levels, materials, meshes, pictures, priors, versions
+from meshsplats.blender.inside import foreign, frame, levels, materials, meshes, priors, rendering, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
@@ -201,9 +201,9 @@ def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions 
     linear = bool(objs) and all(obj.data.get(LINEAR) for obj in objs)
     limit = bounce_limit(layers)
     if lit:
-        pictures.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)
+        rendering.lit_settings(scene, engine, limit=limit, denoise=True, exposure=light.exposure)
     else:
-        pictures.exact_settings(scene, engine, linear=linear)
+        rendering.exact_settings(scene, engine, linear=linear)
         limit = 1024
     return limit
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import frame, levels, materials, meshes, objects, pictures, stage, versions
+from meshsplats.blender.inside import frame, levels, materials, meshes, objects, rendering, stage, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.camera import Camera
@@ -109,12 +109,12 @@ def build(
     if light is None:
         background = np.array(options.background or (0, 0, 0))
         stage.even_world((srgb_to_linear(background) if subject.linear else background).tolist())
-        pictures.exact_settings(scene, options.engine, linear=subject.linear)
+        rendering.exact_settings(scene, options.engine, linear=subject.linear)
     else:
         viewer = np.array(made[0].matrix_world.translation) if made else None
         floor = np.array([center[0], center[1], subject.floor])
         surround(floor, subject.radius, light, viewer, options.background)
-        pictures.lit_settings(
+        rendering.lit_settings(
             scene,
             options.engine,
             samples=options.samples,

@@ -188,7 +188,7 @@ def add_glass_ball(center: np.ndarray, radius: float, home: Any) -> Any:
     return obj
 
 
-def _faces(name: str, corners: Sequence, faces: Sequence, home: Any) -> Any:
+def _faces(name: str, corners: Sequence[Sequence[float]], faces: Sequence[Sequence[int]], home: Any) -> Any:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(corners, [], faces)
     obj = bpy.data.objects.new(name, mesh)

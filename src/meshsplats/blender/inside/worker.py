@@ -12,6 +12,11 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from meshsplats.blender.inside.scene import Subject
+    from meshsplats.camera import Camera
 
 if __package__ in (None, ""):  # run as a file by Blender, whose Python does not know this package
     sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
@@ -66,7 +71,7 @@ def main(job_path: str) -> None:
         sys.exit(1)
 
     from meshsplats._files.atomic import atomic_path
-    from meshsplats.blender.inside import meshes, pictures, stage, versions
+    from meshsplats.blender.inside import meshes, rendering, stage, versions
     from meshsplats.blender.inside.scene import Subject, build
     from meshsplats.blender.options import LightOptions, SceneOptions
     from meshsplats.camera import Camera
@@ -117,7 +122,7 @@ def main(job_path: str) -> None:
         start, processor = time.perf_counter(), time.process_time()
         name = str(target)
         with atomic_path(target, temporary=Path(temporary[name]), new=name in new) as path:
-            pictures.render_to(built.scene, path, factor, scratch=Path(job_path).parent)
+            rendering.render_to(built.scene, path, factor, scratch=Path(job_path).parent)
         report(
             image=str(target),
             seconds=round(time.perf_counter() - start, 3),
@@ -126,7 +131,7 @@ def main(job_path: str) -> None:
     report(done=True)
 
 
-def _for_painter(subject, camera):
+def _for_painter(subject: Subject, camera: Camera) -> Subject:
     """``subject`` with its faces sorted back to front for ``camera``, as EEVEE needs them."""
     from meshsplats.blender.inside.meshes import far_to_near
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
 from meshsplats.mesh import SplatMesh
 
@@ -32,6 +33,7 @@ def write_compressed_glb(
     lit: bool = False,
     color_type: ColorType = "uint16",
     alpha: Alpha = "blend",
+    cutoff: float = CUTOFF,
 ) -> None:
     """Writes ``mesh`` to ``path`` with positions and colours of 16 bits, compressed.
 
@@ -57,7 +59,7 @@ def write_compressed_glb(
         )
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         plain, packed = Path(folder) / "plain.glb", Path(folder) / "packed.glb"
-        write_glb(mesh, plain, lit=lit, alpha=alpha, extras=False)
+        write_glb(mesh, plain, lit=lit, alpha=alpha, cutoff=cutoff, extras=False)
         precision = ["-vp", str(_BITS), "-vc", "16", "-vn", "12"]
         done = subprocess.run(
             [program, "-i", plain, "-o", packed, "-cc", *precision, "-ke", "-km", "-kn"],

@@ -54,7 +54,7 @@ class GltfDocument:
         self._chunk: memoryview | None = None
         with open(path, "rb") as file:
             data = memoryview(file.read())
-        self.json = self._parse(self._json_chunk(data) if data[:4] == b"glTF" else data)
+        self.json = self._parse(self._json_chunk(data) if bytes(data[:4]) == b"glTF" else data)
         asset = self.json.get("asset")
         version = asset.get("version") if isinstance(asset, dict) else None
         if not isinstance(version, str) or version.split(".")[0] != "2":
@@ -79,7 +79,7 @@ class GltfDocument:
         """Entry ``index`` of the top-level array ``kind``; ``what`` names the object that refers to it."""
         found = self.items(kind)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(found):
-            raise self.error(f"{what} refers to number {str(index)[:20]} of {len(found)} {kind}")
+            raise self.error(f"{what} refers to index {str(index)[:20]} of {len(found)} {kind}")
         return found[index]
 
     def whole(self, owner: dict[str, Any], key: str, what: str, default: int | None = None) -> int:

@@ -151,7 +151,7 @@ def _join(
         colors[:, :3] = linear_to_srgb(colors[:, :3])
     normals: np.ndarray | None = None
     if all(p.normals is not None for p in pieces) and note.get("normals") != "computed":
-        normals = np.concatenate([p.normals for p in pieces])  # type: ignore[misc]
+        normals = np.concatenate([p.normals for p in pieces])
     faces = [p.faces + np.int32(start) for p, start in zip(pieces, counts[:-1], strict=True)]
     arrays: dict[str, Any] = {
         "vertices": pieces[0].vertices if one else np.concatenate([p.vertices for p in pieces]),

@@ -71,14 +71,14 @@ class _Skinning:
             name, weights_name = f"JOINTS_{k}", f"WEIGHTS_{k}"
             if name not in attributes or weights_name not in attributes:
                 break
-            numbers = document.accessor(attributes[name], name)
+            indices = document.accessor(attributes[name], name)
             weights = document.floats(attributes[weights_name], weights_name)
-            if numbers.shape != (v, 4) or weights.shape != (v, 4) or numbers.dtype.kind != "u":
+            if indices.shape != (v, 4) or weights.shape != (v, 4) or indices.dtype.kind != "u":
                 raise document.error(
                     f"{name} and {weights_name} must be {v:,} times 4 integers and weights, got shapes"
-                    f" {numbers.shape} and {weights.shape}"
+                    f" {indices.shape} and {weights.shape}"
                 )
-            used = np.where(weights != 0, numbers, 0)  # an index without weight may be arbitrary
+            used = np.where(weights != 0, indices, 0)  # an index without weight may be arbitrary
             if v and used.max() >= len(joints):
                 raise document.error(f"{name} runs up to {used.max()}, the skin has {len(joints)} joints")
             self._sets.append((used, weights))
@@ -86,14 +86,14 @@ class _Skinning:
     def of(self, part: slice) -> np.ndarray:
         """(n, 4, 4) for these vertices. Weights are scaled to a sum of 1; without any, the first joint
         counts."""
-        numbers = np.concatenate([numbers[part] for numbers, _ in self._sets], axis=1)
+        indices = np.concatenate([indices[part] for indices, _ in self._sets], axis=1)
         weights = np.concatenate([weights[part] for _, weights in self._sets], axis=1).astype(np.float64)
         total = weights.sum(axis=1)
         weights[total <= 0] = np.eye(1, weights.shape[1])
         weights /= np.where(total > 0, total, 1)[:, None]
-        blended = np.zeros((len(numbers), 4, 4))
-        for k in range(numbers.shape[1]):
-            blended += weights[:, k, None, None] * self._joints[numbers[:, k]]
+        blended = np.zeros((len(indices), 4, 4))
+        for k in range(indices.shape[1]):
+            blended += weights[:, k, None, None] * self._joints[indices[:, k]]
         return blended
 
 
@@ -105,7 +105,7 @@ def placed_meshes(document: GltfDocument) -> Iterator[Placed]:
         return
     if scenes:
         scene = document.item("scenes", document.json.get("scene", 0), "the file")
-        roots = _numbers(document, scene.get("nodes", []), "nodes of a scene")
+        roots = _indices(document, scene.get("nodes", []), "nodes of a scene")
     else:
         roots = _root_nodes(document)
     matrices = _world_matrices(document, roots)
@@ -127,26 +127,26 @@ def _joints(document: GltfDocument, index: Any, matrices: dict[int, np.ndarray])
     """(j, 4, 4) from the frame of a skinned mesh to the scene's. The transform of the mesh's own node is
     ignored (glTF 2.0, 3.7.3.3)."""
     skin = document.item("skins", index, "a node")
-    numbers = _numbers(document, skin.get("joints"), "joints of a skin")
-    if not numbers:
+    indices = _indices(document, skin.get("joints"), "joints of a skin")
+    if not indices:
         raise document.error("a skin needs joints")
-    document.budget.spend(_PLACE_BYTES * len(numbers), f"the {len(numbers):,} joints of a node")
+    document.budget.spend(_PLACE_BYTES * len(indices), f"the {len(indices):,} joints of a node")
     bound = np.eye(4)[None]
     if "inverseBindMatrices" in skin:
         bound = document.floats(skin["inverseBindMatrices"], "inverseBindMatrices").astype(np.float64)
-        if bound.shape[1] != 16 or len(bound) < len(numbers):
+        if bound.shape[1] != 16 or len(bound) < len(indices):
             raise document.error(
-                f"inverseBindMatrices must be {len(numbers)} matrices of 16 numbers, got shape {bound.shape}"
+                f"inverseBindMatrices must be {len(indices)} matrices of 16 numbers, got shape {bound.shape}"
             )
-        bound = bound[: len(numbers)].reshape(-1, 4, 4).transpose(0, 2, 1)
-    outside = set(numbers) - matrices.keys()
+        bound = bound[: len(indices)].reshape(-1, 4, 4).transpose(0, 2, 1)
+    outside = set(indices) - matrices.keys()
     if outside:  # in another scene, or in none
         matrices = matrices | _world_matrices(document, _root_nodes(document))
         for n in outside:
             document.item("nodes", n, "a skin or node")
             if n not in matrices:
                 raise document.error(f"a cycle in the node hierarchy at node {n}")
-    return np.stack([matrices[n] for n in numbers]) @ bound
+    return np.stack([matrices[n] for n in indices]) @ bound
 
 
 def _world_matrices(document: GltfDocument, roots: Sequence[int]) -> dict[int, np.ndarray]:
@@ -159,14 +159,14 @@ def _world_matrices(document: GltfDocument, roots: Sequence[int]) -> dict[int, n
         if index in matrices:
             raise document.error(f"node {index} has two parents")
         matrices[index] = parent @ _local_matrix(document, node)
-        children = _numbers(document, node.get("children", []), "children of a node")
+        children = _indices(document, node.get("children", []), "children of a node")
         stack += [(child, matrices[index]) for child in reversed(children)]
     return matrices
 
 
 def _root_nodes(document: GltfDocument) -> list[int]:
     nodes = document.items("nodes")
-    below = {c for n in nodes for c in _numbers(document, n.get("children", []), "children of a node")}
+    below = {c for n in nodes for c in _indices(document, n.get("children", []), "children of a node")}
     return [i for i in range(len(nodes)) if i not in below]
 
 
@@ -191,9 +191,9 @@ def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:
         }
     if len(counts) != 1:
         raise document.error(f"{INSTANCING} needs equal counts of all attributes, got {sorted(counts)}")
-    number = counts.pop()
-    document.budget.spend(_PLACE_BYTES * number, f"{number:,} instances")
-    for i in range(number):
+    n = counts.pop()
+    document.budget.spend(_PLACE_BYTES * n, f"{n:,} instances")
+    for i in range(n):
         yield _matrix(
             *(rows[name][i] if name in rows else None for name in ("TRANSLATION", "ROTATION", "SCALE"))
         )
@@ -226,7 +226,7 @@ def rotation_matrix(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _numbers(document: GltfDocument, value: object, what: str) -> list[int]:
+def _indices(document: GltfDocument, value: object, what: str) -> list[int]:
     if not isinstance(value, list) or not all(isinstance(x, int) for x in value):
         raise document.error(f"{what} must be an array of whole numbers")
     return value

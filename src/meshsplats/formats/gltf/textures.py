@@ -51,12 +51,12 @@ def gltf_textures(
             material = material_of(document, primitive)
             info = dict_or_empty(pbr_of(material).get("baseColorTexture"))
             uv = _coordinates(document, attributes, info, v) if info or override is not None else None
-            number = -1
+            index = -1
             if uv is not None:
-                number = 0 if override is not None else found.number(material, info)
+                index = 0 if override is not None else found.index_of(material, info)
                 document.budget.spend(24 * len(faces), "texture coordinates")
             corners = np.zeros((len(faces), 3, 2), np.float32) if uv is None else uv[faces]
-            parts.append((corners, np.full(len(faces), number, np.int32)))
+            parts.append((corners, np.full(len(faces), index, np.int32)))
     if found.unread:
         warnings.warn(
             f"{path}: {found.unread} textures are of a kind that is not read; their faces have none",
@@ -103,10 +103,10 @@ class _Textures:
     read: Callable[[Path, bytes], np.ndarray]
     textures: list[Texture] = field(default_factory=list)
     unread: int = 0
-    _numbers: dict[tuple, int] = field(default_factory=dict)
+    _indices: dict[tuple[Any, ...], int] = field(default_factory=dict)
     _images: dict[int, np.ndarray] = field(default_factory=dict)
 
-    def number(self, material: dict[str, Any], info: dict[str, Any]) -> int:
+    def index_of(self, material: dict[str, Any], info: dict[str, Any]) -> int:
         """Index of the base-colour texture ``info`` of ``material``; -1 if it is of an unknown kind."""
         document = self.document
         texture = document.item("textures", info.get("index"), "baseColorTexture")
@@ -126,16 +126,16 @@ class _Textures:
         mode = material.get("alphaMode", "OPAQUE")
         cutoff = float(document.numbers([material.get("alphaCutoff", 0.5)], 1, "alphaCutoff")[0])
         key = (source, *wraps, *factor, mode, cutoff)
-        if key not in self._numbers:
+        if key not in self._indices:
             pixels = self._image(source)
             if mode != "BLEND":
                 pixels = pixels.copy()
                 shown = pixels[..., 3] * (factor[3] / 255) >= cutoff
                 pixels[..., 3] = 255 if mode == "OPAQUE" else np.where(shown, 255, 0)
                 factor[3] = 1
-            self._numbers[key] = len(self.textures)
+            self._indices[key] = len(self.textures)
             self.textures.append(Texture(pixels, (wraps[0], wraps[1]), tuple(factor)))  # type: ignore[arg-type]
-        return self._numbers[key]
+        return self._indices[key]
 
     def _image(self, source: object) -> np.ndarray:
         document = self.document

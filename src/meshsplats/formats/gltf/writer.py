@@ -21,14 +21,11 @@ from meshsplats._geometry import vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._validation import check_attribute_names
+from meshsplats.formats.cutting import CUTOFF
 from meshsplats.mesh import SplatMesh
 
 ColorType = Literal["uint16", "float32"]
-Alpha = Literal["blend", "mask"]
-
-MASK_CUTOFF = 0.2
-"""Least opacity that ``alpha='mask'`` renders: of 0.05 to 0.5 the best compromise over an opaque figure, a
-furry one and an outdoor scene in three.js (docs/viewers.md)."""
+Alpha = Literal["blend", "mask", "opaque"]
 
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -44,6 +41,7 @@ def write_glb(
     lit: bool = False,
     color_type: ColorType = "uint16",
     alpha: Alpha = "blend",
+    cutoff: float = CUTOFF,
     extras: bool = True,
 ) -> None:
     """Writes ``mesh`` to ``path``.
@@ -58,8 +56,10 @@ def write_glb(
             area-weighted vertex normals; False: it is unlit (KHR_materials_unlit).
         color_type: 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
         alpha: how viewers treat opacity. 'blend' is exact in viewers that sort, and good enough in many that
-            do not. 'mask' needs no order: opacities of at least ``MASK_CUTOFF`` are rendered solid, with the
-            depth buffer. docs/viewers.md compares them.
+            do not. 'mask' needs no order: opacities of at least ``cutoff`` are rendered solid, with the depth
+            buffer. 'opaque' is for a mesh of ``cut_mesh``, which is solid: viewers ignore opacity.
+            docs/viewers.md compares them.
+        cutoff: least opacity that 'mask' renders.
         extras: False leaves out the arrays that only this project reads.
 
     Raises:
@@ -73,7 +73,7 @@ def write_glb(
     if not len(mesh.faces):
         raise ValueError("glTF cannot hold a mesh without triangles; save it as .npz or .ply")
     check_attribute_names(mesh)
-    document, parts = _document(mesh, lit, color_type, alpha, extras)
+    document, parts = _document(mesh, lit, color_type, alpha, cutoff, extras)
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     binary = document["buffers"][0]["byteLength"]
@@ -127,7 +127,7 @@ class _Buffer:
 
 
 def _document(
-    mesh: SplatMesh, lit: bool, color_type: ColorType, alpha: Alpha, with_extras: bool
+    mesh: SplatMesh, lit: bool, color_type: ColorType, alpha: Alpha, cutoff: float, with_extras: bool
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The JSON part, and the arrays of the binary part."""
     from meshsplats import __version__
@@ -183,11 +183,11 @@ def _document(
     material: dict[str, Any] = {
         "name": "splats",
         "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
-        "alphaMode": "BLEND" if alpha == "blend" else "MASK",
+        "alphaMode": alpha.upper(),
         "doubleSided": True,
     }
     if alpha == "mask":
-        material["alphaCutoff"] = MASK_CUTOFF
+        material["alphaCutoff"] = cutoff
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
         "scene": 0,

@@ -104,7 +104,7 @@ def read_obj(path: Path) -> SplatMesh:
 
 
 def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
-    """The words of each line with its number; a backslash at the end joins the next line."""
+    """The words of each line with its line number; a backslash at the end joins the next line."""
     joined = b""
     for number, line in enumerate(data.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n"), 1):
         if line.endswith(b"\\"):
@@ -118,8 +118,8 @@ def statements(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
 
 def _corner(word: bytes, count: int) -> int:
     """0-based vertex index of ``v``, ``v/vt`` or ``v/vt/vn``, which count from 1, or from -1 back."""
-    number = int(word.partition(b"/")[0])
-    number = number - 1 if number > 0 else number + count
-    if word[:1] == b"0" or number < 0:
+    stored = int(word.partition(b"/")[0])
+    index = stored - 1 if stored > 0 else stored + count
+    if word[:1] == b"0" or index < 0:
         raise ValueError
-    return number
+    return index

@@ -71,7 +71,13 @@ def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object, *, str
         packed = readers["vertex"].rows(start, m)
         rows = builder.next(m)
 
-        def lerp(low: str, axes: str, t: np.ndarray, ranges=ranges, of_splat=of_splat) -> np.ndarray:
+        def lerp(
+            low: str,
+            axes: str,
+            t: np.ndarray,
+            ranges: np.ndarray = ranges,
+            of_splat: np.ndarray = of_splat,
+        ) -> np.ndarray:
             a = np.stack([ranges["min_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
             b = np.stack([ranges["max_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
             return a * (1 - t) + b * t

@@ -6,7 +6,7 @@ import io
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -14,13 +14,16 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.ply.header import Element, PlyHeader, Property
 
+if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
+
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
 
 
 def read_faces(
-    file: BinaryIO, header: PlyHeader, face: Element, numbers: tuple[str, ...], budget: Budget, path: Path
+    file: BinaryIO, header: PlyHeader, face: Element, names: tuple[str, ...], budget: Budget, path: Path
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Triangles (f, 3) of the element ``face``, and its integer properties among ``numbers``, each (f,)
+    """Triangles (f, 3) of the element ``face``, and its integer properties among ``names``, each (f,)
     int64.
 
     Polygons become fans of triangles around their first corner; points and lines are dropped. Raises
@@ -31,7 +34,7 @@ def read_faces(
         return np.empty((0, 3), np.int64), {}
     if index is None or index.dtype.kind not in "iu":
         raise FileFormatError(f"{path}: element 'face' has no list of integers 'vertex_indices'")
-    keep = [p for p in face.properties if p.name in numbers and not p.is_list and p.dtype.kind in "iu"]
+    keep = [p for p in face.properties if p.name in names and not p.is_list and p.dtype.kind in "iu"]
     size = file.seek(0, io.SEEK_END) - header.data_offset
     if face.count > max(size, 0):
         raise FileFormatError(f"{path}: {face.count:,} faces do not fit {max(size, 0):,} bytes (truncated)")
@@ -45,17 +48,21 @@ def read_faces(
 
 
 def cut_polygons(
-    lengths: np.ndarray, corners: np.ndarray, numbers: dict[str, np.ndarray]
+    lengths: np.ndarray, corners: np.ndarray, values: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Triangles of polygons of ``lengths`` (n,), concatenated in ``corners``; and their ``numbers``."""
+    """Triangles of polygons of ``lengths`` (n,), concatenated in ``corners``.
+
+    Returns:
+        (f, 3) corners of the triangles; ``values``, each (n,), as (f,): those of their polygons.
+    """
     if (lengths == 3).all():
-        return corners.reshape(-1, 3), numbers
+        return corners.reshape(-1, 3), values
     per_face = np.maximum(lengths - 2, 0)
     owner = np.repeat(np.arange(len(lengths)), per_face)
     start = (np.cumsum(lengths) - lengths)[owner]
     step = np.arange(len(owner)) - (np.cumsum(per_face) - per_face)[owner]
     triangles = np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
-    return triangles, {name: v[owner] for name, v in numbers.items()}
+    return triangles, {name: v[owner] for name, v in values.items()}
 
 
 # -- binary
@@ -110,7 +117,7 @@ def _gather(raw: np.ndarray, places: np.ndarray, dtype: np.dtype) -> np.ndarray:
 def _uniform(data: bytes, element: Element, at: int) -> np.dtype | None:
     """Row type if the lists of all rows have the lengths of the first row's; None if rows differ or data
     end."""
-    fields: list[tuple] = []
+    fields: list[tuple[str, DTypeLike]] = []
     offset = at
     for i, p in enumerate(element.properties):
         if p.count_dtype is None:

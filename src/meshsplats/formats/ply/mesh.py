@@ -66,7 +66,7 @@ def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
     header += [f"property float {name}" for name in names]
     header.append(f"element face {len(mesh.faces)}")
     header.append("property list uchar int vertex_indices")
-    fields: list[tuple] = [("n", "u1"), ("corners", "<i4", 3)]
+    fields: list[tuple[str, str] | tuple[str, str, int]] = [("n", "u1"), ("corners", "<i4", 3)]
     numbers = {field.name: values for field, values in extras if field.per == "face"}
     for name in numbers:
         header.append(f"property int {name}")

@@ -60,7 +60,7 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     colors.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(linear[:, :3])))
     opacities = shape.CreateDisplayOpacityPrimvar(UsdGeom.Tokens.vertex)
     opacities.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(linear[:, 3])))
-    _add_material(stage, shape, lit)
+    _add_material(stage, shape, lit, opaque=bool((mesh.colors[:, 3] == 1).all()))
     primvars = UsdGeom.PrimvarsAPI(shape)
     types = {
         np.int32: (Sdf.ValueTypeNames.IntArray, Vt.IntArray),
@@ -101,8 +101,8 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
         raise OSError(f"usd-core could not write {path}")
 
 
-def _add_material(stage: Any, shape: Any, lit: bool) -> None:
-    """A UsdPreviewSurface whose colour and opacity come from the primvars."""
+def _add_material(stage: Any, shape: Any, lit: bool, *, opaque: bool) -> None:
+    """A UsdPreviewSurface whose colour and, unless all is opaque, opacity come from the primvars."""
     from pxr import Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
@@ -118,11 +118,12 @@ def _add_material(stage: Any, shape: Any, lit: bool) -> None:
         return shader.CreateOutput("result", result)
 
     color = reader("Color", "displayColor", "float3", (0.5, 0.5, 0.5), types.Float3)
-    opacity = reader("Opacity", "displayOpacity", "float", 1.0, types.Float)
     surface.CreateInput("diffuseColor" if lit else "emissiveColor", types.Color3f).ConnectToSource(color)
     if not lit:
         surface.CreateInput("diffuseColor", types.Color3f).Set((0, 0, 0))
-    surface.CreateInput("opacity", types.Float).ConnectToSource(opacity)
+    if not opaque:  # renderers sort or trace through a surface with an opacity, whatever it is
+        opacity = reader("Opacity", "displayOpacity", "float", 1.0, types.Float)
+        surface.CreateInput("opacity", types.Float).ConnectToSource(opacity)
     surface.CreateInput("roughness", types.Float).Set(1.0)
     # The specular workflow with black has no reflections, which an emissive surface should not show.
     surface.CreateInput("useSpecularWorkflow", types.Int).Set(0 if lit else 1)
