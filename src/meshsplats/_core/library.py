@@ -13,7 +13,7 @@ import numpy as np
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
 
-INTERFACE_VERSION = 5
+INTERFACE_VERSION = 6
 
 
 class CameraStruct(ctypes.Structure):
@@ -38,6 +38,10 @@ class OptionsStruct(ctypes.Structure):
         ("background", c_void_p),
         ("background_per_pixel", c_int32),
         ("cutoff", c_float),
+        ("ramp_slope", c_float),
+        ("ramp_height", c_float),
+        ("ramp_width", c_float),
+        ("ramp_leak", c_float),
     ]
 
 
@@ -84,7 +88,13 @@ class ImageStruct(ctypes.Structure):
 
 
 class ImageGradientsStruct(ctypes.Structure):
-    _fields_ = [("color", c_void_p), ("alpha", c_void_p), ("attributes", c_void_p)]
+    _fields_ = [
+        ("color", c_void_p),
+        ("alpha", c_void_p),
+        ("attributes", c_void_p),
+        ("expected_weight", c_void_p),
+        ("target", c_void_p),
+    ]
 
 
 class VertexGradientsStruct(ctypes.Structure):
