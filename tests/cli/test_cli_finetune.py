@@ -376,5 +376,5 @@ def test_a_mesh_for_engines(splats, tmp_path, capsys):
     data = out.read_bytes()
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     assert document["materials"][0]["alphaMode"] == "OPAQUE"
-    assert run(splats, "-o", tmp_path / "b.npz", *SMALL, "--opacity", "cutoff", "--exposure", "True") != 0
-    assert "exposure is for opacity 'blended'" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "b.npz", *SMALL, "--cutoff", "0.3") != 0
+    assert "cutoff has no effect without opacity 'cutoff'" in capsys.readouterr().err

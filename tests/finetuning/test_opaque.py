@@ -128,6 +128,11 @@ def test_options_that_need_blending_are_refused(changes, message):
         make_config(opacity="cutoff", **changes)
 
 
+def test_options_without_effect_are_refused():
+    with pytest.raises(ValueError, match="settle_share has no effect without opacity 'cutoff'"):
+        make_config(settle_share=0.3)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [({"filter_px2": 0.3}, "without a filter"), ({"blending": "linear"}, "display colours")],

@@ -129,6 +129,10 @@ class FinetuneConfig:
         check_flags(self, ("exposure", "soft_edges"))
         if self.opacity == "cutoff":
             self._check_cutoff()
+        else:
+            for f in fields(self):
+                if f.name in _OF_CUTOFF and getattr(self, f.name) != f.default:
+                    raise ValueError(f"{f.name} has no effect without opacity 'cutoff'")
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
@@ -165,6 +169,9 @@ class FinetuneConfig:
         """All fields, for JSON."""
         return asdict(self)
 
+
+_OF_CUTOFF = ("cutoff", "anneal_share", "expected_share", "settle_share", "hidden_hits")
+"""Options of opacity 'cutoff'."""
 
 _CHOICES = {
     "position_unit": get_args(Unit),
