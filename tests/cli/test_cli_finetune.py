@@ -363,3 +363,18 @@ def test_every_option_of_the_configuration_can_be_given():
     command = Finetune(input=None, output=None, steps=5)  # type: ignore[arg-type]
     assert command.configured() == make_config(steps=5)
     assert TargetOptions().cache_bytes == 2_000_000_000
+
+
+def test_a_mesh_for_engines(splats, tmp_path, capsys):
+    out = tmp_path / "tuned.glb"
+    options = (*SMALL, "--steps", "8", "--opacity", "cutoff", "--cutoff", "0.3", "--json")
+    assert run(splats, "-o", out, *options) == 0
+    result = json.loads(capsys.readouterr().out)
+    mesh = load_mesh(out)
+    assert (mesh.colors[:, 3] == 1).all()
+    assert result["triangles"] == len(mesh.faces)
+    data = out.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert document["materials"][0]["alphaMode"] == "OPAQUE"
+    assert run(splats, "-o", tmp_path / "b.npz", *SMALL, "--cutoff", "0.3") != 0
+    assert "cutoff has no effect without opacity 'cutoff'" in capsys.readouterr().err

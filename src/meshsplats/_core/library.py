@@ -17,7 +17,7 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 5
+INTERFACE_VERSION = 6
 
 
 class CameraStruct(ctypes.Structure):
@@ -42,6 +42,10 @@ class OptionsStruct(ctypes.Structure):
         ("background", c_void_p),
         ("background_per_pixel", c_int32),
         ("cutoff", c_float),
+        ("ramp_slope", c_float),
+        ("ramp_height", c_float),
+        ("ramp_width", c_float),
+        ("ramp_leak", c_float),
     ]
 
 
@@ -88,7 +92,13 @@ class ImageStruct(ctypes.Structure):
 
 
 class ImageGradientsStruct(ctypes.Structure):
-    _fields_ = [("color", c_void_p), ("alpha", c_void_p), ("attributes", c_void_p)]
+    _fields_ = [
+        ("color", c_void_p),
+        ("alpha", c_void_p),
+        ("attributes", c_void_p),
+        ("expected_weight", c_void_p),
+        ("target", c_void_p),
+    ]
 
 
 class VertexGradientsStruct(ctypes.Structure):

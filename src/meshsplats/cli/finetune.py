@@ -53,7 +53,7 @@ class Finetune(TrainingCommand):
     """
 
     COMMON = (
-        *("input", "output", "preset", "minutes", "steps", "data", "downscale", "cameras"),
+        *("input", "output", "preset", "opacity", "minutes", "steps", "data", "downscale", "cameras"),
         *("width", "max_splats", "max_triangles", "crop", "threads", "resume", "json", "force"),
     )
 

@@ -210,7 +210,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 5; }
+MS_EXPORT int ms_interface_version() { return 6; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 

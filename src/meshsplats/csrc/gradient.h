@@ -13,6 +13,7 @@
 // sample sees and their order are constants.
 #pragma once
 
+#include "ramp.h"
 #include "scene.h"
 #include "tape.h"
 
@@ -55,6 +56,7 @@ class GradientTile {
           fragments_(CHUNK),
           visible_(CHUNK),
           depths_(attribute_channels_ ? CHUNK : 0),
+          opacities_(has_ramp(options) ? CHUNK : 0),
           slot_of_step_(CHUNK) {
         // FanFilter::backward takes position gradients in camera space; all others are rotated to world
         // space.
@@ -75,10 +77,14 @@ class GradientTile {
             masks_ = tape.masks(block);
             steps_ = tape.steps(block);
             step_count_ = tape.step_count(block);
-            if (attribute_channels_)
-                backward_block<true>(block);
+            if (has_ramp(options_) && attribute_channels_)
+                backward_block<true, true>(block);
+            else if (has_ramp(options_))
+                backward_block<false, true>(block);
+            else if (attribute_channels_)
+                backward_block<true, false>(block);
             else
-                backward_block<false>(block);
+                backward_block<false, false>(block);
         }
         write_gradients(tape.face_count(), out);
     }
@@ -112,6 +118,10 @@ class GradientTile {
         Lanes z_weight;  // depth z; replay_forward multiplies it by the transmittance T
         Lanes d_alpha;   // c . g, summed over the channels; propagate_behind subtracts B . g
     };
+    // Of an entry with a ramp (see ramp.h): the interpolated opacity a and da'/da. Its RGBA has a'.
+    struct EntryOpacities {
+        Lanes interpolated, slope;
+    };
     // The entry in a slot, and its lanes with fragments that early termination kept.
     struct VisibleEntry {
         uint32_t entry;
@@ -128,6 +138,8 @@ class GradientTile {
         const float share = 1.0f / (s * s);
         bool any = false;
         for (int c = 0; c < 3; ++c) std::fill(grad_color_[c], grad_color_[c] + SAMPLES, 0.0f);
+        for (int c = 0; c < 3; ++c) std::fill(target_[c], target_[c] + SAMPLES, 0.0f);
+        std::fill(expected_weight_, expected_weight_ + SAMPLES, 0.0f);
         std::fill(background_behind_, background_behind_ + SAMPLES, 0.0f);
         std::fill(grad_attributes_.begin(), grad_attributes_.end(), 0.0f);
         for (int y = 0; y < area_.rows; ++y) {
@@ -144,6 +156,15 @@ class GradientTile {
                     grad_color_[c][sample] = g;
                     behind += g * background[c];
                     any |= g != 0;
+                }
+                const float expected =
+                    image_gradients_.expected_weight ? image_gradients_.expected_weight[pixel] * share : 0;
+                expected_weight_[sample] = expected;
+                for (int c = 0; c < 3 && expected != 0; ++c) {
+                    target_[c][sample] = image_gradients_.target[3 * pixel + c];
+                    const float error = background[c] - target_[c][sample];
+                    behind += expected * error * error;
+                    any = true;
                 }
                 for (int c = 0; c < attribute_channels_; ++c) {
                     const float g = image_gradients_.attributes[pixel * attribute_channels_ + c] * share;
@@ -314,7 +335,7 @@ class GradientTile {
     // steps: replay_forward finds T from the front, propagate_behind B from the back, and add_moments takes
     // entries as a whole. Chunks are processed from back to front, so a first sweep over all chunks finds T
     // where each begins.
-    template <bool ATTRIBUTES>
+    template <bool ATTRIBUTES, bool RAMP>
     void backward_block(int block) {
         const BlockSamples samples(block);
         const int64_t chunks = (step_count_ + CHUNK - 1) / CHUNK;
@@ -325,13 +346,13 @@ class GradientTile {
         chunk_transmittance_[0] = broadcast(1);
         for (int64_t chunk = 0; chunk < chunks; ++chunk)
             chunk_transmittance_[chunk + 1] =
-                replay_forward<ATTRIBUTES>(samples, chunk, chunk_transmittance_[chunk]);
+                replay_forward<ATTRIBUTES, RAMP>(samples, chunk, chunk_transmittance_[chunk]);
         Lanes behind = load_lanes(background_behind_ + block * LANES);
         for (int64_t chunk = chunks - 1; chunk >= 0; --chunk) {
             // The sweep ended with the last chunk: its fragments are still there.
-            if (chunk < chunks - 1) replay_forward<ATTRIBUTES>(samples, chunk, chunk_transmittance_[chunk]);
+            if (chunk < chunks - 1) replay_forward<ATTRIBUTES, RAMP>(samples, chunk, chunk_transmittance_[chunk]);
             behind = propagate_behind(chunk, behind);
-            for (uint32_t slot = 0; slot < slot_count_; ++slot) add_moments<ATTRIBUTES>(samples, slot);
+            for (uint32_t slot = 0; slot < slot_count_; ++slot) add_moments<ATTRIBUTES, RAMP>(samples, slot);
         }
     }
 
@@ -342,14 +363,14 @@ class GradientTile {
 
     // Evaluates the entries of a chunk and multiplies their weights by the transmittance in front of them.
     // Takes the transmittance in front of the chunk and returns that behind it.
-    template <bool ATTRIBUTES>
+    template <bool ATTRIBUTES, bool RAMP>
     Lanes replay_forward(const BlockSamples &samples, int64_t chunk, Lanes transmittance) {
         const Lanes limit = broadcast(options_.min_transmittance);
         const PackedTape::IndexedLanes *steps = chunk_steps(chunk);
         const int64_t n = chunk_size(chunk);
         assign_slots(steps, n);
         for (uint32_t slot = 0; slot < slot_count_; ++slot) {
-            const Lanes z = evaluate<ATTRIBUTES>(samples, entries_[visible_[slot].entry], fragments_[slot]);
+            const Lanes z = evaluate<ATTRIBUTES, RAMP>(samples, entries_[visible_[slot].entry], slot);
             if (ATTRIBUTES) depths_[slot] = z;
         }
         for (int64_t i = 0; i < n; ++i) {
@@ -395,9 +416,10 @@ class GradientTile {
     }
 
     // Interpolates an entry, without regard to what lies in front and behind; returns the depth.
-    template <bool ATTRIBUTES>
+    template <bool ATTRIBUTES, bool RAMP>
     __attribute__((always_inline)) Lanes evaluate(const BlockSamples &samples, const TapeEntry entry,
-                                                  EntryFragments &f) {
+                                                  uint32_t slot) {
+        EntryFragments &f = fragments_[slot];
         MS_ASSERT(entry.mask_count >= 1);
         const PackedTape::IndexedLanes *mask = masks_ + entry.first_mask;
         Lanes q, linear[4];  // 1 / depth, RGBA / depth
@@ -423,9 +445,18 @@ class GradientTile {
         const Lanes z = f.z_weight = reciprocal(clamp(q, broadcast(q_min), broadcast(q_max)));
         for (int c = 0; c < 4; ++c) f.rgba[c] = clamp(linear[c] * z, broadcast(low[c]), broadcast(high[c]));
         const int block = samples.block;
+        if (RAMP) evaluate_ramp(entry, z, slot);
         f.d_alpha = mul_add(f.rgba[0], load_lanes(grad_color(0, block)),
                             mul_add(f.rgba[1], load_lanes(grad_color(1, block)),
                                     f.rgba[2] * load_lanes(grad_color(2, block))));
+        if (image_gradients_.expected_weight) {
+            Lanes square = broadcast(0);
+            for (int c = 0; c < 3; ++c) {
+                const Lanes error = target_error(f, c, block);
+                square = mul_add(error, error, square);
+            }
+            f.d_alpha = mul_add(square, load_lanes(expected_weight_ + block * LANES), f.d_alpha);
+        }
         if (!ATTRIBUTES) return z;
         for (uint32_t i = 0; i < entry.mask_count; ++i) {
             t = &triangles_[mask[i].index()];
@@ -437,8 +468,31 @@ class GradientTile {
         return z;
     }
 
+    // c - target of one colour channel.
+    Lanes target_error(const EntryFragments &f, int c, int block) const {
+        return f.rgba[c] - load_lanes(target_[c] + block * LANES);
+    }
+
+    // Replaces the opacity of the entry in a slot by that of the ramp. z is its depth.
+    void evaluate_ramp(const TapeEntry entry, const Lanes &z, uint32_t slot) {
+        Lanes &alpha = fragments_[slot].rgba[3];
+        const PackedTape::IndexedLanes *mask = masks_ + entry.first_mask;
+        Lanes a, b, qa, qb;
+        for (uint32_t i = 0; i < entry.mask_count; ++i) {
+            const TapeTriangle &t = triangles_[mask[i].index()];
+            const LaneMask lanes = mask[i].lanes;
+            a = i ? select(lanes, broadcast(t.a[3]), a) : broadcast(t.a[3]);
+            b = i ? select(lanes, broadcast(t.b[3]), b) : broadcast(t.b[3]);
+            qa = i ? select(lanes, broadcast(t.qa), qa) : broadcast(t.qa);
+            qb = i ? select(lanes, broadcast(t.qb), qb) : broadcast(t.qb);
+        }
+        const Ramp ramp = opacity_ramp(options_, alpha, (a - alpha * qa) * z, (b - alpha * qb) * z);
+        opacities_[slot] = {alpha, ramp.slope};
+        alpha = ramp.opacity;
+    }
+
     // Adds the entry in a slot to the moments of its triangles.
-    template <bool ATTRIBUTES>
+    template <bool ATTRIBUTES, bool RAMP>
     __attribute__((always_inline)) void add_moments(const BlockSamples &samples, uint32_t slot) {
         const EntryFragments &f = fragments_[slot];
         const VisibleEntry visible = visible_[slot];
@@ -446,9 +500,15 @@ class GradientTile {
         const int block = samples.block;
         // z T, z T a, and z times the gradients of RGBA.
         const Lanes weight = masked(visible.lanes, f.z_weight), color_weight = weight * f.rgba[3];
-        const Lanes grad[4] = {color_weight * load_lanes(grad_color(0, block)),
-                               color_weight * load_lanes(grad_color(1, block)),
-                               color_weight * load_lanes(grad_color(2, block)), weight * f.d_alpha};
+        Lanes grad[4] = {color_weight * load_lanes(grad_color(0, block)),
+                         color_weight * load_lanes(grad_color(1, block)),
+                         color_weight * load_lanes(grad_color(2, block)), weight * f.d_alpha};
+        if (image_gradients_.expected_weight) {
+            const Lanes twice = color_weight * load_lanes(expected_weight_ + block * LANES) * broadcast(2);
+            for (int c = 0; c < 3; ++c) grad[c] = mul_add(twice, target_error(f, c, block), grad[c]);
+        }
+        if (RAMP) grad[3] = grad[3] * opacities_[slot].slope;
+        const Lanes &alpha = RAMP ? opacities_[slot].interpolated : f.rgba[3];
         for (uint32_t i = entry.first_mask; i < entry.first_mask + entry.mask_count; ++i) {
             const PackedTape::IndexedLanes mask = masks_[i];
             const uint32_t triangle = mask.index();
@@ -457,7 +517,8 @@ class GradientTile {
             Lanes sums[4], sums_y[4];
             for (int c = 0; c < 4; ++c) sums[c] = masked(mask.lanes, grad[c]);
             Lanes v = sums[0] * (f.rgba[0] - broadcast(t.first[0]));
-            for (int c = 1; c < 4; ++c) v = mul_add(sums[c], f.rgba[c] - broadcast(t.first[c]), v);
+            for (int c = 1; c < 4; ++c)
+                v = mul_add(sums[c], (c == 3 ? alpha : f.rgba[c]) - broadcast(t.first[c]), v);
             if (ATTRIBUTES) {
                 for (int c = 0; c < attribute_channels_; ++c) {
                     const size_t plane = (size_t)triangle * attribute_channels_ + c;
@@ -605,6 +666,8 @@ class GradientTile {
     TileArea area_;
     alignas(64) float grad_color_[3][SAMPLES];      // gradients g of the colour of each sample
     alignas(64) float background_behind_[SAMPLES];  // B . g at the end
+    alignas(64) float target_[3][SAMPLES];          // of the expected loss
+    alignas(64) float expected_weight_[SAMPLES];    // likewise, 0 without one
     std::vector<float> grad_attributes_;            // (channel, sample)
     TriangleSetup<LANES> batch_;
     float origin_x_[LANES], origin_y_[LANES];       // of the triangles of batch_, relative to the tile
@@ -627,6 +690,7 @@ class GradientTile {
     std::vector<EntryFragments> fragments_;
     std::vector<VisibleEntry> visible_;
     std::vector<Lanes> depths_;  // if there are attributes
+    std::vector<EntryOpacities> opacities_;  // if there is a ramp
     std::vector<uint16_t> slot_of_step_;
 
     static constexpr uint32_t CACHE_SIZE = 2048;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "fragment_queue.h"
+#include "ramp.h"
 #include "scene.h"
 #include "tape.h"
 #include "tile_area.h"
@@ -41,7 +42,7 @@ class ImageTile {
     // opaque ones are recorded as if the opaque ones transmitted some light: the gradient of an opacity of 1
     // depends on what lies behind it.
     void record_tape() {
-        MS_ASSERT(!has_cutoff());
+        MS_ASSERT(!has_cutoff(options_) || has_ramp(options_));
         tape_ = std::make_unique<TileTape>();
     }
     const TileTape &tape() const { return *tape_; }
@@ -49,9 +50,7 @@ class ImageTile {
     // Where to add the coverage masks of queue entries, or null if nothing needs them.
     TileCoverage *coverage() { return tape_ || extras_.any() ? &coverage_ : nullptr; }
     bool keeps_transparent() const { return tape_ != nullptr; }
-    // Whether fragments are opaque or not there at all.
-    bool has_cutoff() const { return options_.cutoff >= 0; }
-    float cutoff() const { return options_.cutoff; }
+    const MsOptions &options() const { return options_; }
     bool needs_weights() const { return extras_.any(); }
     // Number of fragments blended so far, in all tiles.
     int64_t fragments() const { return fragments_; }
@@ -84,7 +83,7 @@ class ImageTile {
         // safe.
         const Lanes limit = broadcast(std::max(0.5f * options_.min_transmittance, 1e-30f));
         Lanes transmittance = load_lanes((tape_ ? capped_transmittance_ : transmittance_) + block * LANES);
-        const Lanes max_alpha = broadcast(tape_ ? ALPHA_CAP : 1);
+        const Lanes max_alpha = broadcast(tape_ ? alpha_cap() : 1);
         LaneMask active = active_[block];
         int layers_left[LANES];
         for (int i = 0; i < LANES; ++i)
@@ -134,6 +133,9 @@ class ImageTile {
   private:
     // With a tape, early termination follows the transmittance of alphas limited to this, see record_tape.
     static constexpr float ALPHA_CAP = 0.9f;
+    // Ramps end at 1, where their derivative is small or 0.
+    static constexpr float RAMP_ALPHA_CAP = 0.999f;
+    float alpha_cap() const { return has_ramp(options_) ? RAMP_ALPHA_CAP : ALPHA_CAP; }
 
     // GENERAL: with extra outputs, a layer limit or a tape.
     template <bool GENERAL>
@@ -164,7 +166,7 @@ class ImageTile {
                 if (ready & active) record_step(*tape, queue, entry, ready & active);
                 capped_transmittance =
                     capped_transmittance -
-                    masked(ready & active, capped_transmittance * min_lanes(f.rgba[3], broadcast(ALPHA_CAP)));
+                    masked(ready & active, capped_transmittance * min_lanes(f.rgba[3], broadcast(alpha_cap())));
                 active &= blending | greater_equal(capped_transmittance, limit);
             } else {
                 active &= blending;
@@ -288,7 +290,7 @@ class ImageTile {
     TileArea area_;
     alignas(64) float color_[3][SAMPLES];
     alignas(64) float transmittance_[SAMPLES];
-    alignas(64) float capped_transmittance_[SAMPLES];  // with alphas limited to ALPHA_CAP
+    alignas(64) float capped_transmittance_[SAMPLES];  // with alphas limited to alpha_cap()
     std::unique_ptr<TileTape> tape_;
     TileCoverage coverage_;
     int32_t layers_[SAMPLES];  // fragments blended, if there is a layer limit

@@ -139,7 +139,7 @@ class MeshTile {
         }
         for (int end, begin = 0; begin < batch_size_; begin = end) {
             for (end = begin + 1; end < batch_size_ && group_[end] == group_[begin];) ++end;
-            if (clipped || mesh_.depth_group || image_.needs_weights() || image_.has_cutoff())
+            if (clipped || mesh_.depth_group || image_.needs_weights() || has_cutoff(image_.options()))
                 rasterize_group<true>(begin, end, clipped);
             else
                 rasterize_group<false>(begin, end, 0);
@@ -154,6 +154,7 @@ class MeshTile {
         Lanes at_sample[COUNT];                         // relative to the corner, one lane per sample
         Lanes at_corner[COUNT];                         // one lane per block
         alignas(16) float low[4], high[4];              // range of RGBA over the triangle's corners
+        float alpha_a, alpha_b;                         // opacity / depth per sample along x and y
 
         void set(int function, float a, float b, float c) {
             const Lanes va = broadcast(a), vb = broadcast(b);
@@ -215,7 +216,8 @@ class MeshTile {
                     greater_equal(functions(BlockFunctions::EDGE + i, block), broadcast(t.threshold[i][k]));
             Lanes q = functions(BlockFunctions::Q, block);
             if (GENERAL && clipped >> k & 1) inside &= greater_equal(broadcast(t.q_max[k]), q);
-            if (GENERAL && image_.has_cutoff()) inside &= above_cutoff(k, block, q);
+            Lanes opacity;
+            if (GENERAL && has_cutoff(image_.options())) opacity = cut_opacity(k, block, q, inside);
             if (!inside) continue;
             if (covered & inside) {
                 push();
@@ -233,7 +235,8 @@ class MeshTile {
                     select(written, clamp(value, broadcast(functions.low[c]), broadcast(functions.high[c])),
                            f->rgba[c]);
             }
-            if (GENERAL && image_.has_cutoff()) f->rgba[3] = broadcast(1);
+            if (GENERAL && has_cutoff(image_.options()))
+                f->rgba[3] = select(written, opacity, f->rgba[3]);
             if (!covered) first_face = t.face[k];
             covered |= inside;
             if (coverage) {
@@ -247,13 +250,25 @@ class MeshTile {
         full_blocks_ |= (unsigned)queue.full() << block;
     }
 
-    // The lanes where the opacity of triangle k reaches the cutoff. 1 / depth is q.
-    LaneMask above_cutoff(int k, int block, const Lanes &q) const {
+    // The opacity of triangle k with the cutoff. Removes lanes from `inside` that it makes transparent, unless
+    // they have a derivative on the tape. 1 / depth is q.
+    Lanes cut_opacity(int k, int block, const Lanes &q, LaneMask &inside) const {
         const BlockFunctions &functions = functions_[k];
+        const MsOptions &options = image_.options();
         const Lanes z = broadcast(1) / clamp(q, broadcast(batch_.q_min[k]), broadcast(batch_.q_max[k]));
         const Lanes alpha = clamp(functions(BlockFunctions::RGBA + 3, block) * z,
                                   broadcast(functions.low[3]), broadcast(functions.high[3]));
-        return greater_equal(alpha, broadcast(image_.cutoff()));
+        if (!has_ramp(options)) {
+            inside &= greater_equal(alpha, broadcast(options.cutoff));
+            return broadcast(1);
+        }
+        const Ramp ramp =
+            opacity_ramp(options, alpha, (broadcast(functions.alpha_a) - alpha * broadcast(batch_.qa[k])) * z,
+                         (broadcast(functions.alpha_b) - alpha * broadcast(batch_.qb[k])) * z);
+        LaneMask kept = greater(ramp.opacity, broadcast(0));
+        if (image_.keeps_transparent()) kept |= greater(ramp.slope, broadcast(0));
+        inside &= kept;
+        return ramp.opacity;
     }
 
     // Depth and barycentric weights of triangle k in the lanes `inside`.
@@ -288,8 +303,12 @@ class MeshTile {
         const f4 c[3] = {load4(t.rgba[0][k]), load4(t.rgba[1][k]), load4(t.rgba[2][k])};
         const f4 high = max4(max4(c[0], c[1]), c[2]);
         if (!(t.valid[k] > 0)) return 0;
-        if (image_.has_cutoff() ? high[3] < image_.cutoff() : !(high[3] > 0) && !image_.keeps_transparent())
+        const MsOptions &options = image_.options();
+        if (has_cutoff(options) && !has_ramp(options)) {
+            if (high[3] < options.cutoff) return 0;
+        } else if (!(high[3] > 0) && !image_.keeps_transparent()) {
             return 0;
+        }
         BlockFunctions &functions = functions_[k];
         unsigned blocks = active_blocks_;
         for (int i = 0; i < 3; ++i) {
@@ -307,6 +326,8 @@ class MeshTile {
         const float (*const s[3])[Batch::N] = {t.sa, t.sb, t.sc};
         for (int i = 0; i < 3; ++i)
             store4(plane[i], set4(s[i][0][k]) * c[0] + set4(s[i][1][k]) * c[1] + set4(s[i][2][k]) * c[2]);
+        functions.alpha_a = plane[0][3];
+        functions.alpha_b = plane[1][3];
         for (int i = 0; i < 4; ++i)
             functions.set(BlockFunctions::RGBA + i, plane[0][i], plane[1][i], plane[2][i]);
         store4(functions.low, min4(min4(c[0], c[1]), c[2]));

@@ -20,6 +20,11 @@ struct MsOptions {
     const float *background;  // RGB: 3 values, or (height, width, 3)
     int32_t background_per_pixel;
     float cutoff;  // meshes: fragments of at least this opacity are opaque, others not drawn; negative: as is
+    // With a cutoff, see ramp.h:
+    float ramp_slope;   // greatest slope of a ramp in place of the hard cut; 0: none
+    float ramp_height;  // opacity at the cutoff
+    float ramp_width;   // least width of the ramp in samples; 0: any
+    float ramp_leak;    // derivative where the ramp is 0 or 1
 };
 
 struct MsMesh {
@@ -62,6 +67,10 @@ struct MsImageGradients {
     const float *color;       // (height, width, 3)
     const float *alpha;       // (height, width), or null
     const float *attributes;  // (height, width, attribute_count), or null
+    // The loss also has sum_k T_k a_k |c_k - target|^2, the expected square error of an image in which each
+    // fragment is opaque by a chance of a_k, times this weight:
+    const float *expected_weight;  // (height, width), or null
+    const float *target;           // (height, width, 3), or null
 };
 
 // Gradients of a loss with respect to the vertices. The core adds to the arrays.

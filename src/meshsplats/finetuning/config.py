@@ -97,6 +97,24 @@ class FinetuneConfig:
     samples: int | None = None
     """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
     photographs; 1 for images of a splat viewer (``Dataset.look``)."""
+    opacity: Literal["blended", "cutoff"] = "blended"
+    """blended: translucent triangles. cutoff: for engines and viewers, which draw with a depth buffer and do
+    not sort: optimised for being drawn opaque where the opacity is at least ``cutoff``, and not at all
+    elsewhere. The result is cut there: opaque triangles, without those that no training view shows."""
+    cutoff: float = 0.2
+    """opacity 'cutoff': least opacity that is drawn."""
+    anneal_share: float = 0.5
+    """opacity 'cutoff': opacities turn from blended to cut over this initial fraction of the run."""
+    expected_share: float = 0.5
+    """opacity 'cutoff': share of the loss, from the end of the annealing on, that is l2_weight times the
+    expected square error of images in which each fragment is opaque or not by chance. It makes layers agree
+    with the target one by one, not only in their mean."""
+    settle_share: float = 0.15
+    """opacity 'cutoff': before this last fraction of the run, triangles that the training views do not show
+    are removed."""
+    hidden_hits: int = 4
+    """opacity 'cutoff': triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
+    a pixel, are removed. 0: none."""
     point_share: float = 0.4
     """For rendered images that are means over each pixel's area: for this initial fraction of the run, train
     on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
@@ -109,9 +127,29 @@ class FinetuneConfig:
         check_ranges(self, _RANGES, optional=(*LENGTHS, "samples"))
         check_choices(self, _CHOICES)
         check_flags(self, ("exposure", "soft_edges"))
+        if self.opacity == "cutoff":
+            self._check_cutoff()
+        else:
+            for f in fields(self):
+                if f.name in _OF_CUTOFF and getattr(self, f.name) != f.default:
+                    raise ValueError(f"{f.name} has no effect without opacity 'cutoff'")
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
+
+    def _check_cutoff(self) -> None:
+        """ValueError for options that have no meaning, or were never tried, without blending."""
+        for name, standard in (
+            ("exposure", False),
+            ("relocate_share", 0.0),
+            ("prune_importance", 0.0),
+        ):
+            if getattr(self, name) != standard:
+                raise ValueError(f"{name} is for opacity 'blended', not for 'cutoff'")
+        if self.blending == "linear":
+            raise ValueError("blending 'linear' is for opacity 'blended': opaque triangles are not blended")
+        if self.expected_share and not self.l2_weight:
+            raise ValueError("expected_share is a share of l2_weight, which is 0: set l2_weight, or it to 0")
 
     def total_steps(self, views: int) -> int | None:
         """Number of steps with this number of training views; None if the length is given in minutes."""
@@ -132,10 +170,14 @@ class FinetuneConfig:
         return asdict(self)
 
 
+_OF_CUTOFF = ("cutoff", "anneal_share", "expected_share", "settle_share", "hidden_hits")
+"""Options of opacity 'cutoff'."""
+
 _CHOICES = {
     "position_unit": get_args(Unit),
     "background": get_args(BackgroundMode),
     "blending": ("mesh", "display", "linear"),
+    "opacity": ("blended", "cutoff"),
 }
 
 _RANGES: list[Range] = [
@@ -159,6 +201,11 @@ _RANGES: list[Range] = [
     ("relocate_share", 0, 0.5, False),
     ("relocate_epochs", 1e-3, 1e6, False),
     ("samples", 1, 16, True),
+    ("cutoff", 0, 1, False),
+    ("anneal_share", 0, 1, False),
+    ("expected_share", 0, 1, False),
+    ("settle_share", 0, 1, False),
+    ("hidden_hits", 0, 10**9, True),
     ("point_share", 0, 1, False),
     ("seed", 0, 2**63 - 1, True),
 ]
@@ -225,6 +272,12 @@ class FinetuneChanges(TypedDict, total=False):
     relocate_epochs: float
     blending: Literal["mesh", "display", "linear"]
     samples: int | None
+    opacity: Literal["blended", "cutoff"]
+    cutoff: float
+    anneal_share: float
+    expected_share: float
+    settle_share: float
+    hidden_hits: int
     point_share: float
     seed: int
 

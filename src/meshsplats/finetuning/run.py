@@ -25,8 +25,10 @@ from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
+from meshsplats.finetuning.opaque import visible_faces
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
+from meshsplats.formats.cutting import cut_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import image_of
 
@@ -116,8 +118,9 @@ def finetune(
     """Optimises positions, colours and opacities of ``mesh`` on the training views of ``dataset``.
 
     The targets are photographs (``load_dataset``) or images of the splats themselves (``splat_dataset``). The
-    result has the triangles of ``mesh`` except those that were pruned. It has no normals, since those of
-    ``mesh`` would not fit it.
+    result has the triangles of ``mesh`` except those that were pruned; with ``opacity='cutoff'`` they are
+    opaque and cut where their opacity crosses the cutoff. It has no normals, since those of ``mesh`` would
+    not fit it.
 
     Args:
         config: the configuration; the preset 'default' by default.
@@ -213,6 +216,8 @@ class TrainingLoop:
         self.report_cost = self.save_cost = self.step_cost = 0.0
         self.scored_views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
         self.quarter = int(MIN_PREVIEWS * self.fraction)
+        # A resumed run may have removed hidden triangles before its checkpoint.
+        self.settled = start.step > 0 and self.fraction >= 1 - config.settle_share
 
     @property
     def seconds(self) -> float:
@@ -256,6 +261,8 @@ class TrainingLoop:
                 if loss is not None:
                     self.losses.append(loss)
                     self.last_loss = loss
+                if self._settles():
+                    self._remove_hidden()
                 if prune_interval and self.step % prune_interval == 0 and not self._done():
                     self.state = self.state.prune(kept_faces(self.state, views))
                 due = relocate_interval and self.step % relocate_interval == 0
@@ -275,7 +282,29 @@ class TrainingLoop:
             self._notify()
             if signals.received is not None:
                 raise Interrupted(self.step, signals.received)
-        return self.state.result()
+        return self.result()
+
+    def result(self) -> SplatMesh:
+        """The current mesh, cut if it is made for a cutoff."""
+        mesh = self.state.result()
+        return cut_mesh(mesh, self.config.cutoff) if self.config.opacity == "cutoff" else mesh
+
+    def _settles(self) -> bool:
+        """Whether it is time to remove the triangles that no training view shows: once."""
+        due = self.config.opacity == "cutoff" and self.fraction >= 1 - self.config.settle_share
+        now, self.settled = due and not self.settled, self.settled or due
+        return now and self.config.hidden_hits > 0 and not self._done()
+
+    def _remove_hidden(self) -> None:
+        keep = visible_faces(
+            self.state.result(),
+            self.dataset.train,
+            self.config.cutoff,
+            self.config.hidden_hits,
+            self.options.threads,
+        )
+        if keep.any():
+            self.state = self.state.prune(keep)
 
     def _done(self) -> bool:
         if self.limit is not None:
@@ -288,7 +317,7 @@ class TrainingLoop:
         loss = float(np.mean(self.losses)) if self.losses else None
         mean_ssim = None
         if self.scored_views:
-            mesh = self.state.result()
+            mesh = self.result()
             scores = []
             for view in self.scored_views:
                 image, target = np.clip(self._render(mesh, view), 0, 1), np.clip(view.image, 0, 1)
@@ -316,7 +345,7 @@ class TrainingLoop:
         if self.journal is None or not self.options.preview_every:
             return
         view = (self.scored_views or self.dataset.train)[0]
-        image = np.clip(self._render(self.state.result(), view), 0, 1)
+        image = np.clip(self._render(self.result(), view), 0, 1)
         self.journal.save_preview(self.step, np.clip(view.image, 0, 1), image)
 
     def _render(self, mesh: SplatMesh, view: View) -> np.ndarray:

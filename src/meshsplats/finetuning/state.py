@@ -80,6 +80,8 @@ class State:
     @classmethod
     def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
         """The state before the first step, for ``views`` training views."""
+        if config.opacity == "cutoff":
+            _check_for_cutoff(mesh)
         mesh = replace(mesh, normals=None)  # positions change, normals would not
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
@@ -153,6 +155,8 @@ class State:
         reached."""
         # A vertex has a gradient only if its opacity has one, and a single column is quick to scan.
         reached = gradients.colors[:, 3] != 0
+        if self.config.opacity == "cutoff":  # but where opaque, only its colour
+            reached |= (gradients.colors[:, :3] != 0).any(axis=1)
         opacity = self.colors[:, 3]
         transparent = None if self._boundary is None else self._boundary & (opacity == 0)
         if self._sums is not None:
@@ -224,6 +228,18 @@ class State:
     def _optimisers(self) -> dict[str, RowAdam]:
         found = {"positions": self._positions, "colors": self._colors}
         return found if self._exposures is None else found | {"exposure": self._exposures}
+
+
+def _check_for_cutoff(mesh: SplatMesh) -> None:
+    """ValueError if ``mesh`` cannot become one of opaque triangles."""
+    if mesh.filter_px2:
+        raise ValueError(
+            "opacity 'cutoff' is for meshes without a filter: choose another footprint, or bake_filter"
+        )
+    if mesh.binding is not None:
+        raise ValueError("opacity 'cutoff' cannot keep the binding to a base mesh")
+    if mesh.blending == "linear":
+        raise ValueError("opacity 'cutoff' is for meshes in display colours, this one is in linear light")
 
 
 def _checked_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -14,9 +14,10 @@ from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
+from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
-from meshsplats.rendering.backward import TapedRendering, visible_pixels
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering, visible_pixels
 
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""
@@ -81,13 +82,24 @@ class RenderedView:
         self._rendering, self._linear = rendering, linear
         self.color = linear_to_srgb(rendering.color) if linear else rendering.color
 
-    def backward(self, grad_color: np.ndarray) -> Gradients:
-        """Gradients of vertices and colours, from ``grad_color``, (h, w, 3) float32, that of ``color``."""
+    def backward(self, grad_color: np.ndarray, expected: ExpectedError | None = None) -> Gradients:
+        """Gradients of vertices and colours, from ``grad_color``, (h, w, 3) float32, that of ``color``.
+
+        Those of ``expected`` are added; it is for display blending.
+        """
+        assert not (self._linear and expected)
         if self._linear:
             grad_color = grad_color * encoding_slope(self._rendering.color)
         count = self._rendering.vertex_count
         gradients = Gradients(np.zeros((count, 3), np.float32), np.zeros((count, 4), np.float32))
-        self._rendering.backward(grad_color, None, None, vertices=gradients.vertices, colors=gradients.colors)
+        self._rendering.backward(
+            grad_color,
+            None,
+            None,
+            vertices=gradients.vertices,
+            colors=gradients.colors,
+            expected=expected,
+        )
         return gradients
 
 
@@ -99,7 +111,13 @@ def samples_of(view: View, config: FinetuneConfig) -> int:
     return 1 if viewer else AREA_SAMPLES
 
 
-def render_view(state: State, view: View, background: Sequence[float], samples: int) -> RenderedView:
+def render_view(
+    state: State,
+    view: View,
+    background: Sequence[float],
+    samples: int,
+    ramp: OpacityRamp | None = None,
+) -> RenderedView:
     """The current mesh from the camera of ``view``, over ``background``, display RGB."""
     linear = state.mesh.blending == "linear"
     display = np.asarray(background, np.float32)
@@ -115,6 +133,7 @@ def render_view(state: State, view: View, background: Sequence[float], samples: 
         face_splat=state.mesh.face_splat,
         depth_group=state.mesh.depth_group,
         filter_px2=state.mesh.filter_px2,
+        ramp=ramp,
         threads=state.threads,
     )
     return RenderedView(rendering, linear)
@@ -168,7 +187,8 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
     target = target_of(view, config, step, points)
     if target.mask is not None and not target.mask.any():
         return None
-    rendered = render_view(state, view, target.background, 1 if points else samples_of(view, config))
+    samples = 1 if points else samples_of(view, config)
+    rendered = render_view(state, view, target.background, samples, ramp_of(config, fraction))
     image = rendered.color
     if state.exposures is not None:
         exposure = state.exposures[index]
@@ -180,7 +200,12 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
         if state.exposures is not None:
             grad_exposure = exposure_gradient(rendered.color, grad_image)
             grad_image = grad_image * exposure[GAIN]
-        culprit, gradients = "a gradient", rendered.backward(grad_image)._replace(exposure=grad_exposure)
+        expected, share = None, expected_share(config, fraction)
+        if share:
+            expected = expected_error(target.color, target.mask, config, share)
+            grad_image = grad_image * np.float32(1 - share)
+        culprit, gradients = "a gradient", rendered.backward(grad_image, expected)
+        gradients = gradients._replace(exposure=grad_exposure)
     if gradients is None or not gradients.finite():
         raise DivergenceError(
             f"step {step + 1}, view {view.name!r}: {culprit} is not finite. Check this view's image and"

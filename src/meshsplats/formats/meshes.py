@@ -107,10 +107,11 @@ def save_mesh(
         path: the file; its suffix decides the format.
         lit: (`.glb`, USD; default False) a material that scene lights shade, instead of an unlit one.
         color_type: (`.glb`; default 'uint16') 'float32' stores colours exactly, but larger.
-        alpha: (default 'blend') 'opaque' cuts the triangles where their opacity crosses ``cutoff`` and writes
-            the rest as solid geometry, for programs with a depth buffer, in any format: see ``cut_mesh``.
-            'mask' (`.glb`) keeps the triangles and lets the viewer draw them solid where the opacity reaches
-            the cutoff; their edges stay jagged where 'opaque' ones are smooth.
+        alpha: (default 'blend'; 'opaque' for a mesh whose opacities are all 1) 'opaque' cuts the triangles
+            where their opacity crosses ``cutoff`` and writes the rest as solid geometry, for programs with a
+            depth buffer, in any format: see ``cut_mesh``. 'mask' (`.glb`) keeps the triangles and lets the
+            viewer draw them solid where the opacity reaches the cutoff; their edges stay jagged where those
+            of 'opaque' are smooth.
         cutoff: (with 'opaque' and 'mask'; default 0.2) least opacity that is drawn, 0 to 1.
         compression: (`.glb`) 'meshopt' makes files about a fifth as large, with the external program
             gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
@@ -150,6 +151,8 @@ def save_mesh(
         mesh = cut_mesh(mesh, CUTOFF if cutoff is None else cutoff)
         if suffix not in _GLB:
             del options["alpha"]
+    elif alpha is None and suffix in _GLB and len(mesh.colors) and (mesh.colors[:, 3] == 1).all():
+        options["alpha"] = "opaque"
     elif cutoff is not None:
         options["cutoff"] = float(cutoff)
     if mesh.filter_px2 and suffix in _UNFILTERED:

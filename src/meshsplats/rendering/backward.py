@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from meshsplats.rendering.api import (
     MIN_TRANSMITTANCE,
     Pointers,
     camera_struct,
+    checked_cutoff,
     checked_options,
     compact_groups,
 )
@@ -21,6 +24,47 @@ from meshsplats.rendering.api import (
 TAPE_BYTES = 128 << 20
 """Largest size of the tape of one image, which takes about two bytes a fragment. The backward pass renders
 tiles that did not fit once more."""
+
+
+@dataclass(frozen=True)
+class OpacityRamp:
+    """A differentiable stand-in for the hard cut of ``render(mesh, camera, cutoff=...)``.
+
+    The interpolated opacity a becomes ``clip(height + (a - cutoff) * k, 0, 1)`` with ``k = min(slope, 1 /
+    (width |grad a|))``, where grad a is the gradient of a in the image, per pixel. Slope 1, height = cutoff
+    and width 0 change nothing. Height 0.5, a large slope and width 1 give about the share of the pixel on the
+    opaque side of the level set: what a depth buffer with many samples shows.
+    """
+
+    cutoff: float
+    """Opacity c at which triangles will be cut, 0 to 1."""
+    height: float = 0.5
+    """Value at the cutoff, 0 to 1."""
+    slope: float = 1e6
+    """Greatest slope, above 0."""
+    width: float = 1.0
+    """Least width of the ramp in pixels, 0 or more."""
+    leak: float = 0.0
+    """Derivative that the backward pass uses where the ramp is 0 or 1, in place of 0."""
+
+    def __post_init__(self) -> None:
+        checked_cutoff(self.cutoff)
+        if not (0 <= self.height <= 1 and self.slope > 0 and self.width >= 0 and self.leak >= 0):
+            raise ValueError(f"not a ramp: {self}")
+
+
+class ExpectedError(NamedTuple):
+    """A further loss for the backward pass: ``sum_k T_k a_k |c_k - target|^2`` at each sample.
+
+    The background is the last fragment. This is the expected square error of an image in which each fragment
+    is opaque by a chance of its opacity a_k, and not there otherwise. It is linear in each opacity, so its
+    minima lie at opacities of 0 and 1.
+    """
+
+    target: np.ndarray
+    """(h, w, 3) float32 colours, finite."""
+    weight: np.ndarray
+    """(h, w) float32 weight of the loss in each pixel, which counts the mean over its samples."""
 
 
 class TapedRendering:
@@ -41,6 +85,7 @@ class TapedRendering:
         filter_px2: float = 0.0,
         samples: int = 1,
         min_transmittance: float = MIN_TRANSMITTANCE,
+        ramp: OpacityRamp | None = None,
         threads: int | None = None,
         tape_bytes: int | None = TAPE_BYTES,
     ) -> None:
@@ -53,6 +98,7 @@ class TapedRendering:
             camera: viewpoint, lens and size of the image.
             background, filter_px2, samples, min_transmittance, threads: as in ``render``.
             world_to_camera: (4, 4) float64, overrides the camera's.
+            ramp: changes opacities; none by default.
             tape_bytes: limit on the size of the tape; None: no tape and no backward pass, which is faster.
 
         Raises ValueError for options out of range, and MemoryError where the scene does not fit.
@@ -61,6 +107,10 @@ class TapedRendering:
         keep = self._pointers = Pointers()
         self._options = checked_options(keep, camera, background, samples, threads)
         self._options.min_transmittance = min_transmittance
+        if ramp is not None:
+            self._options.cutoff, self._options.ramp_height = ramp.cutoff, ramp.height
+            self._options.ramp_slope, self._options.ramp_leak = ramp.slope, ramp.leak
+            self._options.ramp_width = ramp.width * samples
         self._camera = camera_struct(camera)
         if world_to_camera is not None:
             self._camera.world_to_camera = (ctypes.c_double * 12)(*world_to_camera[:3].ravel())
@@ -117,6 +167,7 @@ class TapedRendering:
         vertices: np.ndarray,
         colors: np.ndarray,
         vertex_attributes: np.ndarray | None = None,
+        expected: ExpectedError | None = None,
     ) -> None:
         """Runs the backward pass: adds vertex gradients to the arrays given.
 
@@ -127,15 +178,21 @@ class TapedRendering:
             color: (h, w, 3) gradient of the image's colour.
             alpha, attributes: (h, w) and (h, w, k) gradients of those outputs, or None.
             vertices, colors, vertex_attributes: (v, 3), (v, 4) and (v, k), to be added to.
+            expected: a further loss, whose gradient is added.
 
-        All arrays are float32 and C-contiguous. Raises ValueError for a rendering without a tape.
+        The slope k of an ``OpacityRamp`` counts as constant, too. All arrays are float32 and C-contiguous.
+        Raises ValueError for a rendering without a tape.
         """
         if not self._tape:
             raise ValueError("rendered without a tape (tape_bytes=None): no gradients are available")
         if attributes is not None and not self._mesh.attribute_count:
             attributes = None
         image_gradients = library.ImageGradientsStruct(
-            library.pointer(color), library.pointer(alpha), library.pointer(attributes)
+            library.pointer(color),
+            library.pointer(alpha),
+            library.pointer(attributes),
+            None if expected is None else library.pointer(expected.weight),
+            None if expected is None else library.pointer(expected.target),
         )
         vertex_gradients = library.VertexGradientsStruct(
             library.pointer(vertices),

@@ -25,6 +25,7 @@ except ImportError as error:
     ) from error
 
 from meshsplats.rendering.autograd import Raster
+from meshsplats.rendering.backward import OpacityRamp
 
 
 def rasterize(
@@ -39,11 +40,12 @@ def rasterize(
     face_splat: np.ndarray | None = None,
     depth_group: np.ndarray | None = None,
     filter_px2: float = 0.0,
+    ramp: OpacityRamp | None = None,
 ) -> Raster:
     """The result of ``autograd.rasterize`` in float64, without early termination.
 
     Arguments are those of ``autograd.rasterize``; positions and colours may be float32 or float64, but the
-    order of fragments is that of their float32 values.
+    order of fragments is that of their float32 values. A ``ramp`` changes the opacities.
     """
     if isinstance(cameras, Camera):
         pose = None if world_to_camera is None else world_to_camera[None]
@@ -58,12 +60,13 @@ def rasterize(
             face_splat=face_splat,
             depth_group=depth_group,
             filter_px2=filter_px2,
+            ramp=ramp,
         )
         return Raster(*(part[0] for part in batch))
     backdrop = torch.as_tensor(background).double()
     images = []
     constant: dict[str, Any] = dict(
-        samples=samples, face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2
+        samples=samples, face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2, ramp=ramp
     )
     for i, camera in enumerate(cameras):
         pose = (
@@ -72,8 +75,39 @@ def rasterize(
             else world_to_camera[i].double()
         )
         own = backdrop[i] if backdrop.ndim == 4 else backdrop
-        images.append(_image(vertices.double(), faces, attributes.double(), camera, pose, own, **constant))
+        images.append(_image(vertices.double(), faces, attributes.double(), camera, pose, own, **constant)[0])
     return Raster(*(torch.stack(parts) for parts in zip(*images, strict=True)))
+
+
+def expected_error(
+    vertices: torch.Tensor,
+    faces: np.ndarray,
+    attributes: torch.Tensor,
+    camera: Camera,
+    target: torch.Tensor,
+    *,
+    background: Sequence[float] = (1, 1, 1),
+    samples: int = 1,
+    ramp: OpacityRamp | None = None,
+) -> torch.Tensor:
+    """(h, w) ``sum_k T_k a_k |c_k - target|^2``, the background included, of ``backward.ExpectedError``; with
+    ``target`` (h, w, 3) float64."""
+    pose, backdrop = torch.from_numpy(camera.world_to_camera), torch.as_tensor(background).double()
+    image, squares = _image(
+        vertices.double(),
+        faces,
+        attributes.double(),
+        camera,
+        pose,
+        backdrop,
+        samples=samples,
+        face_splat=None,
+        depth_group=None,
+        filter_px2=0.0,
+        ramp=ramp,
+    )
+    # The weights of a sample add up to 1.
+    return squares - 2 * (image.color * target).sum(dim=-1) + (target**2).sum(dim=-1)
 
 
 def filtered(
@@ -129,7 +163,9 @@ def _image(
     face_splat: np.ndarray | None,
     depth_group: np.ndarray | None,
     filter_px2: float,
-) -> Raster:
+    ramp: OpacityRamp | None,
+) -> tuple[Raster, torch.Tensor]:
+    """The image, and (h, w) ``sum_k T_k a_k |c_k|^2``, with the background's."""
     posed = replace(camera, world_to_camera=pose.detach().numpy())
     x, y = reference._sample_positions(camera, samples)
     colors = np.zeros((len(vertices), 4))
@@ -155,12 +191,24 @@ def _image(
     )
     weights = edges / edges.sum(1, keepdim=True)
     values = (weights[:, :, None] * attributes[corner]).sum(1)
+    if ramp is not None:
+        alpha = values[:, 3]
+        # Of e . a / sum e with e linear in x and y, whose coefficients are the cross products.
+        rows = torch.stack([torch.linalg.cross(*pair) for pair in ((b, c), (c, a), (a, b))], dim=1)[..., :2]
+        toward = (rows * (attributes[corner][..., 3] - alpha[:, None])[..., None]).sum(1)
+        slope = (toward / edges.sum(1, keepdim=True)).norm(dim=1).detach()
+        k = torch.clamp(1 / (ramp.width * slope).clamp(min=1e-20), max=ramp.slope)
+        raised = _Leaky.apply(  # type: ignore[no-untyped-call]
+            ramp.height + (alpha - ramp.cutoff) * k, k, ramp.leak
+        )
+        values = torch.cat([values[:, :3], raised[:, None], values[:, 4:]], dim=1)
+    values = torch.cat([values, (values[:, :3] ** 2).sum(1, keepdim=True)], dim=1)
 
     # Front to back, a layer of all samples at a time.
     layer = torch.arange(len(sample)) - torch.searchsorted(sample, sample)
     by_layer = torch.argsort(layer, stable=True)
     sizes = torch.bincount(layer).tolist()
-    sums = torch.zeros(len(x), attributes.shape[1] - 1, dtype=torch.float64)
+    sums = torch.zeros(len(x), attributes.shape[1], dtype=torch.float64)
     through = torch.ones(len(x), 1, dtype=torch.float64)
     layers = zip(torch.split(sample[by_layer], sizes), torch.split(values[by_layer], sizes), strict=True)
     for here, value in layers:
@@ -173,4 +221,21 @@ def _image(
 
     left = pixels(through)
     mean = pixels(sums)
-    return Raster(mean[..., :3] + left * background, 1 - left[..., 0], mean[..., 3:])
+    squares = mean[..., -1] + left[..., 0] * (background**2).sum(dim=-1)
+    return Raster(mean[..., :3] + left * background, 1 - left[..., 0], mean[..., 3:-1]), squares
+
+
+class _Leaky(torch.autograd.Function):
+    """Clamps to [0, 1]; outside, the derivative with respect to the opacity is ``leak``, not 0: that of the
+    value, which has the slope k, is leak / k."""
+
+    @staticmethod
+    def forward(ctx: Any, value: torch.Tensor, k: torch.Tensor, leak: float) -> torch.Tensor:
+        ctx.save_for_backward((value > 0) & (value < 1), k)
+        ctx.leak = leak
+        return value.clamp(0, 1)
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        inside, k = ctx.saved_tensors
+        return grad * torch.where(inside, torch.ones_like(k), ctx.leak / k), None, None

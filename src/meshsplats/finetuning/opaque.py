@@ -1,0 +1,99 @@
+"""Meshes that are drawn with a depth buffer: every fragment is opaque or not there (``opacity='cutoff'``).
+
+The hard cut at the cutoff has no derivative. In its place, a step renders a ramp of opacities around the
+level set, which becomes steeper until it is one pixel wide. A part of the loss is the expected error of
+images of random fragments: unlike that of the image, it does not accept a mean of layers for a color that
+none of them has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from meshsplats._arrays import subsample
+from meshsplats.datasets.views import View
+from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp
+
+STEEPEST = 30.0
+"""Slope of the ramp at the end of the annealing, where it is not limited by its width already."""
+LEAK = 0.05
+"""Derivative outside of the ramp at the start, so that hidden fragments can come back. It falls to 0."""
+HIT_VIEWS = 64
+"""Maximum number of training views, evenly spread, in which triangles are looked for."""
+HIT_SAMPLES = 2
+"""Samples along each side of a pixel there."""
+_ROOT = 1024
+
+
+def ramp_of(config: FinetuneConfig, fraction: float) -> OpacityRamp | None:
+    """The ramp of a step after ``fraction`` (0 to 1) of the run; None for blended meshes."""
+    if config.opacity != "cutoff":
+        return None
+    done = _annealed(config, fraction)
+    return OpacityRamp(
+        config.cutoff,
+        height=config.cutoff + (0.5 - config.cutoff) * done,
+        slope=STEEPEST**done if done < 1 else 1e6,
+        leak=LEAK * (1 - done),
+    )
+
+
+def expected_share(config: FinetuneConfig, fraction: float) -> float:
+    """Share of the expected error in the loss, after ``fraction`` of the run."""
+    return config.expected_share * _annealed(config, fraction) if config.opacity == "cutoff" else 0.0
+
+
+def _annealed(config: FinetuneConfig, fraction: float) -> float:
+    return min(1.0, fraction / config.anneal_share) if config.anneal_share else 1.0
+
+
+def expected_error(
+    target: np.ndarray, mask: np.ndarray | None, config: FinetuneConfig, share: float
+) -> ExpectedError:
+    """The expected error against ``target`` (h, w, 3) where ``mask`` counts, times ``share * l2_weight``."""
+    pixels = np.ones(target.shape[:2], bool) if mask is None else mask
+    weight = np.zeros(pixels.shape, np.float32)
+    weight[pixels] = share * config.l2_weight / (3 * np.count_nonzero(pixels))
+    # Masked values may be anything.
+    known = target if mask is None else np.where(mask[..., None], target, 0)
+    return ExpectedError(np.ascontiguousarray(known, np.float32), weight)
+
+
+def visible_faces(
+    mesh: SplatMesh, views: Sequence[View], cutoff: float, fewest: int, threads: int | None = None
+) -> np.ndarray:
+    """(f,) bool: the triangles that are in front, drawn with ``cutoff``, at ``fewest`` samples or more of all
+    ``views`` together: at most ``HIT_VIEWS`` of them, with ``HIT_SAMPLES`` x ``HIT_SAMPLES`` samples."""
+    count = len(mesh.faces)
+    # Every triangle has corners of its own with its number, in two digits that float32 interpolates exactly.
+    numbers = np.repeat(np.arange(count), 3)
+    numbered = SplatMesh(
+        mesh.vertices[mesh.faces].reshape(-1, 3),
+        np.arange(3 * count).reshape(-1, 3),
+        mesh.colors[mesh.faces].reshape(-1, 4),
+        depth_group=mesh.depth_group,
+        attributes={"number": np.stack([numbers % _ROOT, numbers // _ROOT], axis=1)},
+    )
+    hits = np.zeros(count, np.int64)
+    for view in subsample(views, HIT_VIEWS):
+        camera, s = view.camera, HIT_SAMPLES
+        finer = replace(
+            camera,
+            width=camera.width * s,
+            height=camera.height * s,
+            fx=camera.fx * s,
+            fy=camera.fy * s,
+            cx=camera.cx * s,
+            cy=camera.cy * s,
+        )
+        image = render(numbered, finer, cutoff=cutoff, attributes=("number",), threads=threads)
+        digits = np.rint(image.attributes["number"][image.alpha > 0.5]).astype(np.int64)
+        found = digits[:, 0] + _ROOT * digits[:, 1]
+        hits += np.bincount(found, minlength=count)
+    return hits >= fewest
