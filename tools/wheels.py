@@ -45,6 +45,11 @@ class Platform:
     machine: str  # x86_64 or arm64
 
     @property
+    def target_options(self) -> list[str]:
+        # Unlike for glibc, zig's code for musl is position-dependent by default.
+        return ["-target", self.target, *(["-fPIC"] if self.target.endswith("-musl") else [])]
+
+    @property
     def suffix(self) -> str:
         return {"linux": ".so", "windows": ".dll", "macos": ".dylib"}[self.system]
 
@@ -100,7 +105,7 @@ def zig(*arguments: str) -> None:
 
 def compiled_core(platform: Platform, variant: str, options: list[str]) -> Path:
     """The core's object file, from the cache where it is there."""
-    options = ["-target", platform.target, *options, f'-DMS_VARIANT="{variant}"']
+    options = [*platform.target_options, *options, f'-DMS_VARIANT="{variant}"']
     key = hashlib.sha256("\n".join([source_hash(), *options]).encode()).hexdigest()[:16]
     compiled = CACHE / f"{platform.tag}-{variant}-{key}.o"
     if not compiled.is_file():
@@ -122,7 +127,7 @@ def linked_core(platform: Platform, variant: str, options: list[str]) -> bytes:
     }.get(platform.system, [])
     # -O3, in every step: zig builds its runtime libraries for it, and without it in debug mode. No processor
     # when linking: the runtimes would be built again for it.
-    optimized = ["-target", platform.target, "-O3"]
+    optimized = [*platform.target_options, "-O3"]
     with tempfile.TemporaryDirectory() as scratch:
         library = Path(scratch) / f"meshsplats_{variant}{platform.suffix}"  # macOS writes its name into it
         demangler = Path(scratch) / "no_demangler.o"
