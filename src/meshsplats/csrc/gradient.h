@@ -349,7 +349,8 @@ class GradientTile {
         Lanes behind = load_lanes(background_behind_ + block * LANES);
         for (int64_t chunk = chunks - 1; chunk >= 0; --chunk) {
             // The sweep ended with the last chunk: its fragments are still there.
-            if (chunk < chunks - 1) replay_forward<ATTRIBUTES, RAMP>(samples, chunk, chunk_transmittance_[chunk]);
+            if (chunk < chunks - 1)
+                replay_forward<ATTRIBUTES, RAMP>(samples, chunk, chunk_transmittance_[chunk]);
             behind = propagate_behind(chunk, behind);
             for (uint32_t slot = 0; slot < slot_count_; ++slot) add_moments<ATTRIBUTES, RAMP>(samples, slot);
         }
@@ -688,7 +689,7 @@ class GradientTile {
     uint32_t first_slot_, slot_count_;
     std::vector<EntryFragments> fragments_;
     std::vector<VisibleEntry> visible_;
-    std::vector<Lanes> depths_;  // if there are attributes
+    std::vector<Lanes> depths_;              // if there are attributes
     std::vector<EntryOpacities> opacities_;  // if there is a ramp
     std::vector<uint16_t> slot_of_step_;
 

@@ -166,7 +166,8 @@ class ImageTile {
                 if (ready & active) record_step(*tape, queue, entry, ready & active);
                 capped_transmittance =
                     capped_transmittance -
-                    masked(ready & active, capped_transmittance * min_lanes(f.rgba[3], broadcast(alpha_cap())));
+                    masked(ready & active,
+                           capped_transmittance * min_lanes(f.rgba[3], broadcast(alpha_cap())));
                 active &= blending | greater_equal(capped_transmittance, limit);
             } else {
                 active &= blending;

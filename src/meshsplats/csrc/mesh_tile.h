@@ -235,8 +235,7 @@ class MeshTile {
                     select(written, clamp(value, broadcast(functions.low[c]), broadcast(functions.high[c])),
                            f->rgba[c]);
             }
-            if (GENERAL && has_cutoff(image_.options()))
-                f->rgba[3] = select(written, opacity, f->rgba[3]);
+            if (GENERAL && has_cutoff(image_.options())) f->rgba[3] = select(written, opacity, f->rgba[3]);
             if (!covered) first_face = t.face[k];
             covered |= inside;
             if (coverage) {
@@ -250,14 +249,14 @@ class MeshTile {
         full_blocks_ |= (unsigned)queue.full() << block;
     }
 
-    // The opacity of triangle k with the cutoff. Removes lanes from `inside` that it makes transparent, unless
-    // they have a derivative on the tape. 1 / depth is q.
+    // The opacity of triangle k with the cutoff. Removes lanes from `inside` that it makes transparent,
+    // unless they have a derivative on the tape. 1 / depth is q.
     Lanes cut_opacity(int k, int block, const Lanes &q, LaneMask &inside) const {
         const BlockFunctions &functions = functions_[k];
         const MsOptions &options = image_.options();
         const Lanes z = broadcast(1) / clamp(q, broadcast(batch_.q_min[k]), broadcast(batch_.q_max[k]));
-        const Lanes alpha = clamp(functions(BlockFunctions::RGBA + 3, block) * z,
-                                  broadcast(functions.low[3]), broadcast(functions.high[3]));
+        const Lanes alpha = clamp(functions(BlockFunctions::RGBA + 3, block) * z, broadcast(functions.low[3]),
+                                  broadcast(functions.high[3]));
         if (!has_ramp(options)) {
             inside &= greater_equal(alpha, broadcast(options.cutoff));
             return broadcast(1);

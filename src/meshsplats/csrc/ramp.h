@@ -30,8 +30,7 @@ inline Ramp opacity_ramp(const MsOptions &options, const Lanes &a, const Lanes &
         alignas(64) float length[LANES];
         store_lanes(length, gradient_x * gradient_x + gradient_y * gradient_y);
         for (int i = 0; i < LANES; ++i) length[i] = std::sqrt(length[i]);
-        const Lanes width =
-            max_lanes(broadcast(options.ramp_width) * load_lanes(length), broadcast(1e-20f));
+        const Lanes width = max_lanes(broadcast(options.ramp_width) * load_lanes(length), broadcast(1e-20f));
         slope = min_lanes(slope, broadcast(1) / width);
     }
     const Lanes value = broadcast(options.ramp_height) + (a - broadcast(options.cutoff)) * slope;
