@@ -237,3 +237,10 @@ def test_cutoffs_without_effect_are_refused(tmp_path):
     with pytest.raises(ValueError, match="cutoff must be an opacity"):
         save_mesh(SQUARE, tmp_path / "m.glb", alpha="mask", cutoff=2)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_without_translucency_needs_no_option(tmp_path):
+    save_mesh(cut_mesh(SQUARE, 0.25), tmp_path / "m.glb")
+    assert chunks(tmp_path / "m.glb")[0]["materials"][0]["alphaMode"] == "OPAQUE"
+    save_mesh(cut_mesh(SQUARE, 0.25), tmp_path / "m.glb", alpha="blend")
+    assert chunks(tmp_path / "m.glb")[0]["materials"][0]["alphaMode"] == "BLEND"

@@ -112,7 +112,7 @@ class FinetuneConfig:
     settle_share: float = 0.15
     """opacity 'cutoff': before this last fraction of the run, triangles that the training views do not show
     are removed."""
-    hidden_hits: int = 4
+    hidden_hits: int = 1
     """opacity 'cutoff': triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
     a pixel, are removed. 0: none."""
     point_share: float = 0.4
