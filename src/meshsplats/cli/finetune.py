@@ -54,7 +54,7 @@ class Finetune(TrainingCommand):
 
     COMMON = (
         *("input", "output", "preset", "opacity", "minutes", "steps", "data", "downscale", "cameras"),
-        *("width", "max_splats", "max_triangles", "crop", "threads", "resume", "json", "force"),
+        *("width", "max_triangles", "threads", "resume", "force"),
     )
 
     input: tyro.conf.Positional[Path]

@@ -48,7 +48,7 @@ class TargetOptions:
     inside a room."""
     cameras: File = None
     """Without --data: cameras, a JSON list or a cameras.json of a 3DGS trainer. Default: those of a model
-    folder, unless --placement, --distance or --up is given; else they are placed."""
+    folder, else placed ones (--placement)."""
     up: Text = None
     """Without --data: direction that points up, an axis (-y, z, ...) or x,y,z."""
     look: Annotated[

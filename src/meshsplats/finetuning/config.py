@@ -98,9 +98,8 @@ class FinetuneConfig:
     """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
     photographs; 1 for images of a splat viewer (``Dataset.look``)."""
     opacity: Literal["blended", "cutoff"] = "blended"
-    """blended: translucent triangles. cutoff: for engines and viewers, which draw with a depth buffer and do
-    not sort: optimised for being drawn opaque where the opacity is at least ``cutoff``, and not at all
-    elsewhere. The result is cut there: opaque triangles, without those that no training view shows."""
+    """blended: translucent triangles. cutoff: opaque ones, cut where the opacity reaches ``cutoff``, for
+    engines and viewers with a depth buffer."""
     cutoff: float = 0.2
     """opacity 'cutoff': least opacity that is drawn."""
     anneal_share: float = 0.5
