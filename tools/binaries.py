@@ -19,7 +19,7 @@ def check(content: bytes, system: str, machine: str, tag: str) -> None:
     system and its version in the ``tag`` of the wheel provide."""
     expected = MACHINES[system][machine]
     if system == "linux":
-        _check_elf(content, expected)
+        _check_elf(content, expected, tag)
     elif system == "windows":
         _check_pe(content, expected)
     else:
@@ -37,8 +37,8 @@ def _require(condition: object, message: str) -> None:
         raise ValueError(message)
 
 
-def _check_elf(content: bytes, machine: str) -> None:
-    # Which libraries and symbol versions it may need is auditwheel's part.
+def _check_elf(content: bytes, machine: str, tag: str) -> None:
+    # Which libraries and symbol versions it may need is auditwheel's part. That looks for musl on this machine.
     from elftools.elf.elffile import ELFFile
 
     file = ELFFile(io.BytesIO(content))
@@ -46,6 +46,9 @@ def _check_elf(content: bytes, machine: str) -> None:
     _require(file.get_section_by_name(".symtab") is None, "is not stripped")
     symbols = file.get_section_by_name(".dynsym").iter_symbols()
     _check_exports([s.name for s in symbols if s.name and s["st_shndx"] != "SHN_UNDEF"])
+    if tag.startswith("musllinux"):
+        needed = [d.needed for d in file.get_section_by_name(".dynamic").iter_tags("DT_NEEDED")]
+        _require(needed == ["libc.so"], f"needs {', '.join(needed)}")
     stack = [s["p_flags"] for s in file.iter_segments() if s["p_type"] == "PT_GNU_STACK"]
     _require(stack and not stack[0] & 1, "wants an executable stack")
 

@@ -221,7 +221,7 @@ def check(path: Path) -> str:
                 binaries.check(content, platform.system, platform.machine, platform.tag)
             except ValueError as error:
                 raise Failed(f"{name}: {error}") from None
-    if platform.system == "linux":
+    if platform.tag.startswith("manylinux"):
         check_with_auditwheel(path, platform)
     check_that_pip_installs(path, platform)
     best = check_best_variant(files, platform)
