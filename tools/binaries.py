@@ -38,7 +38,7 @@ def _require(condition: object, message: str) -> None:
 
 
 def _check_elf(content: bytes, machine: str, tag: str) -> None:
-    # Which libraries and symbol versions it may need is auditwheel's part. That looks for musl on this machine.
+    # Which libraries and symbol versions it may need is auditwheel's part, except for musl.
     from elftools.elf.elffile import ELFFile
 
     file = ELFFile(io.BytesIO(content))
