@@ -98,8 +98,7 @@ class FinetuneConfig:
     """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
     photographs; 1 for images of a splat viewer (``Dataset.look``)."""
     opacity: Literal["blended", "cutoff"] = "blended"
-    """blended: translucent triangles. cutoff: opaque ones, cut where the opacity reaches ``cutoff``, for
-    engines and viewers with a depth buffer."""
+    """blended: translucent triangles. cutoff: opaque ones, for engines and viewers with a depth buffer."""
     cutoff: float = 0.2
     """opacity 'cutoff': least opacity that is drawn."""
     anneal_share: float = 0.5
