@@ -187,17 +187,14 @@ def find_chain(context, name):
     return active if active is not None else chains[0] if len(chains) == 1 else None
 
 
-class ShowLevel(bpy.types.Operator):
-    """Show one level of detail, in the viewport and in renders, and hide the others"""
+class ChainOperator:
+    """Mix-in for operators on a chain of levels, which define ``chosen_level``."""
 
-    bl_idname = "scene.meshsplats_level"
-    bl_label = "Show Level"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
     chain: StringProperty(
         name="Chain", description="Collection of the levels; that of the active object if left out"
     )
-    level: IntProperty(name="Level", description="0 is the finest", default=0, min=0)
 
     def execute(self, context):
         from meshsplats.blender.inside import levels
@@ -206,30 +203,32 @@ class ShowLevel(bpy.types.Operator):
         try:
             if chain is None:
                 raise ValueError(f"no chain of levels of detail {self.chain}".rstrip())
-            levels.show(chain, self._level(context, chain))
+            levels.show(chain, self.chosen_level(context, chain))
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 
-    def _level(self, context, chain):
+
+class ShowLevel(ChainOperator, bpy.types.Operator):
+    """Show one level of detail, in the viewport and in renders, and hide the others"""
+
+    bl_idname = "scene.meshsplats_level"
+    bl_label = "Show Level"
+
+    level: IntProperty(name="Level", description="0 is the finest", default=0, min=0)
+
+    def chosen_level(self, context, chain):
         return self.level
 
 
-class FitLevel(bpy.types.Operator):
+class FitLevel(ChainOperator, bpy.types.Operator):
     """Show the level of detail made for the size that the active camera sees at the render resolution"""
 
     bl_idname = "scene.meshsplats_fit_level"
     bl_label = "Fit Level to Camera"
-    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
 
-    chain: StringProperty(
-        name="Chain", description="Collection of the levels; that of the active object if left out"
-    )
-
-    execute = ShowLevel.execute
-
-    def _level(self, context, chain):
+    def chosen_level(self, context, chain):
         from meshsplats.blender.inside import levels
 
         size = levels.screen_size(chain, context.scene)

@@ -53,6 +53,12 @@ def check_flags(options: object, names: Iterable[str]) -> None:
             raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
+def did_you_mean(name: str, known: Collection[str]) -> str:
+    """A question for messages with the closest of the ``known`` names to ``name``; empty if none is close."""
+    close = difflib.get_close_matches(name, known, 1)
+    return f"did you mean {close[0]!r}?" if close else ""
+
+
 def check_names(owner: str, given: Iterable[str], known: Collection[str]) -> None:
     """TypeError for the first of the ``given`` names that is not ``known``, with the closest one that is.
 
@@ -61,6 +67,5 @@ def check_names(owner: str, given: Iterable[str], known: Collection[str]) -> Non
     """
     for name in given:
         if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {close[0]!r}?" if close else f"; options: {', '.join(known)}"
-            raise TypeError(f"{owner} has no option {name!r}{hint}")
+            hint = did_you_mean(name, known) or f"options: {', '.join(known)}"
+            raise TypeError(f"{owner} has no option {name!r}; {hint}")

@@ -214,3 +214,10 @@ def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
 def splat_starts(face_splat: np.ndarray) -> np.ndarray:
     """Index of the first triangle of each splat in ``face_splat`` (f,), f > 0."""
     return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))
+
+
+def checked_cutoff(cutoff: float) -> float:
+    """``cutoff`` as the least opacity that is drawn as opaque. Raises ValueError unless it lies in [0, 1]."""
+    if not 0 <= cutoff <= 1:
+        raise ValueError(f"cutoff must be an opacity from 0 to 1, got {cutoff}")
+    return float(cutoff)

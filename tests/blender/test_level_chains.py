@@ -37,7 +37,9 @@ def test_the_folder_that_the_command_writes_is_a_chain(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "not JSON"),
+        ("{", "not a JSON file"),
+        ("[" * 100_000, "not a JSON file"),
+        (" " * (17 << 20), "larger than 16 MiB"),
         ("[1]", "expected a table of levels"),
         ('{"levels": []}', "expected a table of levels"),
         ('{"levels": [3]}', "level 0: expected the name of a file beside it, got None"),

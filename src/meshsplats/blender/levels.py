@@ -3,12 +3,12 @@ it."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from meshsplats.cameras.files import read_json
 from meshsplats.errors import FileFormatError
 from meshsplats.mesh import SplatMesh
 
@@ -63,10 +63,7 @@ def read_chain(path: Path) -> Chain:
     """
     table = path / TABLE if path.is_dir() else path
     folder = table.parent
-    try:
-        content = json.loads(table.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise FileFormatError(f"{table}: not JSON ({error})") from None
+    content = read_json(table)
     rows = content.get("levels") if isinstance(content, dict) else None
     if not isinstance(rows, list) or not rows:
         raise FileFormatError(f"{table}: expected a table of levels, as `meshsplats levels` writes it")

@@ -51,11 +51,11 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a camera file. FileFormatError if it is not JSON or too large."""
+    """The content of a file of cameras or levels. FileFormatError if it is not JSON or too large."""
     with open(path, "rb") as file:
         text = file.read(MAX_FILE_BYTES + 1)
     if len(text) > MAX_FILE_BYTES:
-        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, the limit for camera files")
+        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, the limit for such a file")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:

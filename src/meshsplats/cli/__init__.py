@@ -220,9 +220,8 @@ def _overview() -> str:
 
 
 def _unknown(name: str) -> int:
-    import difflib
+    from meshsplats._options import did_you_mean
 
-    close = difflib.get_close_matches(name, COMMANDS, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"commands: {', '.join(COMMANDS)}"
+    hint = did_you_mean(name, COMMANDS) or f"commands: {', '.join(COMMANDS)}"
     say(f"error: there is no command {name!r}; {hint}")
     return USAGE

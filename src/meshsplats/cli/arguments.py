@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import inspect
 import os
 import re
@@ -18,6 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, 
 
 import tyro
 
+from meshsplats._options import did_you_mean
 from meshsplats.cli import toml
 from meshsplats.cli.messages import OK, UsageError, flag, say
 
@@ -255,9 +255,8 @@ def _read(command: type[Command], file: Path, name: str) -> tuple[dict[str, Any]
 def _refuse_unknown(table: Mapping[str, Any], known: Collection[str], problem: str) -> None:
     for key in table:
         if key not in known:
-            close = difflib.get_close_matches(key[:60], known, 1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
-            raise UsageError(f"{problem} {_short(key)}{hint}")
+            hint = did_you_mean(key[:60], known)
+            raise UsageError(f"{problem} {_short(key)}" + (f"; {hint}" if hint else ""))
 
 
 def _warn_of_changes(

@@ -56,7 +56,7 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, checked_cutoff
 
 _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect with --as-splats."""
@@ -197,8 +197,7 @@ class Convert(Command):
         if self.cutoff is not None:
             if self.alpha == "blend":
                 raise UsageError("--cutoff is for --alpha opaque or mask")
-            if not 0 <= self.cutoff <= 1:
-                raise ValueError(f"--cutoff must be an opacity from 0 to 1, got {self.cutoff}")
+            checked_cutoff(self.cutoff)
         if self.data is not None and self.cameras is not None:
             raise UsageError("give --cameras or --data, not both")
         if self.up is not None:
@@ -285,7 +284,7 @@ class Convert(Command):
             cameras = cameras_beside(job.source) or []
         times.append(time.perf_counter())
         up = None if self.up is None else parse_up(self.up)
-        mesh = convert(cloud, preset=self.preset, cameras=cameras, up=up, **asdict(self.conversion))
+        mesh = convert(cloud, self.conversion, preset=self.preset, cameras=cameras, up=up)
         mesh = self._cut(mesh)
         times.append(time.perf_counter())
         self._write(mesh, job)
@@ -336,7 +335,7 @@ class Convert(Command):
                 path,
                 lit=True if self.lit and (glb or path.suffix.lower().startswith(".usd")) else None,
                 color_type=self.color_type if glb and self.color_type != "uint16" else None,
-                alpha=self.alpha if glb and self.alpha != "blend" else None,
+                alpha="mask" if glb and self.alpha == "mask" else None,  # 'opaque' is cut already
                 cutoff=self.cutoff if glb and self.alpha == "mask" else None,
                 compression=self.compression if glb and self.compression != "none" else None,
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import warnings
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -138,9 +138,8 @@ class Finetune(TrainingCommand):
     def _converted(self, cloud: GaussianCloud, dataset: Dataset) -> SplatMesh:
         preset = self.preset if self.start == "same" else self.start
         cameras = [view.camera for view in dataset.train]
-        options = asdict(self.conversion) | {"crop": None}  # cropped already
-        del options["look"]
-        return starting_mesh(cloud, cameras, preset=preset, look=dataset.look, **options)
+        options = replace(self.conversion, crop=None)  # cropped already
+        return starting_mesh(cloud, cameras, options, preset=preset, look=dataset.look)
 
 
 def _warn_of_the_rest(image: ViewImage) -> None:

@@ -172,7 +172,7 @@ class Render(Command):
         return _Files(images, depths, turntable, out / CAMERAS, out / CONFIGURATION)
 
     def _check(self, single: bool) -> None:
-        from meshsplats.rendering.api import checked_cutoff
+        from meshsplats.mesh import checked_cutoff
 
         self.views.check()
         if self.draw.background is not None:

@@ -144,7 +144,7 @@ class ImageTile {
                                                                                       block * LANES;
         Lanes transmittance = load_lanes(transmittances), capped_transmittance = load_lanes(capped), color[3];
         for (int c = 0; c < 3; ++c) color[c] = load_lanes(color_[c] + block * LANES);
-        const Lanes limit = broadcast(options_.min_transmittance);
+        const Lanes limit = broadcast(options_.min_transmittance), max_alpha = broadcast(alpha_cap());
         // `active` includes samples that only record; `blending` are those above the limit.
         LaneMask active = active_[block], blending = greater_equal(transmittance, limit);
         TileTape::Block *tape = tape_ ? &tape_->blocks[block] : nullptr;
@@ -166,8 +166,7 @@ class ImageTile {
                 if (ready & active) record_step(*tape, queue, entry, ready & active);
                 capped_transmittance =
                     capped_transmittance -
-                    masked(ready & active,
-                           capped_transmittance * min_lanes(f.rgba[3], broadcast(alpha_cap())));
+                    masked(ready & active, capped_transmittance * min_lanes(f.rgba[3], max_alpha));
                 active &= blending | greater_equal(capped_transmittance, limit);
             } else {
                 active &= blending;

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-
-if TYPE_CHECKING:
-    from meshsplats.rendering.looks import Look
+from meshsplats.rendering.looks import Look, check_look, draw_splats, image_of, mesh_samples
 
 
 @dataclass(frozen=True)
@@ -93,9 +92,6 @@ def compare_views(
     Yields:
         A ``ComparedView`` for each camera, in their order.
     """
-    from meshsplats.evaluation.metrics import psnr, ssim
-    from meshsplats.rendering.looks import check_look, draw_splats, image_of, mesh_samples
-
     check_look(look)
     samples = mesh_samples(look, mesh, cameras) if samples is None else samples
     options: dict[str, Any] = {"samples": samples, "max_layers": max_layers, "threads": threads}

@@ -9,7 +9,6 @@ none of them has.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -71,29 +70,20 @@ def visible_faces(
     """(f,) bool: the triangles that are in front, drawn with ``cutoff``, at ``fewest`` samples or more of all
     ``views`` together: at most ``HIT_VIEWS`` of them, with ``HIT_SAMPLES`` x ``HIT_SAMPLES`` samples."""
     count = len(mesh.faces)
-    # Every triangle has corners of its own with its number, in two digits that float32 interpolates exactly.
-    numbers = np.repeat(np.arange(count), 3)
-    numbered = SplatMesh(
+    # Every triangle has corners of its own with its index, in two digits that float32 interpolates exactly.
+    indices = np.repeat(np.arange(count), 3)
+    indexed = SplatMesh(
         mesh.vertices[mesh.faces].reshape(-1, 3),
         np.arange(3 * count).reshape(-1, 3),
         mesh.colors[mesh.faces].reshape(-1, 4),
         depth_group=mesh.depth_group,
-        attributes={"number": np.stack([numbers % _ROOT, numbers // _ROOT], axis=1)},
+        attributes={"index": np.stack([indices % _ROOT, indices // _ROOT], axis=1)},
     )
     hits = np.zeros(count, np.int64)
     for view in subsample(views, HIT_VIEWS):
-        camera, s = view.camera, HIT_SAMPLES
-        finer = replace(
-            camera,
-            width=camera.width * s,
-            height=camera.height * s,
-            fx=camera.fx * s,
-            fy=camera.fy * s,
-            cx=camera.cx * s,
-            cy=camera.cy * s,
-        )
-        image = render(numbered, finer, cutoff=cutoff, attributes=("number",), threads=threads)
-        digits = np.rint(image.attributes["number"][image.alpha > 0.5]).astype(np.int64)
+        camera = view.camera.scaled(HIT_SAMPLES)
+        image = render(indexed, camera, cutoff=cutoff, attributes=("index",), threads=threads)
+        digits = np.rint(image.attributes["index"][image.alpha > 0.5]).astype(np.int64)
         found = digits[:, 0] + _ROOT * digits[:, 1]
         hits += np.bincount(found, minlength=count)
     return hits >= fewest

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, checked_cutoff
 
 CUTOFF = 0.2
 """Least opacity that is drawn as solid: of 0.05 to 0.5 the best compromise over an opaque figure, a furry one
@@ -33,14 +33,12 @@ def cut_mesh(mesh: SplatMesh, cutoff: float = CUTOFF) -> SplatMesh:
     Raises:
         ValueError: ``cutoff`` is out of its range, or the mesh has a filter.
     """
-    if not 0 <= cutoff <= 1:
-        raise ValueError(f"cutoff must be an opacity from 0 to 1, got {cutoff}")
+    level = np.float32(checked_cutoff(cutoff))
     if mesh.filter_px2:
         raise ValueError(
             f"the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which opaque triangles"
             " cannot have: make it part of the triangles first, bake_filter(mesh, cameras) or meshsplats bake"
         )
-    level = np.float32(cutoff)
     opacity = mesh.colors[mesh.faces, 3]
     solid = (opacity >= level).sum(axis=1)
     crossed = np.flatnonzero((solid == 1) | (solid == 2))
@@ -98,15 +96,15 @@ def _crossings(mesh: SplatMesh, corners: np.ndarray) -> tuple[np.ndarray, np.nda
 
     Returns:
         The less and the more opaque end (m,) of each distinct edge, in this order so that both triangles at
-        an edge compute the same point; and for each triangle the vertex numbers (n,) of its crossings on the
+        an edge compute the same point; and for each triangle the vertex indices (n,) of its crossings on the
         edges to its second and its third corner, which count on from the vertices of ``mesh``.
     """
     count = len(mesh.vertices)
     ends = corners[:, [[0, 1], [0, 2]]].reshape(-1, 2)
     falling = mesh.colors[ends[:, 0], 3] > mesh.colors[ends[:, 1], 3]
     ends = np.where(falling[:, None], ends[:, ::-1], ends).astype(np.int64)
-    keys, numbers = np.unique(ends[:, 0] * max(count, 1) + ends[:, 1], return_inverse=True)
-    first, second = (numbers.reshape(-1, 2) + count).T
+    keys, indices = np.unique(ends[:, 0] * max(count, 1) + ends[:, 1], return_inverse=True)
+    first, second = (indices.reshape(-1, 2) + count).T
     return keys // max(count, 1), keys % max(count, 1), first, second
 
 

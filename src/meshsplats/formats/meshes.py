@@ -20,7 +20,7 @@ from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_ply
 from meshsplats.formats.sniff import Content
 from meshsplats.formats.usd.reader import read_usd
 from meshsplats.formats.usd.writer import write_usd
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, checked_cutoff
 
 _USD = (".usdc", ".usda", ".usd")
 _WRITERS: dict[str, Callable[..., None]] = {
@@ -134,8 +134,7 @@ def save_mesh(
     if cutoff is not None:
         if alpha not in ("opaque", "mask"):
             raise ValueError("the option cutoff needs alpha='opaque' or alpha='mask'")
-        if not 0 <= cutoff <= 1:
-            raise ValueError(f"cutoff must be an opacity from 0 to 1, got {cutoff}")
+        cutoff = checked_cutoff(cutoff)
     for name in options:
         if suffix not in _OPTION_SUFFIXES[name] and options[name] != "opaque":
             suffixes = ", ".join(_OPTION_SUFFIXES[name])
@@ -154,7 +153,7 @@ def save_mesh(
     elif alpha is None and suffix in _GLB and len(mesh.colors) and (mesh.colors[:, 3] == 1).all():
         options["alpha"] = "opaque"
     elif cutoff is not None:
-        options["cutoff"] = float(cutoff)
+        options["cutoff"] = cutoff
     if mesh.filter_px2 and suffix in _UNFILTERED:
         warnings.warn(
             f"{target.name}: the mesh is to be rendered with a filter of {mesh.filter_px2:g} px^2, which"

@@ -11,7 +11,7 @@ import numpy as np
 from meshsplats._core import library
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh, checked_filter
+from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
 
 MIN_TRANSMITTANCE = 1e-6
 """Early termination: a sample stops once its transmittance is below this. The error stays below it, too."""
@@ -220,13 +220,6 @@ def render_splats(
     image = library.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
     library.call("ms_render_splats", splats, camera_struct(camera), options, image)
     return Rendering(color, alpha, fragments=int(image.fragments))
-
-
-def checked_cutoff(cutoff: float) -> float:
-    """``cutoff`` as the least opacity that is drawn as opaque. Raises ValueError unless it lies in [0, 1]."""
-    if not 0 <= cutoff <= 1:
-        raise ValueError(f"cutoff must be an opacity from 0 to 1, got {cutoff}")
-    return float(cutoff)
 
 
 class Pointers:

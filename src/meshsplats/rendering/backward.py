@@ -11,12 +11,11 @@ import numpy as np
 
 from meshsplats._core import library
 from meshsplats.camera import Camera
-from meshsplats.mesh import checked_filter
+from meshsplats.mesh import checked_cutoff, checked_filter
 from meshsplats.rendering.api import (
     MIN_TRANSMITTANCE,
     Pointers,
     camera_struct,
-    checked_cutoff,
     checked_options,
     compact_groups,
 )

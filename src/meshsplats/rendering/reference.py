@@ -14,8 +14,8 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh, checked_filter
-from meshsplats.rendering.api import Rendering, checked_cutoff
+from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
+from meshsplats.rendering.api import Rendering
 
 SPLAT_MIN_ALPHA = 1 / 255
 """Splats fainter than this at a sample are left out there, as in 3DGS."""
