@@ -1,7 +1,7 @@
 """Fewer splats: merged and dropped, drawn as splats and as meshes, before and after fine-tuning.
 
     python benchmarks/simplification.py splats SPLATS CAMERAS [--shares 0.5 0.25 0.125] [--other FILE ...]
-    python benchmarks/simplification.py meshes SPLATS CAMERAS [--shares ...] [--steps 100]
+    python benchmarks/simplification.py meshes SPLATS CAMERAS [--shares ...] [--steps 100] [--look splats]
     python benchmarks/simplification.py triangles SPLATS CAMERAS [--budgets 0.5 1 2 4]
     python benchmarks/simplification.py speed COUNT
 
@@ -94,13 +94,15 @@ def splats(arguments):
 def meshes(arguments):
     cloud, cameras = flat_colored(arguments.splats), load_cameras(arguments.cameras)
     truth = Truth(cloud, cameras)
-    data = splat_dataset(cloud, train=200, test=8)
+    look = arguments.look
+    data = splat_dataset(cloud, train=200, test=8, look=look)
     seen_from = [view.camera for view in data.train]
-    print(f"all {len(cloud):,}: {truth.of_mesh(starting_mesh(cloud, seen_from))} dB (i) / (ii)", flush=True)
+    whole = starting_mesh(cloud, seen_from, look=look)
+    print(f"all {len(cloud):,}: {truth.of_mesh(whole)} dB (i) / (ii)", flush=True)
     for share in arguments.shares:
         count = round(share * len(cloud))
         for budget in ("drop", "merge"):
-            mesh = starting_mesh(cloud, seen_from, max_splats=count, budget=budget)
+            mesh = starting_mesh(cloud, seen_from, look=look, max_splats=count, budget=budget)
             line = f"{count:,} {budget}: {len(mesh.faces):,} triangles, {truth.of_mesh(mesh)} dB"
             if arguments.steps:
                 tuned = finetune(mesh, data, make_config("default", steps=arguments.steps))
@@ -154,6 +156,7 @@ def main():
             command.add_argument("--shares", type=float, nargs="+", default=[0.5, 0.25, 0.125])
     commands.choices["splats"].add_argument("--other", nargs="+", default=[])
     commands.choices["meshes"].add_argument("--steps", type=int, default=0)
+    commands.choices["meshes"].add_argument("--look", choices=["area", "splats"], default="area")
     command = commands.add_parser("speed")
     command.set_defaults(task=speed)
     command.add_argument("count", type=int)
