@@ -13,10 +13,15 @@ BUILD_INPUTS := pyproject.toml CMakeLists.txt ci-constraints.txt $(CORE_SOURCES)
 	$(wildcard src/meshsplats/csrc/options.txt src/meshsplats/csrc/exports.*)
 
 # Blender's Python module exists for one version of Python only, and each version of it lives in a place of its own.
+# Before a release: make test-blender BPY="4.2.23 4.5.15 5.0.1 5.2.3". Since 5.1 it is Python 3.13, which is looked for
+# by its place, too, as below.
 BLENDER_VENV ?= .venv-blender
 BPY ?= 4.2.23 5.0.1
 BLENDER_PYTHON ?= $(shell for name in python3.11 python3 python; do \
 	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && echo $$name && break; done)
+BLENDER_PYTHON_313 ?= $(shell for name in python3.13 $(wildcard $(HOME)/.pyenv/versions/3.13.*/bin/python) python3; do \
+	$$name -c 'import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 13))' 2>/dev/null && echo $$name && break; done)
+before_5_1 = $(filter 4.% 5.0.%,$(1))
 
 # The lowest versions that pyproject.toml allows want the lowest Python. That of pyenv answers to its short name only
 # where it was chosen, so it is looked for by its place, too.
@@ -30,6 +35,7 @@ LOWEST_PYTHON ?= $(shell for name in python3.10 $(wildcard $(HOME)/.pyenv/versio
 WHEELS_VENV ?= .venv-wheels
 WHEELS_PYTHON ?= $(or $(BLENDER_PYTHON),$(PYTHON))
 WHEELS_BIN := $(WHEELS_VENV)/bin
+DOCS_VENV ?= .venv-docs
 OTHER_TESTS ?= tests
 WINDOWS := build/windows
 ARM64 := build/arm64
@@ -46,7 +52,7 @@ CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
 .PHONY: help demo test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
-	release lint format clean
+	release docs lint format clean
 .DEFAULT_GOAL := help
 
 help:
@@ -58,6 +64,7 @@ help:
 	@echo 'make wheels  wheels for Linux, Windows and macOS, in dist/'
 	@echo 'make test-windows, test-arm64   the tests with the wheels for Windows, under wine, and for arm64, under qemu'
 	@echo 'make release   all that a release consists of, in dist/ (docs/releasing.md)'
+	@echo 'make docs    the documents as a site, in site/'
 	@echo 'make lint    ruff, mypy and clang-format (make format tidies the source)'
 	@echo 'make clean   removes everything that these made'
 
@@ -110,15 +117,17 @@ $(LOWEST_VENV)/installed: build/wheel/made lowest-constraints.txt
 test-lowest: $(LOWEST_VENV)/installed
 	$(LOWEST_VENV)/bin/python -m pytest
 
+$(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))
+$(BLENDER_VENV)/%/installed: blender_numpy = $(if $(call before_5_1,$*),'numpy<2')
 $(BLENDER_VENV)/%/installed: build/wheel/made
-	@if [ -z "$(BLENDER_PYTHON)" ]; then echo 'Blender needs Python 3.11 with venv, and it was not found.' \
-	  'Name it: make test-blender BLENDER_PYTHON=...' >&2; exit 1; fi
+	@if [ -z "$(blender_python)" ]; then echo 'Blender needs Python 3.11, since 5.1 Python 3.13, with venv. It was not' \
+	  'found. Name it: make test-blender BLENDER_PYTHON=... BLENDER_PYTHON_313=...' >&2; exit 1; fi
 	@echo 'Installing Blender $* into $(@D)'
-	@test -x $(@D)/bin/python || $(BLENDER_PYTHON) -m venv $(@D)
-	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install 'bpy==$*' 'numpy<2' pytest hypothesis \
+	@test -x $(@D)/bin/python || $(blender_python) -m venv $(@D)
+	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install 'bpy==$*' $(blender_numpy) pytest hypothesis \
 	  $(<D)/*.whl
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --force-reinstall --no-deps $(<D)/*.whl
-	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install mitsuba 'numpy<2' \
+	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install mitsuba $(blender_numpy) \
 	  || echo 'Mitsuba cannot be installed here: the test that compares it with Cycles is skipped'
 	@touch $@
 
@@ -183,6 +192,16 @@ test-arm64: $(VENV)/installed-dev $(WHEELS_VENV)/installed
 release: $(WHEELS_VENV)/installed
 	$(WHEELS_BIN)/python tools/release.py -o dist
 
+$(DOCS_VENV)/installed: tools/docs-requirements.txt
+	@if [ -z "$(WHEELS_PYTHON)" ]; then echo 'make docs needs Python 3.11 or newer with venv: WHEELS_PYTHON=...' >&2; exit 1; fi
+	@echo 'Making $(DOCS_VENV) with $(WHEELS_PYTHON)'
+	@test -x $(DOCS_VENV)/bin/python || $(WHEELS_PYTHON) -m venv $(DOCS_VENV)
+	@$(DOCS_VENV)/bin/python -m pip --disable-pip-version-check --quiet install --requirement $<
+	@touch $@
+
+docs: $(DOCS_VENV)/installed
+	$(DOCS_VENV)/bin/python tools/docs_site.py -o site
+
 lint: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m mypy
@@ -194,5 +213,6 @@ format: $(VENV)/installed-dev
 	$(BIN)/clang-format -i $(CORE_SOURCES)
 
 clean:
-	rm -rf $(VENV) $(LOWEST_VENV) $(BLENDER_VENV) $(WHEELS_VENV) $(DEMO) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST_VENV) $(BLENDER_VENV) $(WHEELS_VENV) $(DOCS_VENV) $(DEMO) build dist site
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests examples benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

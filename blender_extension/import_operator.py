@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
 from .settings import CHOICES, Choices, copy_choices, draw_choices
-from .work import Modal, Work
+from .work import Modal, Work, settle
 
 SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".npz", ".glb", ".gltf")
 CHAIN = "levels.json"
@@ -73,17 +73,7 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
                 obj.meshsplats.path = path
                 copy_choices(obj.meshsplats, self)
             objs.append(made[0])
-        for other in context.selected_objects:
-            other.select_set(False)
-        for obj in objs:
-            obj.select_set(True)
-        if self.set_up_scene:
-            # All splat meshes of the scene, as rays may pass through several.
-            every = objects.splat_objects(context.scene)
-            objects.render_settings(context.scene, every, self.shading == "lit")
-            clash = objects.clash(every, self.shading == "lit")
-            if clash:
-                self.report({"WARNING"}, f"MeshSplats: {clash}")
+        settle(self, context, objs)
         count = sum(len(obj.data.polygons) for obj in objs)
         self.report({"INFO"}, f"MeshSplats: {len(objs)} imported, {count:,} triangles")
 

@@ -2,11 +2,13 @@
 """Operators on objects and scenes: conversion, shading, render settings, stage, mesh priors, levels of
 detail."""
 
+import warnings
+
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from .settings import CHOICES, copy_choices
-from .work import Modal, Work
+from .settings import CHOICES, Choices, copy_choices, draw_choices
+from .work import CloudWork, Modal, Work, settle
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
@@ -55,6 +57,72 @@ class ConvertAgain(Modal, bpy.types.Operator):
             self.report({"WARNING"}, "MeshSplats: the object is gone")
         else:
             self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
+
+
+class ConvertSplats(Modal, Choices, bpy.types.Operator):
+    """Make a mesh of splats that Blender imported itself: it takes light, casts shadows and can be edited"""
+
+    bl_idname = "object.meshsplats_from_splats"
+    bl_label = "Convert Splats to Mesh"
+    bl_options = {"UNDO"}  # noqa: RUF012 - Blender's own form
+
+    hide_splats: BoolProperty(
+        name="Hide Splats", description="Hide the splats, whose place the mesh takes", default=True
+    )
+    set_up_scene: BoolProperty(
+        name="Set up Render",
+        description="Set bounce limits and colour management for these meshes",
+        default=True,
+    )
+
+    @classmethod
+    def poll(cls, context):
+        # Loads no library of ours: the panel asks whenever it is drawn.
+        obj = context.object
+        return obj is not None and obj.type == "POINTCLOUD" and "radiance:base" in obj.data.attributes
+
+    def invoke(self, context, event):
+        return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split = True
+        draw_choices(self, layout, [name for name in CHOICES if name != "axes"])
+        layout.prop(self, "hide_splats")
+        layout.prop(self, "set_up_scene")
+
+    def execute(self, context):
+        from meshsplats.blender.inside import frame, splat_points
+
+        source = context.object
+        self._source = source.name
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                cloud = splat_points.cloud_of(source, context.evaluated_depsgraph_get())
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        for warning in caught:
+            self.report({"WARNING"}, str(warning.message))
+        choices = {name: getattr(self, name) for name in CHOICES}
+        return self.begin(context, CloudWork(cloud, f"{source.name} mesh", frame.up_of(source), choices))
+
+    def done(self, context, work):
+        from meshsplats.blender.inside import objects, splat_points
+
+        (result,) = work.results
+        obj = objects.add(result.prepared[0], result.name, context.collection)
+        copy_choices(obj.meshsplats, self)
+        source = bpy.data.objects.get(self._source)
+        if source is None:
+            self.report({"WARNING"}, "MeshSplats: the splats are gone, the mesh stands upright")
+        else:
+            splat_points.take_place(obj, source, result.prepared[0]["origin"])
+            if self.hide_splats:
+                source.hide_viewport = source.hide_render = True
+        settle(self, context, [obj])
+        self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
 
 
 class SetShading(bpy.types.Operator):
@@ -237,7 +305,7 @@ class FitLevel(ChainOperator, bpy.types.Operator):
         return level
 
 
-CLASSES = (ConvertAgain, SetShading, SetUpRender, SetUpStage, FollowBase, ShowLevel, FitLevel)
+CLASSES = (ConvertAgain, ConvertSplats, SetShading, SetUpRender, SetUpStage, FollowBase, ShowLevel, FitLevel)
 
 
 def register():

@@ -6,6 +6,7 @@ import bpy
 from .import_operator import ImportMeshSplats
 from .object_operators import (
     ConvertAgain,
+    ConvertSplats,
     FitLevel,
     FollowBase,
     SetShading,
@@ -32,6 +33,8 @@ class MeshSplatsPanel(bpy.types.Panel):
         obj = context.object
         if obj is not None and obj.type == "MESH":
             self._object(layout, obj)
+        if ConvertSplats.poll(context):
+            layout.operator(ConvertSplats.bl_idname, icon="MESH_DATA")
         for collection in context.scene.collection.children_recursive:
             if CHAIN in collection:
                 self._chain(layout, collection)

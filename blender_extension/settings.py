@@ -56,9 +56,9 @@ class Choices:
 CHOICES = ("preset", "max_triangles", "min_opacity", "axes", "shading")
 
 
-def draw_choices(owner, layout):
+def draw_choices(owner, layout, names=CHOICES):
     """Shows the properties of ``owner``, an operator or an object's."""
-    for name in CHOICES:
+    for name in names:
         layout.prop(owner, name)
 
 

@@ -98,7 +98,6 @@ class Work:
         """Arguments of ``objects.add``. Progress, in files, goes from ``begin`` on by ``share``."""
         from pathlib import Path
 
-        from meshsplats.blender.inside import objects
         from meshsplats.formats.sniff import identify
 
         self._at(begin, "reading")
@@ -107,23 +106,45 @@ class Work:
 
             mesh = load_mesh(path)
         else:
-            from meshsplats.conversion import convert
             from meshsplats.formats.gaussians import load_gaussians
 
             cloud = load_gaussians(path, axes=self.choices["axes"])
             self._at(begin + 0.3 * share, "converting")
-            options = {"max_triangles": self.choices["max_triangles"] or None}
-            if self.choices["min_opacity"] > 0:
-                options["min_opacity"] = self.choices["min_opacity"]
-            if self.choices["shading"] == "lit":
-                # Crossed ellipses stand upright on the surface and catch too little light.
-                options["mode"] = "flat"
-            mesh = convert(cloud, preset=self.choices["preset"], **options)
+            mesh = self._converted(cloud)
+        return self._ready(mesh, begin, share)
+
+    def _converted(self, cloud, up=None):
+        from meshsplats.conversion import convert
+
+        options = {"max_triangles": self.choices["max_triangles"] or None}
+        if self.choices["min_opacity"] > 0:
+            options["min_opacity"] = self.choices["min_opacity"]
+        if self.choices["shading"] == "lit":
+            # Crossed ellipses stand upright on the surface and catch too little light.
+            options["mode"] = "flat"
+        return convert(cloud, preset=self.choices["preset"], up=up, **options)
+
+    def _ready(self, mesh, begin, share):
+        from meshsplats.blender.inside import objects
+
         lit = self.choices["shading"] == "lit"
         self._at(begin + 0.6 * share, "shading normals" if lit else "counting layers")
         prepared = objects.prepare(mesh, lit)
         self._at(begin + share, "building")
         return prepared
+
+
+class CloudWork(Work):
+    """Converts splats that are in the scene already: ``cloud``, with ``up`` in its frame."""
+
+    def __init__(self, cloud, name, up, choices):
+        super().__init__([name], choices)
+        self._cloud, self._up = cloud, up
+
+    def _one(self, path, index):
+        self._at(index, "converting")
+        mesh = self._converted(self._cloud, self._up)
+        return Result("", path, (self._ready(mesh, index, 1.0),))
 
 
 class Modal:
@@ -176,6 +197,23 @@ class Modal:
 
     def cancelled(self):
         """Called when there is no result."""
+
+
+def settle(operator, context, objs):
+    """Selects new splat meshes and, if ``operator`` is to, sets up the render for all of the scene."""
+    from meshsplats.blender.inside import objects
+
+    for other in context.selected_objects:
+        other.select_set(False)
+    for obj in objs:
+        obj.select_set(True)
+    if operator.set_up_scene:
+        # Rays may pass through several meshes.
+        every = objects.splat_objects(context.scene)
+        objects.render_settings(context.scene, every, operator.shading == "lit")
+        clash = objects.clash(every, operator.shading == "lit")
+        if clash:
+            operator.report({"WARNING"}, f"MeshSplats: {clash}")
 
 
 def bpy_background():

@@ -4,7 +4,7 @@
     python tools/release.py -o dist --rehearsal  # the same without refusing
 
 In ``dist``: the source distribution, wheels for all platforms, extensions for Blender, and SHA256SUMS. What
-remains is in ``docs/releasing.md``. Needs the packages of ``tools/requirements.txt``.
+remains is in ``docs/releasing.md``. Needs the packages of ``tools/requirements.txt`` and Python 3.11.
 """
 
 from __future__ import annotations
@@ -13,12 +13,17 @@ import argparse
 import hashlib
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
+import time
+import zipfile
 from pathlib import Path
+
+import tomllib
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
@@ -82,26 +87,49 @@ def find_python(number: str) -> str | None:
     return None
 
 
-def try_wheel(wheel: Path, number: str) -> str:
-    """Installs the wheel with Python ``number`` and runs the first commands; returns how it went."""
+def check_extension(path: Path, number: str) -> None:
+    """SystemExit unless an extension's manifest fits what is in the .zip, and its wheels one platform."""
+    with zipfile.ZipFile(path) as archive:
+        names = set(archive.namelist())
+        facts = tomllib.loads(archive.read("blender_manifest.toml").decode())
+    wheels = [wheel.removeprefix("./") for wheel in facts["wheels"]]
+    (platform,) = facts["platforms"]
+    first, beyond = facts["blender_version_min"], facts.get("blender_version_max")
+    checks = {
+        "id or version": (facts["id"], facts["version"]) == ("meshsplats", number),
+        "wheels": set(wheels) == {name for name in names if name.startswith("wheels/")},
+        "packages": [w.split("/")[1].split("-")[0] for w in wheels] == ["meshsplats", "pillow"],
+        "name": path.stem == f"meshsplats-{number}-{platform.replace('-', '_')}-blender_{first[:-2]}",
+        "Python": f"-cp{'311' if beyond else '313'}-" in wheels[1],
+        "files": {"__init__.py", "LICENSE"} <= names,
+    }
+    if wrong := [name for name, right in checks.items() if not right]:
+        raise SystemExit(f"{path.name}: wrong {', '.join(wrong)}")
+
+
+def try_wheel(wheel: Path, number: str, constraints: Path | None = None) -> str:
+    """Installs the wheel with Python ``number``, as a newcomer does, and runs the first commands; returns how
+    it went."""
     python = find_python(number)
     if python is None:
         return "not on this machine"
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([python, "-m", "venv", f"{folder}/venv"], check=True)
         python = f"{folder}/venv/bin/python"
-        pip = [
-            python,
-            "-m",
-            "pip",
-            "--disable-pip-version-check",
-            "install",
-            "--quiet",
-            "--only-binary=:all:",
-        ]
+        pip = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
+        pip += ["--only-binary=:all:", *(["--constraint", str(constraints)] if constraints else [])]
+        wall, processor = time.monotonic(), processor_seconds()
         subprocess.run([*pip, str(wheel)], check=True)
         run_commands([python], folder)
-    return "ok"
+        wall, processor = time.monotonic() - wall, processor_seconds() - processor
+        numpy = output_of(python, "-c", "import numpy; print(numpy.__version__)")
+    return f"ok with NumPy {numpy}, in {wall:.0f} s, {processor:.0f} s of processor time"
+
+
+def processor_seconds() -> float:
+    """Of the processes that this one started and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def run_commands(python: list[str], folder: str, environment: dict[str, str] | None = None) -> None:
@@ -166,10 +194,14 @@ def main() -> None:
     wheels = sorted(output.glob("*.whl"))
     extension = [sys.executable, str(ROOT / "blender_extension/build.py"), "-o", str(output)]
     subprocess.run([*extension, "--wheel", *map(str, wheels)], check=True)
+    for package in output.glob("*-blender_*.zip"):
+        check_extension(package, number)
 
     native = next(wheel for wheel in wheels if wheel.stem.endswith(f"manylinux_2_17_{os.uname().machine}"))
     for python in PYTHONS:
         print(f"{native.name}, Python {python}: {try_wheel(native, python)}", flush=True)
+    lowest = try_wheel(native, PYTHONS[0], ROOT / "lowest-constraints.txt")
+    print(f"{native.name}, Python {PYTHONS[0]}, lowest versions: {lowest}", flush=True)
     try_elsewhere(wheels)
 
     files = sorted(path for path in output.iterdir() if path.name != "SHA256SUMS")

@@ -243,12 +243,9 @@ def check_contents(files: dict[str, bytes], version: str, platform: Platform) ->
         f"meshsplats/_core/meshsplats_{variant}{platform.suffix}"
         for variant in variant_options(platform.machine)
     }
-    source = ROOT / "src"
-    for path in source.glob("meshsplats/**/*.py"):
-        expected.add(path.relative_to(source).as_posix())
-    expected.add("meshsplats/py.typed")
+    expected |= package_files()
     found = {name for name in files if not name.startswith(info + "/")}
-    missing, foreign = sorted(expected - found), sorted(found - expected - package_data())
+    missing, foreign = sorted(expected - found), sorted(found - expected)
     require(not missing, f"missing: {', '.join(missing)}")
     require(not foreign, f"does not belong here: {', '.join(foreign)}")
 
@@ -259,11 +256,12 @@ def check_contents(files: dict[str, bytes], version: str, platform: Platform) ->
             require(digest == _record_hash(files[name]), f"{name} is not as RECORD says")
 
 
-def package_data() -> set[str]:
-    """Files beside the Python that git knows and that are part of the package."""
-    command = ["git", "-C", str(ROOT / "src"), "ls-files", "meshsplats"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return {name for name in done.stdout.splitlines() if not name.startswith("meshsplats/csrc/")}
+def package_files() -> set[str]:
+    """Files of the package besides its core: Python, and data of any kind that git does not ignore."""
+    command = ["git", "-C", str(ROOT / "src"), "ls-files", "--cached", "--others", "--exclude-standard"]
+    done = subprocess.run([*command, "meshsplats"], capture_output=True, text=True, check=True)
+    names = {name for name in done.stdout.splitlines() if (ROOT / "src" / name).is_file()}
+    return {name for name in names if not name.startswith("meshsplats/csrc/")}
 
 
 def check_with_auditwheel(path: Path, platform: Platform) -> None:

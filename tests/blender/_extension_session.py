@@ -1,5 +1,6 @@
 """Run by test_bpy_extension: installs the extension, uses it, removes it, and records what happened."""
 
+import contextlib
 import json
 import sys
 import time
@@ -148,6 +149,34 @@ report["staged"] = sorted(c.name for c in scene.collection.children)
 report["camera"] = scene.camera.name
 report["dressed"] = chair.data.materials[0].name.startswith("Splats, lit")
 bpy.data.objects.remove(chair)
+
+# Splats that Blender imported itself.
+from _splat_points import splat_points  # noqa: E402
+
+report["own_splats"] = None
+points = splat_points(meshsplats.load_gaussians(folder / "ball.ply"), "points", scene.collection)
+if points is not None:
+    points.location = (7, 0, 0)
+    bpy.context.view_layer.update()
+    drawn = []
+    # What follows the buttons of the active object is of no interest here.
+    layout = SimpleNamespace(operator=lambda name, **_: drawn.append(name), separator=lambda: 1 / 0)
+    with contextlib.suppress(ZeroDivisionError):
+        sys.modules[addon + ".panel"].MeshSplatsPanel.draw(SimpleNamespace(layout=layout), bpy.context)
+    answer = sorted(bpy.ops.object.meshsplats_from_splats(shading="lit", max_triangles=800))
+    converted = bpy.context.object
+    report["own_splats"] = {
+        "buttons": drawn,
+        "answer": answer,
+        "name": converted.name,
+        "triangles": len(converted.data.polygons),
+        "material": converted.data.materials[0].name,
+        "middle": converted.matrix_world.translation.x,
+        "hidden": [points.hide_viewport, points.hide_render, converted.hide_render],
+        "poll": bpy.ops.object.meshsplats_from_splats.poll(),
+    }
+    bpy.data.objects.remove(converted)
+    bpy.data.objects.remove(points)
 
 # Levels of detail, from the folder and from its table dropped on the window.
 chain = folder / "chain"

@@ -26,13 +26,15 @@ from meshsplats.prior import bind
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = Path(__file__).with_name("_extension_session.py")
+RANGE = "5.1" if bpy.app.version >= (5, 1, 0) else "4.2"
+"""First Blender of the range that the package is for."""
 
 
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("extension")
     command = [sys.executable, str(ROOT / "blender_extension" / "build.py"), "-o", str(folder)]
-    command += ["--blender", "4.2"]
+    command += ["--blender", RANGE]
     if "MESHSPLATS_WHEEL" in os.environ:  # built already
         command += ["--wheel", os.environ["MESHSPLATS_WHEEL"]]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -57,7 +59,10 @@ def test_package_holds_the_wheels_of_one_platform(packed):
     assert [wheel.split("/")[1].split("-")[0] for wheel in wheels] == ["meshsplats", "pillow"]
     assert f'wheels = ["./{wheels[0]}", "./{wheels[1]}"]' in manifest
     assert 'license = ["SPDX:GPL-3.0-or-later"]' in manifest
-    assert 'blender_version_min = "4.2.0"\nblender_version_max = "5.1.0"\n' in manifest
+    versions = {"4.2": 'min = "4.2.0"\nblender_version_max = "5.1.0"\n', "5.1": 'min = "5.1.0"\nlicense'}
+    assert f"blender_version_{versions[RANGE]}" in manifest
+    python = f"cp{sys.version_info[0]}{sys.version_info[1]}"
+    assert wheels[1].split("-")[2] == python, "Pillow for the Python of this Blender"
     assert {"__init__.py", "LICENSE", "blender_manifest.toml"} <= set(names)
     assert "build.py" not in names
 
@@ -135,6 +140,18 @@ def test_a_whole_session(packed, tmp_path):
     assert report["staged"] == ["Cameras", "Lights", "Surroundings"]
     assert report["camera"] == "Camera"
     assert report["dressed"]
+    if bpy.app.version >= (4, 5, 0):
+        own = report["own_splats"]
+        assert own.pop("material").startswith("Splats, lit")
+        assert 0 < own.pop("triangles") <= 800
+        assert own.pop("middle") == pytest.approx(7, abs=0.12), "the mesh stands where the splats do"
+        assert own == {
+            "buttons": ["import_scene.meshsplats", "object.meshsplats_from_splats"],
+            "answer": ["FINISHED"],
+            "name": "points mesh",
+            "hidden": [True, True, False],
+            "poll": False,
+        }
     assert report["levels"] == [
         "chain",
         ["chain.001 level 0", ["chain.001 level 0"], False],

@@ -129,7 +129,8 @@ def _text(findings: dict[str, Any]) -> str:
         missing = findings["to_install"].get(extra)
         advice = f"; to install: pip install {missing}" if missing else ""
         if missing and extra == "blender":
-            advice = f"; to install, in an environment of its own with Python 3.11: pip install {missing}"
+            where = "in an environment of its own with Python 3.11 or 3.13"
+            advice = f"; to install, {where}: pip install {missing}"
         lines.append(f"extra {extra!r}: {_listed(libraries)}{advice}")
     return "\n".join(lines)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats.blender.inside import frame
 from meshsplats.colors import linear_to_srgb
 from meshsplats.mesh import Blending, SplatMesh
 
@@ -44,14 +45,12 @@ def splat_mesh(obj: Any) -> SplatMesh:
     blending = _blending(data)
     if blending == "display":
         colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
-    # Up in Blender's world, in the frame of the object.
-    up = np.array(obj.matrix_world.to_3x3().inverted_safe())[:, 2]
     return SplatMesh(
         vertices.reshape(-1, 3),
         faces.reshape(-1, 3),
         colors,
         face_splat=_owner(data),
-        up=up if np.linalg.norm(up) > 0 else np.array([0, 0, 1]),
+        up=frame.up_of(obj),
         blending=blending,
     )
 

@@ -17,6 +17,12 @@ def to_blender(up: np.ndarray) -> np.ndarray:
     return np.stack([right, forward, upward])
 
 
+def up_of(obj: Any) -> np.ndarray:
+    """(3,) Blender's up direction in the frame of the object ``obj``."""
+    up = np.array(obj.matrix_world.to_3x3().inverted_safe())[:, 2]
+    return up if np.linalg.norm(up) > 0 else np.array([0.0, 0.0, 1.0])
+
+
 def camera_pose(camera: Camera, rotation: np.ndarray) -> np.ndarray:
     """(4, 4) float64 camera-to-world matrix in Blender's frame; Blender's cameras look along -z with y up."""
     world_to_camera = camera.world_to_camera[:3, :3]

@@ -1,0 +1,234 @@
+"""Makes the documents a site; ``make docs`` runs it:
+
+    python tools/docs_site.py -o site
+
+Documents keep the places that they have in the repository, so the same links work in both; README.md is the
+first page. A page for each group of public names comes from their docstrings, and one shows the examples.
+The site works from the disk, with its search, and loads nothing from other servers. It appears whole or not
+at all: broken links and anchors, docstrings that cannot be read and public names without a page are errors.
+
+Needs the packages of ``tools/docs-requirements.txt``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import posixpath
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+ROOT = Path(__file__).resolve().parents[1]
+NAVIGATION = {
+    "Tutorials": ["docs/tutorials/from_a_splat_file", "docs/tutorials/from_photographs"],
+    "Using it": [
+        *("docs/pipelines", "docs/finetuning", "docs/levels", "docs/mesh-prior", "docs/datasets"),
+        *("docs/blender", "docs/viewers", "examples"),
+    ],
+    "Python": [],  # the reference
+    "How it works": ["docs/method", "docs/conventions", "docs/architecture", "benchmarks/RESULTS"],
+    "The project": ["CHANGELOG", "CONTRIBUTING", "docs/releasing", "license"],
+}
+"""Pages by section. Documents that are not listed come last in "Using it"."""
+REFERENCE = {
+    "Splats and meshes": [
+        *("GaussianCloud", "SplatMesh", "load_gaussians", "save_gaussians", "load_mesh", "save_mesh"),
+        *("convert", "ConversionOptions", "simplify", "bake_filter", "cut_mesh"),
+    ],
+    "Cameras and images": [
+        *("Camera", "orbit", "dome", "look_at", "look_around", "load_cameras", "save_cameras"),
+        *("render", "render_splats", "Rendering", "draw_splats", "needed_samples", "rasterize", "save_image"),
+    ],
+    "Data sets and scores": [
+        *("Dataset", "View", "ViewImage", "load_dataset", "splat_dataset", "find_background"),
+        *("compare", "Comparison", "evaluate", "Report", "psnr", "ssim"),
+    ],
+    "Fine-tuning": [
+        *("finetune", "FinetuneConfig", "make_config", "starting_mesh", "RunOptions", "Progress"),
+        "Interrupted",
+    ],
+    "Mesh priors": ["BaseMesh", "load_base", "bind", "MeshPrior", "load_prior", "train_prior"],
+    "Errors": ["FileFormatError", "MissingDependencyError", "DivergenceError", "DataWarning"],
+}
+"""Public names by page; names that are not listed come last."""
+
+
+# Pages
+
+
+def public_names() -> dict[str, str]:
+    """The names that ``import meshsplats`` offers, and the module of each."""
+    names: dict[str, str] = {}
+    tree = ast.parse((ROOT / "src/meshsplats/__init__.py").read_text(encoding="utf-8"))
+    for statement in tree.body:
+        if isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING":
+            for line in statement.body:
+                if isinstance(line, ast.ImportFrom):
+                    names |= {alias.asname or alias.name: str(line.module) for alias in line.names}
+    return names
+
+
+def reference_pages() -> dict[str, str]:
+    """Pages of the Python reference by name, without suffix."""
+    names = public_names()
+    listed = {name for group in REFERENCE.values() for name in group}
+    if unknown := sorted(listed - names.keys()):
+        raise SystemExit(f"tools/docs_site.py lists what meshsplats does not have: {', '.join(unknown)}")
+    groups = dict(REFERENCE)
+    if rest := sorted(names.keys() - listed):
+        groups["More"] = rest
+    pages = {}
+    for title, group in groups.items():
+        entries = []
+        for name in group:
+            entry = (
+                f".. autoclass:: meshsplats.{name}\n   :members:"
+                if name[0].isupper()
+                else f".. autofunction:: meshsplats.{name}"
+            )
+            entries.append(f"## {name}\n\n```{{eval-rst}}\n{entry}\n```\n")
+        pages["reference/" + title.lower().replace(" ", "-")] = f"# {title}\n\n" + "\n".join(entries)
+    return pages
+
+
+def example_files() -> dict[str, str]:
+    """The heading of each example, by its place in the repository."""
+    files = sorted((ROOT / "examples").rglob("*.py"))
+    places = [path.relative_to(ROOT).as_posix() for path in files]
+    return {place: place.removeprefix("examples/").removesuffix(".py").replace("/", " ") for place in places}
+
+
+def examples_page() -> str:
+    parts = ["# Examples\n\nRun them from the root of the repository.\n"]
+    for place, heading in example_files().items():
+        source = (ROOT / place).read_text(encoding="utf-8").rstrip()
+        parts.append(f"## {heading}\n\n````python\n{source}\n````\n")
+    return "\n".join(parts)
+
+
+def navigation(pages: list[str]) -> str:
+    """Tables of contents for the side bar; ``pages`` are all pages, without suffix."""
+    sections = {title: list(names) for title, names in NAVIGATION.items()}
+    sections["Python"] = list(reference_pages())
+    listed = {name for names in sections.values() for name in names}
+    sections["Using it"] += sorted(set(pages) - listed - {"index"})
+    tables = [
+        "```{{toctree}}\n:hidden:\n:caption: {}\n\n{}\n```\n".format(title, "\n".join(names))
+        for title, names in sections.items()
+    ]
+    return "\n" + "\n".join(tables)
+
+
+def moved_links(text: str, here: str) -> str:
+    """Links of a document at ``here`` to what has another place on the site."""
+    places = {"README.md": "index.md", "LICENSE": "license.md", "examples": "examples.md"}
+    for place, heading in example_files().items():
+        places[place] = "examples.md#" + heading.lower().replace(" ", "-")
+
+    def moved(match: re.Match[str]) -> str:
+        target, _, anchor = match[1].partition("#")
+        place = places.get(posixpath.normpath(posixpath.join(posixpath.dirname(here), target)))
+        if place is None or not target:
+            return match[0]
+        link = posixpath.relpath(place, posixpath.dirname(here) or ".")
+        return f"]({link}{'#' + anchor if anchor else ''})"
+
+    return re.sub(r"\]\(([\w./#-]+)\)", moved, text)
+
+
+def write_sources(folder: Path) -> None:
+    """All that Sphinx reads."""
+    documents = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+    documents += sorted((ROOT / "benchmarks").glob("*.md"))
+    texts = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in documents}
+    texts = {place: moved_links(text, place) for place, text in texts.items()}
+    texts |= {f"{name}.md": text for name, text in reference_pages().items()}
+    texts["examples.md"] = examples_page()
+    license_text = (ROOT / "LICENSE").read_text(encoding="utf-8").rstrip()
+    texts["license.md"] = f"# Licence\n\n```text\n{license_text}\n```\n"
+    index = texts.pop("README.md")
+    texts["index.md"] = index + navigation([place.removesuffix(".md") for place in [*texts, "index.md"]])
+    for place, text in texts.items():
+        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        (folder / place).write_text(text, encoding="utf-8")
+    shutil.copytree(ROOT / "docs/images", folder / "docs/images")
+
+
+# Checks
+
+
+class Page(HTMLParser):
+    """Anchors of a page, its links, and what a browser loads to show it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.anchors: set[str] = set()
+        self.links: list[str] = []
+        self.loaded: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        if anchor := values.get("id"):
+            self.anchors.add(anchor)
+        if source := values.get("src"):
+            self.loaded.append(source)
+        if link := values.get("href"):
+            loads = tag == "link" and values.get("rel") in ("stylesheet", "icon", "preload", "preconnect")
+            (self.loaded if loads else self.links).append(link)
+
+
+def problems_of(site: Path) -> list[str]:
+    """Broken links and anchors, things loaded from elsewhere, and public names without an entry."""
+    pages = {path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
+    problems = []
+    for path, page in pages.items():
+        name = path.relative_to(site).as_posix()
+        problems += [f"{name} loads {link}" for link in page.loaded if urlsplit(link).netloc]
+        for link in page.links + page.loaded:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if not target.is_file() or not target.is_relative_to(site):
+                problems.append(f"{name}: {link} leads nowhere")
+            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
+                problems.append(f"{name}: {link} has no such anchor")
+    pattern = r"(?:url\(|@import)\s*[\"']?((?:https?:)?//[^)\"']+)"
+    for sheet in site.rglob("*.css"):
+        found = re.findall(pattern, sheet.read_text(encoding="utf-8"))
+        problems += [f"{sheet.relative_to(site)} loads {link}" for link in found]
+    anchors = set().union(*(page.anchors for page in pages.values()))
+    problems += [f"no entry for {name}" for name in public_names() if f"meshsplats.{name}" not in anchors]
+    return problems
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Makes the documents a site.")
+    parser.add_argument("-o", "--output", type=Path, default=Path("site"), help="folder of the site")
+    output = parser.parse_args().output.resolve()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=output.parent, prefix=".site-") as scratch:
+        sources, site = Path(scratch, "sources"), Path(scratch, "site").resolve()
+        write_sources(sources)
+        command = [sys.executable, "-m", "sphinx", "-b", "html", "-c", str(ROOT / "docs"), "-q"]
+        command += ["--fail-on-warning", "--keep-going", "-d", f"{scratch}/doctrees", str(sources), str(site)]
+        if subprocess.run(command).returncode:
+            raise SystemExit("the site was not made")
+        if problems := problems_of(site):
+            raise SystemExit("\n".join(["the site was not made:", *problems]))
+        for name in (".buildinfo", "objects.inv"):
+            (site / name).unlink(missing_ok=True)
+        shutil.rmtree(output, ignore_errors=True)
+        site.replace(output)
+    print(f"{output / 'index.html'}")
+
+
+if __name__ == "__main__":
+    main()
