@@ -36,7 +36,13 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     )
     from meshsplats.formats.base_meshes import load_base
     from meshsplats.formats.cutting import cut_mesh
-    from meshsplats.formats.gaussians import load_gaussians, save_gaussians
+    from meshsplats.formats.gaussians import (
+        SplatStream,
+        load_gaussians,
+        save_gaussian_blocks,
+        save_gaussians,
+        stream_gaussians,
+    )
     from meshsplats.formats.meshes import load_mesh, save_mesh
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.images.writing import save_image
@@ -73,7 +79,9 @@ _HOME = {
     ),
     "meshsplats.formats.base_meshes": ("load_base",),
     "meshsplats.formats.cutting": ("cut_mesh",),
-    "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussians"),
+    "meshsplats.formats.gaussians": (
+        *("SplatStream", "load_gaussians", "save_gaussian_blocks", "save_gaussians", "stream_gaussians"),
+    ),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh"),
     "meshsplats.gaussians": ("GaussianCloud",),
     "meshsplats.images.writing": ("save_image",),
@@ -107,6 +115,7 @@ __all__ = [
     "Report",
     "RunOptions",
     "SplatMesh",
+    "SplatStream",
     "View",
     "ViewImage",
     "__version__",
@@ -135,6 +144,7 @@ __all__ = [
     "render",
     "render_splats",
     "save_cameras",
+    "save_gaussian_blocks",
     "save_gaussians",
     "save_image",
     "save_mesh",
@@ -142,6 +152,7 @@ __all__ = [
     "splat_dataset",
     "ssim",
     "starting_mesh",
+    "stream_gaussians",
     "train_prior",
 ]
 

@@ -72,7 +72,7 @@ def make_scene(count: int = 20_000, seed: int = 0) -> GaussianCloud:
     )
     return GaussianCloud(
         means=np.concatenate([p.points for p in patches]),
-        quaternions=_quaternions(frames),
+        quaternions=quaternions_of_frames(frames),
         scales=np.concatenate([p.sigmas for p in patches]),
         opacities=np.concatenate([p.opacities for p in patches]),
         sh=sh,
@@ -294,7 +294,7 @@ def _smooth_curve(knots: np.ndarray, n: int) -> np.ndarray:
     return p1 + 0.5 * t * (p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0)))
 
 
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
+def quaternions_of_frames(rotations: np.ndarray) -> np.ndarray:
     """(n, 4) unit quaternions w, x, y, z of (n, 3, 3) rotation matrices.
 
     Four times the outer product q q^T is linear in the matrix; the row with the largest diagonal is not zero.

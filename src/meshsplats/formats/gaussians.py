@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -14,15 +15,17 @@ from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transforme
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.splats import read_splat_gltf
 from meshsplats.formats.ply.compressed_splats import read_compressed_ply
-from meshsplats.formats.ply.splats import read_float_ply, write_float_ply
+from meshsplats.formats.ply.splats import read_float_ply, write_float_blocks, write_float_ply
 from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats
 from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
-from meshsplats.formats.splats.spz import read_spz
-from meshsplats.formats.splats.streamed_sog import read_streamed_sog
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.formats.splats.spz import open_spz, read_spz
+from meshsplats.formats.splats.streamed_sog import read_streamed_sog, streamed_parts
+from meshsplats.gaussians import GaussianCloud, Kernel
 
 Axes = Literal["auto", "y-down", "y-up"]
+_SUFFIXES = (".ply", ".gz", ".splat", ".spz", ".sog", ".glb", ".gltf")
+"""Names of splat files in a folder."""
 
 
 def load_gaussians(
@@ -30,9 +33,9 @@ def load_gaussians(
 ) -> GaussianCloud:
     """Splats of a file or folder, after activation.
 
-    The content decides the format, not the name: `.ply` (float or PlayCanvas compressed), `.splat`, SPZ 1
-    to 4, SOG (archive, folder or its meta.json), streamed SOG (folder or its lod-meta.json), glTF and GLB
-    with KHR_gaussian_splatting.
+    The content decides the format, not the name: `.ply` (float or PlayCanvas compressed, also gzipped),
+    `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json), streamed SOG (folder or its lod-meta.json),
+    glTF and GLB with KHR_gaussian_splatting.
 
     A folder is a model of the 3D Gaussian Splatting code, read from the highest iteration of
     ``point_cloud/iteration_*/point_cloud.ply``, or an unpacked SOG file. A streamed SOG scene is read at the
@@ -62,17 +65,17 @@ def load_gaussians(
     content = Content(found)
     kind = content.splat_format()
     to_y_down, turn = np.eye(3), HALF_TURN_X
-    with found.open("rb") as file:
+    with content.open() as file:
         if kind == "ply":
-            cloud = read_float_ply(file, content.ply_header, found, strict=strict)
+            cloud = read_float_ply(file, content.ply_header, found).read(strict=strict)
         elif kind == "compressed.ply":
-            cloud = read_compressed_ply(file, content.ply_header, found, strict=strict)
+            cloud = read_compressed_ply(file, content.ply_header, found).read(strict=strict)
         elif kind == "splat":
-            cloud = read_dot_splat(file, found, strict=strict)
+            cloud = read_dot_splat(file, found).read(strict=strict)
         elif kind == "spz":
             cloud, to_y_down = read_spz(file.read(), found, Budget(found), strict=strict)
         elif kind == "sog":
-            cloud = read_sog(found, Budget(found), strict=strict)
+            cloud = read_sog(found, Budget(found)).read(strict=strict)
         elif kind == "streamed sog":
             cloud = read_streamed_sog(found, strict=strict)
         else:
@@ -80,6 +83,116 @@ def load_gaussians(
     if axes != "auto":
         to_y_down = turn if axes == "y-up" else np.eye(3)
     return transformed(cloud, to_y_down)
+
+
+class SplatStream:
+    """The splats of files in blocks of about ``block`` splats, in the order of the files.
+
+    Each iteration reads the files anew, and memory does not grow with them. SOG and glTF are exceptions:
+    images are unpacked as a whole (24 bytes a splat; one part at a time of a streamed scene), and a glTF file
+    is read before it is cut into blocks. Blocks of one file have the same degree and kernel.
+
+    Concretely, the blocks of a file together are ``load_gaussians`` of it, to the last bit.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[str | os.PathLike[str]],
+        *,
+        block: int = 1 << 16,
+        strict: bool = False,
+        axes: Axes = "auto",
+    ) -> None:
+        if axes not in get_args(Axes):
+            raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+        if isinstance(block, bool) or not isinstance(block, (int, np.integer)) or block < 1:
+            raise ValueError(f"block must be a number of splats, at least 1, got {block!r}")
+        self.paths = tuple(Path(path) for path in paths)
+        """The files, in their order."""
+        self.block, self._strict, self._axes = int(block), strict, axes
+
+    def __iter__(self) -> Iterator[GaussianCloud]:
+        for path in self.paths:
+            yield from self._of(path)
+
+    def _of(self, path: Path) -> Iterator[GaussianCloud]:
+        content = Content(path)
+        kind = content.splat_format()
+        to_y_down, turn = np.eye(3), HALF_TURN_X
+        with content.open() as file:
+            if kind == "ply":
+                readers = iter([read_float_ply(file, content.ply_header, path)])
+            elif kind == "compressed.ply":
+                readers = iter([read_compressed_ply(file, content.ply_header, path)])
+            elif kind == "splat":
+                readers = iter([read_dot_splat(file, path)])
+            elif kind == "spz":
+                reader, to_y_down = open_spz(path)
+                readers = iter([reader])
+            elif kind == "sog":
+                readers = iter([read_sog(path, Budget(path))])
+            elif kind == "streamed sog":
+                readers = (part for _, part, _ in streamed_parts(path))
+            else:
+                readers = iter([])
+                to_y_down = turn = HALF_TURN_Z
+            if self._axes != "auto":
+                to_y_down = turn if self._axes == "y-up" else np.eye(3)
+            for reader in readers:
+                for block in reader.blocks(self.block, strict=self._strict):
+                    yield transformed(block, to_y_down)
+        if kind == "gltf":
+            cloud = read_splat_gltf(path, strict=self._strict)
+            for start in range(0, len(cloud), self.block):
+                part = np.arange(start, min(start + self.block, len(cloud)))
+                yield transformed(cloud.select(part), to_y_down)
+
+
+def stream_gaussians(
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    block: int = 1 << 16,
+    strict: bool = False,
+    axes: Axes = "auto",
+) -> SplatStream:
+    """Splats of files that are larger than memory, in blocks.
+
+    Args:
+        path: a file or folder as for ``load_gaussians``; several of them; or a folder of splat files, which
+            are read in the order of their names.
+        block: about this many splats at a time.
+        strict, axes: as for ``load_gaussians``.
+
+    Returns:
+        A stream of clouds, which can be iterated over several times. Errors and warnings of
+        ``load_gaussians`` come while it is read.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        FileFormatError: a folder without splats.
+    """
+    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    if not given:
+        raise ValueError("name at least one splat file")
+    files = [file for one in given for file in _splat_files(Path(one))]
+    return SplatStream(files, block=block, strict=strict, axes=axes)
+
+
+def _splat_files(path: Path) -> list[Path]:
+    """The file of a model or the splat files of a folder, by name."""
+    try:
+        return [splat_file(path)]
+    except FileFormatError:
+        if not path.is_dir():
+            raise
+        found = [
+            part
+            for part in sorted(path.iterdir())
+            if part.is_file() and part.suffix.lower() in _SUFFIXES and splat_format(part) is not None
+        ]
+        if not found:
+            raise
+        return found
 
 
 def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
@@ -118,6 +231,36 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     if not len(cloud):
         raise ValueError("no splats to write: the cloud is empty, and no reader takes such a file")
     write_float_ply(cloud, target)
+
+
+def save_gaussian_blocks(
+    blocks: Iterable[GaussianCloud],
+    path: str | os.PathLike[str],
+    count: int,
+    *,
+    degree: int = 0,
+    kernel: Kernel = "3dgs",
+) -> None:
+    """Writes splats that come in ``blocks`` as a .ply; in memory there is one block at a time.
+
+    The file is that of ``save_gaussians`` for all of them together.
+
+    Args:
+        blocks: clouds whose degree is at most ``degree``; what they lack of it is 0.
+        path: the file, whose name ends in .ply.
+        count: of all splats together, at least 1.
+        degree: of the spherical harmonics, 0 to 3.
+        kernel: of the splats. Third scales of '2dgs' splats are left out.
+
+    Raises:
+        ValueError: the suffix is not .ply, a count or degree out of range, or blocks of another count.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".ply":
+        raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
+    if count < 1 or degree not in (0, 1, 2, 3):
+        raise ValueError(f"count must be at least 1 and degree 0 to 3, got {count} and {degree}")
+    write_float_blocks(blocks, target, count, (degree + 1) ** 2, kernel, flat=kernel == "2dgs")
 
 
 def subject_name(path: Path) -> str:

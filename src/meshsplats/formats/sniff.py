@@ -6,11 +6,13 @@ import errno
 import os
 import re
 import zipfile
+import zlib
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal, cast
 
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._gzipped import GzippedFile
 from meshsplats.formats.gltf.splats import has_splats
 from meshsplats.formats.ply.compressed_splats import is_compressed_splat
 from meshsplats.formats.ply.header import PlyHeader, read_header
@@ -63,8 +65,22 @@ class Content:
     @cached_property
     def ply_header(self) -> PlyHeader:
         """The header of a PLY file. FileFormatError if it is broken."""
-        with open(self.path, "rb") as file:
+        with self.open() as file:
             return read_header(file, self.path)
+
+    @cached_property
+    def is_gzipped_ply(self) -> bool:
+        """Whether the file is a gzipped PLY file."""
+        if self.container != "gzip":
+            return False
+        try:
+            return _SIGNATURES["ply"].match(zlib.decompressobj(31).decompress(self.head, 64)) is not None
+        except zlib.error:
+            return False
+
+    def open(self) -> BinaryIO:
+        """The opened file; a gzipped PLY file is unpacked while it is read."""
+        return cast(BinaryIO, GzippedFile(self.path)) if self.is_gzipped_ply else open(self.path, "rb")
 
     @property
     def is_text(self) -> bool:
@@ -90,7 +106,7 @@ class Content:
         path, name = self.path, self.path.name.lower()
         convert = f"convert it first: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
         self.refuse_empty()
-        if self.container == "ply":
+        if self.container == "ply" or self.is_gzipped_ply:
             # A mesh is left to the float reader, which says what is missing.
             return "compressed.ply" if is_compressed_splat(self.ply_header) else "ply"
         if is_spz(self.head):

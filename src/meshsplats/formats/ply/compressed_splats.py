@@ -7,7 +7,8 @@ opacity 8. Specification: developer.playcanvas.com, "Compressed PLY".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import BinaryIO
 
 import numpy as np
@@ -16,8 +17,8 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats.ply.header import Element, PlyHeader
 from meshsplats.formats.ply.splats import kernel_of_comments
 from meshsplats.formats.ply.table import RowReader
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, decode_smallest_three
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
+from meshsplats.gaussians import SH_C0
 
 _SHARED = 256
 """Splats that share a chunk's ranges."""
@@ -34,7 +35,7 @@ def is_compressed_splat(header: PlyHeader) -> bool:
     return vertex is not None and "packed_position" in vertex.names
 
 
-def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object, *, strict: bool) -> GaussianCloud:
+def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object) -> SplatReader:
     """The splats of an opened compressed .ply whose header has been read; errors as ``load_gaussians``."""
     if header.encoding == "ascii":
         raise FileFormatError(f"{where}: compressed splats must be binary, this .ply is ASCII")
@@ -61,43 +62,46 @@ def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object, *, str
         if sh.count != vertex.count:
             raise FileFormatError(f"{where}: {sh.count:,} rows of element 'sh' for {vertex.count:,} splats")
     readers = {e.name: RowReader(file, header, e, where) for e in (vertex, chunk, sh) if e is not None}
-    builder = CloudBuilder(vertex.count, 1 + rest // 3, where)
-    for first in range(0, chunk.count, _CHUNKS_AT_ONCE):
-        n_chunks = min(_CHUNKS_AT_ONCE, chunk.count - first)
+    kernel = kernel_of_comments(header.comments)
+    return SplatReader(
+        vertex.count, 1 + rest // 3, kernel, where, _chunks(readers, chunk.count, vertex.count)
+    )
+
+
+def _chunks(readers: dict[str, RowReader], chunks: int, count: int) -> Iterator[tuple[int, Fill]]:
+    for first in range(0, chunks, _CHUNKS_AT_ONCE):
+        n_chunks = min(_CHUNKS_AT_ONCE, chunks - first)
         start = first * _SHARED
-        m = min(n_chunks * _SHARED, vertex.count - start)
+        m = min(n_chunks * _SHARED, count - start)
         ranges = readers["chunk"].rows(first, n_chunks)
-        of_splat = np.arange(m) // _SHARED
         packed = readers["vertex"].rows(start, m)
-        rows = builder.next(m)
+        table = readers["sh"].rows(start, m) if "sh" in readers else None
+        yield m, partial(_fill, ranges, packed, table)
 
-        def lerp(
-            low: str,
-            axes: str,
-            t: np.ndarray,
-            ranges: np.ndarray = ranges,
-            of_splat: np.ndarray = of_splat,
-        ) -> np.ndarray:
-            a = np.stack([ranges["min_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
-            b = np.stack([ranges["max_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
-            return a * (1 - t) + b * t
 
-        color = _unpacked(packed["packed_color"], (8, 8, 8, 8))
-        with np.errstate(over="ignore", invalid="ignore"):
-            rows.means[:] = lerp("", "xyz", _unpacked(packed["packed_position"], (11, 10, 11)))
-            rows.scales[:] = np.exp(lerp("scale_", "xyz", _unpacked(packed["packed_scale"], (11, 10, 11))))
-            rgb = lerp("", "rgb", color[:, :3]) if colored else color[:, :3]
-            rows.sh[:, 0] = (rgb - np.float32(0.5)) / np.float32(SH_C0)
-        rows.opacities[:] = color[:, 3]
-        turns = packed["packed_rotation"]
-        small = (_unpacked(turns << np.uint32(2), (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))
-        decode_smallest_three(rows.quaternions, small, turns >> np.uint32(30))
-        if rest:
-            table = readers["sh"].rows(start, m)
-            stored = np.stack([table[f"f_rest_{i}"] for i in range(rest)], axis=1)
-            rows.sh[:, 1:] = _COEFFICIENTS[stored].reshape(m, 3, -1).transpose(0, 2, 1)
-        builder.keep(rows)
-    return builder.finish(kernel_of_comments(header.comments), strict=strict)
+def _fill(ranges: np.ndarray, packed: np.ndarray, table: np.ndarray | None, rows: SplatRows) -> None:
+    m = len(packed)
+    of_splat = np.arange(m) // _SHARED
+
+    def lerp(low: str, axes: str, t: np.ndarray) -> np.ndarray:
+        a = np.stack([ranges["min_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
+        b = np.stack([ranges["max_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
+        return a * (1 - t) + b * t
+
+    color = _unpacked(packed["packed_color"], (8, 8, 8, 8))
+    colored = "min_r" in (ranges.dtype.names or ())
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows.means[:] = lerp("", "xyz", _unpacked(packed["packed_position"], (11, 10, 11)))
+        rows.scales[:] = np.exp(lerp("scale_", "xyz", _unpacked(packed["packed_scale"], (11, 10, 11))))
+        rgb = lerp("", "rgb", color[:, :3]) if colored else color[:, :3]
+        rows.sh[:, 0] = (rgb - np.float32(0.5)) / np.float32(SH_C0)
+    rows.opacities[:] = color[:, 3]
+    turns = packed["packed_rotation"]
+    small = (_unpacked(turns << np.uint32(2), (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))
+    decode_smallest_three(rows.quaternions, small, turns >> np.uint32(30))
+    if table is not None:
+        stored = np.stack([table[f"f_rest_{i}"] for i in range(len(table.dtype.names or ()))], axis=1)
+        rows.sh[:, 1:] = _COEFFICIENTS[stored].reshape(m, 3, -1).transpose(0, 2, 1)
 
 
 def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:

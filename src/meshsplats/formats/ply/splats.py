@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,7 +22,7 @@ from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.ply.header import Element, PlyHeader
 from meshsplats.formats.ply.table import CHUNK_BYTES, FloatTable
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, SplatRows
+from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
 from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
 
 _POSITION = ("x", "y", "z")
@@ -93,7 +95,7 @@ def is_float_splat(header: PlyHeader) -> bool:
     return bool(marks & set(element.names))
 
 
-def read_float_ply(file: BinaryIO, header: PlyHeader, where: object, *, strict: bool) -> GaussianCloud:
+def read_float_ply(file: BinaryIO, header: PlyHeader, where: object) -> SplatReader:
     """The splats of an opened .ply whose header has been read; errors and warnings as ``load_gaussians``."""
     element = header.element("vertex")
     if element is None:
@@ -103,30 +105,33 @@ def read_float_ply(file: BinaryIO, header: PlyHeader, where: object, *, strict: 
         )
     columns = _Columns(element, header, where)
     table = FloatTable(file, header, element, columns.needed, where)
-    index = {name: i for i, name in enumerate(table.names)}
-    order = {
-        "means": [index[n] for n in _POSITION],
-        "quaternions": [index[n] for n in _ROTATION],
-        "scales": [index[n] for n in columns.scale],
-        "sh": [index[n] for n in columns.sh],
-    }
-    builder = CloudBuilder(element.count, columns.coefficients, where)
-    for chunk in table.chunks():
-        rows = builder.next(len(chunk))
-        np.take(chunk, order["means"], axis=1, out=rows.means, mode="clip")
-        np.take(chunk, order["quaternions"], axis=1, out=rows.quaternions, mode="clip")
-        np.take(chunk, order["sh"], axis=1, out=rows.sh.reshape(len(chunk), -1), mode="clip")
-        _activate(
-            rows,
-            log_scales=chunk[:, order["scales"]],
-            logits=chunk[:, index["opacity"]],
-            filter_3d=chunk[:, index[_FILTER]] if columns.filter else None,
-        )
-        if columns.color_span is not None:
-            rows.sh[:, 0] = (rows.sh[:, 0] / columns.color_span - np.float32(0.5)) / np.float32(SH_C0)
-        builder.keep(rows)
     kernel: Kernel = "antialiased" if columns.filter else kernel_of_comments(header.comments)
-    return builder.finish("2dgs" if len(columns.scale) == 2 else kernel, strict=strict)
+    if len(columns.scale) == 2:
+        kernel = "2dgs"
+    return SplatReader(element.count, columns.coefficients, kernel, where, _chunks(table, columns))
+
+
+def _chunks(table: FloatTable, columns: _Columns) -> Iterator[tuple[int, Fill]]:
+    index = {name: i for i, name in enumerate(table.names)}
+    for chunk in table.chunks():
+        yield len(chunk), partial(_fill, chunk, columns, index)
+
+
+def _fill(chunk: np.ndarray, columns: _Columns, index: dict[str, int], rows: SplatRows) -> None:
+    def take(names: Sequence[str], out: np.ndarray) -> None:
+        np.take(chunk, [index[n] for n in names], axis=1, out=out, mode="clip")
+
+    take(_POSITION, rows.means)
+    take(_ROTATION, rows.quaternions)
+    take(columns.sh, rows.sh.reshape(len(chunk), -1))
+    _activate(
+        rows,
+        log_scales=chunk[:, [index[n] for n in columns.scale]],
+        logits=chunk[:, index["opacity"]],
+        filter_3d=chunk[:, index[_FILTER]] if columns.filter else None,
+    )
+    if columns.color_span is not None:
+        rows.sh[:, 0] = (rows.sh[:, 0] / columns.color_span - np.float32(0.5)) / np.float32(SH_C0)
 
 
 def kernel_of_comments(comments: tuple[str, ...]) -> Kernel:
@@ -171,7 +176,6 @@ def _listed(names: tuple[str, ...] | list[str]) -> str:
 
 def write_float_ply(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     """Writes ``cloud`` in the layout of the 3D Gaussian Splatting code; see ``save_gaussians``."""
-    k = cloud.sh.shape[1]
     flat = cloud.kernel == "2dgs" and not cloud.scales[:, 2].any()
     if cloud.kernel == "2dgs" and not flat:
         warnings.warn(
@@ -180,31 +184,62 @@ def write_float_ply(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
             DataWarning,
             stacklevel=3,
         )
+    write_float_blocks([cloud], path, len(cloud), cloud.sh.shape[1], cloud.kernel, flat=flat)
+
+
+def write_float_blocks(
+    blocks: Iterable[GaussianCloud],
+    path: str | os.PathLike[str],
+    count: int,
+    coefficients: int,
+    kernel: Kernel,
+    *,
+    flat: bool,
+) -> None:
+    """Writes ``count`` splats that come in ``blocks``.
+
+    Args:
+        blocks: clouds; spherical harmonics that they lack are 0.
+        path: the file.
+        count: of all splats together.
+        coefficients: of the file, 1, 4, 9 or 16 per channel: those of the blocks at most.
+        kernel: of the file.
+        flat: leave out the third scale.
+
+    Raises ValueError if the blocks hold another number of splats.
+    """
+    k = coefficients
     scale_names = [f"scale_{i}" for i in range(2 if flat else 3)]
     rest_names = [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names = [*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, "opacity", *scale_names, *_ROTATION]
     at = {name: i for i, name in enumerate(names)}
     lines = ["ply", "format binary_little_endian 1.0"]
-    if cloud.kernel == "antialiased":
+    if kernel == "antialiased":
         lines.append("comment SplatRenderMode: mip")
-    lines.append(f"element vertex {len(cloud)}")
+    lines.append(f"element vertex {count}")
     lines += [f"property float {name}" for name in names] + ["end_header", ""]
     per_chunk = max(1, CHUNK_BYTES // (4 * len(names)))
-    size = 4 * len(names) * len(cloud)
-    with atomic_path(path, needs=size) as temporary, Path(temporary).open("wb") as file:
+    written = 0
+    with atomic_path(path, needs=4 * len(names) * count) as temporary, Path(temporary).open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
-        for start in range(0, len(cloud), per_chunk):
-            part = slice(start, start + per_chunk)
-            sh = cloud.sh[part]
-            rows = np.zeros((len(sh), len(names)), "<f4")
-            rows[:, :3] = cloud.means[part]
-            rows[:, 6:9] = sh[:, 0]
-            rows[:, 9 : at["opacity"]] = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)
-            opacities = cloud.opacities[part].astype(np.float64)
-            with np.errstate(divide="ignore"):
-                logits = np.log(opacities) - np.log1p(-opacities)
-                logs = np.log(cloud.scales[part, : len(scale_names)])
-            rows[:, at["opacity"]] = np.clip(logits, MIN_LOGIT, MAX_LOGIT)
-            rows[:, at["scale_0"] : at["rot_0"]] = np.maximum(logs, MIN_LOG_SCALE)
-            rows[:, at["rot_0"] : at["rot_0"] + 4] = cloud.quaternions[part]
-            file.write(rows.data)
+        for cloud in blocks:
+            for start in range(0, len(cloud), per_chunk):
+                part = slice(start, start + per_chunk)
+                sh = cloud.sh[part]
+                rows = np.zeros((len(sh), len(names)), "<f4")
+                rows[:, :3] = cloud.means[part]
+                rows[:, 6:9] = sh[:, 0]
+                rest = rows[:, 9 : at["opacity"]].reshape(len(sh), 3, k - 1)
+                rest[:, :, : sh.shape[1] - 1] = sh[:, 1:].transpose(0, 2, 1)
+                rows[:, 9 : at["opacity"]] = rest.reshape(len(sh), -1)
+                opacities = cloud.opacities[part].astype(np.float64)
+                with np.errstate(divide="ignore"):
+                    logits = np.log(opacities) - np.log1p(-opacities)
+                    logs = np.log(cloud.scales[part, : len(scale_names)])
+                rows[:, at["opacity"]] = np.clip(logits, MIN_LOGIT, MAX_LOGIT)
+                rows[:, at["scale_0"] : at["rot_0"]] = np.maximum(logs, MIN_LOG_SCALE)
+                rows[:, at["rot_0"] : at["rot_0"] + 4] = cloud.quaternions[part]
+                file.write(rows.data)
+            written += len(cloud)
+        if written != count:
+            raise ValueError(f"{path}: {written:,} splats came for a file of {count:,}")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,26 +24,86 @@ class SplatRows(NamedTuple):
     sh: np.ndarray
 
 
+Fill = Callable[[SplatRows], None]
+"""Writes the splats of a chunk of a file into rows that are as many."""
+
+
+@dataclass(frozen=True)
+class SplatReader:
+    """The splats of an opened file, ready to be read once, as a whole or in blocks."""
+
+    count: int
+    """Count of the splats that the file declares."""
+    coefficients: int
+    """Spherical harmonics per channel, 1, 4, 9 or 16."""
+    kernel: Kernel
+    where: object
+    """The file, for messages."""
+    chunks: Iterator[tuple[int, Fill]]
+    """Count of the splats of each chunk, and what reads them."""
+
+    def read(self, *, strict: bool) -> GaussianCloud:
+        """All splats; errors and warnings as ``load_gaussians``, which must be the caller."""
+        builder = CloudBuilder(self.count, self.coefficients, self.where)
+        for m, fill in self.chunks:
+            rows = builder.next(m)
+            fill(rows)
+            builder.keep(rows)
+        return builder.finish(self.kernel, strict=strict)
+
+    def blocks(self, size: int, *, strict: bool) -> Iterator[GaussianCloud]:
+        """The same splats in blocks of about ``size``."""
+        builder: CloudBuilder | None = None
+        for m, fill in self.chunks:
+            if builder is None:
+                builder = CloudBuilder(self.count, self.coefficients, self.where, capacity=max(size, m))
+            elif builder.held and builder.held + m > size:
+                yield builder.take(self.kernel)
+            rows = builder.next(m)
+            fill(rows)
+            builder.keep(rows)
+            if strict:
+                builder.report(strict=True)
+        builder = builder or CloudBuilder(self.count, self.coefficients, self.where)
+        builder.report(strict=strict)
+        if builder.held:
+            yield builder.take(self.kernel)
+
+
 class CloudBuilder:
     """The arrays of a cloud, filled in chunks: ``rows = builder.next(m)``, fill them, ``builder.keep(rows)``.
 
     A row is dropped and counted if a value is not finite after activation or if its quaternion is zero. Later
-    rows take its place, so that no array is copied.
+    rows take its place, so that no array is copied. With a ``capacity`` of fewer rows than ``count``, kept
+    rows must be taken out before there are more.
     """
 
-    def __init__(self, count: int, coefficients: int, where: object) -> None:
+    def __init__(self, count: int, coefficients: int, where: object, capacity: int | None = None) -> None:
         if count == 0:
             raise FileFormatError(f"{where}: no splats, the file declares 0 of them")
         self._where, self._count = where, count
+        rows = count if capacity is None else min(capacity, count)
         self._arrays = SplatRows(
-            np.empty((count, 3), np.float32),
-            np.empty((count, 4), np.float32),
-            np.empty((count, 3), np.float32),
-            np.empty(count, np.float32),
-            np.empty((count, coefficients, 3), np.float32),
+            np.empty((rows, 3), np.float32),
+            np.empty((rows, 4), np.float32),
+            np.empty((rows, 3), np.float32),
+            np.empty(rows, np.float32),
+            np.empty((rows, coefficients, 3), np.float32),
         )
-        self._kept = self._not_finite = self._zero_quaternions = 0
+        self._kept = self._taken = self._not_finite = self._zero_quaternions = 0
         self._first_bad: int | None = None
+
+    @property
+    def held(self) -> int:
+        """Count of the rows that are kept and not yet taken."""
+        return self._kept
+
+    def take(self, kernel: Kernel) -> GaussianCloud:
+        """The kept rows as a cloud of their own; they make room for others."""
+        means, quaternions, scales, opacities, sh = (array[: self._kept].copy() for array in self._arrays)
+        self._taken += self._kept
+        self._kept = 0
+        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
 
     def next(self, m: int) -> SplatRows:
         """The next ``m`` rows, to be written."""
@@ -66,7 +127,7 @@ class CloudBuilder:
         good = finite & has_rotation
         if not good.all():
             if self._first_bad is None:
-                self._first_bad = self._kept + int(good.argmin())
+                self._first_bad = self._taken + self._kept + int(good.argmin())
             self._not_finite += int((~finite).sum())
             self._zero_quaternions += int((finite & ~has_rotation).sum())
             m = int(good.sum())
@@ -76,6 +137,14 @@ class CloudBuilder:
 
     def finish(self, kernel: Kernel, *, strict: bool) -> GaussianCloud:
         """The cloud. Dropped splats give a DataWarning; an error if ``strict`` or if none is left."""
+        if self.report(strict=strict):
+            for array in self._arrays:
+                array.resize((self._kept, *array.shape[1:]), refcheck=False)  # shrinks in place
+        means, quaternions, scales, opacities, sh = self._arrays
+        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
+
+    def report(self, *, strict: bool) -> int:
+        """Count of dropped splats; they give a DataWarning, an error if ``strict`` or if none is left."""
         dropped = self._not_finite + self._zero_quaternions
         if dropped:
             reasons = []
@@ -85,15 +154,12 @@ class CloudBuilder:
                 reasons.append(f"{self._zero_quaternions:,} with a zero quaternion")
             what = f"{dropped:,} of {self._count:,} splats are unusable: {' and '.join(reasons)}"
             what += f"; the first is splat {self._first_bad:,} (from 0)"
-            if not self._kept:
+            if not self._kept + self._taken:
                 raise FileFormatError(f"{self._where}: no usable splats; {what}")
             if strict:
                 raise FileFormatError(f"{self._where}: {what}; without strict they would be left out")
-            warnings.warn(f"{self._where}: {what}; they are left out", DataWarning, stacklevel=4)
-            for array in self._arrays:
-                array.resize((self._kept, *array.shape[1:]), refcheck=False)  # shrinks in place
-        means, quaternions, scales, opacities, sh = self._arrays
-        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
+            warnings.warn(f"{self._where}: {what}; they are left out", DataWarning, stacklevel=5)
+        return dropped
 
 
 def joined(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCloud:

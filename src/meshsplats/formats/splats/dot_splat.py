@@ -8,13 +8,15 @@ its rotations, which must have length 1.
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from functools import partial
 from typing import BinaryIO
 
 import numpy as np
 
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.splats._cloud_builder import CloudBuilder
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
+from meshsplats.gaussians import SH_C0
 
 _RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _AT_ONCE = 1 << 16
@@ -34,26 +36,29 @@ def is_dot_splat(file: BinaryIO) -> bool:
     return bool((np.abs(np.linalg.norm(rotations, axis=1) - 1) < 0.05).mean() >= 0.9)
 
 
-def read_dot_splat(file: BinaryIO, where: object, *, strict: bool) -> GaussianCloud:
+def read_dot_splat(file: BinaryIO, where: object) -> SplatReader:
     """The splats of an opened file for which ``is_dot_splat`` holds; errors as ``load_gaussians``."""
     count = file.seek(0, io.SEEK_END) // _RECORD.itemsize
-    builder = CloudBuilder(count, 1, where)
+    return SplatReader(count, 1, "3dgs", where, _chunks(file, count, where))
+
+
+def _chunks(file: BinaryIO, count: int, where: object) -> Iterator[tuple[int, Fill]]:
     file.seek(0)
     for start in range(0, count, _AT_ONCE):
         m = min(_AT_ONCE, count - start)
         data = file.read(m * _RECORD.itemsize)
         if len(data) < m * _RECORD.itemsize:
             raise FileFormatError(f"{where}: the file became shorter while it was read")
-        records = np.frombuffer(data, _RECORD)
-        rows = builder.next(m)
-        color = records["color"] / np.float32(255)
-        rows.means[:] = records["position"]
-        rows.scales[:] = np.where(records["scale"] < 0, np.nan, records["scale"])  # no deviation is negative
-        rows.quaternions[:] = _rotations(records)
-        rows.opacities[:] = color[:, 3]
-        rows.sh[:, 0] = (color[:, :3] - np.float32(0.5)) / np.float32(SH_C0)
-        builder.keep(rows)
-    return builder.finish("3dgs", strict=strict)
+        yield m, partial(_fill, np.frombuffer(data, _RECORD))
+
+
+def _fill(records: np.ndarray, rows: SplatRows) -> None:
+    color = records["color"] / np.float32(255)
+    rows.means[:] = records["position"]
+    rows.scales[:] = np.where(records["scale"] < 0, np.nan, records["scale"])  # no deviation is negative
+    rows.quaternions[:] = _rotations(records)
+    rows.opacities[:] = color[:, 3]
+    rows.sh[:, 0] = (color[:, :3] - np.float32(0.5)) / np.float32(SH_C0)
 
 
 def _rotations(records: np.ndarray) -> np.ndarray:

@@ -14,17 +14,19 @@ import re
 import warnings
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.sniff import Content
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, SplatRows, decode_smallest_three
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
+from meshsplats.gaussians import Kernel
 
 _MAX_META_BYTES = 4 << 20
 _MAX_SPLATS = 1 << 28
@@ -34,19 +36,18 @@ _PALETTE_COLUMNS = 64
 """Palette entries of harmonics in each row of their image."""
 
 
-def read_sog(
-    path: Path, budget: Budget, *, strict: bool, ranges: Sequence[tuple[int, int]] | None = None
-) -> GaussianCloud:
+def read_sog(path: Path, budget: Budget, ranges: Sequence[tuple[int, int]] | None = None) -> SplatReader:
     """The splats of a `.sog` archive, or of the folder of the meta.json ``path``; errors as
     ``load_gaussians``.
 
-    ``ranges`` selects splats by first and end; ranges may overlap. None selects all.
+    Images are unpacked as a whole, 4 bytes for each splat and image. ``ranges`` selects splats by first and
+    end; ranges may overlap. None selects all.
     """
     if Content(path).container != "zip":
-        return _Reader(_Folder(path.parent, path, budget), path, budget).read(ranges, strict=strict)
+        return _Reader(_Folder(path.parent, path, budget), path, budget).read(ranges)
     try:
         with zipfile.ZipFile(path) as archive:
-            return _Reader(_Archive(archive, path), path, budget).read(ranges, strict=strict)
+            return _Reader(_Archive(archive, path), path, budget).read(ranges)
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
 
@@ -140,7 +141,7 @@ class _Reader:
     def _error(self, message: str) -> FileFormatError:
         return FileFormatError(f"{self._where}: {message}")
 
-    def read(self, ranges: Sequence[tuple[int, int]] | None, *, strict: bool) -> GaussianCloud:
+    def read(self, ranges: Sequence[tuple[int, int]] | None) -> SplatReader:
         version = self._meta.get("version")
         if version not in (None, 2):
             raise self._error(f"SOG version {str(version)[:20]}; known are 2, and 1, which has no number")
@@ -160,49 +161,41 @@ class _Reader:
             palette = self._palette(data["shN"][0], rest, version)
             labels = self._pixels(data["shN"][1], "shN labels", stored)[chosen]
             self._budget.spend(24 * palette.shape[1] * count, "its spherical harmonics")
-        builder = CloudBuilder(count, 1 + palette.shape[1], self._where)
-        rows = builder.next(count)
-        self._fill(
-            rows,
-            {
-                name: [self._pixels(d, name, stored)[chosen] for d in data[name]]
-                for name in data
-                if name != "shN"
-            },
-            version,
-        )
+        pixels = {
+            name: [self._pixels(d, name, stored)[chosen] for d in data[name]]
+            for name in data
+            if name != "shN"
+        }
+        coefficients = 1 + palette.shape[1]
         if labels is not None:
-            index = labels[:, 0] + labels[:, 1].astype(np.int32) * 256
             palette = np.concatenate([palette, np.zeros((1, *palette.shape[1:]), np.float32)])
-            np.minimum(index, len(palette) - 1, out=index)  # a label beyond the palette means no harmonics
-            for start in range(0, count, _AT_ONCE):
-                part = slice(start, start + _AT_ONCE)
-                rows.sh[part, 1:] = palette[index[part]]
-        builder.keep(rows)
-        return builder.finish(self._kernel(), strict=strict)
+        maps = self._maps(version)
+        chunks = self._chunks(count, pixels, labels, palette, maps)
+        return SplatReader(count, coefficients, self._kernel(), self._where, chunks)
 
-    def _fill(self, rows: SplatRows, pixels: dict[str, list[np.ndarray]], version: int | None) -> None:
-        low, high = pixels["means"]
-        steps = (low[:, :3] + high[:, :3].astype(np.uint16) * 256) / 65535
-        least, most = self._range("means", 3)
-        logs = least + (most - least) * steps
-        with np.errstate(over="ignore", invalid="ignore"):
-            rows.means[:] = np.sign(logs) * np.expm1(np.abs(logs))
-            scales, colors = pixels["scales"][0], pixels["sh0"][0]
-            if version is None:
-                rows.scales[:] = np.exp(self._between("scales", scales[:, :3]))
-                stored = self._between("sh0", colors)
-                rows.sh[:, 0] = stored[:, :3]
-                rows.opacities[:] = 1 / (1 + np.exp(-stored[:, 3]))
-            else:
-                rows.scales[:] = np.exp(self._codebook("scales"))[scales[:, :3]]
-                rows.sh[:, 0] = self._codebook("sh0")[colors[:, :3]]
-                rows.opacities[:] = colors[:, 3] / np.float32(255)
-        turns = pixels["quats"][0]
-        small = (turns[:, :3] / np.float32(127.5) - 1) / np.float32(np.sqrt(2))
-        # The fourth byte is 252 + the index of the largest component; other values leave the quaternion zero.
-        rows.quaternions[:] = 0
-        decode_smallest_three(rows.quaternions, small, turns[:, 3].astype(np.int32) - 252)
+    def _chunks(
+        self,
+        count: int,
+        pixels: dict[str, list[np.ndarray]],
+        labels: np.ndarray | None,
+        palette: np.ndarray,
+        maps: _Maps,
+    ) -> Iterator[tuple[int, Fill]]:
+        for start in range(0, count, _AT_ONCE):
+            part = slice(start, min(start + _AT_ONCE, count))
+            own = {name: [image[part] for image in images] for name, images in pixels.items()}
+            index = None
+            if labels is not None:
+                index = labels[part, 0] + labels[part, 1].astype(np.int32) * 256
+                np.minimum(index, len(palette) - 1, out=index)  # a label beyond the palette: no harmonics
+            yield part.stop - start, partial(_fill, own, maps, palette, index)
+
+    def _maps(self, version: int | None) -> _Maps:
+        """Checks and reads what the values of pixels mean."""
+        positions = self._range("means", 3)
+        if version is None:
+            return _Maps(positions, ranges={"scales": self._range("scales", 3), "sh0": self._range("sh0", 4)})
+        return _Maps(positions, books={name: self._codebook(name) for name in ("scales", "sh0")})
 
     def _chosen(
         self, ranges: Sequence[tuple[int, int]] | None, stored: int
@@ -264,10 +257,6 @@ class _Reader:
     def _range(self, section: str, n: int) -> tuple[np.ndarray, np.ndarray]:
         return self._numbers(section, "mins", (n,)), self._numbers(section, "maxs", (n,))
 
-    def _between(self, section: str, pixels: np.ndarray) -> np.ndarray:
-        least, most = self._range(section, pixels.shape[1])
-        return (least + (most - least) * (pixels / np.float64(255))).astype(np.float32)
-
     def _codebook(self, section: str) -> np.ndarray:
         book = self._section(section).get("codebook")
         if isinstance(book, list) and len(book) == 256 and book[0] is None:
@@ -299,8 +288,7 @@ class _Reader:
             )
         entries = image[..., :3].reshape(-1, n, 3)
         if version is None:
-            least, most = self._range("shN", 1)
-            return (least + (most - least) * (entries / np.float64(255))).astype(np.float32)
+            return _between(self._range("shN", 1), entries)
         size = section.get("count", len(entries))
         if not isinstance(size, int) or not 0 <= size <= len(entries):
             raise self._error(f"a palette of {str(size)[:20]} harmonics in an image of {len(entries):,}")
@@ -340,3 +328,51 @@ class _Reader:
             raise self._error(
                 f"the image of {name} cannot be read: {type(error).__name__} {str(error)[:100]}"
             ) from None
+
+
+class _Maps(NamedTuple):
+    """What the values of pixels mean."""
+
+    positions: tuple[np.ndarray, np.ndarray]
+    """Least and largest logarithmic position."""
+    ranges: Mapping[str, tuple[np.ndarray, np.ndarray]] = MappingProxyType({})
+    """Version 1: least and largest values of scales and sh0."""
+    books: Mapping[str, np.ndarray] = MappingProxyType({})
+    """Version 2: their codebooks."""
+
+
+def _fill(
+    pixels: dict[str, list[np.ndarray]],
+    maps: _Maps,
+    palette: np.ndarray,
+    index: np.ndarray | None,
+    rows: SplatRows,
+) -> None:
+    low, high = pixels["means"]
+    steps = (low[:, :3] + high[:, :3].astype(np.uint16) * 256) / 65535
+    least, most = maps.positions
+    logs = least + (most - least) * steps
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows.means[:] = np.sign(logs) * np.expm1(np.abs(logs))
+        scales, colors = pixels["scales"][0], pixels["sh0"][0]
+        if maps.ranges:
+            rows.scales[:] = np.exp(_between(maps.ranges["scales"], scales[:, :3]))
+            stored = _between(maps.ranges["sh0"], colors)
+            rows.sh[:, 0] = stored[:, :3]
+            rows.opacities[:] = 1 / (1 + np.exp(-stored[:, 3]))
+        else:
+            rows.scales[:] = np.exp(maps.books["scales"])[scales[:, :3]]
+            rows.sh[:, 0] = maps.books["sh0"][colors[:, :3]]
+            rows.opacities[:] = colors[:, 3] / np.float32(255)
+    turns = pixels["quats"][0]
+    small = (turns[:, :3] / np.float32(127.5) - 1) / np.float32(np.sqrt(2))
+    # The fourth byte is 252 + the index of the largest component; other values leave the quaternion zero.
+    rows.quaternions[:] = 0
+    decode_smallest_three(rows.quaternions, small, turns[:, 3].astype(np.int32) - 252)
+    if index is not None:
+        rows.sh[:, 1:] = palette[index]
+
+
+def _between(range_: tuple[np.ndarray, np.ndarray], pixels: np.ndarray) -> np.ndarray:
+    least, most = range_
+    return (least + (most - least) * (pixels / np.float64(255))).astype(np.float32)

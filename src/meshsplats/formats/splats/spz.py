@@ -9,17 +9,22 @@ README.
 from __future__ import annotations
 
 import importlib
+import io
 import struct
+import sys
 import warnings
 import zlib
-from typing import NamedTuple
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, decode_smallest_three
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
+from meshsplats.gaussians import GaussianCloud, Kernel
 
 MAGIC = b"NGSP"
 _COLOR_SCALE = 0.15
@@ -40,6 +45,10 @@ _DIRECTIONS = {
     "B": (0, 0, -1),
 }
 _MAX_EXTENSION_BYTES = 1 << 20
+_MAX_HEAD = 32 + _MAX_EXTENSION_BYTES + 16 * 255
+"""Bytes before the streams of version 4."""
+_PIECE = 1 << 18
+"""Bytes of a file that are unpacked at a time."""
 _AT_ONCE = 1 << 16
 
 
@@ -84,29 +93,196 @@ def read_spz(data: bytes | memoryview, where: object, budget: Budget, *, strict:
         header, extensions, streams = _parse_streams(data, where, budget)
     else:
         header, extensions, streams = _parse_gzip(data, where, budget)
-    degree = min(header.degree, 3)
-    if header.degree > 3:
-        warnings.warn(
-            f"{where}: spherical harmonics of degree {header.degree}; those beyond degree 3 are left out",
-            DataWarning,
-            stacklevel=4,
-        )
-    builder = CloudBuilder(header.splats, 1 + _REST[degree], where)
-    for start in range(0, header.splats, _AT_ONCE):
-        m = min(_AT_ONCE, header.splats - start)
-        part = {name: a.reshape(header.splats, -1)[start : start + m] for name, a in streams.items()}
-        rows = builder.next(m)
-        rows.means[:] = _positions(part["positions"], header)
-        rows.opacities[:] = part["alphas"][:, 0] / np.float32(255)
-        rows.sh[:, 0] = (part["colors"] / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE)
-        rows.scales[:] = np.exp(part["scales"] / np.float32(16) - np.float32(10))
-        _fill_rotations(rows.quaternions, part["rotations"])
-        if degree:
-            rest = part["sh"].reshape(m, -1, 3)[:, : _REST[degree]]
-            rows.sh[:, 1:] = (rest - np.float32(128)) / np.float32(128)
-        builder.keep(rows)
-    cloud = builder.finish("antialiased" if header.flags & _ANTIALIASED else "3dgs", strict=strict)
+    _warn_of_degree(header, where)
+
+    def chunks() -> Iterator[tuple[int, Fill]]:
+        for start in range(0, header.splats, _AT_ONCE):
+            m = min(_AT_ONCE, header.splats - start)
+            part = {name: a.reshape(header.splats, -1)[start : start + m] for name, a in streams.items()}
+            yield m, partial(_fill, header, part)
+
+    cloud = _reader(header, where, chunks()).read(strict=strict)
     return SpzSplats(cloud, _axes(extensions, where))
+
+
+def _reader(header: _Header, where: object, chunks: Iterator[tuple[int, Fill]]) -> SplatReader:
+    kernel: Kernel = "antialiased" if header.flags & _ANTIALIASED else "3dgs"
+    return SplatReader(header.splats, 1 + _REST[min(header.degree, 3)], kernel, where, chunks)
+
+
+def _fill(header: _Header, part: dict[str, np.ndarray], rows: SplatRows) -> None:
+    """Writes m splats of ``part``, (m, bytes) of each attribute."""
+    rows.means[:] = _positions(part["positions"], header)
+    rows.opacities[:] = part["alphas"][:, 0] / np.float32(255)
+    rows.sh[:, 0] = (part["colors"] / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE)
+    rows.scales[:] = np.exp(part["scales"] / np.float32(16) - np.float32(10))
+    _fill_rotations(rows.quaternions, part["rotations"])
+    degree = min(header.degree, 3)
+    if degree:
+        rest = part["sh"].reshape(len(rows.means), -1, 3)[:, : _REST[degree]]
+        rows.sh[:, 1:] = (rest - np.float32(128)) / np.float32(128)
+
+
+class OpenedSpz(NamedTuple):
+    """An SPZ file whose splats are read in the axes of the file, and its ``SpzSplats.to_y_down``."""
+
+    reader: SplatReader
+    to_y_down: np.ndarray
+
+
+def open_spz(path: Path) -> OpenedSpz:
+    """The splats of the SPZ file ``path`` without the file in memory; errors as ``load_gaussians``.
+
+    Its attributes lie one after the other, each of all splats: they are unpacked side by side. Versions 1 to
+    3 are one stream, which is unpacked twice: the first time to find where the attributes begin.
+    """
+    with open(path, "rb") as file:
+        plain = file.read(4) == MAGIC
+        file.seek(0)
+        if not plain:
+            header, extensions, streams = _gzip_streams(path, file)
+        else:
+            length = file.seek(0, io.SEEK_END)
+            file.seek(0)
+            header, extensions, table = _contents(file.read(_MAX_HEAD), length, path)
+            streams = {name: _zstd_stream(path, at, packed) for name, (at, packed, _) in table.items()}
+    _warn_of_degree(header, path)
+    if not header.degree and "sh" in streams:
+        streams.pop("sh").close()
+    reader = _reader(header, path, _side_by_side(header, streams, path))
+    return OpenedSpz(reader, _axes(extensions, path))
+
+
+def _side_by_side(header: _Header, streams: dict[str, Any], where: object) -> Iterator[tuple[int, Fill]]:
+    width = {name: size // max(header.splats, 1) for name, size in header.sizes().items()}
+    try:
+        for start in range(0, header.splats, _AT_ONCE):
+            m = min(_AT_ONCE, header.splats - start)
+            part = {
+                name: np.frombuffer(_exactly(stream, m * width[name], name, where), np.uint8).reshape(m, -1)
+                for name, stream in streams.items()
+            }
+            yield m, partial(_fill, header, part)
+    finally:
+        _close(streams)
+
+
+class _Inflater:
+    """A gzip stream in a file from some point on: unpacks as much as is read."""
+
+    def __init__(self, file: BinaryIO, decompressor: Any, rest: bytes = b"") -> None:
+        self._file, self._decompressor, self._rest = file, decompressor, rest
+
+    def read(self, most: int) -> bytes:
+        """Up to ``most`` bytes; none at the end. zlib.error for a broken stream."""
+        found = b""
+        while not found and not self._decompressor.eof:
+            packed = self._rest or self._file.read(_PIECE)
+            found = self._decompressor.decompress(packed, most)
+            self._rest = self._decompressor.unconsumed_tail
+            if not packed:
+                break
+        return found
+
+    @property
+    def complete(self) -> bool:
+        return bool(self._decompressor.eof)
+
+    def again(self) -> _Inflater:
+        """Another reader of the same file that goes on from here."""
+        file = open(self._file.name, "rb")  # noqa: SIM115 (closed by close)
+        file.seek(self._file.tell())
+        return _Inflater(file, self._decompressor.copy(), self._rest)
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _Frame(io.RawIOBase):
+    """The packed bytes of one Zstandard frame of a file."""
+
+    def __init__(self, path: Path, at: int, length: int) -> None:
+        self._file, self._left = open(path, "rb"), length  # noqa: SIM115 (closed by close)
+        self._file.seek(at)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        found = self._file.read(min(len(buffer), self._left))
+        self._left -= len(found)
+        buffer[: len(found)] = found
+        return len(found)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def _exactly(stream: Any, count: int, name: str, where: object) -> bytes:
+    """``count`` bytes of the unpacked ``stream`` of an attribute."""
+    parts, missing = [], count
+    errors: tuple[type[BaseException], ...] = (EOFError, MemoryError, *_unpacking_errors())
+    while missing:
+        try:
+            found = stream.read(min(missing, _PIECE))
+        except errors as error:
+            raise FileFormatError(f"{where}: the stream of {name} is broken: {str(error)[:100]}") from None
+        if not found:
+            raise FileFormatError(f"{where}: the stream of {name} is truncated")
+        parts.append(found)
+        missing -= len(found)
+    return b"".join(parts)
+
+
+def _gzip_streams(path: Path, file: BinaryIO) -> tuple[_Header, bytes, dict[str, Any]]:
+    """Unpacks versions 1 to 3 once, without keeping them: header, extensions, and a stream for each
+    attribute."""
+    source = _Inflater(file, zlib.decompressobj(31))
+    streams: dict[str, Any] = {}
+    try:
+        raw = b""
+        while len(raw) < 16 and (more := source.read(16 - len(raw))):
+            raw += more
+        if len(raw) < 16:
+            raise FileFormatError(f"{path}: truncated SPZ header of {len(raw)} bytes")
+        header = _header(raw, range(1, 4), path)
+        done = 0
+        for name, size in header.sizes().items():
+            streams[name] = source.again()
+            left = size
+            while left and (more := source.read(min(left, _PIECE))):
+                left -= len(more)
+            done += size - left
+        extensions = b""
+        while len(extensions) <= _MAX_EXTENSION_BYTES and (more := source.read(_PIECE)):
+            extensions += more
+        _check_end(header, done, extensions, source.complete, path)
+    except BaseException as error:
+        _close(streams)
+        if isinstance(error, zlib.error):
+            raise FileFormatError(f"{path}: the gzip stream is broken: {error}") from None
+        raise
+    return header, extensions, streams
+
+
+def _close(streams: dict[str, Any]) -> None:
+    for stream in streams.values():
+        stream.close()
+
+
+def _check_end(header: _Header, found: int, extensions: bytes, complete: bool, where: object) -> None:
+    """Refuses a stream that does not have the length that the header promises."""
+    wanted = sum(header.sizes().values())
+    if found < wanted or not complete:
+        problem = "truncated" if found < wanted else "longer than its header says"
+        raise FileFormatError(
+            f"{where}: {problem}: {header.splats:,} splats take {wanted:,} bytes, the stream gave"
+            f" {found + len(extensions):,}"
+        )
+    if extensions and not header.flags & _EXTENDED:
+        what = "; those of Spark's level-of-detail tree, which is not read" if header.flags & _TREE else ""
+        raise FileFormatError(f"{where}: {len(extensions):,} bytes follow the {header.splats:,} splats{what}")
 
 
 def _header(raw: bytes, versions: range, where: object) -> _Header:
@@ -125,6 +301,15 @@ def _header(raw: bytes, versions: range, where: object) -> _Header:
             f"{where}: SPZ positions with {fraction_bits} fractional bits, expected 0 to 30"
         )
     return _Header(version, count, degree, fraction_bits, flags)
+
+
+def _warn_of_degree(header: _Header, where: object) -> None:
+    if header.degree > 3:
+        warnings.warn(
+            f"{where}: spherical harmonics of degree {header.degree}; those beyond degree 3 are left out",
+            DataWarning,
+            stacklevel=5,
+        )
 
 
 def _spend(header: _Header, where: object, budget: Budget) -> None:
@@ -148,16 +333,8 @@ def _parse_gzip(
         body = stream.decompress(stream.unconsumed_tail, wanted + _MAX_EXTENSION_BYTES)
     except zlib.error as error:
         raise FileFormatError(f"{where}: the gzip stream is broken: {error}") from None
-    if len(body) < wanted or not stream.eof:
-        problem = "truncated" if len(body) < wanted else "longer than its header says"
-        raise FileFormatError(
-            f"{where}: {problem}: {header.splats:,} splats take {wanted:,} bytes, the stream gave"
-            f" {len(body):,}"
-        )
     extensions = body[wanted:]
-    if extensions and not header.flags & _EXTENDED:
-        what = "; those of Spark's level-of-detail tree, which is not read" if header.flags & _TREE else ""
-        raise FileFormatError(f"{where}: {len(extensions):,} bytes follow the {header.splats:,} splats{what}")
+    _check_end(header, min(len(body), wanted), extensions, stream.eof, where)
     streams, at = {}, 0
     for name, size in sizes.items():
         streams[name] = np.frombuffer(body, np.uint8, size, at)
@@ -169,33 +346,70 @@ def _parse_streams(
     data: bytes | memoryview, where: object, budget: Budget
 ) -> tuple[_Header, bytes, dict[str, np.ndarray]]:
     """Parses version 4."""
-    if len(data) < 32:
-        raise FileFormatError(f"{where}: truncated SPZ header of {len(data)} bytes")
-    header = _header(bytes(data[:16]), range(4, 5), where)
+    header, extensions, table = _contents(data[:_MAX_HEAD], len(data), where, budget)
+    streams = {}
+    for name, (at, packed, size) in table.items():
+        streams[name] = np.frombuffer(_unzstd(bytes(data[at : at + packed]), size, name, where), np.uint8)
+    return header, extensions, {"sh": np.empty(0, np.uint8), **streams}
+
+
+def _contents(
+    head: bytes | memoryview, length: int, where: object, budget: Budget | None = None
+) -> tuple[_Header, bytes, dict[str, tuple[int, int, int]]]:
+    """Header, extensions, and place, length and unpacked length of each stream of a file of ``length`` bytes
+    that begins with ``head``. The splats are taken from the ``budget`` before the streams are looked at."""
+    if len(head) < 32:
+        raise FileFormatError(f"{where}: truncated SPZ header of {len(head)} bytes")
+    header = _header(bytes(head[:16]), range(4, 5), where)
     sizes = {name: size for name, size in header.sizes().items() if size}
-    n_streams = data[15]
-    (table,) = struct.unpack_from("<I", data, 16)
+    n_streams = head[15]
+    (table,) = struct.unpack_from("<I", head, 16)
     at = table + 16 * n_streams
-    if n_streams != len(sizes) or table < 32 or at > len(data):
+    if n_streams != len(sizes) or table < 32 or at > len(head):
         raise FileFormatError(
             f"{where}: an SPZ table of {n_streams} streams at byte {table:,}; {len(sizes)} streams are needed"
-            f" and the file has {len(data):,} bytes"
+            f" and the file has {length:,} bytes"
         )
-    _spend(header, where, budget)
-    streams = {}
+    if budget is not None:
+        _spend(header, where, budget)
+    found = {}
     for i, (name, size) in enumerate(sizes.items()):
-        packed, unpacked = struct.unpack_from("<QQ", data, table + 16 * i)
-        if unpacked != size or packed > len(data) - at:
+        packed, unpacked = struct.unpack_from("<QQ", head, table + 16 * i)
+        if unpacked != size or packed > length - at:
             raise FileFormatError(
                 f"{where}: the stream of {name} has {packed:,} bytes for {unpacked:,}; {size:,} are needed,"
-                f" {len(data) - at:,} are left in the file"
+                f" {length - at:,} are left in the file"
             )
-        streams[name] = np.frombuffer(_unzstd(bytes(data[at : at + packed]), size, name, where), np.uint8)
+        found[name] = (at, packed, size)
         at += packed
-    if at != len(data):
-        raise FileFormatError(f"{where}: {len(data) - at:,} bytes follow the last SPZ stream")
-    extensions = bytes(data[32:table]) if header.flags & _EXTENDED else b""
-    return header, extensions, {"sh": np.empty(0, np.uint8), **streams}
+    if at != length:
+        raise FileFormatError(f"{where}: {length - at:,} bytes follow the last SPZ stream")
+    extensions = bytes(head[32:table]) if header.flags & _EXTENDED else b""
+    return header, extensions, found
+
+
+def _zstd_stream(path: Path, at: int, length: int) -> Any:
+    """The unpacked bytes of the Zstandard frame at a place of the file, as a file to be read."""
+    try:
+        zstd = importlib.import_module("compression.zstd")
+    except ImportError:
+        try:
+            zstandard = importlib.import_module("zstandard")
+        except ImportError:
+            raise _no_zstandard(path) from None
+        decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 27)
+        return decompressor.stream_reader(_Frame(path, at, length), closefd=True)
+    return zstd.ZstdFile(_Frame(path, at, length))
+
+
+def _unpacking_errors() -> tuple[type[Exception], ...]:
+    """The errors of zlib, and of the modules for Zstandard that have been imported."""
+    loaded = [sys.modules.get(name) for name in ("compression.zstd", "zstandard")]
+    return (zlib.error, *(module.ZstdError for module in loaded if module is not None))
+
+
+def _no_zstandard(where: object) -> MissingDependencyError:
+    return MissingDependencyError(f"{where}: SPZ version 4 needs the extra 'formats': pip install zstandard")
 
 
 def _unzstd(packed: bytes, size: int, name: str, where: object) -> bytes:
@@ -207,9 +421,7 @@ def _unzstd(packed: bytes, size: int, name: str, where: object) -> bytes:
         try:
             zstandard = importlib.import_module("zstandard")
         except ImportError:
-            raise MissingDependencyError(
-                f"{where}: SPZ version 4 needs the extra 'formats': pip install zstandard"
-            ) from None
+            raise _no_zstandard(where) from None
         error_type = zstandard.ZstdError
         reader = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed)
     else:

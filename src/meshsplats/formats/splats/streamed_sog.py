@@ -7,14 +7,15 @@ detail. Specification: developer.playcanvas.com, "The Streamed SOG Format".
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.splats._cloud_builder import joined
+from meshsplats.formats.splats._cloud_builder import SplatReader, joined
 from meshsplats.formats.splats.sog import json_object, read_sog
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import GaussianCloud, Kernel
 
 _MAX_INDEX_BYTES = 64 << 20
 _MAX_DEPTH = 64
@@ -24,25 +25,35 @@ _PATH = re.compile(r"[^/\\:\0]{1,255}(/[^/\\:\0]{1,255}){0,7}")
 def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
     """The splats of the index ``path`` at the finest level of each leaf, and those of its environment; errors
     as ``load_gaussians``."""
-    index = _Index(path)
     budget = Budget(path)
     parts = []
-    for name, ranges in index.parts().items():
+    for name, part, own in streamed_parts(path):
+        cloud = part.read(strict=strict)
+        budget.extend(own.file_bytes)
+        budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
+        parts.append(cloud)
+    return joined(parts, budget)
+
+
+def streamed_parts(path: Path) -> Iterator[tuple[str, SplatReader, Budget]]:
+    """Name, splats and budget of each part of the index ``path``, at the finest level of each leaf; only one
+    part at a time is in memory. Errors as ``load_gaussians``."""
+    kernels: set[Kernel] = set()
+    for name, ranges in _Index(path).parts().items():
         part = path.parent / name
         if not part.is_file():
             raise FileFormatError(f"{path}: the part {name!r} that it names is missing")
         # Only the splats stay in memory after a part has been read.
         own = Budget(part)
-        cloud = read_sog(part, own, strict=strict, ranges=ranges)
-        budget.extend(own.file_bytes)
-        budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
-        parts.append(cloud)
-    if not parts:
+        reader = read_sog(part, own, ranges)
+        kernels.add(reader.kernel)
+        if len(kernels) > 1:
+            raise FileFormatError(
+                f"{path}: its parts are of several kinds of splats: {', '.join(sorted(kernels))}"
+            )
+        yield name, reader, own
+    if not kernels:
         raise FileFormatError(f"{path}: no splats, its tree has none")
-    kernels = sorted({part.kernel for part in parts})
-    if len(kernels) > 1:
-        raise FileFormatError(f"{path}: its parts are of several kinds of splats: {', '.join(kernels)}")
-    return joined(parts, budget)
 
 
 class _Index:
