@@ -32,6 +32,7 @@ var<workgroup> ids: array<u32, 64>;        // face and OWNER bits
 var<workgroup> corners: array<vec4f, 192>; // values
 var<workgroup> planes: array<vec4f, 64>;   // of the depth group: slopes, 1 / z at the corner of the tile; 1 if there is one
 var<workgroup> ranges: array<vec2f, 64>;   // of 1 / z of the depth group
+var<workgroup> boxes: array<u32, 128>;     // the samples in its box, one bit each: two words a slot
 var<workgroup> keys: array<f32, 8>;        // of the runs
 var<workgroup> ready: array<atomic<u32>, 2>;
 var<workgroup> open_count: atomic<u32>;
@@ -168,6 +169,15 @@ fn edges_at(slot: u32, p: vec2f) -> vec3f {
   return vec3f(
     edge_at(edges[3u * slot], p, c.x), edge_at(edges[3u * slot + 1u], p, c.y), edge_at(edges[3u * slot + 2u], p, c.z));
 }
+// Bit 8 y + x for all samples with low <= (x, y) <= high in rows 0 to 3; other rows are left out.
+fn box_bits(low: vec2i, high: vec2i) -> u32 {
+  let y0 = max(low.y, 0);
+  let y1 = min(high.y, 3);
+  if (y0 > y1) { return 0u; }
+  let row = ((2u << u32(high.x - low.x)) - 1u) << u32(low.x);
+  return row * ((0x01010101u << u32(8 * y0)) & (0x01010101u >> u32(8 * (3 - y1))));
+}
+
 fn covers(slot: u32, p: vec2f) -> bool {
   let e = edges_at(slot, p);
   let id = ids[slot];
@@ -181,6 +191,7 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
   let p = array<vec4f, 3>(projected[i.x], projected[i.y], projected[i.z]);
   let visible = vec3<bool>(p[0].z > 0.0, p[1].z > 0.0, p[2].z > 0.0);
   if (!any(visible)) { return false; }
+  var box = vec2u(0xffffffffu);
   if (all(visible)) {
     let low = min(min(p[0].xy, p[1].xy), p[2].xy);
     let high = max(max(p[0].xy, p[1].xy), p[2].xy);
@@ -188,6 +199,9 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
     let first = ceil(max(low - o - room, vec2f(0.5)) - 0.5);
     let last = floor(min(high - o + room, vec2f(f32(TILE) - 0.5)) - 0.5);
     if (any(first > last)) { return false; }
+    let a = vec2i(first);
+    let b = vec2i(last);
+    box = vec2u(box_bits(a, b), box_bits(a - vec2i(0, 4), b - vec2i(0, 4)));
   }
   let v = array<vec4f, 3>(values[i.x], values[i.y], values[i.z]);
   let opacity = max(max(v[0].w, v[1].w), v[2].w);
@@ -240,6 +254,8 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
   scales[slot] = vec4f(scale, nearest);
   least[slot] = farthest;
   ids[slot] = bits;
+  boxes[2u * slot] = box.x;
+  boxes[2u * slot + 1u] = box.y;
   if (OUTPUT == 3u) {  // values are positions
     corners[3u * slot] = vec4f(cross(v[1].xyz - v[0].xyz, v[2].xyz - v[0].xyz), v[0].w);
   }
@@ -396,19 +412,30 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
     let triangles = countOneBits(now.y) + countOneBits(now.z);
     spent += triangles + 8u;
     if (open) {
-      tests += triangles;
-      effort = 0u;
-      var hits = vec2u(0u);
+      // Slots whose box holds the sample; those that cover it; then their fragments: lanes differ less so.
+      let word = t / 32u;
+      let bit = t % 32u;
+      var near = vec2u(0u);
       var rest = now.yz;
       while (rest.x != 0u) {
         let slot = firstTrailingBit(rest.x);
-        if (covers(slot, p)) { hits.x |= 1u << slot; }
+        near.x |= ((boxes[2u * slot + word] >> bit) & 1u) << slot;
         rest.x &= rest.x - 1u;
       }
       while (rest.y != 0u) {
         let slot = firstTrailingBit(rest.y);
-        if (covers(slot + 32u, p)) { hits.y |= 1u << slot; }
+        near.y |= ((boxes[2u * slot + 64u + word] >> bit) & 1u) << slot;
         rest.y &= rest.y - 1u;
+      }
+      effort = countOneBits(near.x) + countOneBits(near.y);
+      tests += effort;
+      var hits = vec2u(0u);
+      while ((near.x | near.y) != 0u) {
+        var slot = 0u;
+        if (near.x != 0u) { slot = firstTrailingBit(near.x); near.x &= near.x - 1u; }
+        else { slot = 32u + firstTrailingBit(near.y); near.y &= near.y - 1u; }
+        let hit = select(0u, 1u << (slot % 32u), covers(slot, p));
+        if (slot < 32u) { hits.x |= hit; } else { hits.y |= hit; }
       }
       while ((hits.x | hits.y) != 0u && open) {
         var slot = 0u;
@@ -420,7 +447,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
         effort++;
       }
       atomicAdd(&efforts[t / 16u], effort);
-      whole = whole && (rest.x | rest.y) == 0u && ((hits.x | hits.y) == 0u || !open);
+      whole = whole && (rest.x | rest.y | near.x | near.y) == 0u && ((hits.x | hits.y) == 0u || !open);
     }
     at += RUN;
   }
