@@ -18,7 +18,7 @@ LOWEST = (
 FLOORS = (
     ("binding", "camera", "gaussians"),
     ("base_mesh", "demo_scene", "images", "mesh"),
-    ("cameras", "formats"),
+    ("cameras", "formats", "webgpu"),
     ("rendering",),
     ("conversion", "datasets"),
     ("evaluation",),
