@@ -31,3 +31,7 @@ class NoTextureWarning(DataWarning):
 
 class DivergenceError(ValueError):
     """An optimisation met values that are not finite; the message names the view."""
+
+
+class DeviceError(RuntimeError):
+    """The GPU failed, or cannot draw this; the message says what to do."""

@@ -1,0 +1,1 @@
+"""Images of meshes on any GPU, by WebGPU. See :mod:`meshsplats.webgpu.renderer`."""

@@ -1,0 +1,94 @@
+"""The GPU: its adapter and its device."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from meshsplats.errors import DeviceError, MissingDependencyError
+
+GET_WGPU = "pip install 'meshsplats[gpu]'"
+
+BACKENDS = ("Vulkan", "Metal", "D3D12")
+KINDS = ("DiscreteGPU", "IntegratedGPU", "Unknown", "CPU")
+"""Kinds of adapters, the best first."""
+
+CORE_BINDING = 128 << 20
+"""Bytes of a storage buffer that a shader can see, on every device."""
+
+CORE_BUFFER = 256 << 20
+"""Bytes of a buffer, on every device."""
+
+
+class Device:
+    """A device with WebGPU's core limits: no features, 8 storage buffers a stage, 128 MiB a binding."""
+
+    def __init__(self, adapter: Any) -> None:
+        self.adapter = adapter
+        self.info: dict[str, str] = {key: str(value) for key, value in dict(adapter.info).items()}
+        self.device: Any = adapter.request_device_sync()
+        self.binding_limit = CORE_BINDING
+        self._pipelines: dict[tuple[Any, ...], Any] = {}
+        self._modules: dict[tuple[Any, ...], Any] = {}
+
+    def pipeline(self, entry: str, key: tuple[Any, ...], source: Callable[[], str]) -> Any:
+        """The pipeline of a kernel, compiled on first use; ``key`` stands for the text of ``source``."""
+        import wgpu
+
+        if (entry, *key) not in self._pipelines:
+            if key not in self._modules:
+                self._modules[key] = self.device.create_shader_module(code=source())
+            self._pipelines[(entry, *key)] = self.device.create_compute_pipeline(
+                layout=wgpu.AutoLayoutMode.auto, compute={"module": self._modules[key], "entry_point": entry}
+            )
+        return self._pipelines[(entry, *key)]
+
+    @property
+    def name(self) -> str:
+        """Name of the adapter, its kind and the interface to it."""
+        info = self.info
+        kind = {"CPU": "software", "DiscreteGPU": "GPU", "IntegratedGPU": "integrated GPU"}
+        return f"{info['device']} ({kind.get(info['adapter_type'], 'unknown kind')}, {info['backend_type']})"
+
+
+def find_adapters() -> list[Any]:
+    """The adapters of this machine, the best first.
+
+    Raises:
+        MissingDependencyError: wgpu is not installed or cannot be loaded.
+    """
+    try:
+        import wgpu
+    except ImportError as error:
+        raise MissingDependencyError(f"the GPU needs wgpu ({error}): {GET_WGPU}") from None
+    try:
+        adapters = list(wgpu.gpu.enumerate_adapters_sync())
+    except (RuntimeError, OSError) as error:
+        raise MissingDependencyError(f"wgpu finds no graphics driver: {error}") from None
+
+    def rank(adapter: Any) -> int:
+        kind = adapter.info["adapter_type"]
+        return KINDS.index(kind) if kind in KINDS else KINDS.index("Unknown")
+
+    return sorted((a for a in adapters if a.info["backend_type"] in BACKENDS), key=rank)
+
+
+@functools.lru_cache(maxsize=1)
+def open_device() -> Device:
+    """The best device of this machine; the same one on every call.
+
+    Raises:
+        MissingDependencyError: there is no wgpu or no driver.
+        DeviceError: the driver refuses.
+    """
+    adapters = find_adapters()
+    if not adapters:
+        raise MissingDependencyError(
+            "no GPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Linux without a GPU, the"
+            " package mesa-vulkan-drivers draws on processors, slowly)"
+        )
+    try:
+        return Device(adapters[0])
+    except RuntimeError as error:
+        raise DeviceError(f"{adapters[0].info['device']}: the driver refuses: {error}") from None

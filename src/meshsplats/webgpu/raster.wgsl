@@ -1,0 +1,474 @@
+// Draws tiles: a workgroup a tile, an invocation a sample.
+//
+// The host replaces what begins with $.
+//
+// The list of a tile comes nearest run first. Each sample keeps the nearest K of its fragments that are not blended
+// yet, sorted. One that is nearer than all runs to come is blended. If there are more than K, the farthest is
+// dropped, and the list is walked again, behind the last fragment that was blended: the result is exact for any K.
+
+const K = $Ku;                 // fragments of the queue of each sample
+const OUTPUT = $OUTPUTu;       // 0: RGB of the vertices; 1: depth; 2: normals of vertices; 3: of faces
+const GROUPS = $GROUPS;        // whether the mesh has depth groups
+
+@group(0) @binding(1) var<storage, read> projected: array<vec4f>;
+@group(0) @binding(2) var<storage, read> mesh: array<u32>;
+@group(0) @binding(3) var<storage, read> values: array<vec4f>;   // by vertex: RGB, normal or world position; opacity
+@group(0) @binding(4) var<storage, read> pairs: array<vec2u>;
+@group(0) @binding(5) var<storage, read> work: array<vec4u>;     // from 1 on: (tile, first pair, end, walks so far)
+@group(0) @binding(6) var<storage, read_write> samples: array<vec4u>;  // RGB and transmittance; then the state
+@group(0) @binding(7) var<storage, read_write> next_work: array<atomic<u32>>;  // tiles to walk again, as `work`
+@group(0) @binding(8) var<storage, read_write> counters: array<atomic<u32>>;
+
+const SLOTS = 64u;             // triangles that are set up together
+const OWNER = 0x20000000u;     // with the face: bit i says that edge i owns the samples on it
+const FACE = 0x1fffffffu;
+
+// By slot. Edge i lies opposite to corner i: E_i = a (x - x_i) + b (y - y_i) + c_i, from the corner of the tile.
+var<workgroup> edges: array<vec4f, 192>;   // a, b, x_i, y_i
+var<workgroup> ends: array<vec4f, 64>;     // c_i, 0 except where the near plane cuts; 1 / determinant there, else 0
+var<workgroup> scales: array<vec4f, 64>;   // E_i times these are proportional to the weights of corners; largest 1 / z
+var<workgroup> least: array<f32, 64>;      // least 1 / z
+var<workgroup> ids: array<u32, 64>;        // face and OWNER bits
+var<workgroup> corners: array<vec4f, 192>; // values
+var<workgroup> planes: array<vec4f, 64>;   // of the depth group: slopes, 1 / z at the corner of the tile; 1 if there is one
+var<workgroup> ranges: array<vec2f, 64>;   // of 1 / z of the depth group
+var<workgroup> keys: array<f32, 8>;        // of the runs
+var<workgroup> ready: array<atomic<u32>, 2>;
+var<workgroup> open_count: atomic<u32>;
+var<workgroup> begin_again: atomic<u32>;
+var<workgroup> moved: atomic<u32>;
+var<workgroup> broken: atomic<u32>;
+var<workgroup> totals: array<atomic<u32>, 4>;
+var<workgroup> decision: vec4u;
+// Loop iterations of 16 invocations together: not less than those of the SIMD lanes that run in step.
+var<workgroup> efforts: array<atomic<u32>, 4>;
+
+// The sample.
+var<private> rgb: vec3f;
+var<private> through: f32;        // transmittance
+var<private> layers: u32;         // fragments blended
+var<private> floor_q: f32;        // the last fragment blended
+var<private> floor_face: u32;
+var<private> limit_q: f32;        // the nearest fragment dropped; below 0: none
+var<private> limit_face: u32;
+var<private> blended: u32;        // in this walk, visible ones
+var<private> advanced: bool;      // in this walk
+var<private> effort: u32;         // loop iterations in this batch
+// Its queue: a ring, nearest first.
+var<private> head: u32;
+var<private> count: u32;
+var<private> queue_key: array<f32, K>;
+var<private> queue_face: array<u32, K>;
+var<private> queue_value: array<vec4f, K>;
+
+fn place(i: u32) -> u32 {
+  let j = head + i;
+  return select(j, j - K, j >= K);
+}
+
+fn most_effort() -> u32 {
+  return max(max(atomicLoad(&efforts[0]), atomicLoad(&efforts[1])), max(atomicLoad(&efforts[2]), atomicLoad(&efforts[3])));
+}
+
+fn is_open() -> bool {
+  return through > 0.0 && through >= frame.min_transmittance && (frame.max_layers == 0u || layers < frame.max_layers);
+}
+
+fn blend_front() {
+  let value = queue_value[head];
+  let weight = through * value.w;
+  rgb = fma(vec3f(weight), value.xyz, rgb);
+  through = fma(-through, value.w, through);
+  if (weight > 0.0) { layers++; blended++; }
+  floor_q = queue_key[head];
+  floor_face = queue_face[head];
+  advanced = true;
+  head = place(1u);
+  count--;
+  effort++;
+}
+
+fn is_nearer(q: f32, face: u32, other_q: f32, other_face: u32) -> bool {
+  return q > other_q || (q == other_q && face < other_face);
+}
+
+// Puts a fragment into its place. The farthest is dropped if there are too many.
+fn insert(q: f32, face: u32, value: vec4f) {
+  var dropped_q = -1.0;
+  var dropped_face = 0u;
+  if (count == K) {
+    let last = place(K - 1u);
+    if (!is_nearer(q, face, queue_key[last], queue_face[last])) {
+      drop(q, face);
+      return;
+    }
+    dropped_q = queue_key[last];
+    dropped_face = queue_face[last];
+    count--;
+  }
+  var i = count;
+  while (i > 0u) {
+    let before = place(i - 1u);
+    if (!is_nearer(q, face, queue_key[before], queue_face[before])) { break; }
+    let after = place(i);
+    queue_key[after] = queue_key[before];
+    queue_face[after] = queue_face[before];
+    queue_value[after] = queue_value[before];
+    i--;
+    effort++;
+  }
+  let free = place(i);
+  queue_key[free] = q;
+  queue_face[free] = face;
+  queue_value[free] = value;
+  count++;
+  if (dropped_q >= 0.0) { drop(dropped_q, dropped_face); }
+}
+
+// Notes a fragment that lies behind the full queue.
+fn drop(q: f32, face: u32) {
+  if (hidden()) { return; }
+  limit_q = q;
+  limit_face = face;
+}
+
+// Whether nothing behind the whole queue can be blended. Rounding is why half of the limit is safe.
+fn hidden() -> bool {
+  if (frame.max_layers != 0u && layers + K >= frame.max_layers) { return true; }
+  if (frame.min_transmittance == 0.0) { return false; }
+  var rest = through;
+  for (var i = 0u; i < K; i++) { rest *= 1.0 - queue_value[i].w; }
+  effort += K;
+  return rest < 0.5 * frame.min_transmittance;
+}
+
+// ------------------------------------------------------------------------------------------------ triangle set-up
+
+struct Edge { a: f32, b: f32, x: f32, y: f32, c: f32 };
+
+// The edge from p to q, from the corner o of the tile. The other direction has the same bits, negated.
+fn edge(p: vec4f, q: vec4f, o: vec2f) -> Edge {
+  let swapped = q.x < p.x || (q.x == p.x && (q.y < p.y || (q.y == p.y && q.w < p.w)));
+  var j = p;
+  var k = q;
+  var s = 1.0;
+  if (swapped) { j = q; k = p; s = -1.0; }
+  if (p.z > 0.0 && q.z > 0.0) { return Edge(s * (j.y - k.y), s * (k.x - j.x), j.x - o.x, j.y - o.y, 0.0); }
+  let u = homogeneous(j);
+  let v = homogeneous(k);
+  let n = cross(vec3f(u.xy - o * u.z, u.z), vec3f(v.xy - o * v.z, v.z));
+  return Edge(s * n.x, s * n.y, 0.0, 0.0, s * n.z);
+}
+// Top-left rule. Of two triangles at an edge, one sees (a, b), the other (-a, -b).
+fn owns(a: f32, b: f32) -> bool { return a > 0.0 || (a == 0.0 && b > 0.0); }
+
+fn edge_at(e: vec4f, p: vec2f, c: f32) -> f32 { return fma(e.x, p.x - e.z, fma(e.y, p.y - e.w, c)); }
+fn edges_at(slot: u32, p: vec2f) -> vec3f {
+  let c = ends[slot];
+  return vec3f(
+    edge_at(edges[3u * slot], p, c.x), edge_at(edges[3u * slot + 1u], p, c.y), edge_at(edges[3u * slot + 2u], p, c.z));
+}
+fn covers(slot: u32, p: vec2f) -> bool {
+  let e = edges_at(slot, p);
+  let id = ids[slot];
+  let owned = vec3<bool>((id & OWNER) != 0u, (id & (2u * OWNER)) != 0u, (id & (4u * OWNER)) != 0u);
+  return all((e > vec3f(0.0)) | ((e == vec3f(0.0)) & owned));
+}
+
+// Sets up a face in a slot, for the tile with the corner o; false if it covers no sample of it.
+fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
+  let i = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
+  let p = array<vec4f, 3>(projected[i.x], projected[i.y], projected[i.z]);
+  let visible = vec3<bool>(p[0].z > 0.0, p[1].z > 0.0, p[2].z > 0.0);
+  if (!any(visible)) { return false; }
+  if (all(visible)) {
+    let low = min(min(p[0].xy, p[1].xy), p[2].xy);
+    let high = max(max(p[0].xy, p[1].xy), p[2].xy);
+    let room = vec2f(1e-3) + 1e-6 * max(abs(low), abs(high));
+    let first = ceil(max(low - o - room, vec2f(0.5)) - 0.5);
+    let last = floor(min(high - o + room, vec2f(f32(TILE) - 0.5)) - 0.5);
+    if (any(first > last)) { return false; }
+  }
+  let v = array<vec4f, 3>(values[i.x], values[i.y], values[i.z]);
+  let opacity = max(max(v[0].w, v[1].w), v[2].w);
+  if (frame.cutoff >= 0.0) {
+    if (opacity < frame.cutoff) { return false; }
+  } else if (!(opacity > 0.0)) {
+    return false;
+  }
+  var e = array<Edge, 3>(edge(p[1], p[2], o), edge(p[2], p[0], o), edge(p[0], p[1], o));
+  var flip = 1.0;
+  var inverse = 0.0;
+  var scale = vec3f(p[0].z, p[1].z, p[2].z);
+  var farthest = min(min(p[0].z, p[1].z), p[2].z);
+  var nearest = max(max(p[0].z, p[1].z), p[2].z);
+  if (all(visible)) {
+    let u = p[1].xy - p[0].xy;
+    let w = p[2].xy - p[0].xy;
+    let d = u.x * w.y - w.x * u.y;
+    if (!(abs(d) > 1e-30)) { return false; }
+    if (d < 0.0) { flip = -1.0; }
+  } else {
+    var h: array<vec3f, 3>;
+    for (var k = 0u; k < 3u; k++) {
+      let c = homogeneous(p[k]);
+      h[k] = vec3f(c.xy - o * c.z, c.z);
+    }
+    let det = dot(h[0], cross(h[1], h[2]));
+    if (!(abs(det) > 1e-30)) { return false; }
+    if (det < 0.0) { flip = -1.0; }
+    inverse = 1.0 / abs(det);
+    scale = vec3f(
+      select(1.0, p[1].w * p[2].w, visible.y && visible.z), select(1.0, p[2].w * p[0].w, visible.z && visible.x),
+      select(1.0, p[0].w * p[1].w, visible.x && visible.y));
+    farthest = 1.0 / max(max(p[0].w, p[1].w), p[2].w);
+    nearest = 1.0 / frame.near;
+  }
+  var bits = face;
+  for (var k = 0u; k < 3u; k++) {
+    let line = vec4f(flip * e[k].a, flip * e[k].b, e[k].x, e[k].y);
+    let c = flip * e[k].c;
+    let far = f32(TILE) - 0.5;
+    let best = edge_at(line, vec2f(select(0.5, far, line.x > 0.0), select(0.5, far, line.y > 0.0)), c);
+    if (!(best >= 0.0)) { return false; }
+    edges[3u * slot + k] = line;
+    e[k].c = c;
+    if (owns(line.x, line.y)) { bits |= OWNER << k; }
+    corners[3u * slot + k] = v[k];
+  }
+  ends[slot] = vec4f(e[0].c, e[1].c, e[2].c, inverse);
+  scales[slot] = vec4f(scale, nearest);
+  least[slot] = farthest;
+  ids[slot] = bits;
+  if (OUTPUT == 3u) {  // values are positions
+    corners[3u * slot] = vec4f(cross(v[1].xyz - v[0].xyz, v[2].xyz - v[0].xyz), v[0].w);
+  }
+  if (GROUPS) {
+    let g = mesh[frame.face_groups_at + face];
+    planes[slot] = vec4f(0.0);
+    if (g != NO_GROUP) {
+      let anchor = projected[frame.vertices + 2u * g];
+      let plane = projected[frame.vertices + 2u * g + 1u];
+      planes[slot] = vec4f(plane.xy, fma(plane.x, o.x - anchor.x, fma(plane.y, o.y - anchor.y, anchor.z)), 1.0);
+      ranges[slot] = plane.zw;
+    }
+  }
+  return true;
+}
+
+// ------------------------------------------------------------------------------------------------ fragments
+
+// The fragment of the triangle in a slot at the sample p, which it covers: adds it to the queue unless it is
+// blended already or lies behind what was dropped. `key` bounds it.
+fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32) {
+  let e = edges_at(slot, p);
+  let scale = scales[slot];
+  let b = e * scale.xyz;
+  let sum = b.x + b.y + b.z;
+  let inverse = ends[slot].w;
+  var depth = 0.0;  // 1 / z
+  if (inverse == 0.0) {
+    depth = sum / (e.x + e.y + e.z);
+  } else {
+    depth = sum * inverse;
+    if (depth > scale.w) { return; }  // nearer than the near plane
+  }
+  depth = clamp(depth, least[slot], scale.w);
+  var q = depth;
+  if (GROUPS) {
+    let plane = planes[slot];
+    if (plane.w > 0.0) { q = clamp(fma(plane.x, p.x, fma(plane.y, p.y, plane.z)), ranges[slot].x, ranges[slot].y); }
+  }
+  q = min(q, key);
+  let face = ids[slot] & FACE;
+  if (!(q < floor_q || (q == floor_q && face > floor_face))) { return; }
+  if (q < limit_q || (q == limit_q && face > limit_face)) { return; }
+  let w = b / sum;
+  let v0 = corners[3u * slot];
+  let v1 = corners[3u * slot + 1u];
+  let v2 = corners[3u * slot + 2u];
+  var value = fma(vec4f(w.x), v0, fma(vec4f(w.y), v1, w.z * v2));
+  if (OUTPUT == 3u) { value = vec4f(v0.xyz, value.w); }
+  value.w = clamp(value.w, min(min(v0.w, v1.w), v2.w), max(max(v0.w, v1.w), v2.w));
+  if (frame.cutoff >= 0.0) {
+    if (value.w < frame.cutoff) { return; }
+    value.w = 1.0;
+  }
+  if (!(value.w > 0.0)) { return; }
+  if (OUTPUT == 1u) { value = vec4f(1.0 / depth, 0.0, 0.0, value.w); }
+  if (OUTPUT >= 2u) { value = vec4f(facing(value.xyz, tile + p), value.w); }
+  insert(q, face, value);
+}
+
+// The unit normal that faces the camera at the position p of the image; 0 for one without direction.
+fn facing(n: vec3f, p: vec2f) -> vec3f {
+  let most = max(max(abs(n.x), abs(n.y)), abs(n.z));
+  if (!(most > 0.0)) { return vec3f(0.0); }
+  let unit = normalize(n / most);
+  let ray = (p - frame.lens.zw) / frame.lens.xy;
+  let along = dot(unit, ray.x * frame.right.xyz + ray.y * frame.down.xyz + frame.forward.xyz);
+  return select(unit, -unit, along > 0.0);
+}
+
+// ------------------------------------------------------------------------------------------------ tiles
+
+fn add_wide(at: u32, value: u32) {  // to a counter of 64 bits
+  let old = atomicAdd(&counters[at], value);
+  if (old > 0xffffffffu - value) { atomicAdd(&counters[at + 1u], 1u); }
+}
+
+@compute @workgroup_size(64)
+fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: u32) {
+  let item = work[wg.x + 1u];
+  let tile = select(item.x, wg.x, item.w == 0u);
+  let tile_x = tile % frame.tiles_x;
+  let tile_y = tile / frame.tiles_x;
+  let o = vec2f(f32(tile_x * TILE), f32(tile_y * TILE));
+  let x = tile_x * TILE + t % TILE;
+  let y = tile_y * TILE + t / TILE;
+  let p = vec2f(f32(t % TILE) + 0.5, f32(t / TILE) + 0.5);
+  let in_image = x < frame.width && y < frame.height;
+  let index = y * frame.width + x;
+  let state_index = frame.width * frame.height + index;
+
+  rgb = vec3f(0.0);
+  through = 1.0;
+  layers = 0u;
+  floor_q = 3e38;
+  floor_face = 0u;
+  limit_q = -1.0;
+  limit_face = 0u;
+  blended = 0u;
+  advanced = false;
+  head = 0u;
+  count = 0u;
+  effort = 0u;
+  var open = in_image;
+  if (item.w > 0u && in_image) {
+    let color = bitcast<vec4f>(samples[index]);
+    let state = samples[state_index];
+    rgb = color.xyz;
+    through = color.w;
+    floor_q = bitcast<f32>(state.x);
+    floor_face = state.y;
+    layers = state.z;
+    open = state.w == 1u;
+  }
+  let was_open = open;
+  if (t == 0u) { atomicStore(&broken, 0u); }
+  if (t < 4u) { atomicStore(&efforts[t], 0u); }
+
+  var clean = item.y;     // everything before it is blended
+  var at = item.y;
+  let end = item.z;
+  var spent = 0u;
+  var cut = false;        // the budget is spent
+  var ended = false;      // the loop was left by its own exits
+  var whole = true;       // so were the inner loops
+  var tests = 0u;
+  loop {
+    if (at >= end) { ended = true; break; }
+    if (t < 2u) { atomicStore(&ready[t], 0u); }
+    if (t == 2u) { atomicStore(&open_count, 0u); }
+    workgroupBarrier();
+    // No fragment to come is nearer than this.
+    let nearest_to_come = unpack_depth(pairs[at].x);
+    if (open) {
+      while (count > 0u && open && queue_key[head] > nearest_to_come) { blend_front(); open = is_open(); }
+      if (count == 0u && limit_q < 0.0) { clean = at; }
+      if (open) { atomicAdd(&open_count, 1u); }
+    }
+    let pair_at = at + t / RUN;
+    if (pair_at < end) {
+      let pair = pairs[pair_at];
+      let run = unpack_run(mesh[frame.runs_at + (pair.y & 0xffffffu)]);
+      let k = t % RUN;
+      if (k == 0u) { keys[t / RUN] = unpack_depth(pair.x); }
+      if (k < run.count) {
+        if (set_up(t, run.first + k, o)) { atomicOr(&ready[t / 32u], 1u << (t % 32u)); }
+      }
+    }
+    workgroupBarrier();
+    if (t == 0u) { decision = vec4u(atomicLoad(&open_count), atomicLoad(&ready[0]), atomicLoad(&ready[1]), most_effort()); }
+    let now = workgroupUniformLoad(&decision);
+    if (now.x == 0u) { ended = true; break; }
+    if (spent + now.w > frame.budget) { ended = true; cut = true; break; }
+    let triangles = countOneBits(now.y) + countOneBits(now.z);
+    spent += triangles + 8u;
+    if (open) {
+      tests += triangles;
+      effort = 0u;
+      var hits = vec2u(0u);
+      var rest = now.yz;
+      while (rest.x != 0u) {
+        let slot = firstTrailingBit(rest.x);
+        if (covers(slot, p)) { hits.x |= 1u << slot; }
+        rest.x &= rest.x - 1u;
+      }
+      while (rest.y != 0u) {
+        let slot = firstTrailingBit(rest.y);
+        if (covers(slot + 32u, p)) { hits.y |= 1u << slot; }
+        rest.y &= rest.y - 1u;
+      }
+      while ((hits.x | hits.y) != 0u && open) {
+        var slot = 0u;
+        if (hits.x != 0u) { slot = firstTrailingBit(hits.x); hits.x &= hits.x - 1u; }
+        else { slot = 32u + firstTrailingBit(hits.y); hits.y &= hits.y - 1u; }
+        let key = keys[slot / RUN];
+        if (count == K && queue_key[head] > key) { blend_front(); open = is_open(); }
+        if (open) { add_fragment(slot, p, o, key); }
+        effort++;
+      }
+      atomicAdd(&efforts[t / 16u], effort);
+      whole = whole && (rest.x | rest.y) == 0u && ((hits.x | hits.y) == 0u || !open);
+    }
+    at += RUN;
+  }
+  if (open && !cut) {
+    while (count > 0u && open) { blend_front(); open = is_open(); }
+    whole = whole && (count == 0u || !open);
+  }
+  let again = open && (cut || limit_q >= 0.0);
+
+  workgroupBarrier();
+  if (t == 0u) { atomicStore(&open_count, 0u); atomicStore(&begin_again, end); atomicStore(&moved, 0u); }
+  if (t < 4u) { atomicStore(&totals[t], 0u); }
+  workgroupBarrier();
+  if (again) {
+    atomicAdd(&open_count, 1u);
+    atomicMin(&begin_again, clean);
+    if (advanced || clean > item.y) { atomicOr(&moved, 1u); }
+  }
+  if (!(whole && ended)) { atomicOr(&broken, 1u); }
+  if (was_open && !again) { atomicOr(&moved, 1u); }
+  atomicAdd(&totals[0], tests);
+  atomicAdd(&totals[1], blended);
+  workgroupBarrier();
+  let left = atomicLoad(&open_count);
+  if (in_image) {
+    samples[index] = bitcast<vec4u>(vec4f(rgb, through));
+    if (left > 0u) { samples[state_index] = vec4u(bitcast<u32>(floor_q), floor_face, layers, select(0u, 1u, again)); }
+  }
+  if (t != 0u) { return; }
+  atomicAdd(&counters[3], 1u);
+  atomicMax(&counters[4], item.w + 1u);
+  add_wide(5u, atomicLoad(&totals[0]));
+  add_wide(7u, atomicLoad(&totals[1]));
+  if (cut) { atomicAdd(&counters[10], 1u); }
+  if (atomicLoad(&broken) != 0u) {
+    atomicAdd(&counters[12], 1u);
+  } else if (left == 0u) {
+    atomicAdd(&counters[2], 1u);
+  } else if (atomicLoad(&moved) == 0u) {
+    atomicAdd(&counters[9], 1u);
+  } else {
+    if (item.w == 0u) { atomicAdd(&counters[11], left); }
+    let place = 4u * (atomicAdd(&next_work[0], 1u) + 1u);
+    atomicStore(&next_work[1], 1u);
+    atomicStore(&next_work[2], 1u);
+    atomicStore(&next_work[place], tile);
+    atomicStore(&next_work[place + 1u], atomicLoad(&begin_again));
+    atomicStore(&next_work[place + 2u], end);
+    atomicStore(&next_work[place + 3u], item.w + 1u);
+  }
+}

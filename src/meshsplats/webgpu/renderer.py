@@ -1,0 +1,507 @@
+"""Draws meshes on the GPU: buffers, frames, windows of the image. docs/webgpu.md describes the kernels."""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.errors import DeviceError
+from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.webgpu import kernels
+from meshsplats.webgpu.device import Device, open_device
+
+WINDOW_SAMPLES = 1 << 22
+"""Largest number of samples of a frame; larger images are drawn in windows."""
+
+FIRST_PAIRS = 1 << 18
+"""Room for pairs of a run and a tile, until a frame needs more."""
+
+MAX_FAN = 8192
+"""Most triangles of a splat with a low-pass filter: one invocation goes through all of them three times."""
+
+LOOP_BUDGET = 40_000
+"""Loop iterations of one walk through a tile list. Drivers end what runs too long, some without an error;
+lavapipe cuts loops after 65,535 iterations."""
+
+MAX_ROUNDS = 10_000
+"""Most repetitions of a frame's last steps."""
+
+
+@dataclass(frozen=True)
+class DrawSettings:
+    """What does not change from window to window."""
+
+    samples: int = 1
+    max_layers: int = 0
+    min_transmittance: float = 1e-6
+    cutoff: float = -1.0
+    filter_px2: float = 0.0
+    queue: int = kernels.QUEUE
+    long_queue: int = kernels.LONG_QUEUE
+    budget: int = LOOP_BUDGET
+
+
+@dataclass
+class Work:
+    """Counters of what was drawn."""
+
+    windows: int = 0
+    frames: int = 0
+    """With those that were repeated because lists were too short."""
+    dispatches: int = 0
+    """Of the last frame."""
+    bytes: int = 0
+    """Of all buffers."""
+    tiles: int = 0
+    pairs: int = 0
+    """Pairs of a run and a tile in its box."""
+    walks: int = 0
+    """Through tile lists."""
+    most_walks: int = 0
+    tests: int = 0
+    """Of a triangle at a sample."""
+    fragments: int = 0
+    """Blended."""
+    overflowed: int = 0
+    """Samples whose queue was too short in the first walk."""
+
+
+@dataclass
+class Images:
+    """The outputs of ``draw``: sums over the fragments of each pixel, weighted as their colours are."""
+
+    color: np.ndarray
+    """(h, w, 3) float32, without the background."""
+    transmittance: np.ndarray
+    """(h, w) float32."""
+    depth: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    values: np.ndarray | None = None
+    work: Work = field(default_factory=Work)
+
+
+def draw(
+    mesh: SplatMesh,
+    camera: Camera,
+    settings: DrawSettings,
+    *,
+    depth: bool = False,
+    normals: bool = False,
+    values: np.ndarray | None = None,
+) -> Images:
+    """Draws a mesh on the best GPU of this machine; arguments are those of ``rendering.render``, checked.
+
+    Args:
+        values: (v, c) float32 further values of the vertices to blend.
+
+    Raises:
+        MissingDependencyError: there is no wgpu or no GPU.
+        DeviceError: the GPU failed or did not finish.
+        MemoryError: the scene does not fit.
+        ValueError: two splats share a vertex, and the mesh has a filter.
+    """
+    return _renderer(mesh).draw(camera, settings, depth=depth, normals=normals, values=values)
+
+
+_lock = threading.Lock()
+_last: tuple[weakref.ref[SplatMesh], MeshRenderer] | None = None
+
+
+def _renderer(mesh: SplatMesh) -> MeshRenderer:
+    """The renderer of ``mesh``: that of the last call if it was for the same mesh."""
+    global _last
+    with _lock:
+        if _last is None or _last[0]() is not mesh:
+            _last = None  # frees its buffers first
+            _last = weakref.ref(mesh), MeshRenderer(open_device(), mesh)
+        return _last[1]
+
+
+class MeshRenderer:
+    """A mesh on a GPU."""
+
+    def __init__(self, device: Device, mesh: SplatMesh) -> None:
+        self.device = device
+        self._mesh = mesh
+        self._lock = threading.Lock()
+        self._buffers: dict[str, Any] = {}
+        self._capacity = FIRST_PAIRS
+        self._fans = 0
+        runs = find_runs(mesh.faces, mesh.face_splat)
+        parts = [mesh.faces.view(np.uint32).ravel(), runs]
+        self._counts = {"one": 1, "vertices": len(mesh.vertices), "faces": len(mesh.faces), "runs": len(runs)}
+        self._counts |= {"fans": 0, "groups": 0}
+        self._offsets = (3 * len(mesh.faces), 0, 0)
+        if mesh.depth_group is not None and (mesh.depth_group >= 0).any():
+            of_face, largest = find_groups(mesh)
+            parts += [of_face, largest]
+            start = 3 * len(mesh.faces) + len(runs)
+            self._offsets = (3 * len(mesh.faces), start, start + len(of_face))
+            self._counts["groups"] = len(largest)
+        if self._counts["runs"] >= kernels.MAX_RUNS:
+            raise MemoryError(f"the mesh has {len(runs):,} runs of triangles; the GPU takes {kernels.MAX_RUNS:,}")
+        if not len(mesh.faces):
+            return
+        self._check_size("vertices", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
+        self._check_size("triangles", 4 * sum(map(len, parts)))
+        self._upload("vertices", mesh.vertices)
+        self._upload("values", mesh.colors)
+        self._upload("mesh", np.concatenate(parts))
+        self._allocate("projected", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
+        self._allocate("group_bounds", 8 * self._counts["groups"])
+        self._allocate("boxes", 8 * len(runs))
+        self._allocate("offsets", 4 * len(runs))
+        self._allocate("plan", 64)
+        self._allocate("counters", 64)
+        self._allocate("frame", 256)
+        digits = np.zeros((len(kernels.DIGITS) + 1, 64), np.uint32)
+        digits[:-1, :2] = kernels.DIGITS
+        digits[:-1, 2] = 1
+        self._upload("digits", digits)
+
+    # ------------------------------------------------------------------------------------------ buffers
+
+    def _check_size(self, name: str, size: int) -> None:
+        if size > self.device.binding_limit:
+            raise MemoryError(
+                f"the mesh has too many {name} for the GPU: {size / 2**20:.0f} MiB; a buffer holds"
+                f" {self.device.binding_limit >> 20} MiB. Use device='cpu'"
+            )
+
+    def _usage(self, name: str) -> int:
+        import wgpu
+
+        usage = wgpu.BufferUsage
+        if name in ("frame", "digits"):
+            return int(usage.UNIFORM | usage.COPY_DST)
+        indirect = usage.INDIRECT if name in ("plan", "lists", "again") else 0
+        return int(usage.STORAGE | usage.COPY_DST | usage.COPY_SRC | indirect)
+
+    def _allocate(self, name: str, size: int) -> None:
+        """A buffer of at least ``size`` bytes; its contents are lost if it grows."""
+        size = max(64, -(-size // 16) * 16)
+        old = self._buffers.get(name)
+        if old is not None and old.size >= size:
+            return
+        if size > self.device.binding_limit:
+            raise MemoryError(f"the GPU cannot hold {name}: {size / 2**20:.0f} MiB")
+        if old is not None:
+            del self._buffers[name]
+            old.destroy()
+        self._buffers[name] = self.device.device.create_buffer(size=size, usage=self._usage(name))
+
+    def _upload(self, name: str, array: np.ndarray) -> None:
+        data = np.ascontiguousarray(array)
+        self._allocate(name, data.nbytes)
+        if data.nbytes:
+            self.device.device.queue.write_buffer(self._buffers[name], 0, data)
+
+    # ------------------------------------------------------------------------------------------ drawing
+
+    def draw(
+        self,
+        camera: Camera,
+        settings: DrawSettings,
+        *,
+        depth: bool = False,
+        normals: bool = False,
+        values: np.ndarray | None = None,
+    ) -> Images:
+        h, w = camera.height, camera.width
+        images = Images(np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32))
+        images.depth = np.zeros((h, w), np.float32) if depth else None
+        images.normals = np.zeros((h, w, 3), np.float32) if normals else None
+        images.values = None if values is None else np.zeros((h, w, values.shape[1]), np.float32)
+        if not len(self._mesh.faces):
+            return images
+        with self._lock:
+            self._prepare_filter(settings)
+            waiting = [(0, 0, w, h)]
+            while waiting:
+                window = waiting.pop()
+                if not self._fits(window, settings.samples) or not self._draw_window(
+                    camera, window, settings, images, values
+                ):
+                    waiting += _halves(window)
+            images.work.bytes = sum(buffer.size for buffer in self._buffers.values())
+        return images
+
+    def _prepare_filter(self, settings: DrawSettings) -> None:
+        if not settings.filter_px2 or "fans" in self._buffers:
+            return
+        splat = self._mesh.face_splat
+        assert splat is not None
+        starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
+        if np.diff(starts).max() > MAX_FAN:
+            raise DeviceError(
+                f"the filter of the GPU takes splats of up to {MAX_FAN:,} triangles; one has"
+                f" {np.diff(starts).max():,}. Use device='cpu'"
+            )
+        owner = np.full(len(self._mesh.vertices), -1, np.int32)
+        owner[self._mesh.faces] = splat[:, None]
+        if (owner[self._mesh.faces] != splat[:, None]).any():
+            raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
+        self._upload("fans", starts)
+        self._fans = len(starts) - 1
+
+    def _fits(self, window: tuple[int, int, int, int], samples: int) -> bool:
+        w, h = window[2] * samples, window[3] * samples
+        most = min(WINDOW_SAMPLES, self.device.binding_limit // 32)
+        return w * h <= most and _tiles(w) * _tiles(h) <= kernels.MAX_TILES
+
+    def _draw_window(
+        self,
+        camera: Camera,
+        window: tuple[int, int, int, int],
+        settings: DrawSettings,
+        images: Images,
+        values: np.ndarray | None,
+    ) -> bool:
+        """Draws a window; False if it has too many pairs."""
+        x0, y0, w, h = window
+        part = replace(camera, cx=camera.cx - x0, cy=camera.cy - y0, width=w, height=h)
+        counts = self._begin(part, settings)
+        work = images.work
+        while True:
+            counters = self._frame("color", counts, settings, work)
+            needed = int(counters[0])
+            if needed <= self._capacity:
+                break
+            if needed > min(kernels.MAX_PAIRS, self.device.binding_limit // 8):
+                return False
+            self._capacity = min(kernels.MAX_PAIRS, self.device.binding_limit // 8, needed + needed // 4)
+            counts = self._begin(part, settings)
+        work.windows += 1
+        work.tiles += counts["tiles"]
+        work.pairs += needed
+        work.walks += int(counters[3])
+        work.most_walks = max(work.most_walks, int(counters[4]))
+        work.tests += int(counters[5]) + (int(counters[6]) << 32)
+        work.fragments += int(counters[7]) + (int(counters[8]) << 32)
+        work.overflowed += int(counters[11])
+        rows, columns = slice(y0, y0 + h), slice(x0, x0 + w)
+        pixels = self._read(w, h, settings.samples)
+        images.color[rows, columns] = pixels[..., :3]
+        images.transmittance[rows, columns] = pixels[..., 3]
+        if images.depth is not None:
+            self._frame("depth", counts, settings, None)
+            images.depth[rows, columns] = self._read(w, h, settings.samples)[..., 0]
+        alpha = self._mesh.colors[:, 3:]
+        if images.normals is not None:
+            known = self._mesh.normals is not None
+            of_vertex = self._mesh.normals if known else self._mesh.vertices
+            self._upload("values", np.concatenate([of_vertex, alpha], axis=1, dtype=np.float32))
+            self._frame("vertex_normals" if known else "face_normals", counts, settings, None)
+            images.normals[rows, columns] = self._read(w, h, settings.samples)[..., :3]
+        if values is not None and images.values is not None:
+            for first in range(0, values.shape[1], 3):
+                some = values[:, first : first + 3]
+                padding = np.zeros((len(some), 3 - some.shape[1]), np.float32)
+                self._upload("values", np.concatenate([some, padding, alpha], axis=1, dtype=np.float32))
+                self._frame("color", counts, settings, None)
+                count = some.shape[1]
+                images.values[rows, columns, first : first + count] = self._read(w, h, settings.samples)[
+                    ..., :count
+                ]
+        if images.normals is not None or values is not None:
+            self._upload("values", self._mesh.colors)
+        return True
+
+    def _begin(self, camera: Camera, settings: DrawSettings) -> dict[str, int]:
+        """Sizes the buffers of a frame and writes its uniforms; returns the counts of its steps."""
+        s = settings.samples
+        w, h = camera.width * s, camera.height * s
+        counts = self._counts | {"tiles": _tiles(w) * _tiles(h), "columns": camera.width, "rows": camera.height}
+        if settings.filter_px2:
+            counts["fans"] = self._fans
+        blocks = -(-self._capacity // 2048)
+        self._allocate("pairs_a", 8 * self._capacity)
+        self._allocate("pairs_b", 8 * self._capacity)
+        self._allocate("table", 4 * 256 * blocks)
+        self._allocate("sums", 4 * (2 + max(-(-256 * blocks // 2048), -(-counts["runs"] // 2048))))
+        self._allocate("lists", 16 * (counts["tiles"] + 1))
+        self._allocate("again", 16 * (counts["tiles"] + 1))
+        self._allocate("samples", 32 * w * h)
+        if s > 1:
+            self._allocate("pixels", 16 * camera.width * camera.height)
+        frame = frame_uniform(camera, settings, counts, self._capacity, self._offsets)
+        self.device.device.queue.write_buffer(self._buffers["frame"], 0, frame)
+        return counts
+
+    def _frame(
+        self, output: kernels.Output, counts: dict[str, int], settings: DrawSettings, work: Work | None
+    ) -> np.ndarray:
+        """Renders one frame to the samples, until all tiles are finished; returns the counters."""
+        steps = (kernels.list_steps() if output == "color" and work is not None else []) + kernels.raster_steps()
+        if work is not None:
+            work.frames += 1
+            work.dispatches = 0
+        previous = None
+        for _ in range(MAX_ROUNDS):
+            self._run(steps, output, counts, settings, work)
+            counters = self._counters()
+            if counters[0] > self._capacity:
+                return counters
+            if counters[2] == counts["tiles"]:
+                return counters
+            if counters[9] or counters[12] or (previous is not None and previous == counters[3]):
+                break
+            previous = counters[3]
+            steps = kernels.again_steps()
+        raise DeviceError(
+            f"the GPU did not finish {counts['tiles'] - int(counters[2]):,} of {counts['tiles']:,} tiles"
+            f" ({self.device.name}): use device='cpu', or a smaller image"
+        )
+
+    def _counters(self) -> np.ndarray:
+        data = self.device.device.queue.read_buffer(self._buffers["counters"], 0, 64)
+        return np.frombuffer(data, np.uint32).copy()
+
+    def _read(self, width: int, height: int, samples: int) -> np.ndarray:
+        """(h, w, 4) float32: the pixels of the last frame."""
+        name = "samples"
+        if samples > 1:
+            counts = {"columns": width, "rows": height}
+            self._run(kernels.resolve_steps(), "color", counts, DrawSettings(), None)
+            name = "pixels"
+        data = self.device.device.queue.read_buffer(self._buffers[name], 0, 16 * width * height)
+        return np.frombuffer(data, np.float32).reshape(height, width, 4)
+
+    def _run(
+        self,
+        steps: Sequence[dict[str, Any]],
+        output: kernels.Output,
+        counts: dict[str, int],
+        settings: DrawSettings,
+        work: Work | None,
+    ) -> None:
+        gpu = self.device.device
+        encoder = gpu.create_command_encoder()
+        compute = None
+        for step in steps:
+            if "clear" in step:
+                if compute is not None:
+                    compute.end()
+                    compute = None
+                encoder.clear_buffer(self._buffers[step["clear"]], step["from"])
+                continue
+            if "if" in step and not counts[step["if"]]:
+                continue
+            if compute is None:
+                compute = encoder.begin_compute_pass()
+            pipeline = self._pipeline(step["kernel"], output, settings)
+            compute.set_pipeline(pipeline)
+            compute.set_bind_group(0, self._bind_group(pipeline, step["bind"]))
+            if "indirect" in step:
+                name, byte = step["indirect"]
+                compute.dispatch_workgroups_indirect(self._buffers[name], byte)
+            else:
+                sizes = [step["count"], step.get("rows", ("one", 1))]
+                compute.dispatch_workgroups(*(-(-counts.get(name, 1) // n) for name, n in sizes))
+            if work is not None:
+                work.dispatches += 1
+        if compute is not None:
+            compute.end()
+        gpu.queue.submit([encoder.finish()])
+
+    def _bind_group(self, pipeline: Any, bind: dict[str, str]) -> Any:
+        entries = []
+        for binding, name in bind.items():
+            base, _, index = name.partition(".")
+            buffer = self._buffers[base]
+            offset, size = (256 * int(index), 16) if index else (0, buffer.size)
+            entries.append(
+                {"binding": int(binding), "resource": {"buffer": buffer, "offset": offset, "size": size}}
+            )
+        return self.device.device.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries)
+
+    def _pipeline(self, kernel: str, output: kernels.Output, settings: DrawSettings) -> Any:
+        groups = self._counts["groups"] > 0
+        if kernel in ("raster", "raster_again"):
+            queue = settings.queue if kernel == "raster" else settings.long_queue
+            return self.device.pipeline(
+                "raster",
+                ("raster", queue, output, groups),
+                lambda: kernels.raster_source(queue, output=output, groups=groups),
+            )
+        return self.device.pipeline(kernel, ("lists",), kernels.lists_source)
+
+
+def frame_uniform(
+    camera: Camera, settings: DrawSettings, counts: dict[str, int], capacity: int, offsets: Sequence[int]
+) -> np.ndarray:
+    """The bytes of the uniform ``Frame``."""
+    s = settings.samples
+    w, h = camera.width * s, camera.height * s
+    data = np.zeros(64, np.float32)
+    words = data.view(np.uint32)
+    for i in range(3):
+        data[4 * i : 4 * i + 3] = camera.world_to_camera[i, :3]
+    center = camera.center
+    data[12:15] = center
+    data[16:19] = center - data[12:15]
+    data[20:24] = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) * s
+    data[24:28] = camera.near, settings.min_transmittance, settings.cutoff, settings.filter_px2 * s * s
+    words[28:32] = w, h, _tiles(w), _tiles(h)
+    words[32:36] = counts["vertices"], counts["faces"], counts["runs"], counts["fans"]
+    words[36:40] = counts["groups"], capacity, settings.max_layers, settings.budget
+    words[40:43] = offsets
+    words[43] = s
+    return data
+
+
+def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
+    """(r,) uint32 runs: the first face, and from bit 29 on the count less 1.
+
+    A run holds up to 8 consecutive triangles of one splat; without splats, such that each has a vertex of the
+    one before.
+    """
+    count = len(faces)
+    if not count:
+        return np.zeros(0, np.uint32)
+    if face_splat is not None:
+        new = face_splat[1:] != face_splat[:-1]
+    else:
+        new = ~(faces[1:, :, None] == faces[:-1, None, :]).any(axis=(1, 2))
+    starts = np.flatnonzero(np.concatenate([[True], new]))
+    lengths = np.diff(np.append(starts, count))
+    pieces = -(-lengths // kernels.RUN)
+    before = np.cumsum(pieces) - pieces
+    first = np.repeat(starts, pieces) + kernels.RUN * (np.arange(pieces.sum()) - np.repeat(before, pieces))
+    ends = np.minimum(first + kernels.RUN, np.repeat(starts + lengths, pieces))
+    return (first.astype(np.uint32) | ((ends - first - 1).astype(np.uint32) << np.uint32(29))).astype(np.uint32)
+
+
+def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:
+    """(f,) uint32 depth group of each face, without gaps, 2^32 - 1 for none; and (g,) uint32 the face of each
+    group with the largest area in world space."""
+    assert mesh.depth_group is not None
+    chosen = np.flatnonzero(mesh.depth_group >= 0)
+    _, group = np.unique(mesh.depth_group[chosen], return_inverse=True)
+    group = group.reshape(-1)
+    corners = mesh.vertices[mesh.faces[chosen]].astype(np.float64)
+    area = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(axis=1)
+    order = np.lexsort((chosen, -area, group))  # the first of equal areas
+    heads = np.concatenate([[True], np.diff(group[order]) > 0])
+    of_face = np.full(len(mesh.faces), 0xFFFFFFFF, np.uint32)
+    of_face[chosen] = group
+    return of_face, chosen[order[heads]].astype(np.uint32)
+
+
+def _tiles(samples: int) -> int:
+    return -(-samples // kernels.TILE)
+
+
+def _halves(window: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
+    x, y, w, h = window
+    if max(w, h) == 1:
+        raise MemoryError("the GPU cannot hold the triangles of a single pixel: use device='cpu'")
+    if w >= h:
+        return [(x, y, w // 2, h), (x + w // 2, y, w - w // 2, h)]
+    return [(x, y, w, h // 2), (x, y + h // 2, w, h - h // 2)]
