@@ -18,9 +18,9 @@ LOWEST = (
 FLOORS = (
     ("binding", "camera", "gaussians"),
     ("base_mesh", "demo_scene", "images", "mesh"),
-    ("cameras", "formats"),
+    ("cameras", "formats", "webgpu"),
     ("rendering",),
-    ("conversion", "datasets"),
+    ("conversion", "datasets", "viewer"),
     ("evaluation",),
     ("finetuning",),
     ("levels", "prior"),

@@ -141,7 +141,7 @@ class Page:
             self.send("Page.addScriptToEvaluateOnNewDocument", source=before)
         self.send("Page.navigate", url=url)
 
-    def send(self, method: str, timeout: float = 120, **parameters: Any) -> dict:
+    def send(self, method: str, timeout: float = 400, **parameters: Any) -> dict:
         return self.browser.send(method, self.session, timeout, **parameters)
 
     def size(self, width: int, height: int, ratio: float = 1, mobile: bool = False) -> None:

@@ -24,7 +24,10 @@ from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.viewer.streams import Packer, Unpacker, rounded
 
 BYTES_A_TRIANGLE = 8.5
-"""The finest of ``PRECISIONS`` is used whose data stays below this; the coarsest, where none does."""
+"""The finest of ``PRECISIONS`` is used whose data stays below this; the coarsest, where none does..."""
+
+SMALL = 1_000_000
+"""... and the finest for meshes of fewer bytes in all."""
 
 FINER = 8
 """Steps of the vertices from which others are predicted are this much finer."""
@@ -58,18 +61,19 @@ class Precision:
 
 
 PRECISIONS = (
-    Precision(17, 12, 12),
-    Precision(16, 10, 12),
-    Precision(16, 9, 10),
+    Precision(21, 16, 16),
+    Precision(19, 13, 13),
+    Precision(18, 12, 12),
+    Precision(17, 11, 12),
+    Precision(16, 10, 11),
     Precision(15, 9, 10),
     Precision(15, 8, 9),
-    Precision(14, 8, 9),
     Precision(14, 8, 8),
     Precision(13, 8, 8),
-    Precision(13, 7, 8),
 )
 """From the finest to the coarsest. Views of the whole scene are about 2^11 pixels wide, so the finest steps
-are 1/64 of a pixel there, the coarsest a quarter."""
+are 1/1000 of a pixel there, the coarsest a quarter. Where layers nearly touch, steps of 1/64 still change
+their order in a few pixels, by several levels."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,8 @@ def quantise_mesh(mesh: SplatMesh, limit: float = BYTES_A_TRIANGLE) -> Quantised
     chosen = PRECISIONS[-1]
     sample = _sample(mesh)
     for precision in PRECISIONS[:-1]:
-        if len(pack_mesh(sample, precision, radius)) <= limit * len(sample.faces):
+        share = len(sample.faces) / len(mesh.faces)
+        if len(pack_mesh(sample, precision, radius)) <= max(limit * len(sample.faces), SMALL * share):
             chosen = precision
             break
     data = pack_mesh(mesh, chosen, radius)
@@ -133,8 +138,8 @@ def pack_mesh(mesh: SplatMesh, precision: Precision, radius: float) -> bytes:
     renumber[order] = np.arange(len(order))
     faces = renumber[mesh.faces]
     origin = rounded((vertices.min(axis=0) + vertices.max(axis=0)) / 2)
-    # Positions are at most 2^27 fine steps from the origin, whatever strays there are.
-    step = max(radius * 2.0**-precision.position, float(np.ptp(vertices, axis=0).max()) * FINER * 2.0**-28)
+    # Positions are at most 2^30 fine steps from the origin, whatever strays there are.
+    step = max(radius * 2.0**-precision.position, float(np.ptp(vertices, axis=0).max()) * FINER * 2.0**-31)
     step = rounded([step])[0]
     rgb = np.rint(colors[:, :3].astype(np.float64) * (2**precision.color - 1)).astype(np.int64)
     alpha = np.rint(colors[:, 3].astype(np.float64) * (2**precision.alpha - 1)).astype(np.int64)

@@ -3,7 +3,7 @@
 
 const TILE = 8, RUN = 8, WINDOW = 1 << 22;
 const FIRST_PAIRS = 1 << 18, MOST_PAIRS = 16e6, MOST_RUNS = 1 << 24, MOST_TILES = 65535;
-const BUDGET = 60000; // loop iterations of one walk through a tile list
+const BUDGET = 40000; // loop iterations of one walk through a tile list
 const ROUNDS = 1000; // most repetitions of a frame's last steps
 const NONE = 0xffffffff;
 
