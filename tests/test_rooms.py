@@ -20,7 +20,7 @@ FLOORS = (
     ("base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),
-    ("conversion", "datasets"),
+    ("conversion", "datasets", "viewer"),
     ("evaluation",),
     ("finetuning",),
     ("levels", "prior"),

@@ -34,6 +34,7 @@ from meshsplats.cli.messages import (
 COMMANDS = {
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
     "clean": ("meshsplats.cli.clean:Clean", "splats or a mesh without its floaters"),
+    "view": ("meshsplats.cli.view:View", "a scene in the browser, or in one .html file for anyone"),
     "render": ("meshsplats.cli.render:Render", "images of splats or a mesh, and a turntable"),
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, images side by side"),
     "finetune": ("meshsplats.cli.finetune:Finetune", "a mesh optimised to look like splats or photographs"),

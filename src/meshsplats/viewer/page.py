@@ -1,0 +1,202 @@
+"""The page of the viewer: one HTML file with its styles, scripts, shaders and data inside.
+
+Its modules lie in ``page/``. They are joined into one script, whose hash the content security policy of the
+page names: no other script runs, whatever the names of cameras and scenes contain, and nothing is loaded
+from anywhere.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up, scene_bounds
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.webgpu import kernels
+from meshsplats.viewer.quantise import QuantisedMesh, pack_splats, quantise_mesh
+
+MODULES = ("scene.js", "camera.js", "sorted.js", "exact.js", "controls.js", "crop.js", "app.js")
+"""The scripts of the page, in the order in which they are joined."""
+
+MOST_CAMERAS = 2000
+"""Cameras in the list of the page; of more, some are left out evenly."""
+
+LONGEST_NAME = 120
+"""Characters of a title or the name of a camera."""
+
+_IMPORT = re.compile(r"^import \{[^}]*\} from \"\./\w+\.js\";\n", re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async )?(?:function|class|const) )", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """What a page shows first."""
+
+    title: str = "MeshSplats"
+    """Name of the scene."""
+    background: Sequence[float] = (1.0, 1.0, 1.0)
+    """Display RGB, 0 to 1."""
+    up: Sequence[float] | None = None
+    """(3,) direction that points up. None: by the cameras, else by the mesh."""
+    statistics: Mapping[str, str] = field(default_factory=dict)
+    """Further lines for the statistics."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page, and the mesh as it is inside."""
+
+    html: str
+    mesh: QuantisedMesh
+
+
+def make_page(
+    mesh: SplatMesh,
+    *,
+    splats: GaussianCloud | None = None,
+    cameras: Sequence[Camera] = (),
+    options: PageOptions | None = None,
+) -> Page:
+    """A page that shows ``mesh`` in any current browser, from a server or a disk, without a network.
+
+    Args:
+        mesh: the triangles. Normals, attributes and bindings are left out.
+        splats: shown beside the mesh or in its place, with colours of degree 0.
+        cameras: viewpoints to choose from. The first is where the page begins; without any, it begins before
+            the subject.
+        options: title, background, up.
+
+    Raises ValueError for a mesh without triangles.
+    """
+    options = options or PageOptions()
+    packed = quantise_mesh(mesh)
+    views = list(cameras[:: max(1, -(-len(cameras) // MOST_CAMERAS))])
+    up = np.asarray(guess_up(mesh, views) if options.up is None else options.up, np.float64)
+    up = up / np.linalg.norm(up)
+    if not views:
+        views = [orbit(mesh, 1, azimuth=30, elevation=15, width=1000, height=1000, up=up)[0]]
+    bounds = scene_bounds(mesh)
+    settings = {
+        "title": options.title[:LONGEST_NAME],
+        "background": "#" + "".join(f"{round(255 * min(max(c, 0), 1)):02x}" for c in options.background),
+        "up": up.tolist(),
+        "center": bounds.center.tolist(),
+        "radius": bounds.radius,
+        "extent": _extent(mesh),
+        "cameras": [_described(camera) for camera in views],
+        "statistics": {
+            "data": f"{packed.bytes_a_triangle:.1f} bytes a triangle",
+            "position error": f"{packed.position_error:.2g}",
+            "colour error": f"{packed.color_error:.2g} of 255",
+            **options.statistics,
+        },
+    }
+    groups = mesh.depth_group is not None and bool((mesh.depth_group >= 0).any())
+    blocks = {
+        "settings": ("application/json", _json(settings)),
+        "kernels": ("application/json", _json(_kernels(groups))),
+        "mesh": ("text/plain", _base64(packed.data)),
+    }
+    if splats is not None:
+        blocks["splats"] = ("text/plain", _base64(pack_splats(splats)))
+    return Page(_assembled(settings["title"], blocks), packed)
+
+
+def _kernels(groups: bool) -> dict[str, object]:
+    """The text of the kernels and the steps of a frame, for ``page/exact.js``. ``groups``: whether the mesh
+    has depth groups."""
+    return {
+        "groups": groups,
+        "digits": kernels.DIGITS,
+        "lists": kernels.list_steps(),
+        "raster": kernels.raster_steps(),
+        "again": kernels.again_steps(),
+        "sources": {
+            "lists": kernels.lists_source(),
+            "raster": kernels.raster_source(kernels.QUEUE, groups=groups),
+            "again": kernels.raster_source(kernels.LONG_QUEUE, groups=groups),
+        },
+    }
+
+
+def script() -> str:
+    """The modules of the page as one script, in strict mode and a scope of its own."""
+    parts = [_EXPORT.sub("", _IMPORT.sub("", _read(name))) for name in MODULES]
+    return '"use strict";\n{\n' + "\n".join(parts) + "}\n"
+
+
+def _assembled(title: str, blocks: Mapping[str, tuple[str, str]]) -> str:
+    import meshsplats
+
+    code, style = script(), _read("style.css")
+    for text in (code, style):
+        # Either would end the element that holds it.
+        assert "</script" not in text.lower() and "</style" not in text.lower() and "<!--" not in text
+    policy = "; ".join(
+        [
+            "default-src 'none'",
+            f"script-src {_hash(code)}",
+            f"style-src {_hash(style)}",
+            "img-src data:",
+            "base-uri 'none'",
+            "form-action 'none'",
+        ]
+    )
+    data = "\n".join(
+        f'<script type="{kind}" id="{name}">{content}</script>' for name, (kind, content) in blocks.items()
+    )
+    values = {
+        "policy": policy,
+        "generator": f"meshsplats {meshsplats.__version__}",
+        "title": title,
+    }
+    replaced = {name: html.escape(text, quote=True) for name, text in values.items()}
+    replaced |= {"style": style, "script": code, "data": data}
+    # In one pass, so that nothing in a title is taken for a place to fill.
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: replaced[match[1]], _read("index.html"))
+
+
+def _described(camera: Camera) -> dict[str, object]:
+    return {
+        "name": camera.name[:LONGEST_NAME],
+        "matrix": camera.world_to_camera[:3].ravel().tolist(),
+        "width": camera.width,
+        "height": camera.height,
+        **{name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "near")},
+    }
+
+
+def _extent(mesh: SplatMesh) -> list[list[float]]:
+    """Ends of the crop box's sliders: what holds nearly all vertices, and a margin."""
+    low, high = np.quantile(mesh.vertices[:: max(1, len(mesh.vertices) // 200_000)], (0.002, 0.998), axis=0)
+    margin = 0.02 * (high - low) + 1e-3 * float((high - low).max() or 1)
+    return [(low - margin).tolist(), (high + margin).tolist()]
+
+
+def _json(value: object) -> str:
+    """JSON that can stand in a script element: no character of it begins a tag."""
+    return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+def _hash(text: str) -> str:
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def _read(name: str) -> str:
+    return (resources.files("meshsplats.viewer") / "page" / name).read_text(encoding="utf-8")

@@ -1,0 +1,408 @@
+// The page: settings, the loop that draws while something moves and refines the image when it is still.
+
+import { View, add, dot, project } from "./camera.js";
+import { connect, connectDivider } from "./controls.js";
+import { CropBox } from "./crop.js";
+import { ExactRenderer } from "./exact.js";
+import { decodeMesh, decodeSplats, unpack } from "./scene.js";
+import { SortedRenderer } from "./sorted.js";
+
+const QUIET = 180; // milliseconds without a change, after which the image is still
+const DRAFTS = [1 / 4, 1 / 3, 1 / 2, 1]; // sizes of the image while it moves
+const SLOW = 50, QUICK = 16, HOPELESS = 150; // milliseconds of a frame: a smaller draft, a larger one, the other renderer
+const MOST_PIXELS = 3.9e6; // of the canvas: the exact renderer draws an image in one piece
+const FLIGHT = 450; // milliseconds from one camera to the next
+
+const element = id => document.getElementById(id);
+const number = value => Math.round(value).toLocaleString("en");
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+class App {
+  constructor(settings, mesh, splats) {
+    Object.assign(this, { settings, mesh, splats });
+    this.stage = element("stage");
+    this.canvases = { exact: element("exact"), sorted: element("sorted") };
+    this.options = { content: "mesh", style: "blended", renderer: "exact", samples: 2, split: 0.5, gain: 1 };
+    this.view = this.#viewOf(0);
+    this.camera = 0;
+    this.flying = false;
+    this.thrust = [0, 0, 0];
+    this.changedAt = -Infinity;
+    this.passes = 0;
+    this.dirty = true;
+    this.drafts = { exact: 2, sorted: 2 };
+    this.wake = () => {};
+  }
+
+  // WebGL draws from the first moment on; WebGPU takes over when its shaders are compiled.
+  async start(kernels) {
+    const problems = [];
+    try {
+      this.sorted = new SortedRenderer(this.canvases.sorted, this.mesh, this.splats);
+    } catch (error) {
+      problems.push(error.message);
+    }
+    this.#connect();
+    this.preparing = true;
+    if (this.sorted) this.#begin();
+    try {
+      const lost = reason => this.#fall(`The graphics device was lost (${reason}); triangles are drawn by WebGL now.`);
+      this.exact = await ExactRenderer.create(this.canvases.exact, this.mesh, kernels, lost);
+      if (this.kept) this.exact.crop(this.kept);
+    } catch (error) {
+      problems.push(error.message);
+    }
+    this.preparing = false;
+    if (!this.exact && !this.sorted) throw new Error(`This browser cannot draw the scene: ${problems.join("; ")}.`);
+    if (this.exact) {
+      this.changed();
+    } else {
+      this.#fall(`No exact image here: ${problems.join("; ")}. Triangles are sorted by their centres and drawn by WebGL.` +
+        " Current versions of Chrome, Edge, Safari and Firefox have WebGPU.");
+    }
+    if (!this.sorted) {
+      for (const input of document.querySelectorAll("[name=content], [name=style]")) input.disabled = true;
+      this.#begin();
+    }
+  }
+
+  #begin() {
+    document.body.dataset.state = "moving";
+    this.#loop();
+  }
+
+  // From now on without the exact renderer.
+  #fall(message) {
+    this.exact = null;
+    this.options.renderer = "sorted";
+    element("renderer").value = "sorted";
+    element("renderer").options[0].disabled = true;
+    this.say(message);
+    this.changed();
+  }
+
+  say(text) {
+    element("message").hidden = !text;
+    element("message").textContent = text;
+  }
+
+  // ---- Views
+
+  #viewOf(index) {
+    const { cameras, up, center, radius } = this.settings, camera = cameras[index];
+    const view = new View(camera, up, 1);
+    view.distance = Math.max(dot(add(center, view.position, -1), view.forward), 0.2 * radius);
+    return view;
+  }
+
+  jump(index) {
+    const count = this.settings.cameras.length;
+    this.camera = (index + count) % count;
+    element("cameras").value = String(this.camera);
+    const target = this.#viewOf(this.camera);
+    this.flight = calm.matches ? null : { from: this.view.copy(), target, start: performance.now() };
+    if (!this.flight) this.view = target;
+    this.changed();
+  }
+
+  changed() {
+    this.changedAt = performance.now();
+    this.dirty = true;
+    this.wake();
+  }
+
+  command(name) {
+    const { body } = document;
+    if (name === "home") this.jump(0);
+    else if (name === "previous") this.jump(this.camera - 1);
+    else if (name === "next") this.jump(this.camera + 1);
+    else if (name === "plain") body.classList.toggle("plain");
+    else document.querySelector(`input[value=${name}]:not(:disabled)`)?.click();
+    if (name === "plain") this.changed();
+  }
+
+  fly(keys, fast) {
+    const pressed = (plus, minus) => Number(keys.has(plus)) - Number(keys.has(minus));
+    const speed = this.settings.radius * (fast ? 2.4 : 0.6);
+    this.thrust = [pressed("d", "a"), pressed("q", "e"), pressed("w", "s")].map(value => value * speed);
+    if (keys.size) this.changed();
+  }
+
+  // Centres the nearest fan at a point of the stage, in CSS pixels.
+  pick(x, y) {
+    const pinhole = this.view.pinhole(this.stage.clientWidth, this.stage.clientHeight), { mesh } = this;
+    let best = null;
+    for (let v = 0; v < mesh.vertices.length / 3; v++) {
+      if (mesh.colors[4 * v + 3] < 0.2) continue;
+      const point = mesh.vertices.subarray(3 * v, 3 * v + 3), [px, py, z] = project(pinhole, point);
+      if (z > pinhole.near && Math.hypot(px - x, py - y) < 8 && !(best?.z <= z)) best = { z, point: [...point] };
+    }
+    if (!best) return;
+    const target = this.view.copy(), away = add(best.point, this.view.position, -1);
+    target.distance = Math.max(dot(away, target.forward), 0.02 * this.settings.radius);
+    target.position = add(best.point, target.forward, -target.distance);
+    this.flight = { from: this.view.copy(), target, start: calm.matches ? -Infinity : performance.now() };
+    this.changed();
+  }
+
+  // ---- Settings
+
+  #connect() {
+    const { settings, options } = this, list = element("cameras");
+    settings.cameras.forEach((camera, i) => {
+      const option = document.createElement("option");
+      option.value = String(i);
+      option.textContent = camera.name || `camera ${i + 1}`;
+      list.append(option);
+    });
+    element("previous").disabled = element("next").disabled = settings.cameras.length < 2;
+    list.addEventListener("change", () => this.jump(Number(list.value)));
+    for (const name of ["previous", "next", "home"]) element(name).addEventListener("click", () => this.command(name));
+    element("fly").addEventListener("change", event => { this.flying = event.target.checked; });
+    element("spin").addEventListener("change", event => {
+      this.spinning = event.target.checked;
+      this.changed();
+    });
+    const choose = (name, apply) => {
+      for (const input of document.querySelectorAll(`[name=${name}]`)) {
+        input.addEventListener("change", () => { options[name] = input.value; apply(); });
+      }
+    };
+    choose("content", () => {
+      element("divider").hidden = options.content !== "both";
+      this.changed();
+    });
+    choose("style", () => this.changed());
+    element("content").closest("fieldset").hidden = !this.splats;
+    if (!this.splats) for (const input of document.querySelectorAll("[name=content]")) input.disabled = true;
+    connectDivider(element("divider"), this.stage, split => {
+      options.split = split;
+      this.changed();
+    });
+    const background = element("background");
+    background.value = settings.background;
+    const paint = () => {
+      options.background = [1, 3, 5].map(i => parseInt(background.value.slice(i, i + 2), 16) / 255);
+      document.body.style.background = background.value;
+      this.changed();
+    };
+    background.addEventListener("input", paint);
+    paint();
+    element("exposure").addEventListener("input", event => {
+      const stops = Number(event.target.value);
+      options.gain = 2 ** stops;
+      element("exposureText").value = `${stops > 0 ? "+" : ""}${stops} EV`;
+      this.changed();
+    });
+    element("samples").addEventListener("change", event => {
+      options.samples = Number(event.target.value);
+      this.changed();
+    });
+    element("renderer").addEventListener("change", event => {
+      options.renderer = event.target.value;
+      this.changed();
+    });
+    this.crop = new CropBox(settings.extent, this.mesh, this.splats, kept => {
+      this.kept = kept;
+      this.sorted?.crop(kept);
+      this.exact?.crop(kept);
+      this.changed();
+    });
+    element("crop").addEventListener("toggle", () => this.changed());
+    const panel = element("panel"), toggle = element("toggle");
+    const open = shown => {
+      panel.classList.toggle("closed", !shown);
+      toggle.setAttribute("aria-expanded", String(shown));
+    };
+    toggle.addEventListener("click", () => open(panel.classList.contains("closed")));
+    document.addEventListener("keydown", event => {
+      if (event.key !== "Escape" || panel.classList.contains("closed")) return;
+      open(false);
+      toggle.focus();
+    });
+    open(!matchMedia("(max-width: 640px)").matches);
+    connect(this.stage, this, settings.radius * 1e-3);
+    new ResizeObserver(() => this.changed()).observe(this.stage);
+    this.#measure();
+  }
+
+  // ---- Drawing
+
+  async #loop() {
+    let before = performance.now();
+    for (;;) {
+      if (!this.#busy()) await new Promise(resolve => { this.wake = resolve; });
+      const now = await new Promise(requestAnimationFrame);
+      this.#advance(performance.now(), Math.min(100, now - before) / 1000);
+      before = now;
+      try {
+        await this.#frame(now);
+      } catch (error) {
+        if (!this.exact || !this.sorted) {
+          this.say(`Drawing failed: ${error.message}`);
+          document.body.dataset.state = "failed";
+          return;
+        }
+        this.#fall(`The exact image failed (${error.message}); triangles are drawn by WebGL now.`);
+      }
+    }
+  }
+
+  #busy() { return this.dirty || this.#moves() || !this.finished; }
+
+  #moves() { return Boolean(this.flight) || Boolean(this.spinning) || this.thrust.some(Boolean); }
+
+  #advance(now, seconds) {
+    if (this.flight) {
+      const t = Math.min(1, (now - this.flight.start) / FLIGHT);
+      this.view = this.flight.from.towards(this.flight.target, t < 1 ? t * t * (3 - 2 * t) : 1);
+      if (t === 1) this.flight = null;
+      this.changed();
+    }
+    if (this.spinning) {
+      this.view.orbit(seconds * 0.5, 0);
+      this.changed();
+    }
+    if (this.thrust.some(Boolean)) {
+      this.view.move(...this.thrust.map(value => value * seconds));
+      this.changed();
+    }
+  }
+
+  #measure() {
+    const { clientWidth, clientHeight } = this.stage;
+    const ratio = Math.min(devicePixelRatio || 1, 2, Math.sqrt(MOST_PIXELS / (clientWidth * clientHeight)));
+    const width = Math.max(1, Math.round(clientWidth * ratio)), height = Math.max(1, Math.round(clientHeight * ratio));
+    for (const canvas of Object.values(this.canvases)) {
+      if (canvas.width !== width) canvas.width = width;
+      if (canvas.height !== height) canvas.height = height;
+    }
+  }
+
+  async #frame(now) {
+    const quiet = performance.now() - this.changedAt >= QUIET && !this.#moves();
+    if (this.dirty) {
+      this.dirty = false;
+      this.passes = 0;
+      this.finished = false;
+      this.#measure();
+      this.#outline();
+      await this.#draft(now);
+      return;
+    }
+    if (!quiet || this.finished) return;
+    const { options } = this, exact = this.#exactly();
+    const passes = exact && options.content !== "splats" ? options.samples ** 2 : 1, pass = this.passes++;
+    if (exact) await this.#drawExact(1, pass, options.samples);
+    if (pass === 0) this.#drawSorted(1, true, exact);
+    if (this.dirty) return;
+    this.finished = this.passes >= passes;
+    this.#report(!this.finished ? "refining" : this.preparing ? "preparing" : "still", exact, passes, 1);
+  }
+
+  #exactly() { return Boolean(this.exact) && this.options.renderer === "exact" && this.options.style === "blended"; }
+
+  // A quick image while something changes: small enough to be fluid, by WebGL where WebGPU is too slow.
+  async #draft(now) {
+    const exact = this.#exactly() && (this.drafts.exact >= 0 || !this.sorted);
+    const kind = exact ? "exact" : "sorted", scale = DRAFTS[Math.max(0, this.drafts[kind])];
+    if (!exact) this.#drawSorted(scale, false, false);
+    let took = this.lastDraft === kind ? now - this.draftAt : 0;
+    if (exact) {
+      const begun = performance.now();
+      await this.#drawExact(scale, 0, 1);
+      this.#drawSorted(scale, false, true);
+      took = performance.now() - begun;
+    }
+    this.lastDraft = kind;
+    this.draftAt = now;
+    if (exact && took > HOPELESS && this.sorted) this.drafts.exact--;
+    else if (took > SLOW && took < 1000) this.drafts[kind] = Math.max(0, this.drafts[kind] - 1);
+    else if (took && took < QUICK) this.drafts[kind] = Math.min(DRAFTS.length - 1, this.drafts[kind] + 1);
+    this.took = took;
+    this.#report("moving", exact, 1, scale);
+  }
+
+  #drawSorted(scale, still, exact) {
+    const { options } = this, meshToo = !exact, parts = [];
+    const split = { mesh: 0, both: options.split, splats: 1 }[options.content];
+    if (this.splats && split > 0) parts.push({ what: "splats", from: 0, to: split });
+    if (meshToo && split < 1) parts.push({ what: "mesh", from: split, to: 1 });
+    this.canvases.exact.style.visibility = exact && split < 1 ? "visible" : "hidden";
+    this.canvases.sorted.style.visibility = parts.length ? "visible" : "hidden";
+    if (!parts.length) return;
+    const { style, background, gain } = options;
+    this.sorted?.draw({ view: this.view, parts, style, still, scale, background, gain });
+  }
+
+  // Sample `pass` of n x n in each pixel.
+  async #drawExact(scale, pass, n) {
+    if (this.options.content === "splats") return;
+    const { width, height } = this.canvases.exact, { background, gain } = this.options;
+    const w = Math.max(1, Math.round(width * scale)), h = Math.max(1, Math.round(height * scale));
+    const begun = performance.now();
+    const dx = (pass % n + 0.5) / n - 0.5, dy = (Math.floor(pass / n) + 0.5) / n - 0.5;
+    await this.exact.draw(this.view.pinhole(w, h, dx, dy), { first: pass === 0, background, gain, filterScale: scale });
+    this.exactTook = performance.now() - begun;
+  }
+
+  #outline() {
+    const svg = element("box"), shown = element("crop").open || this.crop.active;
+    svg.toggleAttribute("hidden", !shown);
+    if (!shown) return;
+    const pinhole = this.view.pinhole(this.stage.clientWidth, this.stage.clientHeight);
+    svg.firstElementChild.setAttribute("d", this.crop.outline(pinhole));
+  }
+
+  // ---- Status and statistics
+
+  #report(state, exact, passes, scale) {
+    const { options } = this, only = options.content === "splats";
+    const kind = only ? "splats" : exact ? "exact" : "sorted";
+    const size = scale < 1 ? `1/${Math.round(1 / scale)} size` : state === "moving" ? "moving" : `${passes} sample${passes > 1 ? "s" : ""}`;
+    const wording = { refining: `${this.passes} of ${passes} samples`, preparing: "preparing the exact image" };
+    element("status").textContent = `${kind}, ${wording[state] ?? size}`;
+    document.body.dataset.renderer = kind;
+    document.body.dataset.state = state;
+    if (state === "moving" && !element("statistics").open) return;
+    const { width, height } = this.canvases.sorted, { mesh, splats, view, settings } = this;
+    const shown = this.kept;
+    const point = values => values.map(value => Number(value.toPrecision(4))).join(" ");
+    const rows = {
+      triangles: shown ? `${number(shown.triangles.length)} of ${number(mesh.faces.length / 3)}` : number(mesh.faces.length / 3),
+      vertices: number(mesh.vertices.length / 3),
+      ...(splats ? { splats: shown ? `${number(shown.splats.length)} of ${number(splats.count)}` : number(splats.count) } : {}),
+      image: `${width} × ${height}`,
+      "exact frame": this.exactTook === undefined ? "–" : `${number(this.exactTook)} ms`,
+      "graphics": exact ? this.exact.name : this.sorted?.name ?? "",
+      position: point(view.position),
+      direction: point(view.forward),
+      ...settings.statistics,
+    };
+    const list = element("statistics").querySelector("dl");
+    list.replaceChildren(...Object.entries(rows).flatMap(([term, text]) => {
+      const dt = document.createElement("dt"), dd = document.createElement("dd");
+      dt.textContent = term;
+      dd.textContent = text;
+      return [dt, dd];
+    }));
+  }
+}
+
+async function main() {
+  const text = id => element(id)?.textContent.trim();
+  const settings = JSON.parse(text("settings"));
+  const paint = () => new Promise(resolve => requestAnimationFrame(() => setTimeout(resolve)));
+  await paint();
+  const mesh = decodeMesh(await unpack(text("mesh")));
+  const splats = text("splats") ? decodeSplats(await unpack(text("splats"))) : null;
+  for (const id of ["mesh", "splats"]) element(id)?.remove();
+  await new App(settings, mesh, splats).start(JSON.parse(text("kernels")));
+}
+
+main().catch(error => {
+  document.body.dataset.state = "failed";
+  element("loading").remove();
+  element("message").hidden = false;
+  element("message").textContent = error.message;
+});

@@ -1,0 +1,110 @@
+// Viewpoints: a pinhole with OpenCV axes (x right, y down, z forward) that orbits a pivot or flies.
+
+export const add = (a, b, t = 1) => [a[0] + t * b[0], a[1] + t * b[1], a[2] + t * b[2]];
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+export const unit = a => { const l = Math.hypot(...a) || 1; return [a[0] / l, a[1] / l, a[2] / l]; };
+
+// `v` turned by `angle` around the unit vector `axis`.
+export function turned(v, axis, angle) {
+  const c = Math.cos(angle), s = Math.sin(angle), w = cross(axis, v), d = dot(axis, v) * (1 - c);
+  return [c * v[0] + s * w[0] + d * axis[0], c * v[1] + s * w[1] + d * axis[1], c * v[2] + s * w[2] + d * axis[2]];
+}
+
+export class View {
+  // camera: {matrix: 12 numbers, the rows of world to camera; fx, fy, cx, cy, width, height, near}; up: unit vector;
+  // distance: of the pivot before the camera.
+  constructor(camera, up, distance) {
+    this.up = up;
+    this.jump(camera, distance);
+  }
+
+  jump(camera, distance) {
+    const m = camera.matrix;
+    this.right = unit([m[0], m[1], m[2]]);
+    this.forward = unit([m[8], m[9], m[10]]);
+    this.down = unit(cross(this.forward, this.right));
+    const t = [m[3], m[7], m[11]];
+    this.position = [0, 1, 2].map(k => -(m[k] * t[0] + m[4 + k] * t[1] + m[8 + k] * t[2]));
+    this.lens = camera;
+    this.distance = distance;
+  }
+
+  get pivot() { return add(this.position, this.forward, this.distance); }
+
+  copy() { return Object.assign(Object.create(View.prototype), this); }
+
+  // Between two views: t from 0 to 1. Returns this view itself for 1.
+  towards(other, t) {
+    if (t >= 1) return other.copy();
+    const view = this.copy(), mix = (a, b) => a.map((x, k) => x + t * (b[k] - x));
+    view.position = mix(this.position, other.position);
+    view.forward = unit(mix(this.forward, other.forward));
+    const down = mix(this.down, other.down);
+    view.right = unit(cross(down, view.forward));
+    view.down = cross(view.forward, view.right);
+    view.distance = this.distance + t * (other.distance - this.distance);
+    const lens = { ...other.lens };
+    for (const key of ["fx", "fy", "cx", "cy", "width", "height"]) {
+      lens[key] = this.lens[key] + t * (other.lens[key] - this.lens[key]);
+    }
+    view.lens = lens;
+    return view;
+  }
+
+  #turn(axis, angle) {
+    for (const name of ["right", "down", "forward"]) this[name] = unit(turned(this[name], axis, angle));
+  }
+
+  // Turns by angles: around the up direction, then around the camera's right; not over the poles.
+  #rotate(yaw, pitch) {
+    const tilt = Math.asin(Math.max(-1, Math.min(1, -dot(this.forward, this.up))));
+    const least = -1.55 - tilt, most = 1.55 - tilt;
+    this.#turn(this.up, yaw);
+    const level = dot(this.right, this.up);
+    if (Math.abs(level) < 0.3) pitch = Math.max(Math.min(0, least), Math.min(Math.max(0, most), pitch));
+    this.#turn(this.right, -pitch);
+  }
+
+  orbit(yaw, pitch) {
+    const pivot = this.pivot;
+    this.#rotate(yaw, pitch);
+    this.position = add(pivot, this.forward, -this.distance);
+  }
+
+  look(yaw, pitch) { this.#rotate(yaw, pitch); }
+
+  // Moves by shares of the image's shorter side, at the depth of the pivot.
+  pan(x, y) {
+    const scale = this.distance * this.side / this.lens.fx;
+    this.position = add(add(this.position, this.right, -x * scale), this.down, -y * scale);
+  }
+
+  get side() { return Math.min(this.lens.width, this.lens.height); }
+
+  zoom(factor, least) {
+    const pivot = this.pivot;
+    this.distance = Math.max(this.distance * factor, least);
+    this.position = add(pivot, this.forward, -this.distance);
+  }
+
+  // Along right, down, forward in scene units.
+  move(x, y, z) { this.position = add(add(add(this.position, this.right, x), this.down, y), this.forward, z); }
+
+  // The pinhole of an image of w x h pixels: the lens' whole image fits in it. dx, dy: offset of the samples
+  // from the pixels' centres.
+  pinhole(w, h, dx = 0, dy = 0) {
+    const lens = this.lens, s = Math.min(w / lens.width, h / lens.height), p = this.position;
+    const rows = [this.right, this.down, this.forward].map(axis => [...axis, -dot(axis, p)]);
+    return {
+      rows, center: p, fx: lens.fx * s, fy: lens.fy * s, near: lens.near, width: w, height: h,
+      cx: w / 2 + (lens.cx - lens.width / 2) * s - dx, cy: h / 2 + (lens.cy - lens.height / 2) * s - dy,
+    };
+  }
+}
+
+// Pixel (x, y) and depth of a point.
+export function project(pinhole, point) {
+  const [x, y, z] = pinhole.rows.map(r => r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]);
+  return [pinhole.fx * x / z + pinhole.cx, pinhole.fy * y / z + pinhole.cy, z];
+}

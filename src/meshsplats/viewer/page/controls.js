@@ -1,0 +1,124 @@
+// Mouse, touch and keys: they move the view of `pilot`, {view, changed(), flying, command(name), pick(x, y)}.
+
+const STEP = 0.05; // radians of an arrow key
+const ZOOM = 0.85; // of a press of +
+
+export function connect(stage, pilot, least) {
+  const touches = new Map(), keys = new Set();
+  const shorter = () => Math.min(stage.clientWidth, stage.clientHeight);
+
+  stage.addEventListener("pointerdown", event => {
+    if (event.target.closest("#divider")) return;
+    stage.setPointerCapture(event.pointerId);
+    touches.set(event.pointerId, { x: event.clientX, y: event.clientY, pans: event.button > 0 || event.shiftKey });
+    stage.classList.add("dragging");
+    stage.focus({ preventScroll: true });
+  });
+  const leave = event => {
+    touches.delete(event.pointerId);
+    if (!touches.size) stage.classList.remove("dragging");
+  };
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) stage.addEventListener(name, leave);
+  stage.addEventListener("pointermove", event => {
+    const touch = touches.get(event.pointerId);
+    if (!touch) return;
+    const before = pair(touches), x = event.clientX - touch.x, y = event.clientY - touch.y;
+    if (x === 0 && y === 0) return;
+    Object.assign(touch, { x: event.clientX, y: event.clientY });
+    const { view } = pilot, side = shorter();
+    if (touches.size >= 2) {
+      const after = pair(touches);
+      view.pan((after.x - before.x) / side, (after.y - before.y) / side);
+      if (after.apart > 10 && before.apart > 10) view.zoom(before.apart / after.apart, least);
+    } else if (touch.pans) {
+      view.pan(x / side, y / side);
+    } else if (pilot.flying) {
+      view.look(-x / side * 1.2, -y / side * 1.2);
+    } else {
+      view.orbit(-x / side * 4, -y / side * 4);
+    }
+    pilot.changed();
+  });
+  stage.addEventListener("wheel", event => {
+    event.preventDefault();
+    const lines = event.deltaY * (event.deltaMode === 1 ? 30 : event.deltaMode === 2 ? 300 : 1);
+    pilot.view.zoom(Math.exp(Math.max(-300, Math.min(300, lines)) * 0.0015), least);
+    pilot.changed();
+  }, { passive: false });
+  stage.addEventListener("contextmenu", event => event.preventDefault());
+  stage.addEventListener("dblclick", event => {
+    if (event.target.closest("#divider")) return;
+    const bounds = stage.getBoundingClientRect();
+    pilot.pick(event.clientX - bounds.left, event.clientY - bounds.top);
+  });
+
+  const once = {
+    Home: "home", "[": "previous", "]": "next", 1: "mesh", 2: "both", 3: "splats", b: "blended", o: "opaque",
+    x: "wireframe", h: "plain",
+  };
+  document.addEventListener("keydown", event => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target.closest("input, select, textarea, summary, button, a, [role=slider]")) return;
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    const { view } = pilot;
+    if (once[key]) {
+      if (!event.repeat) pilot.command(once[key]);
+    } else if ("wasdqe".includes(key)) {
+      keys.add(key);
+      pilot.fly(keys, event.shiftKey);
+    } else if (key.startsWith("Arrow")) {
+      const x = Number(key === "ArrowRight") - Number(key === "ArrowLeft");
+      const y = Number(key === "ArrowDown") - Number(key === "ArrowUp");
+      if (event.shiftKey) view.pan(-x * STEP, -y * STEP);
+      else if (pilot.flying) view.look(x * STEP, y * STEP);
+      else view.orbit(x * STEP * 2, y * STEP * 2);
+      pilot.changed();
+    } else if (key === "+" || key === "=" || key === "-") {
+      view.zoom(key === "-" ? 1 / ZOOM : ZOOM, least);
+      pilot.changed();
+    } else {
+      return;
+    }
+    event.preventDefault();
+  });
+  document.addEventListener("keyup", event => {
+    keys.delete(event.key.toLowerCase());
+    pilot.fly(keys, event.shiftKey);
+  });
+  window.addEventListener("blur", () => {
+    keys.clear();
+    pilot.fly(keys, false);
+  });
+}
+
+// Middle and distance of the first two touches.
+function pair(touches) {
+  const [a, b = a] = touches.values();
+  return { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2, apart: Math.hypot(a.x - b.x, a.y - b.y) };
+}
+
+// The boundary between splats and mesh: moved(share) while it is dragged or moved by keys.
+export function connectDivider(divider, stage, moved) {
+  const set = share => {
+    const value = Math.max(0, Math.min(1, share));
+    divider.style.left = `${100 * value}%`;
+    divider.setAttribute("aria-valuenow", String(Math.round(100 * value)));
+    moved(value);
+  };
+  const at = event => set((event.clientX - stage.getBoundingClientRect().left) / stage.clientWidth);
+  divider.addEventListener("pointerdown", event => {
+    event.stopPropagation();
+    divider.setPointerCapture(event.pointerId);
+  });
+  divider.addEventListener("pointermove", event => {
+    if (divider.hasPointerCapture(event.pointerId)) at(event);
+  });
+  divider.addEventListener("keydown", event => {
+    const now = Number(divider.getAttribute("aria-valuenow")) / 100;
+    const steps = { ArrowLeft: now - 0.02, ArrowRight: now + 0.02, PageDown: now - 0.1, PageUp: now + 0.1, Home: 0, End: 1 };
+    if (!(event.key in steps)) return;
+    set(steps[event.key]);
+    event.preventDefault();
+    event.stopPropagation();
+  });
+}

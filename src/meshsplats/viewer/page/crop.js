@@ -1,0 +1,100 @@
+// The crop box: which fans, triangles and splats have their centres in it, its sliders and its outline.
+
+import { project } from "./camera.js";
+
+const STEPS = 200;
+
+export class CropBox {
+  // extent: [[x, y, z], [x, y, z]], where the sliders end. changed(kept) as in SortedRenderer.crop.
+  constructor(extent, mesh, splats, changed) {
+    Object.assign(this, { extent, mesh, splats, changed });
+    this.marks = [[0, 0, 0], [STEPS, STEPS, STEPS]];
+    this.inputs = [];
+    const grid = document.querySelector("#crop .six");
+    "xyz".split("").forEach((axis, k) => {
+      const name = document.createElement("b");
+      name.textContent = axis;
+      grid.append(name);
+      for (const end of [0, 1]) {
+        const input = document.createElement("input");
+        Object.assign(input, { type: "range", min: 0, max: STEPS, step: 1, value: end * STEPS, id: `crop-${axis}${end}` });
+        input.setAttribute("aria-label", `${axis}, ${end ? "upper" : "lower"} end of the crop box`);
+        input.addEventListener("input", () => this.#moved(k, end, Number(input.value)));
+        this.inputs.push(input);
+        grid.append(input);
+      }
+    });
+    document.getElementById("uncrop").addEventListener("click", () => this.reset());
+    this.#tell();
+  }
+
+  get active() { return this.marks[0].some(mark => mark > 0) || this.marks[1].some(mark => mark < STEPS); }
+
+  // The two corners in scene units.
+  get corners() {
+    return this.marks.map(marks => marks.map((mark, k) => {
+      const [low, high] = [this.extent[0][k], this.extent[1][k]];
+      return low + (high - low) * mark / STEPS;
+    }));
+  }
+
+  reset() {
+    this.marks = [[0, 0, 0], [STEPS, STEPS, STEPS]];
+    this.inputs.forEach((input, i) => { input.value = this.marks[i % 2][i >> 1]; });
+    this.#tell();
+    this.changed(null);
+  }
+
+  #moved(axis, end, mark) {
+    const other = this.marks[1 - end][axis];
+    this.marks[end][axis] = end ? Math.max(mark, other + 1) : Math.min(mark, other - 1);
+    this.inputs[2 * axis + end].value = this.marks[end][axis];
+    this.#tell();
+    this.changed(this.active ? this.#kept() : null);
+  }
+
+  #tell() {
+    const numbers = this.corners.flat().map(value => Number(value.toPrecision(4)));
+    this.inputs.forEach((input, i) => input.setAttribute("aria-valuetext", String(numbers[(i % 2) * 3 + (i >> 1)])));
+    document.getElementById("cropText").textContent = this.active ? `--crop ${numbers.join(" ")}` : "";
+  }
+
+  // A slider at its end does not bound the scene.
+  #inside(x, y, z) {
+    const [low, high] = this.corners, [from, to] = this.marks, p = [x, y, z];
+    return p.every((value, k) => (from[k] === 0 || value >= low[k]) && (to[k] === STEPS || value <= high[k]));
+  }
+
+  #kept() {
+    const { mesh, splats } = this, F = mesh.faces.length / 3;
+    const fans = mesh.fans ?? Uint32Array.from({ length: F + 1 }, (_, i) => i);
+    const keptFans = [], triangles = [], keptSplats = [];
+    for (let fan = 0; fan + 1 < fans.length; fan++) {
+      const middle = [0, 0, 0], weight = 1 / (3 * (fans[fan + 1] - fans[fan]));
+      for (let i = 3 * fans[fan]; i < 3 * fans[fan + 1]; i++) {
+        for (let c = 0; c < 3; c++) middle[c] += weight * mesh.vertices[3 * mesh.faces[i] + c];
+      }
+      if (!this.#inside(...middle)) continue;
+      keptFans.push(fan);
+      for (let f = fans[fan]; f < fans[fan + 1]; f++) triangles.push(f);
+    }
+    for (let i = 0; i < (splats?.count ?? 0); i++) if (this.#inside(...splats.means.subarray(3 * i, 3 * i + 3))) keptSplats.push(i);
+    return { fans: Uint32Array.from(keptFans), triangles: Uint32Array.from(triangles), splats: Uint32Array.from(keptSplats) };
+  }
+
+  // The edges of the box in an image, in pixels.
+  outline(pinhole) {
+    const ends = this.corners, lines = [];
+    const corner = bits => [0, 1, 2].map(k => ends[(bits >> k) & 1][k]);
+    for (let bits = 0; bits < 8; bits++) {
+      for (let k = 0; k < 3; k++) {
+        if ((bits >> k) & 1) continue;
+        const a = project(pinhole, corner(bits)), b = project(pinhole, corner(bits | (1 << k)));
+        if (a[2] > pinhole.near && b[2] > pinhole.near) {
+          lines.push(`M${a[0].toFixed(1)} ${a[1].toFixed(1)}L${b[0].toFixed(1)} ${b[1].toFixed(1)}`);
+        }
+      }
+    }
+    return lines.join("");
+  }
+}

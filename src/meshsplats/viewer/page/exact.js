@@ -1,0 +1,340 @@
+// WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in the
+// page as Python wrote them; docs/webgpu.md says what a host has to do.
+
+const TILE = 8, RUN = 8, WINDOW = 1 << 22;
+const FIRST_PAIRS = 1 << 18, MOST_PAIRS = 16e6, MOST_RUNS = 1 << 24, MOST_TILES = 65535;
+const BUDGET = 40000; // loop iterations of one walk through a tile list
+const ROUNDS = 1000; // most repetitions of a frame's last steps
+const NONE = 0xffffffff;
+
+// Sums frames and shows their mean over the background.
+const PRESENT = `
+struct Show { background: vec3f, gain: f32, size: vec2u, canvas: vec2f, weight: f32, linear: u32, first: u32 };
+@group(0) @binding(0) var<uniform> show: Show;
+@group(0) @binding(1) var<storage, read> samples: array<vec4f>;
+@group(0) @binding(2) var<storage, read_write> sums: array<vec4f>;
+@group(0) @binding(3) var<storage, read> total: array<vec4f>;
+
+@compute @workgroup_size(8, 8) fn collect(@builtin(global_invocation_id) id: vec3u) {
+  if (any(id.xy >= show.size)) { return; }
+  let i = id.y * show.size.x + id.x;
+  sums[i] = select(sums[i], vec4f(0), show.first == 1u) + samples[i];
+}
+@vertex fn corner(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
+  return vec4f(f32(i & 1u) * 4 - 1, f32(i >> 1u) * 4 - 1, 0, 1);
+}
+fn decode(c: vec3f) -> vec3f {
+  return select(pow((max(c, vec3f(0)) + 0.055) / 1.055, vec3f(2.4)), c / 12.92, c <= vec3f(0.04045));
+}
+fn encode(c: vec3f) -> vec3f {
+  return select(1.055 * pow(max(c, vec3f(0)), vec3f(1 / 2.4)) - 0.055, c * 12.92, c <= vec3f(0.0031308));
+}
+fn pixel(p: vec2i) -> vec4f {
+  let q = vec2u(clamp(p, vec2i(0), vec2i(show.size) - 1));
+  return total[q.y * show.size.x + q.x] * show.weight;
+}
+@fragment fn paint(@builtin(position) at: vec4f) -> @location(0) vec4f {
+  let p = at.xy * vec2f(show.size) / show.canvas - 0.5;
+  let low = floor(p + 1e-4);
+  let t = max(p - low, vec2f(0));
+  let i = vec2i(low);
+  var c = pixel(i);
+  if (any(vec2f(show.size) != show.canvas)) {
+    let top = mix(c, pixel(i + vec2i(1, 0)), t.x);
+    c = mix(top, mix(pixel(i + vec2i(0, 1)), pixel(i + vec2i(1, 1)), t.x), t.y);
+  }
+  var rgb = c.xyz;
+  let alpha = 1 - c.w;
+  let linear = show.linear == 1u;
+  if (show.gain != 1) {
+    let own = rgb / max(alpha, 1e-6);
+    rgb = alpha * select(encode(decode(own) * show.gain), own * show.gain, linear);
+  }
+  rgb += c.w * select(show.background, decode(show.background), linear);
+  return vec4f(select(rgb, encode(rgb), linear), 1);
+}`;
+
+export class ExactRenderer {
+  // lost(reason) is called when the device goes. Throws where there is no WebGPU, or the scene does not fit.
+  static async create(canvas, mesh, kernels, lost) {
+    if (!navigator.gpu) throw new Error("this browser has no WebGPU");
+    const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
+    if (!adapter) throw new Error("WebGPU finds no graphics device");
+    const { maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
+    const device = await adapter.requestDevice({ requiredLimits: { maxStorageBufferBindingSize, maxBufferSize } });
+    const self = new ExactRenderer();
+    const { vendor, architecture, description } = adapter.info ?? {};
+    Object.assign(self, { canvas, mesh, kernels, device, buffers: {}, groupsOfBindings: new Map(), capacity: FIRST_PAIRS });
+    self.name = description || [vendor, architecture].filter(Boolean).join(" ") || "WebGPU";
+    self.most = Math.min(maxStorageBufferBindingSize, maxBufferSize);
+    device.lost.then(info => { if (info.reason !== "destroyed") lost(info.message || "no reason given"); });
+    device.addEventListener("uncapturederror", event => { self.problem ??= event.error.message; });
+    self.context = canvas.getContext("webgpu");
+    self.format = navigator.gpu.getPreferredCanvasFormat();
+    self.context.configure({ device, format: self.format, alphaMode: "opaque" });
+    await self.#compile();
+    self.#upload("vertices", mesh.vertices);
+    self.#upload("values", mesh.colors);
+    self.#allocate("plan", 64);
+    self.#allocate("counters", 64);
+    self.#allocate("frame", 256);
+    self.#allocate("show", 64);
+    const digits = kernels.digits, words = new Uint32Array(64 * (digits.length + 1));
+    digits.forEach(([shift, word], i) => words.set([shift, word, 1], 64 * i));
+    self.#upload("digits", words);
+    self.back = device.createBuffer({ size: 64, usage: GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ });
+    self.crop(null);
+    if (self.problem) throw new Error(self.problem);
+    return self;
+  }
+
+  async #compile() {
+    const { device, kernels } = this, modules = {};
+    for (const [name, code] of Object.entries({ ...kernels.sources, present: PRESENT })) {
+      modules[name] = device.createShaderModule({ code });
+      const wrong = (await modules[name].getCompilationInfo()).messages.find(message => message.type === "error");
+      if (wrong) throw new Error(`a shader does not compile: ${name}, line ${wrong.lineNum}: ${wrong.message}`);
+    }
+    const steps = [...kernels.lists, ...kernels.raster].filter(step => step.kernel);
+    const entries = new Map(steps.map(({ kernel }) => [kernel, kernel === "raster" ? "raster" : kernel === "raster_again" ? "again" : "lists"]));
+    entries.set("collect", "present");
+    this.pipelines = {};
+    await Promise.all([...entries].map(async ([kernel, module]) => {
+      const compute = { module: modules[module], entryPoint: kernel === "raster_again" ? "raster" : kernel };
+      this.pipelines[kernel] = await device.createComputePipelineAsync({ layout: "auto", compute });
+    }));
+    this.painter = await device.createRenderPipelineAsync({
+      layout: "auto", vertex: { module: modules.present, entryPoint: "corner" },
+      fragment: { module: modules.present, entryPoint: "paint", targets: [{ format: this.format }] },
+    });
+  }
+
+  // ---- The mesh
+
+  // kept as in SortedRenderer.crop.
+  crop(kept) {
+    const { mesh } = this, chosen = kept?.triangles;
+    const pick = (array, width) => {
+      if (!array || !chosen) return array;
+      const some = new array.constructor(chosen.length * width);
+      for (let i = 0; i < chosen.length; i++) {
+        for (let k = 0; k < width; k++) some[width * i + k] = array[width * chosen[i] + k];
+      }
+      return some;
+    };
+    const faces = pick(mesh.faces, 3), splat = pick(mesh.splat, 1), group = pick(mesh.group, 1);
+    const runs = findRuns(faces, splat), F = faces.length / 3;
+    if (runs.length >= MOST_RUNS) throw new Error("the mesh has too many triangles for WebGPU");
+    this.counts = { one: 1, vertices: mesh.vertices.length / 3, faces: F, runs: runs.length, fans: 0, groups: 0 };
+    this.offsets = [3 * F, 0, 0];
+    const parts = [faces, runs];
+    if (this.kernels.groups) {
+      const { ofFace, largest } = findGroups(mesh.vertices, faces, group);
+      parts.push(ofFace, largest);
+      this.offsets = [3 * F, 3 * F + runs.length, 3 * F + runs.length + F];
+      this.counts.groups = largest.length;
+    }
+    if (mesh.filter > 0) {
+      const fans = [];
+      for (let f = 0; f < F; f++) if (f === 0 || splat[f] !== splat[f - 1]) fans.push(f);
+      this.counts.fans = fans.length;
+      this.#upload("fans", Uint32Array.from([...fans, F]));
+    }
+    const joined = new Uint32Array(parts.reduce((sum, part) => sum + part.length, 0));
+    parts.reduce((at, part) => { joined.set(part, at); return at + part.length; }, 0);
+    this.#upload("mesh", joined);
+    this.#allocate("projected", 16 * (this.counts.vertices + 2 * this.counts.groups));
+    this.#allocate("group_bounds", 8 * this.counts.groups);
+    this.#allocate("boxes", 8 * runs.length);
+    this.#allocate("offsets", 4 * runs.length);
+  }
+
+  // A buffer of at least `bytes`; its contents are lost if it grows.
+  #allocate(name, bytes) {
+    const size = Math.max(64, Math.ceil(bytes / 16) * 16), old = this.buffers[name];
+    if (old && old.size >= size) return;
+    if (size > this.most) throw new Error(`${name} needs ${Math.ceil(size / 2 ** 20)} MiB, more than WebGPU allows here`);
+    old?.destroy();
+    const { UNIFORM, STORAGE, COPY_DST, COPY_SRC, INDIRECT } = GPUBufferUsage;
+    const uniform = ["frame", "digits", "show"].includes(name);
+    const indirect = ["plan", "lists", "again"].includes(name) ? INDIRECT : 0;
+    const usage = uniform ? UNIFORM | COPY_DST : STORAGE | COPY_DST | COPY_SRC | indirect;
+    this.buffers[name] = this.device.createBuffer({ size, usage });
+    this.groupsOfBindings.clear();
+  }
+
+  #upload(name, values) {
+    this.#allocate(name, values.byteLength);
+    if (values.byteLength) this.device.queue.writeBuffer(this.buffers[name], 0, values);
+  }
+
+  // ---- Frames
+
+  // Draws one sample in each pixel and shows the mean of it and of the frames since the last one with `first`.
+  // filterScale: size of the image in that of the canvas, for the low-pass filter of the mesh.
+  async draw(pinhole, { first, background, gain, filterScale }) {
+    if (!this.counts.faces) {
+      this.#show(pinhole, { first, background, gain }, true);
+      return;
+    }
+    this.#prepare(pinhole, filterScale);
+    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1;
+    for (let round = 0; ; round++) {
+      const counters = await this.#run(steps);
+      if (this.problem) throw new Error(this.problem);
+      if (counters[0] > this.capacity) {
+        const most = Math.min(MOST_PAIRS, Math.floor(this.most / 8));
+        if (counters[0] > most) throw new Error("the tile lists need more memory than WebGPU allows here");
+        this.capacity = Math.min(most, Math.ceil(counters[0] * 1.25));
+        this.#prepare(pinhole, filterScale);
+        continue;
+      }
+      if (counters[2] === this.counts.tiles) break;
+      if (counters[9] || counters[12] || walks === counters[3] || round > ROUNDS) {
+        throw new Error("the graphics device did not finish the image");
+      }
+      walks = counters[3];
+      steps = this.kernels.again;
+    }
+    this.#show(pinhole, { first, background, gain }, false);
+  }
+
+  #prepare({ width, height, rows, center, fx, fy, cx, cy, near }, filterScale) {
+    const across = Math.ceil(width / TILE), down = Math.ceil(height / TILE), { counts } = this;
+    if (across * down > MOST_TILES || width * height > WINDOW) throw new Error("the image is too large");
+    counts.tiles = across * down;
+    const blocks = Math.ceil(this.capacity / 2048);
+    this.#allocate("pairs_a", 8 * this.capacity);
+    this.#allocate("pairs_b", 8 * this.capacity);
+    this.#allocate("table", 4 * 256 * blocks);
+    this.#allocate("sums", 4 * (2 + Math.max(Math.ceil(256 * blocks / 2048), Math.ceil(counts.runs / 2048))));
+    this.#allocate("lists", 16 * (counts.tiles + 1));
+    this.#allocate("again", 16 * (counts.tiles + 1));
+    this.#allocate("samples", 32 * width * height);
+    const floats = new Float32Array(64), words = new Uint32Array(floats.buffer);
+    rows.forEach((row, k) => floats.set(row.slice(0, 3), 4 * k));
+    floats.set(center, 12);
+    floats.set(center.map((value, k) => value - floats[12 + k]), 16);
+    floats.set([fx, fy, cx, cy, near, 1e-6, -1, this.mesh.filter * filterScale * filterScale], 20);
+    words.set([width, height, across, down, counts.vertices, counts.faces, counts.runs, counts.fans], 28);
+    words.set([counts.groups, this.capacity, 0, BUDGET, ...this.offsets, 1], 36);
+    this.device.queue.writeBuffer(this.buffers.frame, 0, floats);
+  }
+
+  // Runs steps and returns the counters.
+  async #run(steps) {
+    const encoder = this.device.createCommandEncoder();
+    let pass = null;
+    for (const step of steps) {
+      if (step.clear) {
+        pass?.end();
+        pass = null;
+        encoder.clearBuffer(this.buffers[step.clear], step.from);
+        continue;
+      }
+      if (step.if && !this.counts[step.if]) continue;
+      pass ??= encoder.beginComputePass();
+      pass.setPipeline(this.pipelines[step.kernel]);
+      pass.setBindGroup(0, this.#bindings(step));
+      if (step.indirect) {
+        pass.dispatchWorkgroupsIndirect(this.buffers[step.indirect[0]], step.indirect[1]);
+      } else {
+        pass.dispatchWorkgroups(Math.ceil(this.counts[step.count[0]] / step.count[1]));
+      }
+    }
+    pass?.end();
+    encoder.copyBufferToBuffer(this.buffers.counters, 0, this.back, 0, 64);
+    this.device.queue.submit([encoder.finish()]);
+    await this.back.mapAsync(GPUMapMode.READ);
+    const counters = new Uint32Array(this.back.getMappedRange().slice(0));
+    this.back.unmap();
+    return counters;
+  }
+
+  #bindings(step) {
+    const known = this.groupsOfBindings.get(step);
+    if (known) return known;
+    const entries = Object.entries(step.bind).map(([binding, name]) => {
+      const [base, index] = name.split("."), buffer = this.buffers[base];
+      const part = index === undefined ? {} : { offset: 256 * Number(index), size: 16 };
+      return { binding: Number(binding), resource: { buffer, ...part } };
+    });
+    const made = this.device.createBindGroup({ layout: this.pipelines[step.kernel].getBindGroupLayout(0), entries });
+    this.groupsOfBindings.set(step, made);
+    return made;
+  }
+
+  // ---- The canvas
+
+  #show({ width, height }, { first, background, gain }, empty) {
+    const { device, canvas } = this;
+    this.#allocate("total", 16 * width * height);
+    this.#allocate("samples", 32 * width * height);
+    this.frames = first ? 1 : this.frames + 1;
+    const floats = new Float32Array(16), words = new Uint32Array(floats.buffer);
+    floats.set([...background, gain]);
+    words.set([width, height], 4);
+    floats.set([canvas.width, canvas.height, 1 / this.frames], 6);
+    words.set([Number(this.mesh.blending === "linear"), Number(first)], 9);
+    device.queue.writeBuffer(this.buffers.show, 0, floats);
+    if (empty) device.queue.writeBuffer(this.buffers.samples, 0, new Float32Array(4 * width * height).map((_, i) => Number(i % 4 === 3)));
+    const encoder = device.createCommandEncoder(), part = name => ({ buffer: this.buffers[name] });
+    const collect = encoder.beginComputePass();
+    collect.setPipeline(this.pipelines.collect);
+    collect.setBindGroup(0, device.createBindGroup({
+      layout: this.pipelines.collect.getBindGroupLayout(0),
+      entries: [[0, "show"], [1, "samples"], [2, "total"]].map(([binding, name]) => ({ binding, resource: part(name) })),
+    }));
+    collect.dispatchWorkgroups(Math.ceil(width / 8), Math.ceil(height / 8));
+    collect.end();
+    const view = this.context.getCurrentTexture().createView();
+    const paint = encoder.beginRenderPass({ colorAttachments: [{ view, loadOp: "clear", storeOp: "store" }] });
+    paint.setPipeline(this.painter);
+    paint.setBindGroup(0, device.createBindGroup({
+      layout: this.painter.getBindGroupLayout(0),
+      entries: [[0, "show"], [3, "total"]].map(([binding, name]) => ({ binding, resource: part(name) })),
+    }));
+    paint.draw(3);
+    paint.end();
+    device.queue.submit([encoder.finish()]);
+  }
+}
+
+// Runs of up to 8 consecutive triangles: of one splat, or, without splats, such that each has a vertex of the one
+// before. First face, and from bit 29 on the count less 1.
+export function findRuns(faces, splat) {
+  const F = faces.length / 3, runs = [];
+  const joined = f => {
+    if (splat) return splat[f] === splat[f - 1];
+    for (let i = 3 * f; i < 3 * f + 3; i++) for (let j = 3 * f - 3; j < 3 * f; j++) if (faces[i] === faces[j]) return true;
+    return false;
+  };
+  for (let f = 0, count = 0; f < F; f += count) {
+    for (count = 1; count < RUN && f + count < F && joined(f + count);) count++;
+    runs.push((f | ((count - 1) << 29)) >>> 0);
+  }
+  return Uint32Array.from(runs);
+}
+
+// ofFace: the depth group of each face, without gaps, NONE for none; largest: the face of each with the largest area.
+export function findGroups(vertices, faces, group) {
+  const F = faces.length / 3, ofFace = new Uint32Array(F).fill(NONE), names = new Map(), largest = [], areas = [];
+  for (let f = 0; f < F; f++) {
+    if (group[f] < 0) continue;
+    const p = [0, 1, 2].map(k => vertices.subarray(3 * faces[3 * f + k], 3 * faces[3 * f + k] + 3));
+    const u = [0, 1, 2].map(c => p[1][c] - p[0][c]), v = [0, 1, 2].map(c => p[2][c] - p[0][c]);
+    const area = (u[1] * v[2] - u[2] * v[1]) ** 2 + (u[2] * v[0] - u[0] * v[2]) ** 2 + (u[0] * v[1] - u[1] * v[0]) ** 2;
+    if (!names.has(group[f])) {
+      names.set(group[f], largest.length);
+      largest.push(f);
+      areas.push(area);
+    }
+    const g = names.get(group[f]);
+    ofFace[f] = g;
+    if (area > areas[g]) {
+      areas[g] = area;
+      largest[g] = f;
+    }
+  }
+  return { ofFace, largest: Uint32Array.from(largest) };
+}

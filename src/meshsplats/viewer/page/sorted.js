@@ -1,0 +1,406 @@
+// WebGL2: the mesh with its triangles sorted by their centres, and the splats. Not exact, as triangles that
+// overlap in depth are not split, but quick, and it runs where WebGPU is missing.
+
+const WIDTH = 4096; // texels in a row of a data texture
+const LENS = `
+uniform vec4 row0, row1, row2, lens; // world to camera; fx fy cx cy
+uniform vec3 size;                   // width, height, near
+vec3 seen(vec3 p) { vec4 q = vec4(p, 1); return vec3(dot(row0, q), dot(row1, q), dot(row2, q)); }
+vec4 clip(vec3 c) {
+  return vec4(2. * lens.x / size.x * c.x + (2. * lens.z / size.x - 1.) * c.z,
+    -2. * lens.y / size.y * c.y + (1. - 2. * lens.w / size.y) * c.z, c.z - 2. * size.z, c.z);
+}
+ivec2 place(uint i) { return ivec2(i & 4095u, i >> 12); }
+`;
+const HEAD = `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
+`;
+const MESH_VERTEX = HEAD + LENS + `
+uniform sampler2D positions, colors;
+uniform usampler2D faces;
+in uint item;
+centroid out vec4 rgba; out vec3 corner;
+void main() {
+  uvec4 face = texelFetch(faces, place(item), 0);
+  uint v = gl_VertexID == 0 ? face.x : gl_VertexID == 1 ? face.y : face.z;
+  rgba = texelFetch(colors, place(v), 0);
+  corner = vec3(gl_VertexID == 0, gl_VertexID == 1, gl_VertexID == 2);
+  gl_Position = clip(seen(texelFetch(positions, place(v), 0).xyz));
+}`;
+const MESH_FRAGMENT = HEAD + `
+uniform int style; // 0 blended, 1 opaque, 2 wireframe
+centroid in vec4 rgba; in vec3 corner;
+out vec4 result;
+void main() {
+  float alpha = rgba.a;
+  if (style == 1) alpha = 1.;
+  if (style == 2) {
+    vec3 width = max(fwidth(corner), vec3(1e-6)), away = corner / width;
+    alpha = .8 * (1. - smoothstep(.4, 1.4, min(min(away.x, away.y), away.z)));
+  }
+  result = vec4(rgba.rgb * alpha, alpha);
+}`;
+const SPLAT_VERTEX = HEAD + LENS + `
+uniform sampler2D means, shapes, colors;
+uniform float dilation; uniform bool antialiased;
+in uint item;
+out vec4 rgba; out vec2 offset;
+void main() {
+  gl_Position = vec4(0, 0, 2, 1); // outside
+  vec3 c = seen(texelFetch(means, place(item), 0).xyz);
+  rgba = texelFetch(colors, place(item), 0);
+  if (c.z < size.z || rgba.a < 1. / 255.) return;
+  vec4 s = texelFetch(shapes, place(2u * item), 0), t = texelFetch(shapes, place(2u * item + 1u), 0);
+  mat3 covariance = mat3(s.x, s.y, s.z, s.y, s.w, t.x, s.z, t.x, t.y);
+  // EWA: the local affine approximation, where the direction is limited as in 3D Gaussian Splatting.
+  vec2 limit = 1.3 * vec2(max(lens.z, size.x - lens.z), max(lens.w, size.y - lens.w)) / lens.xy;
+  vec2 slope = clamp(c.xy / c.z, -limit, limit);
+  vec3 jx = vec3(lens.x / c.z, 0, -lens.x * slope.x / c.z), jy = vec3(0, lens.y / c.z, -lens.y * slope.y / c.z);
+  mat3 turn = mat3(row0.xyz, row1.xyz, row2.xyz);
+  vec3 x = turn * jx, y = turn * jy;
+  float a = dot(x, covariance * x), b = dot(x, covariance * y), d = dot(y, covariance * y);
+  float before = max(a * d - b * b, 0.);
+  a += dilation; d += dilation;
+  float determinant = a * d - b * b;
+  if (!(determinant > 0.)) return;
+  if (antialiased) rgba.a *= sqrt(before / determinant);
+  if (rgba.a < 1. / 255.) return;
+  float middle = .5 * (a + d), spread = sqrt(max(middle * middle - determinant, 1e-9));
+  float large = middle + spread, small = max(middle - spread, 1e-9);
+  vec2 axis = abs(b) < 1e-9 ? (a >= d ? vec2(1, 0) : vec2(0, 1)) : normalize(vec2(b, large - a));
+  offset = sqrt(2. * log(255. * rgba.a)) * vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID >> 1) * 2 - 1);
+  vec2 pixel = lens.xy * c.xy / c.z + lens.zw + axis * sqrt(large) * offset.x + vec2(-axis.y, axis.x) * sqrt(small) * offset.y;
+  gl_Position = vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0, 1);
+}`;
+const SPLAT_FRAGMENT = HEAD + `
+in vec4 rgba; in vec2 offset;
+out vec4 result;
+void main() {
+  float alpha = min(.99, rgba.a * exp(-.5 * dot(offset, offset)));
+  if (alpha < 1. / 255.) discard;
+  result = vec4(rgba.rgb * alpha, alpha);
+}`;
+const PRESENT_VERTEX = HEAD + `
+out vec2 uv;
+void main() { uv = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.; gl_Position = vec4(2. * uv - 1., 0, 1); }`;
+const PRESENT_FRAGMENT = HEAD + `
+uniform sampler2D image; uniform vec3 background; uniform float gain; uniform bool linear;
+in vec2 uv; out vec4 result;
+vec3 decode(vec3 c) { return mix(c / 12.92, pow((max(c, 0.) + .055) / 1.055, vec3(2.4)), step(.04045, c)); }
+vec3 encode(vec3 c) { return mix(c * 12.92, 1.055 * pow(max(c, 0.), vec3(1. / 2.4)) - .055, step(.0031308, c)); }
+void main() {
+  vec4 c = texture(image, uv);
+  vec3 rgb = c.rgb;
+  if (gain != 1.) {
+    vec3 own = rgb / max(c.a, 1e-6);
+    rgb = c.a * (linear ? own * gain : encode(decode(own) * gain));
+  }
+  rgb += (1. - c.a) * (linear ? decode(background) : background);
+  result = vec4(linear ? encode(rgb) : rgb, 1);
+}`;
+
+// Indices of `items`, the ones with the largest depths first, in `order`. Depths are positive floats: their bits are
+// in the same order. `order` may be `items` itself no longer than the count of depths.
+export function sortFarToNear(depths, items, order) {
+  const n = items.length, bits = new Uint32Array(depths.buffer, depths.byteOffset, depths.length);
+  let low = 0xffffffff, high = 0;
+  for (let i = 0; i < n; i++) {
+    const b = bits[items[i]];
+    if (b < low) low = b;
+    if (b > high) high = b;
+  }
+  const BUCKETS = 1 << 18, shift = Math.max(0, 32 - Math.clz32(Math.max(0, high - low)) - 18);
+  const ends = new Uint32Array(BUCKETS + 1);
+  for (let i = 0; i < n; i++) ends[BUCKETS - ((bits[items[i]] - low) >>> shift)]++;
+  for (let i = 1; i <= BUCKETS; i++) ends[i] += ends[i - 1];
+  for (let i = n - 1; i >= 0; i--) order[--ends[BUCKETS - ((bits[items[i]] - low) >>> shift)]] = items[i];
+  return order;
+}
+
+// Depths of points (3 a point), at least `near`.
+function depthsOf(points, row, near, depths) {
+  const [a, b, c, d] = row;
+  for (let i = 0; i < depths.length; i++) {
+    depths[i] = Math.max(a * points[3 * i] + b * points[3 * i + 1] + c * points[3 * i + 2] + d, near);
+  }
+}
+
+export class SortedRenderer {
+  // Throws where there is no WebGL2.
+  constructor(canvas, mesh, splats) {
+    const gl = canvas.getContext("webgl2", { alpha: true, antialias: false, premultipliedAlpha: true });
+    if (!gl) throw new Error("this browser has no WebGL2");
+    Object.assign(this, { canvas, gl, mesh, splats, frames: new Map() });
+    this.float = Boolean(gl.getExtension("EXT_color_buffer_float"));
+    const info = gl.getExtension("WEBGL_debug_renderer_info");
+    this.name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : gl.getParameter(gl.RENDERER);
+    this.programs = { present: program(gl, PRESENT_VERTEX, PRESENT_FRAGMENT) };
+    this.triangles = null;
+    this.cloud = null;
+  }
+
+  #needMesh() {
+    if (this.triangles) return this.triangles;
+    const { gl, mesh } = this, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
+    const fans = mesh.fans ?? Uint32Array.from({ length: F + 1 }, (_, i) => i);
+    this.programs.mesh = program(gl, MESH_VERTEX, MESH_FRAGMENT);
+    const four = new Float32Array(4 * V), bytes = new Uint8Array(4 * V), corners = new Uint32Array(4 * F);
+    for (let v = 0; v < V; v++) four.set(mesh.vertices.subarray(3 * v, 3 * v + 3), 4 * v);
+    for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
+    const centers = new Float32Array(3 * F), middles = new Float32Array(3 * (fans.length - 1));
+    for (let f = 0, fan = 0; f < F; f++) {
+      while (f >= fans[fan + 1]) fan++;
+      for (let k = 0; k < 3; k++) corners[4 * f + k] = mesh.faces[3 * f + k];
+      for (let c = 0; c < 3; c++) {
+        let sum = 0;
+        for (let k = 0; k < 3; k++) sum += mesh.vertices[3 * mesh.faces[3 * f + k] + c];
+        centers[3 * f + c] = sum / 3;
+        middles[3 * fan + c] += sum / 3 / (fans[fan + 1] - fans[fan]);
+      }
+    }
+    this.triangles = {
+      textures: {
+        positions: texture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, four),
+        colors: texture(gl, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, bytes),
+        faces: texture(gl, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, corners),
+      },
+      ...vertexArray(gl, this.programs.mesh), centers, middles, fans, order: new Uint32Array(F),
+      depths: new Float32Array(F), fanDepths: new Float32Array(fans.length - 1),
+      fanOrder: new Uint32Array(fans.length - 1), count: 0,
+    };
+    this.crop(this.kept ?? null);
+    return this.triangles;
+  }
+
+  #needSplats() {
+    if (this.cloud) return this.cloud;
+    const { gl, splats } = this, n = splats.count, four = new Float32Array(4 * n), shapes = new Float32Array(8 * n);
+    this.programs.splats = program(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
+    for (let i = 0; i < n; i++) {
+      four.set(splats.means.subarray(3 * i, 3 * i + 3), 4 * i);
+      shapes.set(splats.covariances.subarray(6 * i, 6 * i + 6), 8 * i);
+    }
+    this.cloud = {
+      textures: {
+        means: texture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, four),
+        shapes: texture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, shapes),
+        colors: texture(gl, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, splats.colors),
+      },
+      ...vertexArray(gl, this.programs.splats), order: new Uint32Array(n), depths: new Float32Array(n),
+    };
+    this.crop(this.kept ?? null);
+    return this.cloud;
+  }
+
+  // kept: {fans, triangles, splats}, lists of indices in ascending order; null: everything.
+  crop(kept) {
+    this.kept = kept;
+    if (this.triangles) {
+      const all = this.triangles;
+      all.fanItems = kept ? kept.fans : Uint32Array.from({ length: all.fans.length - 1 }, (_, i) => i);
+      all.items = kept ? kept.triangles : Uint32Array.from({ length: all.order.length }, (_, i) => i);
+    }
+    if (this.cloud) {
+      this.cloud.items = kept ? kept.splats : Uint32Array.from({ length: this.splats.count }, (_, i) => i);
+    }
+  }
+
+  // Draws parts [{what: "mesh" or "splats", from, to}] of the image's width, 0 to 1, and leaves the rest of the canvas
+  // transparent. scale: size of the image in that of the canvas; still: triangles are sorted one by one, not fan by fan.
+  draw({ view, parts, style, still, scale, background, gain }) {
+    const { gl, canvas } = this, w = Math.max(1, Math.round(canvas.width * scale));
+    const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    for (const { what, from, to } of parts) {
+      const image = what === "mesh" ? this.#drawMesh(pinhole, style, still) : this.#drawSplats(pinhole, scale);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.viewport(0, 0, canvas.width, canvas.height);
+      gl.enable(gl.SCISSOR_TEST);
+      const x0 = Math.round(from * canvas.width), x1 = Math.round(to * canvas.width);
+      gl.scissor(x0, 0, Math.max(0, x1 - x0), canvas.height);
+      const { id, at } = this.programs.present;
+      gl.useProgram(id);
+      bindTextures(gl, this.programs.present, { image });
+      gl.uniform3fv(at("background"), background);
+      gl.uniform1f(at("gain"), gain);
+      gl.uniform1i(at("linear"), Number(what === "mesh" && this.mesh.blending === "linear"));
+      gl.disable(gl.BLEND);
+      gl.disable(gl.DEPTH_TEST);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+      gl.disable(gl.SCISSOR_TEST);
+    }
+  }
+
+  #drawMesh(pinhole, style, still) {
+    const { gl } = this, all = this.#needMesh(), opaque = style === "opaque";
+    if (!opaque) this.#sortMesh(all, pinhole, still);
+    const list = opaque ? all.items : all.order.subarray(0, all.count);
+    const frame = this.#frame(pinhole.width, pinhole.height, 4, opaque);
+    this.#begin(frame, this.programs.mesh, pinhole, all, list);
+    if (opaque) {
+      gl.disable(gl.BLEND);
+      gl.enable(gl.DEPTH_TEST);
+    }
+    gl.uniform1i(this.programs.mesh.at("style"), ["blended", "opaque", "wireframe"].indexOf(style));
+    gl.drawArraysInstanced(gl.TRIANGLES, 0, 3, list.length);
+    gl.bindVertexArray(null);
+    return resolve(gl, frame);
+  }
+
+  #sortMesh(all, pinhole, still) {
+    const row = pinhole.rows[2];
+    if (still || all.fans.length - 1 === all.order.length) {
+      depthsOf(all.centers, row, pinhole.near, all.depths);
+      sortFarToNear(all.depths, all.items, all.order);
+      all.count = all.items.length;
+      return;
+    }
+    depthsOf(all.middles, row, pinhole.near, all.fanDepths);
+    sortFarToNear(all.fanDepths, all.fanItems, all.fanOrder);
+    let at = 0;
+    for (let i = 0; i < all.fanItems.length; i++) {
+      const fan = all.fanOrder[i];
+      for (let f = all.fans[fan]; f < all.fans[fan + 1]; f++) all.order[at++] = f;
+    }
+    all.count = at;
+  }
+
+  #drawSplats(pinhole, scale) {
+    const { gl } = this, all = this.#needSplats();
+    depthsOf(this.splats.means, pinhole.rows[2], pinhole.near, all.depths);
+    sortFarToNear(all.depths, all.items, all.order);
+    const frame = this.#frame(pinhole.width, pinhole.height, 0, false);
+    const list = all.order.subarray(0, all.items.length);
+    this.#begin(frame, this.programs.splats, pinhole, all, list);
+    gl.uniform1f(this.programs.splats.at("dilation"), 0.3 * scale * scale);
+    gl.uniform1i(this.programs.splats.at("antialiased"), Number(this.splats.kernel === "antialiased"));
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, list.length);
+    gl.bindVertexArray(null);
+    return resolve(gl, frame);
+  }
+
+  #begin(frame, { id, at }, pinhole, { textures, array, buffer }, list) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame.target);
+    gl.viewport(0, 0, frame.width, frame.height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.depthMask(true);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.disable(gl.DEPTH_TEST);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.useProgram(id);
+    bindTextures(gl, { at }, textures);
+    pinhole.rows.forEach((row, k) => gl.uniform4fv(at("row" + k), row));
+    gl.uniform4f(at("lens"), pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy);
+    gl.uniform3f(at("size"), pinhole.width, pinhole.height, pinhole.near);
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, list, gl.STREAM_DRAW);
+  }
+
+  // A frame buffer of that size, kept until another size is asked for.
+  #frame(width, height, samples, depth) {
+    const { gl } = this, format = this.float ? gl.RGBA16F : gl.RGBA8, key = `${samples} ${depth}`;
+    const old = this.frames.get(key);
+    if (old && old.width === width && old.height === height) return old;
+    if (old) for (const free of old.free) free();
+    const frame = { width, height, free: [] };
+    frame.image = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, frame.image);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    for (const axis of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, axis, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
+    frame.plain = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame.plain);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, frame.image, 0);
+    frame.target = frame.plain;
+    frame.free.push(() => gl.deleteTexture(frame.image), () => gl.deleteFramebuffer(frame.plain));
+    const most = gl.getInternalformatParameter(gl.RENDERBUFFER, format, gl.SAMPLES)[0] ?? 0;
+    if (samples && most) {
+      frame.target = gl.createFramebuffer();
+      gl.bindFramebuffer(gl.FRAMEBUFFER, frame.target);
+      frame.free.push(() => gl.deleteFramebuffer(frame.target));
+      attach(gl, frame, gl.COLOR_ATTACHMENT0, format, Math.min(samples, most));
+      if (depth) attach(gl, frame, gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24, Math.min(samples, most));
+    } else if (depth) {
+      attach(gl, frame, gl.DEPTH_ATTACHMENT, gl.DEPTH_COMPONENT24, 0);
+    }
+    this.frames.set(key, frame);
+    return frame;
+  }
+}
+
+function attach(gl, frame, place, format, samples) {
+  const buffer = gl.createRenderbuffer();
+  gl.bindRenderbuffer(gl.RENDERBUFFER, buffer);
+  gl.renderbufferStorageMultisample(gl.RENDERBUFFER, samples, format, frame.width, frame.height);
+  gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, buffer);
+  frame.free.push(() => gl.deleteRenderbuffer(buffer));
+}
+
+function resolve(gl, frame) {
+  if (frame.target !== frame.plain) {
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame.target);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, frame.plain);
+    gl.blitFramebuffer(0, 0, frame.width, frame.height, 0, 0, frame.width, frame.height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+  }
+  return frame.image;
+}
+
+function program(gl, vertex, fragment) {
+  const id = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    gl.attachShader(id, shader);
+  }
+  gl.linkProgram(id);
+  if (!gl.getProgramParameter(id, gl.LINK_STATUS)) {
+    const logs = gl.getAttachedShaders(id).map(shader => gl.getShaderInfoLog(shader));
+    throw new Error(`a shader does not compile: ${[...logs, gl.getProgramInfoLog(id)].join(" ")}`);
+  }
+  const places = new Map();
+  const at = name => {
+    if (!places.has(name)) places.set(name, gl.getUniformLocation(id, name));
+    return places.get(name);
+  };
+  return { id, at };
+}
+
+// One index an instance, far ones first.
+function vertexArray(gl, { id }) {
+  const array = gl.createVertexArray(), buffer = gl.createBuffer(), at = gl.getAttribLocation(id, "item");
+  gl.bindVertexArray(array);
+  gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+  gl.enableVertexAttribArray(at);
+  gl.vertexAttribIPointer(at, 1, gl.UNSIGNED_INT, 0, 0);
+  gl.vertexAttribDivisor(at, 1);
+  gl.bindVertexArray(null);
+  return { array, buffer };
+}
+
+function texture(gl, format, layout, type, values) {
+  const texels = values.length / 4, rows = Math.max(1, Math.ceil(texels / WIDTH));
+  if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("the scene is too large for WebGL2 here");
+  const padded = new values.constructor(4 * WIDTH * rows);
+  padded.set(values);
+  const id = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, id);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, format, WIDTH, rows);
+  gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, rows, layout, type, padded);
+  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, filter, gl.NEAREST);
+  return id;
+}
+
+function bindTextures(gl, { at }, textures) {
+  Object.entries(textures).forEach(([name, id], unit) => {
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, id);
+    gl.uniform1i(at(name), unit);
+  });
+}

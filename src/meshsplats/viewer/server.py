@@ -1,0 +1,79 @@
+"""A server for one page, on this machine only."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+HOST = "127.0.0.1"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: PageServer
+    protocol_version = "HTTP/1.1"
+    server_version = "meshsplats"
+    sys_version = ""
+    timeout = 60
+
+    def do_GET(self) -> None:
+        self._answer(body=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(body=False)
+
+    def _answer(self, *, body: bool) -> None:
+        # A page elsewhere whose name was made to lead here asks with its own name.
+        host = self.headers.get("Host", "")
+        known = host in (f"{HOST}:{self.server.server_port}", f"localhost:{self.server.server_port}")
+        if not known or not hmac.compare_digest(self.path.encode(), self.server.path.encode()):
+            self.send_error(404)
+            return
+        self.send_response(200)
+        for name, value in {
+            "Content-Type": "text/html; charset=utf-8",
+            "Content-Length": str(len(self.server.page)),
+            "Cache-Control": "no-store",
+            "Content-Security-Policy": "frame-ancestors 'none'",
+            "Cross-Origin-Opener-Policy": "same-origin",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "Referrer-Policy": "no-referrer",
+            "X-Content-Type-Options": "nosniff",
+        }.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if body:
+            self.wfile.write(self.server.page)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Requests are not news."""
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves ``page`` on a free port of this machine, at a path that cannot be guessed, and nothing else."""
+
+    daemon_threads = True
+
+    def __init__(self, page: str) -> None:
+        self.page = page.encode("utf-8")
+        self.path = f"/{secrets.token_urlsafe(24)}/"
+        super().__init__((HOST, 0), _Handler)
+
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self.server_port}{self.path}"
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Browsers break off connections; that is no error of ours."""
+
+
+@contextmanager
+def serving(page: str) -> Iterator[PageServer]:
+    """A server that has its port; ``serve_forever`` answers until it is interrupted."""
+    server = PageServer(page)
+    try:
+        yield server
+    finally:
+        server.server_close()
