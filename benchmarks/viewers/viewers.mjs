@@ -60,9 +60,10 @@ window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
   scene.background = new THREE.Color(1, 1, 1);
   scene.add(gltf.scene);
   scene.updateMatrixWorld(true);
-  let mesh;
-  gltf.scene.traverse(o => { if (o.isMesh) mesh = o; });
-  mesh.frustumCulled = false;
+  const meshes = [];
+  gltf.scene.traverse(o => { if (o.isMesh) meshes.push(o); });
+  for (const m of meshes) m.frustumCulled = false;
+  const mesh = meshes[0];
   if (hash) Object.assign(mesh.material, { alphaHash: true, transparent: false, depthWrite: true, needsUpdate: true });
   if (sorted) mesh.material.forceSinglePass = true;  // else back faces are drawn before front faces
   const order = mesh.geometry.index.array.slice();
@@ -92,16 +93,17 @@ const BABYLON_PAGE = `<!doctype html><link rel="icon" href="data:,"><canvas id="
 <script>
 ${MATRICES}
 const canvas = document.getElementById('c');
-window.draw = async (url, cameras, near, far) => {
+window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
   canvas.width = cameras[0].width; canvas.height = cameras[0].height;
-  const engine = new BABYLON.Engine(canvas, false, { preserveDrawingBuffer: true, useHighPrecisionMatrix: true });
+  const engine = new BABYLON.Engine(canvas, antialias, { preserveDrawingBuffer: true, useHighPrecisionMatrix: true });
   const scene = new BABYLON.Scene(engine);
   scene.useRightHandedSystem = true;
   scene.clearColor = new BABYLON.Color4(1, 1, 1, 1);
   const camera = new BABYLON.FreeCamera('camera', BABYLON.Vector3.Zero(), scene);
   await BABYLON.SceneLoader.AppendAsync('', url, scene, undefined, '.glb');
-  const mesh = scene.meshes.find(m => m.getTotalVertices() > 0);
-  mesh.alwaysSelectAsActiveMesh = true;
+  const meshes = scene.meshes.filter(m => m.getTotalVertices() > 0);
+  for (const m of meshes) m.alwaysSelectAsActiveMesh = true;
+  const mesh = meshes[0];
   await scene.whenReadyAsync();
   const back = mesh.computeWorldMatrix(true).clone().invert();
   const images = [];

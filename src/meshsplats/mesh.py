@@ -216,6 +216,11 @@ def splat_starts(face_splat: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))
 
 
+def solid_faces(mesh: SplatMesh) -> np.ndarray:
+    """(f,) bool: the triangles with three opaque corners, which a depth buffer draws exactly."""
+    return (mesh.colors[mesh.faces, 3] == 1).all(axis=1)
+
+
 def checked_cutoff(cutoff: float) -> float:
     """``cutoff`` as the least opacity that is drawn as opaque. Raises ValueError unless it lies in [0, 1]."""
     if not 0 <= cutoff <= 1:

@@ -20,7 +20,8 @@ from meshsplats.cli import main, toml
 from meshsplats.conversion import convert, simplify
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
-from meshsplats.formats.meshes import load_mesh
+from meshsplats.formats.meshes import load_mesh, save_mesh
+from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.rendering.looks import draw_splats
 from meshsplats.rendering.samples import needed_samples
@@ -292,7 +293,25 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
-    assert "--alpha mask and --compression are for .glb" in capsys.readouterr().err
+    assert "--alpha mask or hybrid, and --compression are for .glb" in capsys.readouterr().err
+
+
+def test_hybrid_is_for_meshes_with_solid_triangles(splats, tmp_path, capsys):
+    source, out = tmp_path / "m.npz", tmp_path / "m.glb"
+    colors = [(1, 0, 0, 1)] * 3 + [(0, 1, 0, 0.5)]
+    mesh = SplatMesh([(0, 0, 1), (1, 0, 1), (0, 1, 1), (1, 1, 1)], [(0, 1, 2), (1, 3, 2)], colors)
+    save_mesh(mesh, source)
+    assert run(source, "-o", out, "--alpha", "hybrid", "--no-preview") == 0
+    data = out.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert [m["alphaMode"] for m in document["materials"]] == ["OPAQUE", "BLEND"]
+    capsys.readouterr()
+    assert run(splats, "-o", tmp_path / "b.glb", "--alpha", "hybrid") == 2
+    assert "holds splats" in capsys.readouterr().err
+    assert run(source, "-o", tmp_path / "b.npz", "--alpha", "hybrid") == 2
+    assert "are for .glb" in capsys.readouterr().err
+    assert run(source, "-o", tmp_path / "b.glb", "--alpha", "hybrid", "--cutoff", "0.3") == 2
+    assert not (tmp_path / "b.glb").exists()
 
 
 def test_opaque_triangles_in_every_format(splats, tmp_path, capsys):

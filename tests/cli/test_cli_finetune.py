@@ -365,6 +365,12 @@ def test_every_option_of_the_configuration_can_be_given():
     assert TargetOptions().cache_bytes == 2_000_000_000
 
 
+def alpha_modes(path) -> list[str]:
+    data = path.read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    return [material["alphaMode"] for material in document["materials"]]
+
+
 def test_a_mesh_for_engines(splats, tmp_path, capsys):
     out = tmp_path / "tuned.glb"
     options = (*SMALL, "--steps", "8", "--opacity", "cutoff", "--cutoff", "0.3", "--json")
@@ -373,8 +379,16 @@ def test_a_mesh_for_engines(splats, tmp_path, capsys):
     mesh = load_mesh(out)
     assert (mesh.colors[:, 3] == 1).all()
     assert result["triangles"] == len(mesh.faces)
-    data = out.read_bytes()
-    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    assert document["materials"][0]["alphaMode"] == "OPAQUE"
+    assert alpha_modes(out) == ["OPAQUE"]
     assert run(splats, "-o", tmp_path / "b.npz", *SMALL, "--cutoff", "0.3") != 0
     assert "cutoff has no effect without opacity 'cutoff'" in capsys.readouterr().err
+
+
+def test_a_hybrid_mesh_for_engines(splats, tmp_path):
+    options = (*SMALL, "--steps", "8", "--opacity", "cutoff", "--soft-share", "0.3", "--json")
+    for suffix in ("glb", "npz"):
+        assert run(splats, "-o", tmp_path / f"tuned.{suffix}", *options) == 0
+    assert alpha_modes(tmp_path / "tuned.glb") == ["OPAQUE", "BLEND"]
+    one, two = (load_mesh(tmp_path / f"tuned.{suffix}") for suffix in ("glb", "npz"))
+    assert len(one.faces) == len(two.faces)
+    assert len(np.unique(one.colors[:, 3])) > 2

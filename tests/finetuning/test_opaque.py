@@ -7,17 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _rendering import camera, layers
+from _zbuffer import hybrid_image
 
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
+from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import evaluate
-from meshsplats.finetuning import Interrupted, Progress, RunOptions, finetune, make_config
+from meshsplats.finetuning import Interrupted, Progress, RunOptions, finetune, make_config, starting_mesh
+from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction, softness, with_soft_splats
 from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of, visible_faces
 from meshsplats.finetuning.state import Gradients, State
+from meshsplats.finetuning.step import make_step
 from meshsplats.formats.cutting import cut_mesh
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, solid_faces
+from meshsplats.rendering import render
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +54,13 @@ def test_the_reported_score_is_that_of_the_cut_mesh(scene):
     assert seen[-1].held_out == pytest.approx(score(tuned, dataset), abs=0.02)
 
 
-def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, monkeypatch):
+@pytest.mark.parametrize("soft_share", [0.0, 0.3])
+def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path, soft_share):
     dataset, mesh = scene
-    config = make_config(steps=20, opacity="cutoff", settle_share=0.5)
+    config = make_config(steps=20, opacity="cutoff", settle_share=0.5, soft_share=soft_share)
     whole = finetune(mesh, dataset, config)
-    for stop in (6, 13):  # before hidden triangles go, and after
+    assert is_blended(whole).any() == (soft_share > 0)
+    for stop in (6, 13, 17):  # before hidden triangles go, and after; with blended triangles
 
         def halt(progress: Progress, stop: int = stop) -> None:
             if progress.step == stop:
@@ -121,6 +128,7 @@ def test_a_vertex_with_a_gradient_of_its_colour_alone_moves(scene):
         ({"blending": "linear"}, "opaque triangles are not blended"),
         ({"l2_weight": 0.0}, "expected_share is a share of l2_weight"),
         ({"cutoff": 1.5}, "cutoff"),
+        ({"soft_phase": 0.5}, "soft_phase has no effect without soft_share"),
     ],
 )
 def test_options_that_need_blending_are_refused(changes, message):
@@ -131,6 +139,8 @@ def test_options_that_need_blending_are_refused(changes, message):
 def test_options_without_effect_are_refused():
     with pytest.raises(ValueError, match="settle_share has no effect without opacity 'cutoff'"):
         make_config(settle_share=0.3)
+    with pytest.raises(ValueError, match="soft_share has no effect without opacity 'cutoff'"):
+        make_config(soft_share=0.1)
 
 
 @pytest.mark.parametrize(
@@ -141,3 +151,113 @@ def test_meshes_that_cannot_become_opaque_are_refused(scene, changes, message):
     dataset, mesh = scene
     with pytest.raises(ValueError, match=message):
         finetune(replace(mesh, **changes), dataset, steps=1, opacity="cutoff")
+
+
+def test_blended_triangles_need_splats(scene):
+    dataset, mesh = scene
+    with pytest.raises(ValueError, match="does not know its own"):
+        finetune(replace(mesh, face_splat=None), dataset, steps=1, opacity="cutoff", soft_share=0.1)
+
+
+# Blended triangles beside the opaque ones
+
+
+@pytest.fixture(scope="module")
+def foggy():
+    """A solid still life behind faint, large splats."""
+    cloud = make_scene(300)
+    rng = np.random.default_rng(0)
+    center, size = cloud.means.mean(axis=0), cloud.means.std(axis=0)
+    n = 15
+    fog = replace(
+        cloud.select(np.zeros(n, int)),
+        means=(center + 2 * size * rng.normal(size=(n, 3))).astype(np.float32),
+        scales=np.full((n, 3), 0.6 * size.mean(), np.float32),
+        opacities=np.full(n, 0.3, np.float32),
+    )
+    names = ("means", "quaternions", "scales", "opacities", "sh")
+    both = replace(cloud, **{k: np.concatenate([getattr(cloud, k), getattr(fog, k)]) for k in names})
+    dataset = splat_dataset(both, train=32, test=4, width=48, sh_degree=0)
+    return dataset, starting_mesh(both, [view.camera for view in dataset.train]), len(cloud.means)
+
+
+def is_blended(mesh: SplatMesh) -> np.ndarray:
+    return ~solid_faces(mesh)
+
+
+def test_fog_stays_blended(foggy):
+    dataset, mesh, solid_splats = foggy
+    config = make_config(steps=96, opacity="cutoff")
+    opaque = finetune(mesh, dataset, config)
+    hybrid = finetune(mesh, dataset, replace(config, soft_share=0.2))
+    blended = is_blended(hybrid)
+    assert 0 < blended.sum() <= 0.2 * len(mesh.faces)
+    assert (hybrid.face_splat[blended] >= solid_splats).mean() > 0.5
+    assert score(hybrid, dataset) > score(opaque, dataset) + 1
+
+
+def test_a_viewer_that_does_not_sort_draws_a_hybrid_mesh(foggy):
+    dataset, mesh, _ = foggy
+    hybrid = finetune(mesh, dataset, steps=48, opacity="cutoff", soft_share=0.2)
+    blended = is_blended(hybrid)
+    solid, soft = hybrid.keep_faces(~blended), hybrid.keep_faces(blended)
+    view = dataset.test[0]
+    exact = render(hybrid, view.camera, background=view.background, samples=2).color
+    drawn = hybrid_image(solid, soft, view.camera, background=view.background, samples=2)
+    assert psnr(drawn.astype(np.float32), exact) > 35
+
+
+def test_opaque_triangles_of_a_hybrid_mesh_keep_their_edges(foggy):
+    dataset, mesh, _ = foggy
+    config = make_config(steps=8, opacity="cutoff", soft_share=0.2)
+    start = with_soft_splats(cut_mesh(mesh), mesh, dataset.train, 0.2)
+    state = State.begin_hybrid(start, config, 1)
+    solid = np.isin(np.arange(len(start.vertices)), start.faces[solid_faces(start)])
+    for step in range(6, 8):
+        make_step(state, dataset.train, step, step / 8)
+    end = state.result()
+    assert np.array_equal(end.vertices[solid], start.vertices[solid])
+    assert (end.colors[solid, 3] == 1).all()
+    assert (end.colors[solid, :3] != start.colors[solid, :3]).any()
+    assert (end.vertices[~solid] != start.vertices[~solid]).any()
+    assert (end.colors[~solid, 3] <= np.float32(254 / 255)).all()
+    assert np.array_equal(solid_faces(end), solid_faces(start))
+
+
+def square(x: float, depth: float, opacity: float) -> SplatMesh:
+    """Red, of side 1."""
+    corners = [(x + dx, dy, depth) for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+    return SplatMesh(corners, [(0, 1, 2), (0, 2, 3)], [(1, 0, 0, opacity)] * 4)
+
+
+def test_the_phases_of_a_run():
+    config = make_config(opacity="cutoff", soft_share=0.1, soft_phase=0.25)
+    assert [opaque_fraction(config, f) for f in (0, 0.375, 0.75, 0.9)] == pytest.approx([0, 0.5, 1, 1])
+    assert [soft_fraction(config, f) for f in (0.75, 0.875, 1)] == pytest.approx([0, 0.5, 1])
+    assert soft_fraction(config, 0.74) < 0
+    for other in (make_config(), make_config(opacity="cutoff")):
+        assert opaque_fraction(other, 0.9) == 0.9
+        assert soft_fraction(other, 1.0) < 0
+
+
+def test_only_fans_that_beat_opaque_triangles_stay_blended():
+    """Two splats side by side, the left one opaque in truth, the right one half transparent."""
+    view = camera(16, 8)
+    fans = [square(x, 3, opacity) for x, opacity in ((-1, 1.0), (1, 0.5))]
+    start = SplatMesh(
+        np.concatenate([f.vertices for f in fans]),
+        np.concatenate([fans[0].faces, fans[1].faces + len(fans[0].vertices)]),
+        np.concatenate([f.colors for f in fans]),
+        face_splat=np.repeat([0, 1], [len(f.faces) for f in fans]),
+    )
+    target = render(start, view, background=(1, 1, 1))
+    views = [View(view, ViewImage(target.color))]
+    core = cut_mesh(start)
+    scores = softness(core, start, views)
+    assert scores[0] == pytest.approx(0, abs=1e-6)
+    # Each sample loses (1 - 0.5)^2 in each of the channels that differ from white, and T a (1 - a) is 1/4.
+    right = (target.color[:, 8:] < 0.99).any(axis=2).sum()
+    assert scores[1] == pytest.approx(right * 0.25 * 2 * 0.25, rel=0.05)
+    hybrid = with_soft_splats(core, start, views, 0.5)
+    assert hybrid.face_splat[is_blended(hybrid)].tolist() == [1] * len(fans[1].faces)
+    assert not is_blended(with_soft_splats(core, start, views, 0.4)).any()

@@ -24,6 +24,9 @@ SQUARE = SplatMesh(
     face_splat=[4, 7],
 )
 
+HALF_SOLID = replace(SQUARE, colors=[[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [1, 1, 1, 0.25]])
+"""The first triangle is solid."""
+
 
 def chunks(path):
     """JSON and binary part of a .glb file, by the letter of the specification."""
@@ -117,11 +120,52 @@ def test_true_opacities_come_back_from_masked_files(tmp_path):
     assert_same(load_mesh(tmp_path / "m.glb"), mesh, 1e-4)
 
 
+def test_a_hybrid_glb_has_an_opaque_and_a_blended_primitive(tmp_path):
+    # Two blended triangles that the heights of their corners put in the other order, a solid one between.
+    points = [[0, 0, 2], [1, 0, 2], [1, 1, 2], [0, 1, 2], [0, 2, 2]]
+    colors = [[0, 0, 0, 1], [1, 0, 0, 1], [0, 1, 0, 1], [1, 1, 1, 0.25], [0, 0, 1, 0.5]]
+    faces = np.array([[2, 3, 4], [0, 1, 2], [0, 2, 3]])
+    mesh = SplatMesh(points, faces, colors, up=(0, 1, 0), face_splat=[1, 2, 3])
+    save_mesh(mesh, tmp_path / "m.glb", alpha="hybrid")
+    document, binary = chunks(tmp_path / "m.glb")
+    assert [m["alphaMode"] for m in document["materials"]] == ["OPAQUE", "BLEND"]
+    assert [p["material"] for p in document["meshes"][0]["primitives"]] == [0, 1]
+    corners, opacities = [], []
+    for primitive in document["meshes"][0]["primitives"]:
+        vertices = values(document, binary, primitive["attributes"]["POSITION"])
+        rgba = values(document, binary, primitive["attributes"]["COLOR_0"])
+        rows = [i for (i,) in values(document, binary, primitive["indices"])]
+        assert sorted(set(rows)) == list(range(len(vertices)))  # none that it does not use
+        corners.append([vertices[i][:2] for i in rows])
+        opacities.append([rgba[i][3] for i in rows])
+    assert corners == [[(0, 0), (1, 0), (1, 1)], [(0, 0), (1, 1), (0, 1), (1, 1), (0, 1), (0, 2)]]
+    assert opacities == [3 * [65535], [65535, 65535, 16384, 65535, 16384, 32768]]
+    again, order = load_mesh(tmp_path / "m.glb"), faces[[1, 2, 0]]
+    assert np.array_equal(again.up, mesh.up)
+    assert np.array_equal(again.vertices[again.faces], mesh.vertices[order])
+    assert np.allclose(again.colors[again.faces], mesh.colors[order], atol=1e-4)
+    save_mesh(replace(mesh, up=(0, -1, 0)), tmp_path / "m.glb", alpha="hybrid")
+    again, order = load_mesh(tmp_path / "m.glb"), faces[[1, 0, 2]]
+    assert np.array_equal(again.up, (0, -1, 0))
+    assert np.array_equal(again.vertices[again.faces], mesh.vertices[order])
+
+
+@pytest.mark.parametrize(("opacity", "mode"), [(1, "OPAQUE"), (0.5, "BLEND")])
+def test_a_hybrid_glb_has_no_empty_primitive(tmp_path, opacity, mode):
+    mesh = replace(SQUARE, colors=[(0.5, 0.5, 0.5, opacity)] * 4)
+    save_mesh(mesh, tmp_path / "m.glb", alpha="hybrid")
+    document, _ = chunks(tmp_path / "m.glb")
+    assert [m["alphaMode"] for m in document["materials"]] == [mode]
+    assert len(document["meshes"][0]["primitives"]) == 1
+
+
 def test_what_alpha_refuses(tmp_path):
-    with pytest.raises(ValueError, match="alpha must be one of blend, mask, opaque, got 'add'"):
+    with pytest.raises(ValueError, match="alpha must be one of blend, mask, opaque, hybrid, got 'add'"):
         save_mesh(SQUARE, tmp_path / "m.glb", alpha="add")
     with pytest.raises(ValueError, match=r"alpha applies to \.glb only"):
         save_mesh(SQUARE, tmp_path / "m.ply", alpha="mask")
+    with pytest.raises(ValueError, match=r"alpha applies to \.glb only"):
+        save_mesh(SQUARE, tmp_path / "m.ply", alpha="hybrid")
 
 
 def test_a_glb_with_many_vertices_has_32_bit_indices(tmp_path):
@@ -278,9 +322,9 @@ def test_the_khronos_validator_is_content(tmp_path):
             for color_type in ("uint16", "float32"):
                 files.append(tmp_path / f"{extras}-{lit}-{color_type}.glb")
                 save_mesh(mesh, files[-1], lit=lit, color_type=color_type)
-    for alpha in ("blend", "mask", "opaque"):
+    for alpha in ("blend", "mask", "opaque", "hybrid"):
         files.append(tmp_path / f"{alpha}.glb")
-        save_mesh(SQUARE, files[-1], alpha=alpha)
+        save_mesh(HALF_SOLID if alpha == "hybrid" else SQUARE, files[-1], alpha=alpha)
     for file, issues in zip(files, validator_reports(tmp_path, files), strict=True):
         assert issues["numErrors"] == issues["numWarnings"] == 0, (file, issues["messages"])
         # Arrays that only our extras refer to are reported as possibly unused, by the way.

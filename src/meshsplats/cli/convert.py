@@ -65,6 +65,8 @@ _FOR_SPLATS = (
     *("conversion", "reading", "json", "force"),
 )
 """Options of the command that have one."""
+_GLB_ALPHA = ("mask", "hybrid")
+"""Values of --alpha that only .glb files have."""
 
 
 if TYPE_CHECKING:
@@ -119,10 +121,10 @@ class Convert(Command):
     """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
     color_type: Literal["uint16", "float32"] = "uint16"
     """.glb: storage of colours."""
-    alpha: Literal["blend", "mask", "opaque"] = "blend"
+    alpha: Literal["blend", "mask", "opaque", "hybrid"] = "blend"
     """blend: true opacities. For viewers and engines that neither sort nor blend well: opaque: solid
     triangles, cut where the opacity is --cutoff; mask (.glb): the viewer draws as solid what has at least
-    that."""
+    that; hybrid (.glb), for a mesh of finetune --soft-share: solid and blended triangles apart."""
     cutoff: Number = None
     """--alpha opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
     compression: Literal["none", "meshopt"] = "none"
@@ -191,11 +193,11 @@ class Convert(Command):
         glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
         if self.lit and not (glb or usd):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
-        only_glb = self.color_type != "uint16" or self.alpha == "mask" or self.compression != "none"
+        only_glb = self.color_type != "uint16" or self.alpha in _GLB_ALPHA or self.compression != "none"
         if not glb and only_glb:
-            raise UsageError("--color-type, --alpha mask and --compression are for .glb files")
+            raise UsageError("--color-type, --alpha mask or hybrid, and --compression are for .glb files")
         if self.cutoff is not None:
-            if self.alpha == "blend":
+            if self.alpha in ("blend", "hybrid"):
                 raise UsageError("--cutoff is for --alpha opaque or mask")
             checked_cutoff(self.cutoff)
         if self.data is not None and self.cameras is not None:
@@ -278,6 +280,11 @@ class Convert(Command):
 
     def _save_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """The splats of ``job`` as a mesh."""
+        if self.alpha == "hybrid":
+            raise UsageError(
+                f"{job.shown} holds splats: --alpha hybrid is for a mesh with solid triangles, as finetune"
+                " --opacity cutoff --soft-share makes"
+            )
         times = [time.perf_counter()]
         cloud = self.reading.load(job.source)
         if cameras is None:
@@ -308,7 +315,7 @@ class Convert(Command):
         suffix = path.suffix.lower()
         if suffix != ".glb":
             alone = replace(alone, color_type="uint16", compression="none")
-            if self.alpha == "mask":
+            if self.alpha in _GLB_ALPHA:
                 alone = replace(alone, alpha="blend", cutoff=None)
         return alone if suffix == ".glb" or suffix.startswith(".usd") else replace(alone, lit=False)
 
@@ -335,7 +342,7 @@ class Convert(Command):
                 path,
                 lit=True if self.lit and (glb or path.suffix.lower().startswith(".usd")) else None,
                 color_type=self.color_type if glb and self.color_type != "uint16" else None,
-                alpha="mask" if glb and self.alpha == "mask" else None,  # 'opaque' is cut already
+                alpha=self.alpha if glb and self.alpha in _GLB_ALPHA else None,  # 'opaque' is cut already
                 cutoff=self.cutoff if glb and self.alpha == "mask" else None,
                 compression=self.compression if glb and self.compression != "none" else None,
             )

@@ -104,7 +104,9 @@ class Finetune(TrainingCommand):
         def optimise(run: RunOptions, show: ShowProgress) -> Trained:
             tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
             count = len(tuned.faces)
-            return Trained(tuned, tuned, {"triangles": count}, f"{count:,} triangles")
+            glb = self.output.suffix.lower() == ".glb"
+            alpha: Literal["hybrid"] | None = "hybrid" if config.soft_share and glb else None
+            return Trained(tuned, tuned, {"triangles": count}, f"{count:,} triangles", alpha)
 
         return Plan(mesh, dataset, summary, background, optimise)
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import tyro
 
@@ -156,6 +156,8 @@ class Trained:
     """Sizes, for JSON."""
     summary: str
     """Sizes, in words."""
+    alpha: Literal["hybrid"] | None = None
+    """As in ``save_mesh``."""
 
 
 @dataclass(frozen=True)
@@ -250,7 +252,7 @@ class TrainingCommand(Command):
             return report_interrupt(stop, files)
         except OtherRunError as error:
             raise self._naming_options(error, files) from None
-        save_mesh(trained.saved, files.mesh)
+        save_mesh(trained.saved, files.mesh, alpha=trained.alpha)
         result = None if plan.background is None else plan.background.to_dict()
         write_configuration(files.config, self._name, self, result)
         self.save_more(files, plan)

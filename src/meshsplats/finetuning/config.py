@@ -113,6 +113,12 @@ class FinetuneConfig:
     hidden_hits: int = 1
     """opacity 'cutoff': triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
     a pixel, are removed. 0: none."""
+    soft_share: float = 0.0
+    """opacity 'cutoff': faint splats that opaque triangles cannot replace stay blended, with up to this
+    fraction of the number of triangles at the start. 0: none."""
+    soft_phase: float = 0.3
+    """With soft_share: last fraction of the run, in which the blended triangles are optimised together with
+    the cut ones. The shares above are then fractions of the phase before."""
     point_share: float = 0.4
     """For rendered images that are means over each pixel's area: for this initial fraction of the run, train
     on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
@@ -148,6 +154,8 @@ class FinetuneConfig:
             raise ValueError("blending 'linear' is for opacity 'blended': opaque triangles are not blended")
         if self.expected_share and not self.l2_weight:
             raise ValueError("expected_share is a share of l2_weight, which is 0: set l2_weight, or it to 0")
+        if not self.soft_share and self.soft_phase != FinetuneConfig.soft_phase:
+            raise ValueError("soft_phase has no effect without soft_share")
 
     def total_steps(self, views: int) -> int | None:
         """Number of steps with this number of training views; None if the length is given in minutes."""
@@ -168,7 +176,15 @@ class FinetuneConfig:
         return asdict(self)
 
 
-_OF_CUTOFF = ("cutoff", "anneal_share", "expected_share", "settle_share", "hidden_hits")
+_OF_CUTOFF = (
+    "cutoff",
+    "anneal_share",
+    "expected_share",
+    "settle_share",
+    "hidden_hits",
+    "soft_share",
+    "soft_phase",
+)
 """Options of opacity 'cutoff'."""
 
 _CHOICES = {
@@ -204,6 +220,8 @@ _RANGES: list[Range] = [
     ("expected_share", 0, 1, False),
     ("settle_share", 0, 1, False),
     ("hidden_hits", 0, 10**9, True),
+    ("soft_share", 0, 1, False),
+    ("soft_phase", 0.01, 0.99, False),
     ("point_share", 0, 1, False),
     ("seed", 0, 2**63 - 1, True),
 ]
@@ -276,6 +294,8 @@ class FinetuneChanges(TypedDict, total=False):
     expected_share: float
     settle_share: float
     hidden_hits: int
+    soft_share: float
+    soft_phase: float
     point_share: float
     seed: int
 
@@ -313,7 +333,7 @@ def worthwhile_views(config: FinetuneConfig) -> int:
     return round(min(max(wanted, FEWEST_VIEWS), MOST_VIEWS))
 
 
-def learning_rates(config: FinetuneConfig, step: int, fraction: float) -> tuple[float, float]:
+def learning_rates(config: FinetuneConfig, step: float, fraction: float) -> tuple[float, float]:
     """Learning rates of colours and of positions in step ``step`` (from 0).
 
     ``fraction`` (0 to 1) of the run is over. The total number of steps is estimated as ``step / fraction``,

@@ -22,6 +22,7 @@ from meshsplats.finetuning.checkpoint import (
     mesh_fingerprint,
 )
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
+from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction, with_soft_splats
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
@@ -119,8 +120,8 @@ def finetune(
 
     The targets are photographs (``load_dataset``) or images of the splats themselves (``splat_dataset``). The
     result has the triangles of ``mesh`` except those that were pruned; with ``opacity='cutoff'`` they are
-    opaque and cut where their opacity crosses the cutoff. It has no normals, since those of ``mesh`` would
-    not fit it.
+    opaque and cut where their opacity crosses the cutoff, apart from those that ``soft_share`` keeps blended.
+    It has no normals, since those of ``mesh`` would not fit it.
 
     Args:
         config: the configuration; the preset 'default' by default.
@@ -157,6 +158,8 @@ class RunStart:
     state: State
     fingerprints: tuple[str, str]
     """Those of the mesh and the data set; empty for a run without checkpoints."""
+    mesh: SplatMesh
+    """The mesh before the first step."""
     step: int = 0
     """Number of steps already taken."""
     seconds: float = 0.0
@@ -171,12 +174,12 @@ def _run_start(
     """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
     if journal is None:
-        return RunStart(State.begin(mesh, views, config, options.threads), ("", ""))
+        return RunStart(State.begin(mesh, views, config, options.threads), ("", ""), mesh)
     fingerprints = mesh_fingerprint(mesh), dataset_fingerprint(dataset)
     if not options.resume:
         state = State.begin(mesh, views, config, options.threads)
         journal.begin(config.to_dict())
-        return RunStart(state, fingerprints)
+        return RunStart(state, fingerprints, mesh)
     total = config.total_steps(views)
 
     def check(found: Checkpoint) -> None:
@@ -187,7 +190,7 @@ def _run_start(
     found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
     state = State.resume(found.arrays, blending, views, config, options.threads)
-    return RunStart(state, fingerprints, found.step, found.seconds, found.losses)
+    return RunStart(state, fingerprints, mesh, found.step, found.seconds, found.losses)
 
 
 class TrainingLoop:
@@ -216,8 +219,9 @@ class TrainingLoop:
         self.report_cost = self.save_cost = self.step_cost = 0.0
         self.scored_views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
         self.quarter = int(MIN_PREVIEWS * self.fraction)
+        self.source = start.mesh if config.soft_share else None
         # A resumed run may have removed hidden triangles before its checkpoint.
-        self.settled = start.step > 0 and self.fraction >= 1 - config.settle_share
+        self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - config.settle_share
 
     @property
     def seconds(self) -> float:
@@ -263,6 +267,8 @@ class TrainingLoop:
                     self.last_loss = loss
                 if self._settles():
                     self._remove_hidden()
+                if self._becomes_hybrid():
+                    self._cut()
                 if prune_interval and self.step % prune_interval == 0 and not self._done():
                     self.state = self.state.prune(kept_faces(self.state, views))
                 due = relocate_interval and self.step % relocate_interval == 0
@@ -287,11 +293,13 @@ class TrainingLoop:
     def result(self) -> SplatMesh:
         """The current mesh, cut if it is made for a cutoff."""
         mesh = self.state.result()
-        return cut_mesh(mesh, self.config.cutoff) if self.config.opacity == "cutoff" else mesh
+        uncut = self.config.opacity == "cutoff" and self.state.solid is None
+        return cut_mesh(mesh, self.config.cutoff) if uncut else mesh
 
     def _settles(self) -> bool:
         """Whether it is time to remove the triangles that no training view shows: once."""
-        due = self.config.opacity == "cutoff" and self.fraction >= 1 - self.config.settle_share
+        fraction = opaque_fraction(self.config, self.fraction)
+        due = self.config.opacity == "cutoff" and fraction >= 1 - self.config.settle_share
         now, self.settled = due and not self.settled, self.settled or due
         return now and self.config.hidden_hits > 0 and not self._done()
 
@@ -305,6 +313,20 @@ class TrainingLoop:
         )
         if keep.any():
             self.state = self.state.prune(keep)
+
+    def _becomes_hybrid(self) -> bool:
+        """Whether it is time to cut the mesh and to add blended triangles: once."""
+        due = self.state.solid is None and soft_fraction(self.config, self.fraction) >= 0
+        return due and not self._done()
+
+    def _cut(self) -> None:
+        assert self.source is not None
+        core = self.result()
+        if len(core.faces):
+            mesh = with_soft_splats(
+                core, self.source, self.dataset.train, self.config.soft_share, self.options.threads
+            )
+            self.state = State.begin_hybrid(mesh, self.config, self.options.threads)
 
     def _done(self) -> bool:
         if self.limit is not None:

@@ -14,9 +14,10 @@ from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.hybrid import MAX_OPACITY
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, solid_faces
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)
 
@@ -50,6 +51,8 @@ class State:
             positions, and that determine ``vertices``; otherwise None.
         exposures: (views, 6) float32: gain and offset of red, green and blue for each training view; None if
             they are not fitted.
+        solid: for a mesh of opaque and blended triangles, (v,) bool: the vertices of opaque ones, whose
+            positions and opacities stay; otherwise None.
     """
 
     def __init__(
@@ -76,12 +79,13 @@ class State:
         self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
         relocates = config.relocate_share and self.bound is None
         self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
+        self.solid: np.ndarray | None = None
 
     @classmethod
     def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
         """The state before the first step, for ``views`` training views."""
         if config.opacity == "cutoff":
-            _check_for_cutoff(mesh)
+            _check_for_cutoff(mesh, config)
         mesh = replace(mesh, normals=None)  # positions change, normals would not
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
@@ -103,6 +107,13 @@ class State:
         return cls(mesh, sizes, exposures, config, threads)
 
     @classmethod
+    def begin_hybrid(cls, mesh: SplatMesh, config: FinetuneConfig, threads: int | None) -> State:
+        """The state before the first step with the opaque and blended triangles of ``mesh``."""
+        state = cls(mesh, vertex_sizes(mesh), None, config, threads)
+        state.solid = _solid_vertices(mesh)
+        return state
+
+    @classmethod
     def resume(
         cls,
         arrays: dict[str, np.ndarray],
@@ -120,6 +131,8 @@ class State:
             for name, adam in state._optimisers().items():
                 part = {key: arrays[f"{name}.{key}"] for key in ("mean", "square", "steps")}
                 adam.load_state(part)
+            if arrays.get("solid", np.zeros(())):
+                state.solid = _solid_vertices(mesh)
             if state._sums is not None:
                 shape = (len(mesh.vertices),)
                 parts = (_checked_shape(arrays[name], shape) for name in state._sums.arrays())
@@ -139,6 +152,8 @@ class State:
             arrays |= {f"{name}.{key}": value for key, value in adam.state().items()}
         if self._sums is not None:
             arrays |= self._sums.arrays()
+        if self.solid is not None:
+            arrays["solid"] = np.ones((), np.int32)
         return arrays
 
     def result(self) -> SplatMesh:
@@ -157,6 +172,8 @@ class State:
         reached = gradients.colors[:, 3] != 0
         if self.config.opacity == "cutoff":  # but where opaque, only its colour
             reached |= (gradients.colors[:, :3] != 0).any(axis=1)
+        if self.solid is not None:
+            gradients.colors[self.solid, 3] = 0
         opacity = self.colors[:, 3]
         transparent = None if self._boundary is None else self._boundary & (opacity == 0)
         if self._sums is not None:
@@ -165,9 +182,14 @@ class State:
         self._colors.step(gradients.colors, reached)
         if transparent is not None:
             opacity[transparent] = 0
+        if self.solid is not None:
+            np.minimum(opacity, MAX_OPACITY, out=opacity, where=~self.solid)
         if position_rate > 0:
             self._positions.lr = position_rate
-            if self.bound is None:
+            if self.solid is not None:
+                # Edges of opaque triangles have no gradient: positions would follow the colours alone.
+                self._positions.step(gradients.vertices, reached & ~self.solid)
+            elif self.bound is None:
                 self._positions.step(gradients.vertices, reached)
             else:
                 # A vertex in a corner of its face stays there.
@@ -223,6 +245,8 @@ class State:
             smaller._exposures = self._exposures.select(smaller.exposures, every)
         if self._sums is not None:
             smaller._sums = GradientSums(self._sums.color[used], self._sums.position[used])
+        if self.solid is not None:
+            smaller.solid = self.solid[used]
         return smaller
 
     def _optimisers(self) -> dict[str, RowAdam]:
@@ -230,7 +254,14 @@ class State:
         return found if self._exposures is None else found | {"exposure": self._exposures}
 
 
-def _check_for_cutoff(mesh: SplatMesh) -> None:
+def _solid_vertices(mesh: SplatMesh) -> np.ndarray:
+    """(v,) bool: the vertices of opaque triangles."""
+    solid = np.zeros(len(mesh.vertices), bool)
+    solid[mesh.faces[solid_faces(mesh)]] = True
+    return solid
+
+
+def _check_for_cutoff(mesh: SplatMesh, config: FinetuneConfig) -> None:
     """ValueError if ``mesh`` cannot become one of opaque triangles."""
     if mesh.filter_px2:
         raise ValueError(
@@ -240,6 +271,8 @@ def _check_for_cutoff(mesh: SplatMesh) -> None:
         raise ValueError("opacity 'cutoff' cannot keep the binding to a base mesh")
     if mesh.blending == "linear":
         raise ValueError("opacity 'cutoff' is for meshes in display colours, this one is in linear light")
+    if config.soft_share and mesh.face_splat is None:
+        raise ValueError("soft_share chooses splats, but the mesh does not know its own (face_splat)")
 
 
 def _checked_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

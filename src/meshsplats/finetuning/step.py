@@ -14,6 +14,7 @@ from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
+from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction
 from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
@@ -183,12 +184,19 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
     config = state.config
     index = view_of_step(config, step, len(views))
     view = views[index]
-    points = uses_point_targets(view, config, fraction)
+    hybrid, steps_before = state.solid is not None, 0.0
+    if hybrid:
+        steps_before = step * (1 - config.soft_phase) / fraction
+        fraction = soft_fraction(config, fraction)
+    else:
+        fraction = opaque_fraction(config, fraction)
+    points = not hybrid and uses_point_targets(view, config, fraction)
     target = target_of(view, config, step, points)
     if target.mask is not None and not target.mask.any():
         return None
     samples = 1 if points else samples_of(view, config)
-    rendered = render_view(state, view, target.background, samples, ramp_of(config, fraction))
+    ramp = None if hybrid else ramp_of(config, fraction)
+    rendered = render_view(state, view, target.background, samples, ramp)
     image = rendered.color
     if state.exposures is not None:
         exposure = state.exposures[index]
@@ -200,7 +208,7 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
         if state.exposures is not None:
             grad_exposure = exposure_gradient(rendered.color, grad_image)
             grad_image = grad_image * exposure[GAIN]
-        expected, share = None, expected_share(config, fraction)
+        expected, share = None, 0.0 if hybrid else expected_share(config, fraction)
         if share:
             expected = expected_error(target.color, target.mask, config, share)
             grad_image = grad_image * np.float32(1 - share)
@@ -212,7 +220,7 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
             " camera first; if they are sound, lower the learning rates. The last checkpoint is from before"
             " this step"
         )
-    state.step(gradients, *learning_rates(config, step, fraction), index)
+    state.step(gradients, *learning_rates(config, step - steps_before, fraction), index)
     return loss
 
 

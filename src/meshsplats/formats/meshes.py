@@ -111,7 +111,9 @@ def save_mesh(
             where their opacity crosses ``cutoff`` and writes the rest as solid geometry, for programs with a
             depth buffer, in any format: see ``cut_mesh``. 'mask' (`.glb`) keeps the triangles and lets the
             viewer draw them solid where the opacity reaches the cutoff; their edges stay jagged where those
-            of 'opaque' are smooth.
+            of 'opaque' are smooth. 'hybrid' (`.glb`) is for a mesh with solid and translucent triangles:
+            those with three opaque corners form an opaque primitive, and all others, the lowest first, a
+            blended one. Splat indices, attributes and binding are left out.
         cutoff: (with 'opaque' and 'mask'; default 0.2) least opacity that is drawn, 0 to 1.
         compression: (`.glb`) 'meshopt' makes files about a fifth as large, with the external program
             gltfpack. Each coordinate moves by at most 1/131070 of the longest side of the bounding box; the
@@ -139,7 +141,7 @@ def save_mesh(
         if suffix not in _OPTION_SUFFIXES[name] and options[name] != "opaque":
             suffixes = ", ".join(_OPTION_SUFFIXES[name])
             raise ValueError(f"the option {name} applies to {suffixes} only, not to {suffix}")
-    unbound = suffix not in BOUND_SUFFIXES or "compression" in options or alpha == "opaque"
+    unbound = suffix not in BOUND_SUFFIXES or "compression" in options or alpha in ("opaque", "hybrid")
     if mesh.binding is not None and unbound:
         warnings.warn(
             f"{target.name}: the binding to a base mesh is left out; later poses need .npz or .glb",

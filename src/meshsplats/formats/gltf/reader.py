@@ -160,6 +160,8 @@ def _join(
         "normals": normals,
         "up": (0, 1, 0),
     }
+    if note:
+        arrays |= {"up": note["up"], "blending": note["blending"]}
     if note and len(own["primitives"]) == 1:
         arrays |= _restore(document, own, note, len(arrays["faces"]), colors)
         if arrays.get("binding") is not None and not _matches(arrays["binding"], arrays["vertices"]):
@@ -196,7 +198,7 @@ def _restore(
 ) -> dict[str, Any]:
     """Constructor arguments from our note. Arrays that another program has dropped or altered are left out,
     with a DataWarning: better no splat indices than wrong ones."""
-    result: dict[str, Any] = {"up": note["up"], "blending": note["blending"]}
+    result: dict[str, Any] = {}
     lost: list[str] = []
     v = len(colors)
     for field in SplatMesh.EXTRAS:

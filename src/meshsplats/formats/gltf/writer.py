@@ -1,9 +1,9 @@
 """Writes meshes as binary glTF 2.0 (`.glb`), which viewers, engines and Blender open directly.
 
 Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one double-sided
-primitive, coloured by COLOR_0 (linear RGBA). glTF is y-up: the node has a pure rotation from the mesh's own
-frame to a frame whose +y is the mesh's ``up``; vertices are stored unchanged. All else is in the mesh's
-``extras.meshsplats``.
+primitive, or of two where solid triangles are kept apart, coloured by COLOR_0 (linear RGBA). glTF is y-up:
+the node has a pure rotation from the mesh's own frame to a frame whose +y is the mesh's ``up``; vertices are
+stored unchanged. All else is in the mesh's ``extras.meshsplats``.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 import re
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -22,10 +23,10 @@ from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._validation import check_attribute_names
 from meshsplats.formats.cutting import CUTOFF
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, solid_faces
 
 ColorType = Literal["uint16", "float32"]
-Alpha = Literal["blend", "mask", "opaque"]
+Alpha = Literal["blend", "mask", "opaque", "hybrid"]
 
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
@@ -57,8 +58,10 @@ def write_glb(
         color_type: 'uint16' keeps display colours within 1/10000, 'float32' within 1e-6.
         alpha: how viewers treat opacity. 'blend' is exact in viewers that sort, and good enough in many that
             do not. 'mask' needs no order: opacities of at least ``cutoff`` are rendered solid, with the depth
-            buffer. 'opaque' is for a mesh of ``cut_mesh``, which is solid: viewers ignore opacity.
-            docs/viewers.md compares them.
+            buffer. 'opaque' is for a mesh of ``cut_mesh``, which is solid: viewers ignore opacity. 'hybrid'
+            writes triangles with three opaque corners as an 'opaque' primitive, and all others as a 'blend'
+            primitive, the lowest first, as most views look down; without the arrays that only this project
+            reads. docs/viewers.md compares them.
         cutoff: least opacity that 'mask' renders.
         extras: False leaves out the arrays that only this project reads.
 
@@ -138,8 +141,57 @@ def _document(
         "blending": mesh.blending,
         "up": [float(u) for u in mesh.up],
     }
+    if alpha == "hybrid":
+        with_extras = False
     if mesh.filter_px2 and with_extras:
         extras["filter_px2"] = mesh.filter_px2
+    if mesh.normals is not None:
+        _check_unit(mesh.normals)
+    elif lit:
+        mesh = replace(mesh, normals=computed_normals(mesh))
+        extras["normals"] = "computed"
+    parts: list[tuple[SplatMesh, Alpha]] = [(mesh, alpha)]
+    if alpha == "hybrid":
+        solid = solid_faces(mesh)
+        halves: tuple[tuple[SplatMesh, Alpha], ...] = (
+            (mesh.keep_faces(solid), "opaque"),
+            (_lowest_first(mesh.keep_faces(~solid)), "blend"),
+        )
+        parts = [(half, mode) for half, mode in halves if len(half.faces)]
+    primitives = [_primitive(buffer, part, color_type, k) for k, (part, _) in enumerate(parts)]
+    if with_extras:
+        _add_own_arrays(buffer, mesh, primitives[0]["attributes"], extras)
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "splats", "mesh": 0, "rotation": up_quaternion(mesh.up)}],
+        "meshes": [
+            {
+                "name": "splats",
+                "primitives": primitives,
+                "extras": {"meshsplats": extras},
+            }
+        ],
+        "materials": [_material(mode, lit, cutoff) for _, mode in parts],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": buffer.length}],
+    }
+    if not lit:
+        document["extensionsUsed"] = ["KHR_materials_unlit"]
+    return document, buffer.parts
+
+
+def _lowest_first(mesh: SplatMesh) -> SplatMesh:
+    """``mesh`` with its triangles in the order of their heights."""
+    heights = (mesh.vertices @ mesh.up)[mesh.faces].sum(axis=1)
+    order = np.argsort(heights, kind="stable")
+    return replace(mesh, faces=mesh.faces[order], face_splat=None, depth_group=None)
+
+
+def _primitive(buffer: _Buffer, mesh: SplatMesh, color_type: ColorType, material: int) -> dict[str, Any]:
+    """A primitive with the triangles of ``mesh``."""
     attributes = {
         "POSITION": buffer.accessor(
             mesh.vertices,
@@ -149,14 +201,8 @@ def _document(
             max=[float(x) for x in mesh.vertices.max(axis=0)],
         ),
     }
-    normals = mesh.normals
-    if normals is not None:
-        _check_unit(normals)
-    elif lit:
-        normals = computed_normals(mesh)
-        extras["normals"] = "computed"
-    if normals is not None:
-        attributes["NORMAL"] = buffer.accessor(normals, _FLOAT, _ARRAY_BUFFER)
+    if mesh.normals is not None:
+        attributes["NORMAL"] = buffer.accessor(mesh.normals, _FLOAT, _ARRAY_BUFFER)
     colors = linear_colors(mesh, color_type)
     if color_type == "uint16":
         attributes["COLOR_0"] = buffer.accessor(colors, _UINT16, _ARRAY_BUFFER, normalized=True)
@@ -166,9 +212,29 @@ def _document(
     small = len(mesh.vertices) <= 0xFFFF
     indices = mesh.faces.reshape(-1).astype(np.uint16) if small else mesh.faces.reshape(-1).view(np.uint32)
     index_accessor = buffer.accessor(indices, _UINT16 if small else _UINT32, _ELEMENT_ARRAY_BUFFER)
-    if with_extras:
-        extras |= {field.name: _raw(buffer, values) for field, values in mesh.extras().items()}
-    for name, values in mesh.attributes.items() if with_extras else ():
+    return {"attributes": attributes, "indices": index_accessor, "material": material}
+
+
+def _material(alpha: Alpha, lit: bool, cutoff: float) -> dict[str, Any]:
+    material: dict[str, Any] = {
+        "name": "splats",
+        "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
+        "alphaMode": alpha.upper(),
+        "doubleSided": True,
+    }
+    if alpha == "mask":
+        material["alphaCutoff"] = cutoff
+    if not lit:
+        material["extensions"] = {"KHR_materials_unlit": {}}
+    return material
+
+
+def _add_own_arrays(
+    buffer: _Buffer, mesh: SplatMesh, attributes: dict[str, int], extras: dict[str, Any]
+) -> None:
+    """Stores the arrays that only this project reads, and notes in ``extras`` where they are."""
+    extras |= {field.name: _raw(buffer, values) for field, values in mesh.extras().items()}
+    for name, values in mesh.attributes.items():
         columns = None if values.ndim == 1 else values.shape[1]
         entry: dict[str, Any] = {"name": name, "columns": columns}
         if columns is None or 1 <= columns <= 4:
@@ -178,37 +244,8 @@ def _document(
         elif columns:
             entry |= _raw(buffer, values)
         extras.setdefault("attributes", []).append(entry)
-    if mesh.binding is not None and with_extras:
+    if mesh.binding is not None:
         extras["binding"] = _binding(buffer, mesh.binding)
-    material: dict[str, Any] = {
-        "name": "splats",
-        "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
-        "alphaMode": alpha.upper(),
-        "doubleSided": True,
-    }
-    if alpha == "mask":
-        material["alphaCutoff"] = cutoff
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "splats", "mesh": 0, "rotation": up_quaternion(mesh.up)}],
-        "meshes": [
-            {
-                "name": "splats",
-                "primitives": [{"attributes": attributes, "indices": index_accessor, "material": 0}],
-                "extras": {"meshsplats": extras},
-            }
-        ],
-        "materials": [material],
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": buffer.length}],
-    }
-    if not lit:
-        material["extensions"] = {"KHR_materials_unlit": {}}
-        document["extensionsUsed"] = ["KHR_materials_unlit"]
-    return document, buffer.parts
 
 
 def _raw(buffer: _Buffer, values: np.ndarray) -> dict[str, Any]:
