@@ -6,7 +6,6 @@ import functools
 
 import numpy as np
 import pytest
-
 from _rendering import outputs
 
 from meshsplats import Camera, SplatMesh, render

@@ -56,7 +56,7 @@ def bits(images: renderer.Images) -> bytes:
 # The image of the core
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_triangles_that_pierce_each_other_with_all_outputs(seed):
     view = turned(camera(), seed)
     assert_same_image(*both(soup(seed, view=view), view, **EXTRAS))
@@ -94,8 +94,7 @@ def test_normals_of_vertices():
     assert_same_image(*both(replace(mesh, normals=normals), camera(), normals=True))
 
 
-@pytest.mark.parametrize("samples", [2, 3, 5])
-@pytest.mark.parametrize("size", [(13, 11), (1, 1), (1, 20)])
+@pytest.mark.parametrize(("samples", "size"), [(2, (13, 11)), (3, (1, 20)), (5, (17, 3)), (16, (1, 1))])
 def test_samples_and_odd_images(samples, size):
     mesh = soup(5, 20, spread=(0.5, 0.5, 1.5))
     assert_same_image(*both(mesh, camera(*size), samples=samples, depth=True))
@@ -160,14 +159,16 @@ def test_a_closed_sheet_has_neither_holes_nor_double_samples():
     inner = (points[:, 0] > 0) & (points[:, 0] < n - 1) & (points[:, 1] > 0) & (points[:, 1] < n - 1)
     points[inner, :2] += rng.uniform(-0.3, 0.3, (inner.sum(), 2))
     points = points / (n - 1) * 8 - 4
-    points[:, 2] = 2 + rng.uniform(0, 0.5, len(points))
+    points[:, 2] = 2 + 0.05 * points[:, 0]
     faces = grid_faces(n, n)
-    faces = np.stack([np.roll(face, rng.integers(3))[:: rng.choice([1, -1])] for face in rng.permutation(faces)])
+    faces = np.stack(
+        [np.roll(face, rng.integers(3))[:: rng.choice([1, -1])] for face in rng.permutation(faces)]
+    )
     # Vertices of their own: edges are shared by position, not by index.
     mesh = SplatMesh(
         points[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3), np.full((faces.size, 4), 0.5)
     )
-    image = render(mesh, camera(123, 97), device="gpu")
+    image = render(mesh, camera(61, 51), device="gpu")
     assert (image.alpha == 0.5).all()
 
 
@@ -209,9 +210,9 @@ def test_hundreds_of_layers_behind_each_other_are_walked_again():
 
 
 def test_walks_that_exceed_their_budget_go_on_where_they_ended():
-    mesh, view = many_triangles()
+    mesh, view = random_fans(2000, radius=0.05), camera()
     usual = draw(mesh, view, DrawSettings())
-    short = draw(mesh, view, DrawSettings(budget=700))
+    short = draw(mesh, view, DrawSettings(budget=400))
     assert bits(short) == bits(usual)
     assert short.work.walks > usual.work.walks
 
@@ -234,24 +235,32 @@ def test_lists_grow(monkeypatch):
 def test_large_images_are_drawn_in_windows(monkeypatch):
     mesh, view = many_triangles()
     whole = render(mesh, view, samples=2, device="gpu", **EXTRAS)
-    for name, value in (("WINDOW_SAMPLES", 2000), ("WINDOW_SAMPLES", 1 << 22)):
-        monkeypatch.setattr(renderer, name, value)
-        monkeypatch.setattr(kernels, "MAX_PAIRS", 4000)
-        parts = render(replace(mesh), view, samples=2, device="gpu", **EXTRAS)
-        assert_same_image(parts, whole)
-    images = draw(replace(mesh), view, DrawSettings(samples=2))
-    assert images.work.windows > 1
+    monkeypatch.setattr(renderer, "WINDOW_SAMPLES", 5000)
+    assert_same_image(render(replace(mesh), view, samples=2, device="gpu", **EXTRAS), whole)
+    assert draw(mesh, view, DrawSettings(samples=2)).work.windows == 4
+
+
+def test_windows_are_halved_while_they_have_too_many_pairs(monkeypatch):
+    mesh, view = many_triangles()
+    whole = render(mesh, view, device="gpu")
+    monkeypatch.setattr(renderer, "FIRST_PAIRS", 4)
+    monkeypatch.setattr(kernels, "MAX_PAIRS", 6000)
+    assert_same_image(render(replace(mesh), view, device="gpu"), whole)
+    assert draw(replace(mesh), view, DrawSettings()).work.windows > 1
+    monkeypatch.setattr(kernels, "MAX_PAIRS", 2)
+    with pytest.raises(MemoryError, match="single pixel"):
+        draw(replace(mesh), view, DrawSettings())
 
 
 def test_what_does_not_fit_is_an_error_before_any_work(monkeypatch):
-    mesh, view = many_triangles()
+    mesh = many_triangles()[0]
     monkeypatch.setattr(renderer, "MAX_FAN", 3)
     with pytest.raises(DeviceError, match="splats of up to 3 triangles"):
         render(random_fans(5), camera(), filter_px2=0.3, device="gpu")
-    monkeypatch.setattr("meshsplats.webgpu.device.CORE_BINDING", 5000)
     from meshsplats.webgpu.device import Device, find_adapters
 
     small = Device(find_adapters()[0])
+    small.binding_limit = 5000
     with pytest.raises(MemoryError, match="too many vertices for the GPU"):
         MeshRenderer(small, mesh)
 
@@ -279,7 +288,9 @@ def test_runs_hold_consecutive_triangles_of_one_splat():
     faces = np.arange(300).reshape(-1, 3)
     runs = find_runs(faces, splat)
     first, count = runs & 0x1FFFFFFF, (runs >> 29) + 1
-    assert (np.concatenate([np.arange(a, a + n) for a, n in zip(first, count, strict=True)]) == np.arange(100)).all()
+    assert (
+        np.concatenate([np.arange(a, a + n) for a, n in zip(first, count, strict=True)]) == np.arange(100)
+    ).all()
     for a, n in zip(first, count, strict=True):
         assert len(set(splat[a : a + n])) == 1
     assert len(runs) == sum(-(-int((splat == s).sum()) // 8) for s in set(splat.tolist()))
@@ -288,8 +299,8 @@ def test_runs_hold_consecutive_triangles_of_one_splat():
 
 
 def test_the_plane_of_a_depth_group_is_that_of_its_largest_triangle():
-    mesh = replace(soup(0, 30), depth_group=np.random.default_rng(0).integers(-1, 4, 30) * 7)
-    mesh = replace(mesh, depth_group=np.where(mesh.depth_group < 0, -1, mesh.depth_group))
+    groups = np.random.default_rng(0).integers(-1, 4, 30)
+    mesh = replace(soup(0, 30), depth_group=np.where(groups < 0, -1, 7 * groups))
     of_face, largest = find_groups(mesh)
     assert ((of_face == 0xFFFFFFFF) == (mesh.depth_group < 0)).all()
     corners = mesh.vertices[mesh.faces].astype(float)

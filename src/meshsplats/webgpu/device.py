@@ -17,8 +17,19 @@ KINDS = ("DiscreteGPU", "IntegratedGPU", "Unknown", "CPU")
 CORE_BINDING = 128 << 20
 """Bytes of a storage buffer that a shader can see, on every device."""
 
-CORE_BUFFER = 256 << 20
-"""Bytes of a buffer, on every device."""
+CORE_LIMITS = {
+    "max-buffer-size": 256 << 20,
+    "max-storage-buffer-binding-size": CORE_BINDING,
+    "max-storage-buffers-per-shader-stage": 8,
+    "max-compute-workgroup-storage-size": 16 << 10,
+    "max-compute-invocations-per-workgroup": 256,
+    "max-compute-workgroups-per-dimension": 65535,
+}
+"""What every device has."""
+
+SOFTWARE_BUDGET, BUDGET = 40_000, 4_000_000
+"""Loop iterations of one walk through a tile list. Drivers end what runs too long, some without an error:
+lavapipe cuts loops after 65,535 iterations of an invocation."""
 
 
 class Device:
@@ -27,8 +38,9 @@ class Device:
     def __init__(self, adapter: Any) -> None:
         self.adapter = adapter
         self.info: dict[str, str] = {key: str(value) for key, value in dict(adapter.info).items()}
-        self.device: Any = adapter.request_device_sync()
+        self.device: Any = adapter.request_device_sync(required_limits=CORE_LIMITS)
         self.binding_limit = CORE_BINDING
+        self.budget = SOFTWARE_BUDGET if self.info["adapter_type"] == "CPU" else BUDGET
         self._pipelines: dict[tuple[Any, ...], Any] = {}
         self._modules: dict[tuple[Any, ...], Any] = {}
 

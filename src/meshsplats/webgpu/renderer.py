@@ -25,10 +25,6 @@ FIRST_PAIRS = 1 << 18
 MAX_FAN = 8192
 """Most triangles of a splat with a low-pass filter: one invocation goes through all of them three times."""
 
-LOOP_BUDGET = 40_000
-"""Loop iterations of one walk through a tile list. Drivers end what runs too long, some without an error;
-lavapipe cuts loops after 65,535 iterations."""
-
 MAX_ROUNDS = 10_000
 """Most repetitions of a frame's last steps."""
 
@@ -44,7 +40,8 @@ class DrawSettings:
     filter_px2: float = 0.0
     queue: int = kernels.QUEUE
     long_queue: int = kernels.LONG_QUEUE
-    budget: int = LOOP_BUDGET
+    budget: int | None = None
+    """Loop iterations of one walk through a tile list; None: those of the device."""
 
 
 @dataclass
@@ -145,7 +142,9 @@ class MeshRenderer:
             self._offsets = (3 * len(mesh.faces), start, start + len(of_face))
             self._counts["groups"] = len(largest)
         if self._counts["runs"] >= kernels.MAX_RUNS:
-            raise MemoryError(f"the mesh has {len(runs):,} runs of triangles; the GPU takes {kernels.MAX_RUNS:,}")
+            raise MemoryError(
+                f"the mesh has {len(runs):,} runs of triangles; the GPU takes {kernels.MAX_RUNS:,}"
+            )
         if not len(mesh.faces):
             return
         self._check_size("vertices", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
@@ -317,7 +316,11 @@ class MeshRenderer:
         """Sizes the buffers of a frame and writes its uniforms; returns the counts of its steps."""
         s = settings.samples
         w, h = camera.width * s, camera.height * s
-        counts = self._counts | {"tiles": _tiles(w) * _tiles(h), "columns": camera.width, "rows": camera.height}
+        counts = self._counts | {
+            "tiles": _tiles(w) * _tiles(h),
+            "columns": camera.width,
+            "rows": camera.height,
+        }
         if settings.filter_px2:
             counts["fans"] = self._fans
         blocks = -(-self._capacity // 2048)
@@ -330,6 +333,8 @@ class MeshRenderer:
         self._allocate("samples", 32 * w * h)
         if s > 1:
             self._allocate("pixels", 16 * camera.width * camera.height)
+        if settings.budget is None:
+            settings = replace(settings, budget=self.device.budget)
         frame = frame_uniform(camera, settings, counts, self._capacity, self._offsets)
         self.device.device.queue.write_buffer(self._buffers["frame"], 0, frame)
         return counts
@@ -338,7 +343,9 @@ class MeshRenderer:
         self, output: kernels.Output, counts: dict[str, int], settings: DrawSettings, work: Work | None
     ) -> np.ndarray:
         """Renders one frame to the samples, until all tiles are finished; returns the counters."""
-        steps = (kernels.list_steps() if output == "color" and work is not None else []) + kernels.raster_steps()
+        steps = (
+            kernels.list_steps() if output == "color" and work is not None else []
+        ) + kernels.raster_steps()
         if work is not None:
             work.frames += 1
             work.dispatches = 0
@@ -475,7 +482,9 @@ def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
     before = np.cumsum(pieces) - pieces
     first = np.repeat(starts, pieces) + kernels.RUN * (np.arange(pieces.sum()) - np.repeat(before, pieces))
     ends = np.minimum(first + kernels.RUN, np.repeat(starts + lengths, pieces))
-    return (first.astype(np.uint32) | ((ends - first - 1).astype(np.uint32) << np.uint32(29))).astype(np.uint32)
+    return (first.astype(np.uint32) | ((ends - first - 1).astype(np.uint32) << np.uint32(29))).astype(
+        np.uint32
+    )
 
 
 def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:
