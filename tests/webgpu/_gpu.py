@@ -44,8 +44,8 @@ def both(mesh: SplatMesh, view: Camera, **options) -> tuple[Rendering, Rendering
 
 
 def assert_same_image(gpu: Rendering, core: Rendering, *, least: float = 105, most: float = 0) -> None:
-    """All outputs within ``least`` dB of each other, times their largest value if above 1, and at most the share
-    ``most`` of the pixels off by more than 1e-3."""
+    """All outputs within ``least`` dB of each other, relative to their largest value if above 1. At most the
+    share ``most`` of the pixels is off by more than 1e-3."""
     found, expected = outputs(gpu), outputs(core)
     assert found.keys() == expected.keys()
     for name, value in found.items():

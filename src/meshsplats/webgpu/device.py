@@ -48,13 +48,14 @@ class Device:
         """The pipeline of a kernel, compiled on first use; ``key`` stands for the text of ``source``."""
         import wgpu
 
-        if (entry, *key) not in self._pipelines:
+        name = (entry, *key)
+        if name not in self._pipelines:
             if key not in self._modules:
                 self._modules[key] = self.device.create_shader_module(code=source())
-            self._pipelines[(entry, *key)] = self.device.create_compute_pipeline(
+            self._pipelines[name] = self.device.create_compute_pipeline(
                 layout=wgpu.AutoLayoutMode.auto, compute={"module": self._modules[key], "entry_point": entry}
             )
-        return self._pipelines[(entry, *key)]
+        return self._pipelines[name]
 
     @property
     def name(self) -> str:
@@ -97,8 +98,8 @@ def open_device() -> Device:
     adapters = find_adapters()
     if not adapters:
         raise MissingDependencyError(
-            "no GPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Linux without a GPU, the"
-            " package mesa-vulkan-drivers draws on processors, slowly)"
+            "no GPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Linux without a GPU,"
+            " that of mesa-vulkan-drivers draws on processors, slowly)"
         )
     try:
         return Device(adapters[0])
