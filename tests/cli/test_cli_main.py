@@ -250,13 +250,17 @@ def test_doctor(capsys, monkeypatch):
     assert found["core"]["in_use"] in found["core"]["available"]
     assert found["threads"] >= 1
     assert found["required"]["numpy"] == np.__version__
+    assert found["gpu"]["works"] == (found["gpu"]["problem"] is None)
+    assert found["gpu"]["adapter"] or not found["gpu"]["works"]
     assert main(["doctor"]) == 0
-    assert "in use" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "in use" in out
+    assert f"gpu: {found['gpu']['adapter'] or found['gpu']['problem']}" in out
 
     from meshsplats.cli import doctor
 
     monkeypatch.setattr(doctor.metadata, "requires", lambda _: ["no-such-thing>=1; extra == 'blender'"])
-    monkeypatch.setattr(doctor, "_draws", lambda: False)
+    monkeypatch.setattr(doctor, "_draws", lambda *_: False)
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
     assert "pip install 'no-such-thing>=1'" in out

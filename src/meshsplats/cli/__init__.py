@@ -30,6 +30,7 @@ from meshsplats.cli.messages import (
     read_from_standard_input,
     say,
 )
+from meshsplats.errors import DeviceError
 
 COMMANDS = {
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
@@ -82,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         close_output()  # its reader has gone, `| head` say
         return FAILED
-    except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
+    except (UsageError, ValueError, OSError, ImportError, MemoryError, DeviceError) as error:
         if debug:
             raise
         if isinstance(error, OSError) and error.errno in DISK_FULL and error.filename is None:

@@ -218,6 +218,15 @@ class DrawOptions:
     all."""
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
+    device: Literal["cpu", "gpu"] = "cpu"
+    """Where meshes are rendered. gpu: by WebGPU, on any graphics card (extra gpu)."""
+
+    def check_device(self) -> None:
+        """Raises MissingDependencyError or DeviceError if there is no such device."""
+        if self.device == "gpu":
+            from meshsplats.webgpu.device import open_device
+
+            open_device()
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,7 @@ class Compare(Command):
         if self.draw.background is not None:
             parse_color(self.draw.background)
         self.views.check()
+        self.draw.check_device()
         cloud = self.part.of(self.reading.load(self.splats))
         photographs = self.views.photographs()
         cameras = self.views.make(cloud, self.splats, count=8, side=400, photographs=photographs)
@@ -114,6 +115,7 @@ class Compare(Command):
             samples=samples,
             max_layers=self.draw.max_layers,
             threads=self.draw.threads,
+            device=self.draw.device,
         )
         captions = ("splats", "mesh", f"error x {self.amplify:g}")
         for name, view in zip(strips, track(views, "comparing", len(cameras)), strict=True):

@@ -9,7 +9,7 @@ import shlex
 import sys
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from meshsplats.cli.arguments import Command
 
 @dataclass(frozen=True)
 class Doctor(Command):
-    """Lists installed and missing libraries, and the instruction set in use. Exit code 1 if rendering
-    fails."""
+    """Lists installed and missing libraries, the instruction set in use and the GPU. Exit code 1 if rendering
+    on the CPU fails."""
 
     json: bool = False
     """Print the findings as JSON."""
@@ -46,6 +46,7 @@ def examine() -> dict[str, Any]:
         "platform": platform.platform(),
         "threads": processors(),
         "core": _core(),
+        "gpu": _gpu(),
         "required": libraries.pop("", {}),
         "extras": libraries,
         "to_install": {
@@ -74,7 +75,23 @@ def _core() -> dict[str, Any]:
     return result
 
 
-def _draws() -> bool:
+def _gpu() -> dict[str, Any]:
+    """The adapter that ``device="gpu"`` uses, and whether it draws a triangle."""
+    from meshsplats.errors import DeviceError, MissingDependencyError
+    from meshsplats.webgpu.device import open_device
+
+    result: dict[str, Any] = {"works": False, "adapter": None, "problem": None}
+    try:
+        result["adapter"] = open_device().name
+        result["works"] = _draws("gpu")
+        if not result["works"]:
+            result["problem"] = "the image of one triangle is wrong"
+    except (MissingDependencyError, DeviceError) as error:
+        result["problem"] = " ".join(str(error).split())
+    return result
+
+
+def _draws(device: Literal["cpu", "gpu"] = "cpu") -> bool:
     from meshsplats.cameras.trajectories import look_at
     from meshsplats.mesh import SplatMesh
     from meshsplats.rendering import render
@@ -82,7 +99,7 @@ def _draws() -> bool:
     corners = np.array([[-9, -9, 0], [9, -9, 0], [0, 9, 0]])
     mesh = SplatMesh(corners, np.array([[0, 1, 2]]), np.array([[1, 0.5, 0, 0.5]] * 3))
     camera = look_at((0, 0, -5), (0, 0, 0), width=3, height=3)
-    middle = render(mesh, camera, background=(0, 0, 1)).color[1, 1]
+    middle = render(mesh, camera, background=(0, 0, 1), device=device).color[1, 1]
     return bool(abs(middle - [0.5, 0.25, 0.5]).max() < 1e-5)
 
 
@@ -124,6 +141,9 @@ def _text(findings: dict[str, Any]) -> str:
         )
     else:
         lines.append(f"core: DOES NOT WORK: {core['problem']}")
+    gpu = findings["gpu"]
+    state = "renders correctly" if gpu["works"] else gpu["problem"]
+    lines.append("gpu: " + "; ".join(filter(None, (gpu["adapter"], state))))
     lines.append("libraries: " + _listed(findings["required"]))
     for extra, libraries in findings["extras"].items():
         missing = findings["to_install"].get(extra)

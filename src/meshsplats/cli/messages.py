@@ -9,11 +9,13 @@ import signal
 import sys
 from typing import Any
 
+from meshsplats.errors import DeviceError
+
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of a full disk, as in ``_files.atomic``."""
 OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
-"""Exit codes. FAILED: the input, or a path that was named, is wrong. LACKING: a library, a program or memory
-is missing. Ended by signal n: 128 + n."""
+"""Exit codes. FAILED: the input, or a path that was named, is wrong. LACKING: a library, a program, a GPU or
+memory is missing. Ended by signal n: 128 + n."""
 KINDS = {FAILED: "input", USAGE: "usage", EXISTS: "exists", NO_SPACE: "space", LACKING: "missing"}
 """Names of the exit codes in JSON."""
 ENDINGS = {signal.SIGINT: "interrupted"} | {
@@ -45,7 +47,7 @@ def exit_code(error: BaseException) -> int:
         return EXISTS
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return NO_SPACE
-    return LACKING if isinstance(error, (ImportError, MemoryError)) else FAILED
+    return LACKING if isinstance(error, (ImportError, MemoryError, DeviceError)) else FAILED
 
 
 def error_record(error: BaseException) -> dict[str, Any]:

@@ -195,6 +195,9 @@ class Render(Command):
                 )
         if self.as_splats and self.draw.max_layers is not None:
             raise UsageError("--max-layers counts triangles: it has no effect with --as-splats")
+        if self.as_splats and self.draw.device == "gpu":
+            raise UsageError("--device gpu draws meshes: leave out --as-splats")
+        self.draw.check_device()
 
     def _check_scene(self, scene: GaussianCloud | SplatMesh) -> None:
         if isinstance(scene, SplatMesh) and self.as_splats:
@@ -238,6 +241,7 @@ class Render(Command):
                     max_layers=layers,
                     depth=bool(files.depths),
                     cutoff=self.cutoff,
+                    device=self.draw.device,
                     **options,
                 )
             if not files.images[i].parent.exists():

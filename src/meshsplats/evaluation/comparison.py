@@ -13,6 +13,7 @@ from meshsplats.camera import Camera
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.api import Device
 from meshsplats.rendering.looks import Look, check_look, draw_splats, image_of, mesh_samples
 
 
@@ -72,6 +73,7 @@ def compare_views(
     samples: int | None = None,
     max_layers: int | None = None,
     threads: int | None = None,
+    device: Device = "cpu",
 ) -> Iterator[ComparedView]:
     """Compares ``cloud`` and ``mesh`` view by view; only one pair of images is in memory at a time.
 
@@ -88,13 +90,19 @@ def compare_views(
             'splats'.
         max_layers: as in ``render``, for the mesh.
         threads: maximum number of threads; all processors by default.
+        device: as in ``render``, for the mesh. Splats are drawn on the CPU.
 
     Yields:
         A ``ComparedView`` for each camera, in their order.
     """
     check_look(look)
     samples = mesh_samples(look, mesh, cameras) if samples is None else samples
-    options: dict[str, Any] = {"samples": samples, "max_layers": max_layers, "threads": threads}
+    options: dict[str, Any] = {
+        "samples": samples,
+        "max_layers": max_layers,
+        "threads": threads,
+        "device": device,
+    }
     for i, camera in enumerate(cameras):
         rendered = draw_splats(
             cloud, camera, look, sh_degree=sh_degree, background=background, threads=threads
@@ -116,6 +124,7 @@ def compare(
     samples: int | None = None,
     max_layers: int | None = None,
     threads: int | None = None,
+    device: Device = "cpu",
 ) -> Comparison:
     """PSNR and SSIM of the mesh's images against the splats', view by view. Options are those of
     ``compare_views``.
@@ -134,5 +143,6 @@ def compare(
         samples=samples,
         max_layers=max_layers,
         threads=threads,
+        device=device,
     )
     return Comparison(tuple(view.score for view in views))

@@ -11,7 +11,7 @@ from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import Rendering, render, render_splats
+from meshsplats.rendering.api import Device, Rendering, render, render_splats
 from meshsplats.rendering.samples import needed_samples
 
 Look = Literal["area", "splats"]
@@ -84,6 +84,7 @@ def image_of(
     samples: int = 1,
     max_layers: int | None = None,
     threads: int | None = None,
+    device: Device = "cpu",
 ) -> tuple[np.ndarray, np.ndarray]:
     """(h, w, 3) display RGB over a display ``background``, and (h, w) alpha.
 
@@ -92,5 +93,13 @@ def image_of(
     """
     linear = mesh.blending == "linear"
     backdrop = srgb_to_linear(np.asarray(background)) if linear else background
-    drawn = render(mesh, camera, background=backdrop, samples=samples, max_layers=max_layers, threads=threads)
+    drawn = render(
+        mesh,
+        camera,
+        background=backdrop,
+        samples=samples,
+        max_layers=max_layers,
+        threads=threads,
+        device=device,
+    )
     return (linear_to_srgb(drawn.color) if linear else drawn.color), drawn.alpha

@@ -17,8 +17,19 @@ KINDS = ("DiscreteGPU", "IntegratedGPU", "Unknown", "CPU")
 CORE_BINDING = 128 << 20
 """Bytes of a storage buffer that a shader can see, on every device."""
 
-CORE_BUFFER = 256 << 20
-"""Bytes of a buffer, on every device."""
+CORE_LIMITS = {
+    "max-buffer-size": 256 << 20,
+    "max-storage-buffer-binding-size": CORE_BINDING,
+    "max-storage-buffers-per-shader-stage": 8,
+    "max-compute-workgroup-storage-size": 16 << 10,
+    "max-compute-invocations-per-workgroup": 256,
+    "max-compute-workgroups-per-dimension": 65535,
+}
+"""What every device has."""
+
+SOFTWARE_BUDGET, BUDGET = 40_000, 4_000_000
+"""Loop iterations of one walk through a tile list. Drivers end what runs too long, some without an error:
+lavapipe cuts loops after 65,535 iterations of an invocation."""
 
 
 class Device:
@@ -27,8 +38,9 @@ class Device:
     def __init__(self, adapter: Any) -> None:
         self.adapter = adapter
         self.info: dict[str, str] = {key: str(value) for key, value in dict(adapter.info).items()}
-        self.device: Any = adapter.request_device_sync()
+        self.device: Any = adapter.request_device_sync(required_limits=CORE_LIMITS)
         self.binding_limit = CORE_BINDING
+        self.budget = SOFTWARE_BUDGET if self.info["adapter_type"] == "CPU" else BUDGET
         self._pipelines: dict[tuple[Any, ...], Any] = {}
         self._modules: dict[tuple[Any, ...], Any] = {}
 
@@ -36,13 +48,14 @@ class Device:
         """The pipeline of a kernel, compiled on first use; ``key`` stands for the text of ``source``."""
         import wgpu
 
-        if (entry, *key) not in self._pipelines:
+        name = (entry, *key)
+        if name not in self._pipelines:
             if key not in self._modules:
                 self._modules[key] = self.device.create_shader_module(code=source())
-            self._pipelines[(entry, *key)] = self.device.create_compute_pipeline(
+            self._pipelines[name] = self.device.create_compute_pipeline(
                 layout=wgpu.AutoLayoutMode.auto, compute={"module": self._modules[key], "entry_point": entry}
             )
-        return self._pipelines[(entry, *key)]
+        return self._pipelines[name]
 
     @property
     def name(self) -> str:
@@ -85,8 +98,8 @@ def open_device() -> Device:
     adapters = find_adapters()
     if not adapters:
         raise MissingDependencyError(
-            "no GPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Linux without a GPU, the"
-            " package mesa-vulkan-drivers draws on processors, slowly)"
+            "no GPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Linux without a GPU,"
+            " that of mesa-vulkan-drivers draws on processors, slowly)"
         )
     try:
         return Device(adapters[0])

@@ -74,7 +74,9 @@ def list_steps() -> list[dict[str, Any]]:
 
     def add(kernel: str, bind: dict[int, str], *, only_if: str | None = None, **size: Any) -> None:
         condition = {} if only_if is None else {"if": only_if}
-        steps.append({"kernel": kernel, "bind": {str(i): name for i, name in bind.items()}, **size, **condition})
+        steps.append(
+            {"kernel": kernel, "bind": {str(i): name for i, name in bind.items()}, **size, **condition}
+        )
 
     def scan(digit: str, data: str, **size: Any) -> None:
         common = {0: "frame", 11: "sums", 13: "plan", 17: digit}
@@ -111,7 +113,11 @@ def raster_steps() -> list[dict[str, Any]]:
     need them."""
     return [
         *({"clear": "counters", "from": 8}, {"clear": "lists", "from": 0}, {"clear": "again", "from": 0}),
-        {"kernel": "find_lists", "bind": {"13": "plan", "16": "pairs_b", "18": "lists"}, "indirect": ["plan", 24]},
+        {
+            "kernel": "find_lists",
+            "bind": {"13": "plan", "16": "pairs_b", "18": "lists"},
+            "indirect": ["plan", 24],
+        },
         _raster("raster", "lists", "again", count=["tiles", 1]),
         *again_steps(),
     ]

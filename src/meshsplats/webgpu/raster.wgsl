@@ -41,7 +41,7 @@ var<workgroup> moved: atomic<u32>;
 var<workgroup> broken: atomic<u32>;
 var<workgroup> totals: array<atomic<u32>, 4>;
 var<workgroup> decision: vec4u;
-// Loop iterations of 16 invocations together: not less than those of the SIMD lanes that run in step.
+// Iterations of nested loops of 16 invocations together: not less than those of the SIMD lanes that run in step.
 var<workgroup> efforts: array<atomic<u32>, 4>;
 
 // The sample.
@@ -54,7 +54,7 @@ var<private> limit_q: f32;        // the nearest fragment dropped; below 0: none
 var<private> limit_face: u32;
 var<private> blended: u32;        // in this walk, visible ones
 var<private> advanced: bool;      // in this walk
-var<private> effort: u32;         // loop iterations in this batch
+var<private> effort: u32;         // iterations of nested loops in this batch
 // Its queue: a ring, nearest first.
 var<private> head: u32;
 var<private> count: u32;
@@ -86,7 +86,6 @@ fn blend_front() {
   advanced = true;
   head = place(1u);
   count--;
-  effort++;
 }
 
 fn is_nearer(q: f32, face: u32, other_q: f32, other_face: u32) -> bool {
@@ -410,7 +409,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
     if (now.x == 0u) { ended = true; break; }
     if (spent + now.w > frame.budget) { ended = true; cut = true; break; }
     let triangles = countOneBits(now.y) + countOneBits(now.z);
-    spent += triangles + 8u;
+    spent += 3u * triangles + K + 8u;
     if (open) {
       // Slots whose box holds the sample; those that cover it; then their fragments: lanes differ less so.
       let word = t / 32u;
@@ -427,8 +426,8 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
         near.y |= ((boxes[2u * slot + 64u + word] >> bit) & 1u) << slot;
         rest.y &= rest.y - 1u;
       }
-      effort = countOneBits(near.x) + countOneBits(near.y);
-      tests += effort;
+      tests += countOneBits(near.x) + countOneBits(near.y);
+      effort = 0u;
       var hits = vec2u(0u);
       while ((near.x | near.y) != 0u) {
         var slot = 0u;
@@ -444,7 +443,6 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
         let key = keys[slot / RUN];
         if (count == K && queue_key[head] > key) { blend_front(); open = is_open(); }
         if (open) { add_fragment(slot, p, o, key); }
-        effort++;
       }
       atomicAdd(&efforts[t / 16u], effort);
       whole = whole && (rest.x | rest.y | near.x | near.y) == 0u && ((hits.x | hits.y) == 0u || !open);

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import threading
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.webgpu import kernels
-from meshsplats.webgpu.device import Device, open_device
+from meshsplats.webgpu.device import BUDGET, Device, open_device
 
 WINDOW_SAMPLES = 1 << 22
 """Largest number of samples of a frame; larger images are drawn in windows."""
@@ -25,9 +24,8 @@ FIRST_PAIRS = 1 << 18
 MAX_FAN = 8192
 """Most triangles of a splat with a low-pass filter: one invocation goes through all of them three times."""
 
-LOOP_BUDGET = 40_000
-"""Loop iterations of one walk through a tile list. Drivers end what runs too long, some without an error;
-lavapipe cuts loops after 65,535 iterations."""
+_Output = Literal[kernels.Output, "values"]
+"""What a frame blends: the outputs of ``raster``, and other values than the colours."""
 
 MAX_ROUNDS = 10_000
 """Most repetitions of a frame's last steps."""
@@ -44,7 +42,8 @@ class DrawSettings:
     filter_px2: float = 0.0
     queue: int = kernels.QUEUE
     long_queue: int = kernels.LONG_QUEUE
-    budget: int = LOOP_BUDGET
+    budget: int | None = None
+    """Loop iterations of one walk through a tile list; None: those of the device."""
 
 
 @dataclass
@@ -106,21 +105,38 @@ def draw(
         MemoryError: the scene does not fit.
         ValueError: two splats share a vertex, and the mesh has a filter.
     """
-    return _renderer(mesh).draw(camera, settings, depth=depth, normals=normals, values=values)
+    open_device()
+    import wgpu
+
+    try:
+        return _renderer(mesh).draw(camera, settings, depth=depth, normals=normals, values=values)
+    except wgpu.GPUError as error:
+        _forget()  # the device may be lost
+        if isinstance(error, MemoryError):
+            raise MemoryError(f"the GPU has too little memory: {error}") from None
+        raise DeviceError(f"the GPU failed: {error}") from None
 
 
 _lock = threading.Lock()
-_last: tuple[weakref.ref[SplatMesh], MeshRenderer] | None = None
+_last: MeshRenderer | None = None
 
 
 def _renderer(mesh: SplatMesh) -> MeshRenderer:
     """The renderer of ``mesh``: that of the last call if it was for the same mesh."""
     global _last
     with _lock:
-        if _last is None or _last[0]() is not mesh:
+        if _last is None or _last.mesh is not mesh:
             _last = None  # frees its buffers first
-            _last = weakref.ref(mesh), MeshRenderer(open_device(), mesh)
-        return _last[1]
+            _last = MeshRenderer(open_device(), mesh)
+        return _last
+
+
+def _forget() -> None:
+    """Opens the device anew at the next call."""
+    global _last
+    with _lock:
+        _last = None
+        open_device.cache_clear()
 
 
 class MeshRenderer:
@@ -128,7 +144,7 @@ class MeshRenderer:
 
     def __init__(self, device: Device, mesh: SplatMesh) -> None:
         self.device = device
-        self._mesh = mesh
+        self.mesh = mesh
         self._lock = threading.Lock()
         self._buffers: dict[str, Any] = {}
         self._capacity = FIRST_PAIRS
@@ -145,7 +161,9 @@ class MeshRenderer:
             self._offsets = (3 * len(mesh.faces), start, start + len(of_face))
             self._counts["groups"] = len(largest)
         if self._counts["runs"] >= kernels.MAX_RUNS:
-            raise MemoryError(f"the mesh has {len(runs):,} runs of triangles; the GPU takes {kernels.MAX_RUNS:,}")
+            raise MemoryError(
+                f"the mesh has {len(runs):,} runs of triangles; the GPU takes {kernels.MAX_RUNS:,}"
+            )
         if not len(mesh.faces):
             return
         self._check_size("vertices", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
@@ -218,7 +236,7 @@ class MeshRenderer:
         images.depth = np.zeros((h, w), np.float32) if depth else None
         images.normals = np.zeros((h, w, 3), np.float32) if normals else None
         images.values = None if values is None else np.zeros((h, w, values.shape[1]), np.float32)
-        if not len(self._mesh.faces):
+        if not len(self.mesh.faces):
             return images
         with self._lock:
             self._prepare_filter(settings)
@@ -235,7 +253,7 @@ class MeshRenderer:
     def _prepare_filter(self, settings: DrawSettings) -> None:
         if not settings.filter_px2 or "fans" in self._buffers:
             return
-        splat = self._mesh.face_splat
+        splat = self.mesh.face_splat
         assert splat is not None
         starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
         if np.diff(starts).max() > MAX_FAN:
@@ -243,9 +261,9 @@ class MeshRenderer:
                 f"the filter of the GPU takes splats of up to {MAX_FAN:,} triangles; one has"
                 f" {np.diff(starts).max():,}. Use device='cpu'"
             )
-        owner = np.full(len(self._mesh.vertices), -1, np.int32)
-        owner[self._mesh.faces] = splat[:, None]
-        if (owner[self._mesh.faces] != splat[:, None]).any():
+        owner = np.full(len(self.mesh.vertices), -1, np.int32)
+        owner[self.mesh.faces] = splat[:, None]
+        if (owner[self.mesh.faces] != splat[:, None]).any():
             raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
         self._upload("fans", starts)
         self._fans = len(starts) - 1
@@ -292,32 +310,34 @@ class MeshRenderer:
         if images.depth is not None:
             self._frame("depth", counts, settings, None)
             images.depth[rows, columns] = self._read(w, h, settings.samples)[..., 0]
-        alpha = self._mesh.colors[:, 3:]
+        alpha = self.mesh.colors[:, 3:]
         if images.normals is not None:
-            known = self._mesh.normals is not None
-            of_vertex = self._mesh.normals if known else self._mesh.vertices
-            self._upload("values", np.concatenate([of_vertex, alpha], axis=1, dtype=np.float32))
-            self._frame("vertex_normals" if known else "face_normals", counts, settings, None)
+            known = self.mesh.normals
+            of_vertex = self.mesh.vertices if known is None else known
+            self._upload("other_values", np.concatenate([of_vertex, alpha], axis=1, dtype=np.float32))
+            self._frame("face_normals" if known is None else "vertex_normals", counts, settings, None)
             images.normals[rows, columns] = self._read(w, h, settings.samples)[..., :3]
         if values is not None and images.values is not None:
             for first in range(0, values.shape[1], 3):
                 some = values[:, first : first + 3]
                 padding = np.zeros((len(some), 3 - some.shape[1]), np.float32)
-                self._upload("values", np.concatenate([some, padding, alpha], axis=1, dtype=np.float32))
-                self._frame("color", counts, settings, None)
+                self._upload("other_values", np.concatenate([some, padding, alpha], axis=1, dtype=np.float32))
+                self._frame("values", counts, settings, None)
                 count = some.shape[1]
                 images.values[rows, columns, first : first + count] = self._read(w, h, settings.samples)[
                     ..., :count
                 ]
-        if images.normals is not None or values is not None:
-            self._upload("values", self._mesh.colors)
         return True
 
     def _begin(self, camera: Camera, settings: DrawSettings) -> dict[str, int]:
         """Sizes the buffers of a frame and writes its uniforms; returns the counts of its steps."""
         s = settings.samples
         w, h = camera.width * s, camera.height * s
-        counts = self._counts | {"tiles": _tiles(w) * _tiles(h), "columns": camera.width, "rows": camera.height}
+        counts = self._counts | {
+            "tiles": _tiles(w) * _tiles(h),
+            "columns": camera.width,
+            "rows": camera.height,
+        }
         if settings.filter_px2:
             counts["fans"] = self._fans
         blocks = -(-self._capacity // 2048)
@@ -330,15 +350,18 @@ class MeshRenderer:
         self._allocate("samples", 32 * w * h)
         if s > 1:
             self._allocate("pixels", 16 * camera.width * camera.height)
+        if settings.budget is None:
+            settings = replace(settings, budget=self.device.budget)
         frame = frame_uniform(camera, settings, counts, self._capacity, self._offsets)
         self.device.device.queue.write_buffer(self._buffers["frame"], 0, frame)
         return counts
 
     def _frame(
-        self, output: kernels.Output, counts: dict[str, int], settings: DrawSettings, work: Work | None
+        self, output: _Output, counts: dict[str, int], settings: DrawSettings, work: Work | None
     ) -> np.ndarray:
         """Renders one frame to the samples, until all tiles are finished; returns the counters."""
-        steps = (kernels.list_steps() if output == "color" and work is not None else []) + kernels.raster_steps()
+        steps = kernels.list_steps() if output == "color" else []
+        steps += kernels.raster_steps()
         if work is not None:
             work.frames += 1
             work.dispatches = 0
@@ -368,7 +391,7 @@ class MeshRenderer:
         name = "samples"
         if samples > 1:
             counts = {"columns": width, "rows": height}
-            self._run(kernels.resolve_steps(), "color", counts, DrawSettings(), None)
+            self._run(kernels.resolve_steps(), "color", counts, DrawSettings())
             name = "pixels"
         data = self.device.device.queue.read_buffer(self._buffers[name], 0, 16 * width * height)
         return np.frombuffer(data, np.float32).reshape(height, width, 4)
@@ -376,10 +399,10 @@ class MeshRenderer:
     def _run(
         self,
         steps: Sequence[dict[str, Any]],
-        output: kernels.Output,
+        output: _Output,
         counts: dict[str, int],
         settings: DrawSettings,
-        work: Work | None,
+        work: Work | None = None,
     ) -> None:
         gpu = self.device.device
         encoder = gpu.create_command_encoder()
@@ -397,7 +420,7 @@ class MeshRenderer:
                 compute = encoder.begin_compute_pass()
             pipeline = self._pipeline(step["kernel"], output, settings)
             compute.set_pipeline(pipeline)
-            compute.set_bind_group(0, self._bind_group(pipeline, step["bind"]))
+            compute.set_bind_group(0, self._bind_group(pipeline, step["bind"], output))
             if "indirect" in step:
                 name, byte = step["indirect"]
                 compute.dispatch_workgroups_indirect(self._buffers[name], byte)
@@ -410,10 +433,12 @@ class MeshRenderer:
             compute.end()
         gpu.queue.submit([encoder.finish()])
 
-    def _bind_group(self, pipeline: Any, bind: dict[str, str]) -> Any:
+    def _bind_group(self, pipeline: Any, bind: dict[str, str], output: _Output) -> Any:
         entries = []
         for binding, name in bind.items():
             base, _, index = name.partition(".")
+            if base == "values" and output in ("values", "vertex_normals", "face_normals"):
+                base = "other_values"
             buffer = self._buffers[base]
             offset, size = (256 * int(index), 16) if index else (0, buffer.size)
             entries.append(
@@ -421,14 +446,15 @@ class MeshRenderer:
             )
         return self.device.device.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries)
 
-    def _pipeline(self, kernel: str, output: kernels.Output, settings: DrawSettings) -> Any:
+    def _pipeline(self, kernel: str, output: _Output, settings: DrawSettings) -> Any:
         groups = self._counts["groups"] > 0
+        blended: kernels.Output = "color" if output == "values" else output
         if kernel in ("raster", "raster_again"):
             queue = settings.queue if kernel == "raster" else settings.long_queue
             return self.device.pipeline(
                 "raster",
-                ("raster", queue, output, groups),
-                lambda: kernels.raster_source(queue, output=output, groups=groups),
+                ("raster", queue, blended, groups),
+                lambda: kernels.raster_source(queue, output=blended, groups=groups),
             )
         return self.device.pipeline(kernel, ("lists",), kernels.lists_source)
 
@@ -450,7 +476,8 @@ def frame_uniform(
     data[24:28] = camera.near, settings.min_transmittance, settings.cutoff, settings.filter_px2 * s * s
     words[28:32] = w, h, _tiles(w), _tiles(h)
     words[32:36] = counts["vertices"], counts["faces"], counts["runs"], counts["fans"]
-    words[36:40] = counts["groups"], capacity, settings.max_layers, settings.budget
+    words[36:39] = counts["groups"], capacity, settings.max_layers
+    words[39] = BUDGET if settings.budget is None else settings.budget
     words[40:43] = offsets
     words[43] = s
     return data
@@ -475,7 +502,9 @@ def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
     before = np.cumsum(pieces) - pieces
     first = np.repeat(starts, pieces) + kernels.RUN * (np.arange(pieces.sum()) - np.repeat(before, pieces))
     ends = np.minimum(first + kernels.RUN, np.repeat(starts + lengths, pieces))
-    return (first.astype(np.uint32) | ((ends - first - 1).astype(np.uint32) << np.uint32(29))).astype(np.uint32)
+    return (first.astype(np.uint32) | ((ends - first - 1).astype(np.uint32) << np.uint32(29))).astype(
+        np.uint32
+    )
 
 
 def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:
