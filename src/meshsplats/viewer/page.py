@@ -26,7 +26,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.viewer.quantise import QuantisedMesh, pack_splats, quantise_mesh
 
-MODULES = ("scene.js", "camera.js", "sorted.js", "exact.js", "controls.js", "crop.js", "app.js")
+MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")
 """The scripts of the page, in the order in which they are joined."""
 
 MOST_CAMERAS = 2000
