@@ -372,6 +372,7 @@ class App {
     element("status").textContent = kind + (wording[state] ?? size);
     element("samples").disabled = !this.#exactly();
     document.body.dataset.renderer = kind;
+    document.body.dataset.firstPicture ??= String(Math.round(performance.now())); // milliseconds after the request
     document.body.dataset.state = state;
     if (state === "moving" && !element("statistics").open) return;
     const { width, height } = this.canvases.sorted, { mesh, splats, view, settings } = this;
@@ -384,6 +385,7 @@ class App {
       image: `${width} × ${height}`,
       "exact frame": this.exactTook === undefined ? "–" : `${number(this.exactTook)} ms`,
       "graphics": exact ? this.exact.name : this.sorted?.name ?? "",
+      "first picture": `${number(Number(document.body.dataset.firstPicture))} ms`,
       position: point(view.position),
       direction: point(view.forward),
       ...settings.statistics,
