@@ -2,9 +2,9 @@
 
     python benchmarks/viewer.py SPLATS [SPLATS ...] --cameras FILE [FILE ...] [--chromium SIDE]
 
-A camera file for each splat file; its first camera is the view. `--chromium` opens each page from the disk in a
-headless Chromium, with WebGPU and WebGL by SwiftShader (on processors: slow), and compares a screenshot of SIDE x
-SIDE pixels, one sample a pixel, with `render`.
+A camera file for each splat file; its first camera is the view. `--chromium` opens each page from the disk
+in a headless Chromium, with WebGPU and WebGL by SwiftShader (on processors: slow), and compares a screenshot
+of SIDE x SIDE pixels, one sample a pixel, with `render`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ SIDES = (400, 800)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("splats", type=Path, nargs="+")
     parser.add_argument("--cameras", type=Path, nargs="+", required=True)
     parser.add_argument("--chromium", type=int, metavar="SIDE")
@@ -84,7 +86,8 @@ def in_chromium(name: str, mesh: ms.SplatMesh, camera: ms.Camera, page: Page) ->
             browser.close()
     off = np.abs(image - expected).max(axis=-1)
     print(
-        f"{name}, {camera.width} x {camera.height}, {renderer}: first picture after {first:.1f} s, exact frame {frame};"
+        f"{name}, {camera.width} x {camera.height}, {renderer}: first picture after {first:.1f} s,"
+        f" exact frame {frame};"
         f" at most {off.max()} levels off, {(off > 1).sum()} pixels by more than 1,"
         f" {(off > 0).mean():.2%} at all; {ms.psnr(image / 255, expected / 255):.1f} dB"
     )

@@ -46,7 +46,9 @@ def test_splats_become_a_page_with_both(folder, tmp_path, capsys):
     assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 0
     printed = capsys.readouterr().out
     assert "1,600 triangles, 200 splats" in printed
-    assert re.search(r"\d\.\d bytes a triangle; quantisation moves vertices by at most \S+ of the scene's radius", printed)
+    assert re.search(
+        r"\d\.\d bytes a triangle; quantisation moves vertices by at most \S+ of the scene's radius", printed
+    )
     assert settings(page)["title"] == "scene"
     assert has_splats(page)
     assert toml.load(tmp_path / "page.html.config.toml")["command"] == "view"
@@ -67,14 +69,18 @@ def test_a_mesh_alone_or_with_its_splats(folder, tmp_path):
     alone, both = tmp_path / "alone.html", tmp_path / "both.html"
     assert main(["view", str(folder / "mesh.npz"), "-o", str(alone)]) == 0
     assert not has_splats(alone)
-    assert main(["view", str(folder / "mesh.npz"), "--splats", str(folder / "scene.ply"), "-o", str(both)]) == 0
+    assert (
+        main(["view", str(folder / "mesh.npz"), "--splats", str(folder / "scene.ply"), "-o", str(both)]) == 0
+    )
     assert has_splats(both)
 
 
 def test_a_model_folder_brings_its_cameras(folder, tmp_path):
     model = tmp_path / "model"
     (model / "point_cloud" / "iteration_7").mkdir(parents=True)
-    (model / "point_cloud" / "iteration_7" / "point_cloud.ply").write_bytes((folder / "scene.ply").read_bytes())
+    (model / "point_cloud" / "iteration_7" / "point_cloud.ply").write_bytes(
+        (folder / "scene.ply").read_bytes()
+    )
     (model / "cameras.json").write_bytes((folder / "cameras.json").read_bytes())
     assert main(["view", str(model), "-o", str(tmp_path / "page.html")]) == 0
     assert len(settings(tmp_path / "page.html")["cameras"]) == 2
@@ -108,7 +114,9 @@ def test_a_crop_leaves_less(folder, tmp_path, capsys):
         (["scene.ply", "-o", "nowhere/page.html"], "does not exist"),
     ],
 )
-def test_wrong_usage_is_told_before_anything_is_written(folder, tmp_path, monkeypatch, capsys, words, message):
+def test_wrong_usage_is_told_before_anything_is_written(
+    folder, tmp_path, monkeypatch, capsys, words, message
+):
     for name in ("scene.ply", "mesh.npz", "cameras.json"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     before = sorted(tmp_path.iterdir())

@@ -53,9 +53,7 @@ class Browser:
             (os.POSIX_SPAWN_DUP2, 101, 4),
         ]
         arguments = [PROGRAM, *FLAGS, *flags, "--remote-debugging-pipe", f"--user-data-dir={self._profile}"]
-        self.pid = os.posix_spawn(
-            PROGRAM, arguments, dict(os.environ), file_actions=actions, setpgroup=0
-        )
+        self.pid = os.posix_spawn(PROGRAM, arguments, dict(os.environ), file_actions=actions, setpgroup=0)
         for descriptor in (theirs_in, theirs_out, null, *high):
             os.close(descriptor)
         self._in, self._out = ours_in, ours_out
@@ -196,7 +194,8 @@ class Page:
         """Sets a select, slider or colour, as a user's hand does."""
         self.run(
             f"(e => {{ e.value = {json.dumps(value)}; for (const name of ['input', 'change'])"
-            f" e.dispatchEvent(new Event(name, {{bubbles: true}})); }})(document.querySelector({json.dumps(selector)}))"
+            " e.dispatchEvent(new Event(name, {bubbles: true})); })"
+            f"(document.querySelector({json.dumps(selector)}))"
         )
 
     def text(self, selector: str) -> str:
@@ -210,7 +209,9 @@ class Page:
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
-    def drag(self, x: float, y: float, dx: float, dy: float, button: str = "left", modifiers: int = 0) -> None:
+    def drag(
+        self, x: float, y: float, dx: float, dy: float, button: str = "left", modifiers: int = 0
+    ) -> None:
         bits = {"left": 1, "right": 2}[button]
         more = {"button": button, "buttons": bits, "modifiers": modifiers}
         self.mouse("mousePressed", x, y, clickCount=1, **more)

@@ -138,7 +138,11 @@ def layered(cloud: ms.GaussianCloud, camera: ms.Camera) -> ms.SplatMesh:
 def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud, cameras):
     odd = replace(layered(cloud, cameras[0]), blending="linear", filter_px2=0.5)
     expected = levels(image_of(odd, cameras[0], (1, 1, 1))[0])
-    for plain in (replace(odd, depth_group=None), replace(odd, filter_px2=0), replace(odd, blending="display")):
+    for plain in (
+        replace(odd, depth_group=None),
+        replace(odd, filter_px2=0),
+        replace(odd, blending="display"),
+    ):
         other = levels(image_of(plain, cameras[0], (1, 1, 1))[0])
         assert (np.abs(other - expected) > 1).any(axis=-1).mean() > 0.1
     page = open_page(browser, write_page(odd, "odd", cameras=cameras))

@@ -98,7 +98,11 @@ def test_modules_become_one_script_without_imports():
             names, module = imported
             assert pages.MODULES.index(module) < pages.MODULES.index(name)
             for each in names.split(","):
-                assert re.search(rf"^export (?:async )?(?:class|function|const) {each.strip()}\b", pages._read(module), re.M)
+                assert re.search(
+                    rf"^export (?:async )?(?:class|function|const) {each.strip()}\b",
+                    pages._read(module),
+                    re.M,
+                )
 
 
 def test_a_page_begins_before_the_subject_and_upright(mesh):

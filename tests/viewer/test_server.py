@@ -23,7 +23,9 @@ def server() -> Iterator[PageServer]:
         thread.join()
 
 
-def ask(server: PageServer, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+def ask(
+    server: PageServer, path: str, method: str = "GET", **headers: str
+) -> tuple[int, dict[str, str], bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
     connection.request(method, path, headers=headers)
     answer = connection.getresponse()
@@ -44,7 +46,14 @@ def test_the_page_is_at_its_address(server):
 
 
 def test_other_paths_hold_nothing(server):
-    for path in ("/", "/favicon.ico", server.path[:-2] + "/", server.path + "x", server.path + "?a", "/../etc/passwd"):
+    for path in (
+        "/",
+        "/favicon.ico",
+        server.path[:-2] + "/",
+        server.path + "x",
+        server.path + "?a",
+        "/../etc/passwd",
+    ):
         assert ask(server, path)[0] == 404
     assert ask(server, server.path, "POST")[0] == 501
 

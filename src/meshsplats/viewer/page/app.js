@@ -123,10 +123,12 @@ class App {
     if (name === "plain") this.changed();
   }
 
-  fly(keys, fast) {
+  // begun: a key went down just now; even the shortest press moves the camera.
+  fly(keys, fast, begun = false) {
     const pressed = (plus, minus) => Number(keys.has(plus)) - Number(keys.has(minus));
     const speed = this.settings.radius * (fast ? 2.4 : 0.6);
     this.thrust = [pressed("d", "a"), pressed("q", "e"), pressed("w", "s")].map(value => value * speed);
+    if (begun) this.view.move(...this.thrust.map(value => value / 60));
     if (keys.size) this.changed();
   }
 
