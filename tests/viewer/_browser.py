@@ -53,9 +53,7 @@ class Browser:
             (os.POSIX_SPAWN_DUP2, 101, 4),
         ]
         arguments = [PROGRAM, *FLAGS, *flags, "--remote-debugging-pipe", f"--user-data-dir={self._profile}"]
-        self.pid = os.posix_spawn(
-            PROGRAM, arguments, dict(os.environ), file_actions=actions, setpgroup=0
-        )
+        self.pid = os.posix_spawn(PROGRAM, arguments, dict(os.environ), file_actions=actions, setpgroup=0)
         for descriptor in (theirs_in, theirs_out, null, *high):
             os.close(descriptor)
         self._in, self._out = ours_in, ours_out
@@ -83,7 +81,6 @@ class Browser:
         message = {"id": self._count, "method": method, "params": parameters}
         if session is not None:
             message["sessionId"] = session
-        os.write_all(self._out, b"") if hasattr(os, "write_all") else None
         data = json.dumps(message).encode() + b"\0"
         while data:
             data = data[os.write(self._out, data) :]
@@ -140,6 +137,7 @@ class Page:
         if before:
             self.send("Page.addScriptToEvaluateOnNewDocument", source=before)
         self.send("Page.navigate", url=url)
+        self.wait("document.readyState === 'complete' && location.href !== 'about:blank'")
 
     def send(self, method: str, timeout: float = 400, **parameters: Any) -> dict:
         return self.browser.send(method, self.session, timeout, **parameters)
@@ -185,19 +183,35 @@ class Page:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
     def key(self, key: str, *, shift: bool = False, hold: float = 0) -> None:
-        code = {"keyCode": 0}
         text = {"text": key} if len(key) == 1 else {}
         named = {"windowsVirtualKeyCode": {"Enter": 13, "Tab": 9, " ": 32}.get(key, 0)}
         modifiers = 8 if shift else 0
-        del code
         self.send("Input.dispatchKeyEvent", type="keyDown", key=key, modifiers=modifiers, **text, **named)
         time.sleep(hold)
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key, modifiers=modifiers, **named)
 
+    def choose(self, selector: str, value: str) -> None:
+        """Sets a select, slider or colour, as a user's hand does."""
+        self.run(
+            f"(e => {{ e.value = {json.dumps(value)}; for (const name of ['input', 'change'])"
+            " e.dispatchEvent(new Event(name, {bubbles: true})); })"
+            f"(document.querySelector({json.dumps(selector)}))"
+        )
+
+    def text(self, selector: str) -> str:
+        return self.run(f"document.querySelector({json.dumps(selector)}).textContent")
+
+    def statistics(self) -> dict[str, str]:
+        """The lines of the page's statistics."""
+        terms = "[...document.querySelectorAll('#statistics dt')]"
+        return dict(self.run(f"{terms}.map(dt => [dt.textContent, dt.nextElementSibling.textContent])"))
+
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
-    def drag(self, x: float, y: float, dx: float, dy: float, button: str = "left", modifiers: int = 0) -> None:
+    def drag(
+        self, x: float, y: float, dx: float, dy: float, button: str = "left", modifiers: int = 0
+    ) -> None:
         bits = {"left": 1, "right": 2}[button]
         more = {"button": button, "buttons": bits, "modifiers": modifiers}
         self.mouse("mousePressed", x, y, clickCount=1, **more)

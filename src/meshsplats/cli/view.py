@@ -57,17 +57,17 @@ class View(Command):
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or a mesh."""
-    output: Annotated[
-        Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")
-    ] = None
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = (
+        None
+    )
     """An .html file with everything inside. Default: the browser is opened."""
     splats: File = None
     """Splats to compare a mesh with. Default: the input, where that is splats."""
     without_splats: bool = False
     """Leave the splats out: the page is smaller."""
     cameras: File = None
-    """Viewpoints to choose from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder
-    that has one. Default: those of the input, if it is a model folder."""
+    """Viewpoints to choose from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model
+    folder that has one. Default: those of the input, if it is a model folder."""
     data: Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio): viewpoints to choose from."""
     up: Text = None
@@ -167,7 +167,9 @@ class View(Command):
         from meshsplats.rendering import render
         from meshsplats.viewer.quantise import unpack_mesh
 
-        camera = cameras[0].within(SIDE) if cameras else orbit(mesh, 1, azimuth=30, width=SIDE, height=SIDE)[0]
+        camera = (
+            cameras[0].within(SIDE) if cameras else orbit(mesh, 1, azimuth=30, width=SIDE, height=SIDE)[0]
+        )
         packed = page.mesh
         images = [render(each, camera, samples=2).color for each in (mesh, unpack_mesh(packed.data))]
         return {

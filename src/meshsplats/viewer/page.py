@@ -23,10 +23,10 @@ from meshsplats.cameras.framing import guess_up, scene_bounds
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.webgpu import kernels
 from meshsplats.viewer.quantise import QuantisedMesh, pack_splats, quantise_mesh
+from meshsplats.webgpu import kernels
 
-MODULES = ("scene.js", "camera.js", "sorted.js", "exact.js", "controls.js", "crop.js", "app.js")
+MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")
 """The scripts of the page, in the order in which they are joined."""
 
 MOST_CAMERAS = 2000
@@ -47,7 +47,7 @@ class PageOptions:
     """Name of the scene."""
     background: Sequence[float] = (1.0, 1.0, 1.0)
     """Display RGB, 0 to 1."""
-    up: Sequence[float] | None = None
+    up: Sequence[float] | np.ndarray | None = None
     """(3,) direction that points up. None: by the cameras, else by the mesh."""
     statistics: Mapping[str, str] = field(default_factory=dict)
     """Further lines for the statistics."""
@@ -141,8 +141,8 @@ def _assembled(title: str, blocks: Mapping[str, tuple[str, str]]) -> str:
 
     code, style = script(), _read("style.css")
     for text in (code, style):
-        # Either would end the element that holds it.
-        assert "</script" not in text.lower() and "</style" not in text.lower() and "<!--" not in text
+        # These would end the element that holds them, or hide its end.
+        assert not re.search("</script|</style|<!--", text, re.IGNORECASE)
     policy = "; ".join(
         [
             "default-src 'none'",

@@ -1,6 +1,6 @@
 // The page: settings, the loop that draws while something moves and refines the image when it is still.
 
-import { View, add, dot, project } from "./camera.js";
+import { View, add, dot } from "./camera.js";
 import { connect, connectDivider } from "./controls.js";
 import { CropBox } from "./crop.js";
 import { ExactRenderer } from "./exact.js";
@@ -10,6 +10,7 @@ import { SortedRenderer } from "./sorted.js";
 const QUIET = 180; // milliseconds without a change, after which the image is still
 const DRAFTS = [1 / 4, 1 / 3, 1 / 2, 1]; // sizes of the image while it moves
 const SLOW = 50, QUICK = 16, HOPELESS = 150; // milliseconds of a frame: a smaller draft, a larger one, the other renderer
+const PICK = 8; // CSS pixels around a double click
 const MOST_PIXELS = 3.9e6; // of the canvas: the exact renderer draws an image in one piece
 const FLIGHT = 450; // milliseconds from one camera to the next
 
@@ -57,7 +58,7 @@ class App {
     if (this.exact) {
       this.changed();
     } else {
-      this.#fall(`No exact image here: ${problems.join("; ")}. Triangles are sorted by their centres and drawn by WebGL.` +
+      this.#fall(`The image is not exact here: ${problems.join("; ")}. WebGL draws triangles sorted by their centres.` +
         " Current versions of Chrome, Edge, Safari and Firefox have WebGPU.");
     }
     if (!this.sorted) {
@@ -82,8 +83,8 @@ class App {
   }
 
   say(text) {
-    element("message").hidden = !text;
-    element("message").textContent = text;
+    element("message").hidden = false;
+    element("messageText").textContent = text;
   }
 
   // ---- Views
@@ -108,6 +109,7 @@ class App {
   changed() {
     this.changedAt = performance.now();
     this.dirty = true;
+    if (document.body.dataset.state !== "loading") document.body.dataset.state = "moving";
     this.wake();
   }
 
@@ -121,26 +123,31 @@ class App {
     if (name === "plain") this.changed();
   }
 
-  fly(keys, fast) {
+  // begun: a key went down just now; even the shortest press moves the camera.
+  fly(keys, fast, begun = false) {
     const pressed = (plus, minus) => Number(keys.has(plus)) - Number(keys.has(minus));
     const speed = this.settings.radius * (fast ? 2.4 : 0.6);
     this.thrust = [pressed("d", "a"), pressed("q", "e"), pressed("w", "s")].map(value => value * speed);
+    if (begun) this.view.move(...this.thrust.map(value => value / 60));
     if (keys.size) this.changed();
   }
 
-  // Centres the nearest fan at a point of the stage, in CSS pixels.
+  // Centres the nearest visible vertex at a point of the stage, in CSS pixels.
   pick(x, y) {
     const pinhole = this.view.pinhole(this.stage.clientWidth, this.stage.clientHeight), { mesh } = this;
-    let best = null;
-    for (let v = 0; v < mesh.vertices.length / 3; v++) {
-      if (mesh.colors[4 * v + 3] < 0.2) continue;
-      const point = mesh.vertices.subarray(3 * v, 3 * v + 3), [px, py, z] = project(pinhole, point);
-      if (z > pinhole.near && Math.hypot(px - x, py - y) < 8 && !(best?.z <= z)) best = { z, point: [...point] };
+    const { rows: [a, b, c], fx, fy, cx, cy } = pinhole, points = mesh.vertices;
+    let nearest = Infinity, found = -1;
+    for (let v = 0, i = 0; v < points.length / 3; v++, i += 3) {
+      const z = c[0] * points[i] + c[1] * points[i + 1] + c[2] * points[i + 2] + c[3];
+      if (!(z > pinhole.near) || z >= nearest || mesh.colors[4 * v + 3] < 0.2) continue;
+      const dx = fx * (a[0] * points[i] + a[1] * points[i + 1] + a[2] * points[i + 2] + a[3]) / z + cx - x;
+      const dy = fy * (b[0] * points[i] + b[1] * points[i + 1] + b[2] * points[i + 2] + b[3]) / z + cy - y;
+      if (dx * dx + dy * dy < PICK * PICK) [nearest, found] = [z, i];
     }
-    if (!best) return;
-    const target = this.view.copy(), away = add(best.point, this.view.position, -1);
-    target.distance = Math.max(dot(away, target.forward), 0.02 * this.settings.radius);
-    target.position = add(best.point, target.forward, -target.distance);
+    if (found < 0) return;
+    const point = [...points.subarray(found, found + 3)], target = this.view.copy();
+    target.distance = nearest;
+    target.position = add(point, target.forward, -nearest);
     this.flight = { from: this.view.copy(), target, start: calm.matches ? -Infinity : performance.now() };
     this.changed();
   }
@@ -221,6 +228,8 @@ class App {
       toggle.focus();
     });
     open(!matchMedia("(max-width: 640px)").matches);
+    element("dismiss").addEventListener("click", () => { element("message").hidden = true; });
+    this.canvases.sorted.addEventListener("webglcontextlost", () => this.say("The graphics device was lost: load the page again."));
     connect(this.stage, this, settings.radius * 1e-3);
     new ResizeObserver(() => this.changed()).observe(this.stage);
     this.#measure();
@@ -359,10 +368,13 @@ class App {
   #report(state, exact, passes, scale) {
     const { options } = this, only = options.content === "splats";
     const kind = only ? "splats" : exact ? "exact" : "sorted";
-    const size = scale < 1 ? `1/${Math.round(1 / scale)} size` : state === "moving" ? "moving" : `${passes} sample${passes > 1 ? "s" : ""}`;
-    const wording = { refining: `${this.passes} of ${passes} samples`, preparing: "preparing the exact image" };
-    element("status").textContent = `${kind}, ${wording[state] ?? size}`;
+    const samples = exact && !only ? `, ${passes} sample${passes > 1 ? "s" : ""} per pixel` : "";
+    const size = scale < 1 ? `, 1/${Math.round(1 / scale)} size` : state === "moving" ? ", moving" : samples;
+    const wording = { refining: `, ${this.passes} of ${passes} samples`, preparing: ", preparing the exact image" };
+    element("status").textContent = kind + (wording[state] ?? size);
+    element("samples").disabled = !this.#exactly();
     document.body.dataset.renderer = kind;
+    document.body.dataset.firstPicture ??= String(Math.round(performance.now())); // milliseconds after the request
     document.body.dataset.state = state;
     if (state === "moving" && !element("statistics").open) return;
     const { width, height } = this.canvases.sorted, { mesh, splats, view, settings } = this;
@@ -375,6 +387,7 @@ class App {
       image: `${width} × ${height}`,
       "exact frame": this.exactTook === undefined ? "–" : `${number(this.exactTook)} ms`,
       "graphics": exact ? this.exact.name : this.sorted?.name ?? "",
+      "first picture": `${number(Number(document.body.dataset.firstPicture))} ms`,
       position: point(view.position),
       direction: point(view.forward),
       ...settings.statistics,
@@ -404,5 +417,5 @@ main().catch(error => {
   document.body.dataset.state = "failed";
   element("loading").remove();
   element("message").hidden = false;
-  element("message").textContent = error.message;
+  element("messageText").textContent = error.message;
 });

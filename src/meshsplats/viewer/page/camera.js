@@ -56,7 +56,8 @@ export class View {
     for (const name of ["right", "down", "forward"]) this[name] = unit(turned(this[name], axis, angle));
   }
 
-  // Turns by angles: around the up direction, then around the camera's right; not over the poles.
+  // Turns by angles: to the left, around the up direction; then downwards, around the camera's right, not over the
+  // poles.
   #rotate(yaw, pitch) {
     const tilt = Math.asin(Math.max(-1, Math.min(1, -dot(this.forward, this.up))));
     const least = -1.55 - tilt, most = 1.55 - tilt;

@@ -33,9 +33,9 @@ export function connect(stage, pilot, least) {
     } else if (touch.pans) {
       view.pan(x / side, y / side);
     } else if (pilot.flying) {
-      view.look(-x / side * 1.2, -y / side * 1.2);
+      view.look(x / side * 1.2, -y / side * 1.2);
     } else {
-      view.orbit(-x / side * 4, -y / side * 4);
+      view.orbit(-x / side * 4, y / side * 4);
     }
     pilot.changed();
   });
@@ -65,13 +65,13 @@ export function connect(stage, pilot, least) {
       if (!event.repeat) pilot.command(once[key]);
     } else if ("wasdqe".includes(key)) {
       keys.add(key);
-      pilot.fly(keys, event.shiftKey);
+      pilot.fly(keys, event.shiftKey, !event.repeat);
     } else if (key.startsWith("Arrow")) {
       const x = Number(key === "ArrowRight") - Number(key === "ArrowLeft");
       const y = Number(key === "ArrowDown") - Number(key === "ArrowUp");
       if (event.shiftKey) view.pan(-x * STEP, -y * STEP);
-      else if (pilot.flying) view.look(x * STEP, y * STEP);
-      else view.orbit(x * STEP * 2, y * STEP * 2);
+      else if (pilot.flying) view.look(-x * STEP, y * STEP);
+      else view.orbit(x * STEP * 2, -y * STEP * 2);
       pilot.changed();
     } else if (key === "+" || key === "=" || key === "-") {
       view.zoom(key === "-" ? 1 / ZOOM : ZOOM, least);

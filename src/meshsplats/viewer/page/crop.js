@@ -59,27 +59,25 @@ export class CropBox {
     document.getElementById("cropText").textContent = this.active ? `--crop ${numbers.join(" ")}` : "";
   }
 
-  // A slider at its end does not bound the scene.
-  #inside(x, y, z) {
-    const [low, high] = this.corners, [from, to] = this.marks, p = [x, y, z];
-    return p.every((value, k) => (from[k] === 0 || value >= low[k]) && (to[k] === STEPS || value <= high[k]));
-  }
-
   #kept() {
     const { mesh, splats } = this, F = mesh.faces.length / 3;
-    const fans = mesh.fans ?? Uint32Array.from({ length: F + 1 }, (_, i) => i);
-    const keptFans = [], triangles = [], keptSplats = [];
-    for (let fan = 0; fan + 1 < fans.length; fan++) {
-      const middle = [0, 0, 0], weight = 1 / (3 * (fans[fan + 1] - fans[fan]));
-      for (let i = 3 * fans[fan]; i < 3 * fans[fan + 1]; i++) {
-        for (let c = 0; c < 3; c++) middle[c] += weight * mesh.vertices[3 * mesh.faces[i] + c];
-      }
-      if (!this.#inside(...middle)) continue;
-      keptFans.push(fan);
-      for (let f = fans[fan]; f < fans[fan + 1]; f++) triangles.push(f);
+    this.fans ??= mesh.fans ?? Uint32Array.from({ length: F + 1 }, (_, i) => i);
+    this.middles ??= middlesOf(mesh, this.fans);
+    const fans = this.#within(this.middles), triangles = [];
+    for (const fan of fans) for (let f = this.fans[fan]; f < this.fans[fan + 1]; f++) triangles.push(f);
+    return { fans, triangles: Uint32Array.from(triangles), splats: splats ? this.#within(splats.means) : new Uint32Array(0) };
+  }
+
+  // Indices of the points (3 each) in the box. A slider at its end does not bound the scene.
+  #within(points) {
+    const [from, to] = this.corners, kept = [];
+    const low = from.map((value, k) => this.marks[0][k] === 0 ? -Infinity : value);
+    const high = to.map((value, k) => this.marks[1][k] === STEPS ? Infinity : value);
+    for (let i = 0; i < points.length / 3; i++) {
+      const x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
+      if (x >= low[0] && x <= high[0] && y >= low[1] && y <= high[1] && z >= low[2] && z <= high[2]) kept.push(i);
     }
-    for (let i = 0; i < (splats?.count ?? 0); i++) if (this.#inside(...splats.means.subarray(3 * i, 3 * i + 3))) keptSplats.push(i);
-    return { fans: Uint32Array.from(keptFans), triangles: Uint32Array.from(triangles), splats: Uint32Array.from(keptSplats) };
+    return Uint32Array.from(kept);
   }
 
   // The edges of the box in an image, in pixels.
@@ -97,4 +95,16 @@ export class CropBox {
     }
     return lines.join("");
   }
+}
+
+// The mean of each fan's triangle centres.
+export function middlesOf({ vertices, faces }, fans) {
+  const middles = new Float32Array(3 * (fans.length - 1));
+  for (let fan = 0; fan + 1 < fans.length; fan++) {
+    const weight = 1 / (3 * (fans[fan + 1] - fans[fan]));
+    for (let i = 3 * fans[fan]; i < 3 * fans[fan + 1]; i++) {
+      for (let c = 0; c < 3; c++) middles[3 * fan + c] += weight * vertices[3 * faces[i] + c];
+    }
+  }
+  return middles;
 }

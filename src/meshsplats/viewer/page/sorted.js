@@ -1,6 +1,8 @@
 // WebGL2: the mesh with its triangles sorted by their centres, and the splats. Not exact, as triangles that
 // overlap in depth are not split, but quick, and it runs where WebGPU is missing.
 
+import { middlesOf } from "./crop.js";
+
 const WIDTH = 4096; // texels in a row of a data texture
 const LENS = `
 uniform vec4 row0, row1, row2, lens; // world to camera; fx fy cx cy
@@ -99,8 +101,8 @@ void main() {
   result = vec4(linear ? encode(rgb) : rgb, 1);
 }`;
 
-// Indices of `items`, the ones with the largest depths first, in `order`. Depths are positive floats: their bits are
-// in the same order. `order` may be `items` itself no longer than the count of depths.
+// Fills `order` with `items`, indices of `depths`, the farthest first. Depths are positive floats: their bits are in
+// the same order.
 export function sortFarToNear(depths, items, order) {
   const n = items.length, bits = new Uint32Array(depths.buffer, depths.byteOffset, depths.length);
   let low = 0xffffffff, high = 0;
@@ -147,17 +149,8 @@ export class SortedRenderer {
     const four = new Float32Array(4 * V), bytes = new Uint8Array(4 * V), corners = new Uint32Array(4 * F);
     for (let v = 0; v < V; v++) four.set(mesh.vertices.subarray(3 * v, 3 * v + 3), 4 * v);
     for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
-    const centers = new Float32Array(3 * F), middles = new Float32Array(3 * (fans.length - 1));
-    for (let f = 0, fan = 0; f < F; f++) {
-      while (f >= fans[fan + 1]) fan++;
-      for (let k = 0; k < 3; k++) corners[4 * f + k] = mesh.faces[3 * f + k];
-      for (let c = 0; c < 3; c++) {
-        let sum = 0;
-        for (let k = 0; k < 3; k++) sum += mesh.vertices[3 * mesh.faces[3 * f + k] + c];
-        centers[3 * f + c] = sum / 3;
-        middles[3 * fan + c] += sum / 3 / (fans[fan + 1] - fans[fan]);
-      }
-    }
+    for (let f = 0; f < F; f++) for (let k = 0; k < 3; k++) corners[4 * f + k] = mesh.faces[3 * f + k];
+    const centers = middlesOf(mesh, Uint32Array.from({ length: F + 1 }, (_, i) => i)), middles = middlesOf(mesh, fans);
     this.triangles = {
       textures: {
         positions: texture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, four),

@@ -1,0 +1,186 @@
+"""``meshsplats view``: pages, and the server until Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+from meshsplats.cameras.files import save_cameras
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.cli import main, toml
+from meshsplats.conversion import convert
+from meshsplats.demo_scene import make_scene
+from meshsplats.formats.gaussians import save_gaussians
+from meshsplats.formats.meshes import save_mesh
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """scene.ply, mesh.npz made of it, cameras.json with two cameras."""
+    made = tmp_path_factory.mktemp("view")
+    cloud = make_scene(200)
+    save_gaussians(cloud, made / "scene.ply")
+    save_mesh(convert(cloud), made / "mesh.npz")
+    save_cameras(orbit(cloud, 2, width=60, height=40), made / "cameras.json")
+    return made
+
+
+def settings(path) -> dict:
+    return json.loads(re.search(r'id="settings">(.*?)</script>', path.read_text("utf-8"))[1])  # type: ignore[index]
+
+
+def has_splats(path) -> bool:
+    return 'id="splats">' in path.read_text("utf-8")
+
+
+def test_splats_become_a_page_with_both(folder, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 0
+    printed = capsys.readouterr().out
+    assert "1,600 triangles, 200 splats" in printed
+    assert re.search(
+        r"\d\.\d bytes a triangle; quantisation moves vertices by at most \S+ of the scene's radius", printed
+    )
+    assert settings(page)["title"] == "scene"
+    assert has_splats(page)
+    assert toml.load(tmp_path / "page.html.config.toml")["command"] == "view"
+
+
+def test_options_reach_the_page(folder, tmp_path):
+    page = tmp_path / "page.html"
+    words = ["--title", "a vase", "--background", "#204060", "--up", "z", "--without-splats"]
+    words += ["--cameras", str(folder / "cameras.json")]
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page), *words]) == 0
+    found = settings(page)
+    assert (found["title"], found["background"], found["up"]) == ("a vase", "#204060", [0, 0, 1])
+    assert [camera["width"] for camera in found["cameras"]] == [60, 60]
+    assert not has_splats(page)
+
+
+def test_a_mesh_alone_or_with_its_splats(folder, tmp_path):
+    alone, both = tmp_path / "alone.html", tmp_path / "both.html"
+    assert main(["view", str(folder / "mesh.npz"), "-o", str(alone)]) == 0
+    assert not has_splats(alone)
+    assert (
+        main(["view", str(folder / "mesh.npz"), "--splats", str(folder / "scene.ply"), "-o", str(both)]) == 0
+    )
+    assert has_splats(both)
+
+
+def test_a_model_folder_brings_its_cameras(folder, tmp_path):
+    model = tmp_path / "model"
+    (model / "point_cloud" / "iteration_7").mkdir(parents=True)
+    (model / "point_cloud" / "iteration_7" / "point_cloud.ply").write_bytes(
+        (folder / "scene.ply").read_bytes()
+    )
+    (model / "cameras.json").write_bytes((folder / "cameras.json").read_bytes())
+    assert main(["view", str(model), "-o", str(tmp_path / "page.html")]) == 0
+    assert len(settings(tmp_path / "page.html")["cameras"]) == 2
+
+
+def test_a_crop_leaves_less(folder, tmp_path, capsys):
+    words = ["view", str(folder / "scene.ply"), "-o", str(tmp_path / "page.html"), "--json"]
+    box = ["--crop", "-0.1", "-9", "-9", "9", "9", "9"]
+    assert main([*words, *box]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert 0 < result["triangles"] < 1600
+    assert 0 < result["splats"] < 200
+    assert result["bytes"] == (tmp_path / "page.html").stat().st_size
+    assert 0 < result["position_error_radii"] < 1e-5
+    assert 0 < result["color_error_levels"] < 0.01
+    assert 0 <= result["image_error_levels"] < 3
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["scene.ply", "-o", "page.png"], "must end in .html"),
+        (["scene.ply", "--splats", "scene.ply", "-o", "page.html"], "--splats is for a mesh"),
+        (["mesh.npz", "--splats", "scene.ply", "--without-splats", "-o", "p.html"], "not both"),
+        (["scene.ply", "--no-open", "-o", "page.html"], "no effect with -o"),
+        (["scene.ply", "--force"], "no effect without -o"),
+        (["scene.ply", "--background", "beige", "-o", "page.html"], "--background must be"),
+        (["scene.ply", "--up", "north", "-o", "page.html"], "--up must be"),
+        (["scene.ply", "--cameras", "c.json", "--data", "d", "-o", "page.html"], "not both"),
+        (["cameras.json", "-o", "page.html"], "expected splats or a mesh"),
+        (["scene.ply", "-o", "nowhere/page.html"], "does not exist"),
+    ],
+)
+def test_wrong_usage_is_told_before_anything_is_written(
+    folder, tmp_path, monkeypatch, capsys, words, message
+):
+    for name in ("scene.ply", "mesh.npz", "cameras.json"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", *words]) in (1, 2)
+    assert message in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_page_is_not_overwritten(folder, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    page.write_text("mine")
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 3
+    assert page.read_text() == "mine"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page), "--force"]) == 0
+    assert page.stat().st_size > 50_000
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent as a POSIX signal")
+def test_the_address_is_printed_and_answers_until_ctrl_c(folder):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "meshsplats", "view", str(folder / "scene.ply"), "--no-open"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        url = next(line.strip() for line in process.stdout if line.startswith("http://127.0.0.1:"))
+        with urllib.request.urlopen(url, timeout=30) as answer:
+            text = answer.read().decode()
+        assert 'id="mesh">' in text
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(url.rsplit("/", 2)[0] + "/", timeout=30)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+    finally:
+        process.kill()
+        _, errors = process.communicate()
+    assert errors == "meshsplats: ended\n"
+
+
+def test_a_machine_without_a_window_gets_the_address(folder, monkeypatch, capsys):
+    import webbrowser
+
+    from meshsplats.cli import view
+    from meshsplats.viewer import server
+
+    asked: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda url: asked.append(url) or True)
+    monkeypatch.setattr(server.PageServer, "serve_forever", lambda self: None)
+    monkeypatch.setattr(view.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", str(folder / "mesh.npz")]) == 0
+    printed = capsys.readouterr()
+    assert asked == []
+    assert "open the address above" in printed.err
+    assert re.search(r"^http://127\.0\.0\.1:\d+/\S{20,}/$", printed.out, re.MULTILINE)
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert main(["view", str(folder / "mesh.npz"), "--json"]) == 0
+    printed = capsys.readouterr()
+    assert asked == [json.loads(printed.out)["url"]]
+    assert printed.err == ""
+    assert main(["view", str(folder / "mesh.npz"), "--no-open"]) == 0
+    assert len(asked) == 1
+    assert np.isfinite(json.loads(printed.out)["image_error_levels"])

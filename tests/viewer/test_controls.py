@@ -1,0 +1,544 @@
+"""Every control of the page, driven in headless Chromium without WebGPU, and what WebGL draws there."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import unquote, urlparse
+
+import numpy as np
+import pytest
+from _browser import Browser, Page
+from conftest import levels
+from test_page import HOSTILE, block
+
+import meshsplats as ms
+from meshsplats.viewer.page import PageOptions, _read, make_page
+from meshsplats.viewer.quantise import unpack_mesh
+
+NO_WEBGPU = "Object.defineProperty(Navigator.prototype, 'gpu', { get: () => undefined });"
+WIDTH, HEIGHT = 200, 160
+PATIENCE = 120
+
+
+def open_page(browser: Browser, url: str, width: int = WIDTH, height: int = HEIGHT, **more) -> Page:
+    page = browser.page(url, width, height, before=NO_WEBGPU + more.pop("before", ""), **more)
+    page.still(PATIENCE)
+    return page
+
+
+@pytest.fixture(scope="module")
+def url(write_page, mesh, cloud, cameras):
+    return write_page(
+        mesh, "controls", splats=cloud, cameras=cameras, options=PageOptions(title="still life")
+    )
+
+
+@pytest.fixture(scope="module")
+def page(browser, url):
+    opened = open_page(browser, url)
+    yield opened
+    assert opened.problems() == []
+    assert opened.requests() == [url]
+    opened.close()
+
+
+@pytest.fixture(autouse=True)
+def _first_view(request):
+    """Each test begins at the first camera, with the first settings and without the panel's cover."""
+    if "page" not in request.fixturenames:
+        return
+    page = request.getfixturevalue("page")
+    page.size(WIDTH, HEIGHT)
+    page.run(
+        "document.body.classList.add('plain'); document.querySelector('#stage').focus();"
+        "for (const s of ['[name=content][value=mesh]', '[name=style][value=blended]'])"
+        " document.querySelector(s).click(); document.querySelector('#uncrop').click();"
+        "if (document.querySelector('#fly').checked) document.querySelector('#fly').click()"
+    )
+    page.choose("#background", "#ffffff")
+    page.choose("#exposure", "0")
+    page.choose("#cameras", "0")
+    page.still(PATIENCE)
+
+
+def pose(page: Page) -> tuple[np.ndarray, np.ndarray]:
+    """Position and direction of the camera."""
+    page.still(PATIENCE)
+    rows = page.statistics()
+    position, direction = (
+        np.array([float(x) for x in rows[name].split()]) for name in ("position", "direction")
+    )
+    return position, direction
+
+
+def turned(before: tuple, after: tuple) -> float:
+    """Degrees between two directions."""
+    return float(np.degrees(np.arccos(np.clip(before[1] @ after[1], -1, 1))))
+
+
+def moved(before: tuple, after: tuple) -> float:
+    return float(np.linalg.norm(after[0] - before[0]))
+
+
+# ---- The view
+
+
+def test_dragging_orbits_around_the_pivot(page):
+    before = pose(page)
+    page.drag(100, 80, 40, 0)
+    after = pose(page)
+    assert 20 < turned(before, after) < 120
+    # The scene follows the hand: the camera goes to its left, and looks at the same point.
+    assert (after[0] - before[0]) @ np.cross([0, 1, 0], before[1]) < 0
+    lines = np.stack([before[1], -after[1]], axis=1)
+    one, other = np.linalg.lstsq(lines, after[0] - before[0], rcond=None)[0]
+    assert one == pytest.approx(other, rel=0.01)
+    page.drag(100, 80, 0, 500)
+    above = pose(page)
+    assert above[0][1] < after[0][1] - 0.5  # y points down: the camera rises as the scene's front goes down
+    assert above[1][1] == pytest.approx(0.9998, abs=1e-3)  # and does not go over the pole
+
+
+def test_arrow_keys_orbit_and_with_shift_pan(page):
+    before = pose(page)
+    page.key("ArrowLeft")
+    left = pose(page)
+    assert 3 < turned(before, left) < 10
+    page.key("ArrowRight")
+    assert turned(before, pose(page)) < 0.2
+    page.key("ArrowUp")
+    up = pose(page)
+    assert turned(before, up) > 3
+    assert up[0][1] < before[0][1]
+    page.key("ArrowDown")
+    page.key("ArrowRight", shift=True)
+    after = pose(page)
+    assert turned(before, after) < 0.2
+    assert moved(before, after) > 0.01
+
+
+def test_the_right_button_and_shift_pan(page):
+    for button, modifiers in (("right", 0), ("left", 8)):
+        before = pose(page)
+        page.drag(100, 80, 30, 10, button, modifiers)
+        after = pose(page)
+        assert turned(before, after) < 0.1
+        offset = after[0] - before[0]
+        assert abs(offset @ before[1]) < 0.02 * np.linalg.norm(offset)  # across the line of sight
+        assert np.linalg.norm(offset) > 0.05
+
+
+def test_the_wheel_and_plus_and_minus_zoom(page):
+    before = pose(page)
+    page.mouse("mouseWheel", 100, 80, deltaX=0, deltaY=-200)
+    near = pose(page)
+    assert (near[0] - before[0]) @ before[1] > 0.1
+    page.mouse("mouseWheel", 100, 80, deltaX=0, deltaY=200)
+    assert moved(before, pose(page)) < 0.02
+    page.key("+")
+    assert (pose(page)[0] - before[0]) @ before[1] > 0.1
+    page.key("-")
+    assert moved(before, pose(page)) < 0.02
+
+
+def test_letters_fly_and_shift_flies_faster(page):
+    directions = {
+        "w": (0, 0, 1),
+        "s": (0, 0, -1),
+        "a": (-1, 0, 0),
+        "d": (1, 0, 0),
+        "q": (0, 1, 0),
+        "e": (0, -1, 0),
+    }
+    for key, (x, y, z) in directions.items():
+        before = pose(page)
+        page.key(key, hold=0.25)
+        after = pose(page)
+        right = np.cross([0, 1, 0], before[1])
+        right /= np.linalg.norm(right)
+        axis = x * right + y * np.cross(before[1], right) + z * before[1]
+        offset = after[0] - before[0]
+        assert offset @ axis > 0.9 * np.linalg.norm(offset) > 0
+        assert turned(before, after) < 0.1
+
+
+def test_in_fly_mode_the_camera_turns_where_it_stands(page):
+    page.run("document.querySelector('#fly').click()")
+    before = pose(page)
+    page.drag(100, 80, 40, 0)
+    after = pose(page)
+    assert moved(before, after) < 1e-3
+    assert turned(before, after) > 5
+    page.key("ArrowLeft")
+    assert moved(before, pose(page)) < 1e-3
+
+
+def test_turning_goes_on_until_it_is_switched_off(page):
+    before = pose(page)
+    page.run("document.querySelector('#spin').click()")
+    page.wait("document.body.dataset.state === 'moving'")
+    page.run("new Promise(done => setTimeout(done, 400))")
+    page.run("document.querySelector('#spin').click()")
+    assert turned(before, pose(page)) > 2
+
+
+def test_touch_orbits_pans_and_pinches(page):
+    page.send("Emulation.setTouchEmulationEnabled", enabled=True)
+    before = pose(page)
+    page.touch("touchStart", [(100, 80)])
+    page.touch("touchMove", [(120, 80)])
+    page.touch("touchMove", [(140, 80)])
+    page.touch("touchEnd", [])
+    after = pose(page)
+    assert turned(before, after) > 10
+    page.touch("touchStart", [(80, 80), (120, 80)])
+    for apart in (25, 30, 40):
+        page.touch("touchMove", [(100 - apart, 80), (100 + apart, 80)])
+    page.touch("touchEnd", [])
+    near = pose(page)
+    assert (near[0] - after[0]) @ after[1] > 0.1
+    assert turned(after, near) < 1
+    page.touch("touchStart", [(80, 80), (120, 80)])
+    for shift in (5, 10, 20):
+        page.touch("touchMove", [(80, 80 + shift), (120, 80 + shift)])
+    page.touch("touchEnd", [])
+    panned = pose(page)
+    assert moved(near, panned) > 0.02
+    assert abs((panned[0] - near[0]) @ near[1]) < 0.2 * moved(near, panned)
+    page.send("Emulation.setTouchEmulationEnabled", enabled=False)
+
+
+def test_a_double_click_centres_what_is_there(page, mesh, cameras):
+    before = pose(page)
+    page.run(
+        "document.querySelector('#stage').dispatchEvent(new MouseEvent('dblclick',"
+        " {clientX: 70, clientY: 90, bubbles: true}))"
+    )
+    after = pose(page)
+    assert moved(before, after) > 0.05
+    # Some vertex that was there lies on the new line of sight.
+    scale = HEIGHT / cameras[0].height
+    seen, depth = cameras[0].project(mesh.vertices)
+    at = np.abs(seen * scale + [(WIDTH - cameras[0].width * scale) / 2, 0] - [70, 90]).max(axis=1) < 8.5
+    rays = mesh.vertices[at & (depth > 0)] - after[0]
+    along = rays @ after[1]
+    assert np.linalg.norm(rays - along[:, None] * after[1], axis=1).min() < 0.02
+
+
+def test_cameras_by_list_buttons_and_keys(page, cameras):
+    assert page.run("[...document.querySelectorAll('#cameras option')].map(o => o.textContent)") == [
+        camera.name for camera in cameras
+    ]
+
+    def at(index: int) -> None:
+        position, direction = pose(page)
+        assert np.allclose(position, cameras[index].center, rtol=2e-3, atol=2e-3)
+        assert np.allclose(direction, cameras[index].world_to_camera[2, :3], atol=2e-3)
+        assert page.run("document.querySelector('#cameras').value") == str(index)
+
+    at(0)
+    page.choose("#cameras", "2")
+    at(2)
+    page.key("]")
+    at(0)
+    page.key("[")
+    at(2)
+    page.run("document.querySelector('#previous').click()")
+    at(1)
+    page.run("document.querySelector('#next').click()")
+    at(2)
+    page.key("Home")
+    at(0)
+    page.drag(100, 80, 30, 10)
+    page.run("document.querySelector('#home').click()")
+    at(0)
+
+
+# ---- The image
+
+
+def test_sorted_triangles_are_close_to_the_exact_image(page, mesh, cameras):
+    page.size(cameras[0].width, cameras[0].height)
+    page.still(PATIENCE)
+    image = page.screenshot().astype(int)
+    assert ms.psnr(image / 255, ms.render(mesh, cameras[0], samples=2).color) > 26
+    assert "this browser has no WebGPU" in page.text("#messageText")
+    assert page.run("document.querySelector('#renderer').value") == "sorted"
+    assert page.run("document.querySelector('#renderer option').disabled")
+    assert page.run("document.querySelector('#samples').disabled")
+
+
+def test_opaque_triangles_are_those_of_a_depth_buffer(page, mesh, cameras):
+    page.size(cameras[0].width, cameras[0].height)
+    page.key("o")
+    page.still(PATIENCE)
+    image = page.screenshot() / 255
+    solid = ms.render(mesh, cameras[0], samples=2, cutoff=0).color
+    assert ms.psnr(image, solid) > 24
+    assert ms.psnr(image, ms.render(mesh, cameras[0], samples=2).color) < 20
+    page.key("b")
+    page.still(PATIENCE)
+    assert ms.psnr(page.screenshot() / 255, solid) < 20
+
+
+def test_the_wireframe_shows_edges_and_what_is_between_them(page):
+    solid = page.screenshot().astype(int)
+    page.key("x")
+    page.still(PATIENCE)
+    wires = page.screenshot().astype(int)
+    drawn = np.abs(wires - 255).max(axis=-1) > 8
+    assert 0.02 < drawn.mean() < 0.9
+    assert np.abs(wires - solid).mean() > 2
+
+
+def test_splats_and_the_divider(page, cloud, cameras):
+    page.size(cameras[0].width, cameras[0].height)
+    page.still(PATIENCE)
+    mesh_only = page.screenshot().astype(int)
+    page.key("3")
+    page.still(PATIENCE)
+    splats_only = page.screenshot().astype(int)
+    expected = ms.render_splats(cloud, cameras[0], sh_degree=0).color
+    assert ms.psnr(splats_only / 255, expected) > 45
+    page.key("2")
+    page.still(PATIENCE)
+    both = page.screenshot().astype(int)
+    half = cameras[0].width // 2
+    assert np.array_equal(both[:, : half - 1], splats_only[:, : half - 1])
+    assert np.array_equal(both[:, half + 1 :], mesh_only[:, half + 1 :])
+    page.run("document.body.classList.remove('plain'); document.querySelector('#divider').focus()")
+    for key, value in (("ArrowRight", 52), ("PageUp", 62), ("ArrowLeft", 60), ("PageDown", 50), ("Home", 0)):
+        page.key(key)
+        assert page.run("document.querySelector('#divider').getAttribute('aria-valuenow')") == str(value)
+    page.key("End")
+    page.run("document.body.classList.add('plain')")
+    page.still(PATIENCE)
+    assert np.array_equal(page.screenshot(), splats_only)
+    page.size(WIDTH, HEIGHT)
+    page.run("document.body.classList.remove('plain')")
+    page.run(
+        "const toggle = document.querySelector('#toggle');"
+        " if (toggle.getAttribute('aria-expanded') === 'true') toggle.click()"
+    )
+    page.still(PATIENCE)
+    page.drag(WIDTH - 3, 60, -60, 0)
+    assert page.run("document.querySelector('#divider').getAttribute('aria-valuenow')") == str(
+        int(100 * (WIDTH - 63) / WIDTH + 0.5)
+    )
+    assert moved((np.array(cameras[0].center),), pose(page)) < 0.01
+    page.key("1")
+
+
+def test_background_and_exposure(page):
+    page.choose("#background", "#3366cc")
+    page.still(PATIENCE)
+    blue = page.screenshot().astype(int)
+    assert blue[2, 2].tolist() == [0x33, 0x66, 0xCC]
+    page.choose("#exposure", "2")
+    page.still(PATIENCE)
+    bright = page.screenshot().astype(int)
+    assert bright[2, 2].tolist() == [0x33, 0x66, 0xCC]
+    assert page.text("#exposureText") == "+2 EV"
+    drawn = np.abs(blue - [0x33, 0x66, 0xCC]).max(axis=-1) > 60
+    assert (bright[drawn].mean(axis=0) > blue[drawn].mean(axis=0) + 20).all()
+
+
+def test_the_crop_box_hides_what_is_outside_and_shows_its_edges(page, mesh):
+    whole = page.screenshot().astype(int)
+    count = len(mesh.faces)
+    for axis in "xyz":
+        parts = []
+        for end in (0, 1):
+            page.choose(f"#crop-{axis}{end}", "100")
+            page.still(PATIENCE)
+            parts.append(int(page.statistics()["triangles"].split(" of ")[0].replace(",", "")))
+            page.run("document.querySelector('#uncrop').click()")
+        assert min(parts) > 0
+        assert sum(parts) == count  # each splat is on one side
+    page.choose("#crop-x0", "90")
+    page.choose("#crop-x1", "120")
+    page.still(PATIENCE)
+    assert np.abs(page.screenshot().astype(int) - whole).mean() > 1
+    words = page.text("#cropText").split()
+    assert words[0] == "--crop"
+    low, high = np.array([float(word) for word in words[1:]]).reshape(2, 3)
+    assert (low < high).all()
+    page.choose("#crop-x0", "190")  # not beyond the other end
+    assert page.run("document.querySelector('#crop-x0').value") == "119"
+    assert page.run(
+        "!document.querySelector('#box').hidden"
+        " && document.querySelector('#box path').getAttribute('d').length > 50"
+    )
+    page.run("document.querySelector('#uncrop').click()")
+    page.still(PATIENCE)
+    assert np.array_equal(page.screenshot(), whole)
+    assert page.text("#cropText") == ""
+
+
+# ---- The page around the image
+
+
+def test_statistics_say_what_is_drawn(page, mesh, cloud):
+    rows = page.statistics()
+    assert rows["triangles"] == f"{len(mesh.faces):,}"
+    assert rows["vertices"] == f"{len(mesh.vertices):,}"
+    assert rows["splats"] == f"{len(cloud):,}"
+    assert rows["image"] == f"{WIDTH} × {HEIGHT}"
+    assert re.fullmatch(r"[\d.]+ bytes a triangle", rows["data"])
+
+
+def test_the_panel_closes_and_everything_can_be_hidden(browser, url):
+    page = open_page(browser, url, 1000, 700)
+    shown = "getComputedStyle(document.querySelector('#{}')).display !== 'none'"
+    assert page.run(shown.format("panel"))
+    page.click("#toggle")
+    assert not page.run(shown.format("panel"))
+    assert page.run("document.querySelector('#toggle').getAttribute('aria-expanded')") == "false"
+    page.click("#toggle")
+    page.run("document.querySelector('#background').focus()")
+    page.key("Escape")
+    assert not page.run(shown.format("panel"))
+    assert page.run("document.activeElement.id") == "toggle"
+    page.run("document.activeElement.blur()")
+    page.key("h")
+    for name in ("bar", "panel", "message"):
+        assert not page.run(shown.format(name))
+    page.key("h")
+    assert page.run(shown.format("bar"))
+    assert page.run(shown.format("message"))
+    page.click("#dismiss")
+    assert not page.run(shown.format("message"))
+    page.click("#toggle")
+    for summary in ("#crop", "#statistics", "#help"):
+        page.click(f"{summary} summary")
+        assert page.run(f"document.querySelector('{summary}').open")
+    page.still(PATIENCE)
+    assert page.problems() == []
+    page.close()
+
+
+def test_every_control_has_a_name_and_is_reached_by_tab(browser, url):
+    page = open_page(browser, url, 1000, 700)
+    page.run("for (const d of document.querySelectorAll('details')) d.open = true")
+    page.send("Accessibility.enable")
+    nodes = page.send("Accessibility.getFullAXTree")["nodes"]
+    roles = {
+        "button",
+        "checkbox",
+        "radio",
+        "slider",
+        "combobox",
+        "ColorWell",
+        "application",
+        "DisclosureTriangle",
+    }
+    controls = [node for node in nodes if not node.get("ignored") and node["role"]["value"] in roles]
+    names = [node.get("name", {}).get("value", "") for node in controls]
+    assert len(controls) >= 24
+    assert [node["role"] for node, name in zip(controls, names, strict=True) if not name.strip()] == []
+    reached = set()
+    for _ in range(40):
+        page.send("Input.dispatchKeyEvent", type="keyDown", key="Tab", code="Tab", windowsVirtualKeyCode=9)
+        page.send("Input.dispatchKeyEvent", type="keyUp", key="Tab", code="Tab", windowsVirtualKeyCode=9)
+        reached.add(page.run("document.activeElement.id || document.activeElement.name"))
+    wanted = {"stage", "toggle", "cameras", "previous", "next", "home", "fly", "spin", "content", "style"}
+    assert reached >= wanted | {"background", "exposure", "renderer", "crop-x0", "crop-z1", "uncrop"}
+    page.close()
+
+
+def test_a_phone_gets_the_scene_first_and_large_controls(browser, url):
+    page = open_page(browser, url, 390, 844, mobile=True, ratio=2)
+    assert page.run("document.querySelector('#panel').classList.contains('closed')")
+    assert page.run("document.querySelector('#sorted').width") == 780
+    page.run("document.querySelector('#toggle').click()")
+    assert page.run("document.documentElement.scrollWidth") <= 390
+    heights = page.run(
+        "[...document.querySelectorAll('#panel button, #panel select, .choices label, #toggle')]"
+        ".map(e => e.getBoundingClientRect()).filter(r => r.width).map(r => r.height)"
+    )
+    assert len(heights) > 8
+    assert min(heights) >= 40
+    panel = page.run("document.querySelector('#panel').getBoundingClientRect().top")
+    assert panel > 300  # the scene stays in view
+    page.close()
+
+
+def test_cameras_are_flown_to_unless_motion_is_unwelcome(browser, url):
+    for reduced in (False, True):
+        page = open_page(browser, url, reduced_motion=reduced)
+        page.run("document.querySelector('#statistics').open = true")
+        between = 0
+        for index in (1, 2, 0):
+            seen = page.run(
+                "new Promise(async done => { const seen = []; const place = () => seen.push("
+                "[...document.querySelectorAll('#statistics dt')].find(t => t.textContent === 'position')"
+                ".nextElementSibling.textContent); place(); const list = document.querySelector('#cameras');"
+                f" list.value = '{index}'; list.dispatchEvent(new Event('change'));"
+                " do { await new Promise(requestAnimationFrame); place(); }"
+                " while (document.body.dataset.state !== 'still'); done(seen); })"
+            )
+            between += len(set(seen) - {seen[0], seen[-1]})
+        assert (between > 0) == (not reduced)
+        page.close()
+
+
+def test_hostile_names_are_shown_and_do_nothing(browser, write_page, mesh, cameras):
+    named = [replace(camera, name=HOSTILE) for camera in cameras]
+    address = write_page(mesh, "hostile", cameras=named, options=PageOptions(title=HOSTILE))
+    page = open_page(browser, address)
+    assert page.text("h1") == HOSTILE
+    assert page.run("document.querySelector('#cameras option').textContent") == HOSTILE
+    assert page.run("document.title") == HOSTILE
+    assert page.run("document.querySelectorAll('img, iframe').length") == 0
+    assert page.problems() == []
+    assert page.requests() == [address]
+    # The policy stops what would be injected, and all connections.
+    page.run("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.bad = 1\">')")
+    page.run(
+        "const s = document.createElement('script'); s.textContent = 'window.bad = 2';"
+        " document.body.append(s)"
+    )
+    assert page.run("fetch('http://127.0.0.1:9/').then(() => 'sent', () => 'stopped')") == "stopped"
+    assert page.run("window.bad === undefined")
+    page.close()
+
+
+def test_a_damaged_page_says_so(browser, write_page, mesh, tmp_path):
+    address = write_page(mesh, "whole")
+    whole = Path(unquote(urlparse(address).path)).read_text(encoding="utf-8")
+    data = block(whole, "mesh")
+    (tmp_path / "damaged.html").write_text(
+        whole.replace(data, data[:400] + "AAAA" + data[404:]), encoding="utf-8"
+    )
+    page = browser.page((tmp_path / "damaged.html").as_uri(), WIDTH, HEIGHT)
+    page.wait("document.body.dataset.state === 'failed'", PATIENCE)
+    assert len(page.text("#messageText")) > 10
+    page.close()
+
+
+def test_the_page_decodes_what_python_decodes(browser, mesh):
+    """Bit for bit, with and without fans."""
+    page = browser.page("about:blank#decoding", WIDTH, HEIGHT)
+    source = re.sub(r"^export ", "", _read("scene.js"), flags=re.MULTILINE)
+    page.run(
+        source + "; window.decode = async text => { const m = decodeMesh(await unpack(text));"
+        " return [m.vertices, m.colors, m.faces, m.splat, m.group].map(a => a && [...a]); }; 0"
+    )
+    groups = np.arange(len(mesh.faces), dtype=np.int32) % 7 - 1
+    for each in (mesh, replace(mesh, face_splat=None, depth_group=groups)):
+        data = make_page(each).mesh.data
+        vertices, colors, faces, splat, group = page.run(f"decode('{base64.b64encode(data).decode()}')")
+        back = unpack_mesh(data)
+        assert np.array_equal(np.array(vertices, np.float32), back.vertices.ravel())
+        assert np.array_equal(np.array(colors, np.float32), back.colors.ravel())
+        assert faces == back.faces.ravel().tolist()
+        assert splat == (None if back.face_splat is None else back.face_splat.tolist())
+        assert group == (None if back.depth_group is None else back.depth_group.tolist())
+    page.close()
+
+
+def test_levels_round_as_screenshots_do():
+    assert levels(np.array([0.5, -1, 2])).tolist() == [128, 0, 255]

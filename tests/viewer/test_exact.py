@@ -1,0 +1,152 @@
+"""The exact image of the page, by WebGPU in headless Chromium, against ``render``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _browser import Browser, Page
+from conftest import HEIGHT, WIDTH, levels
+
+import meshsplats as ms
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.conversion.cleaning import cropped
+from meshsplats.rendering.looks import image_of
+
+PATIENCE = 400
+"""Seconds for shaders that a busy processor compiles."""
+
+
+def open_page(browser: Browser, url: str) -> Page:
+    page = browser.page(url, WIDTH, HEIGHT)
+    page.wait("document.body.dataset.state !== 'loading'", PATIENCE)
+    page.run("document.body.classList.add('plain')")
+    page.choose("#samples", "1")
+    page.still(PATIENCE)
+    if page.run("document.body.dataset.renderer") != "exact":
+        reason = page.text("#messageText")
+        page.close()
+        if "no graphics device" in reason or "no WebGPU" in reason:
+            pytest.skip(f"Chromium draws without WebGPU here: {reason}")
+        raise AssertionError(reason)
+    return page
+
+
+@pytest.fixture(scope="module")
+def page(browser, write_page, mesh, cloud, cameras):
+    opened = open_page(browser, write_page(mesh, splats=cloud, cameras=cameras))
+    yield opened
+    assert opened.problems() == []
+    opened.close()
+
+
+@pytest.fixture(autouse=True)
+def _first_view(request):
+    if "page" in request.fixturenames:
+        page = request.getfixturevalue("page")
+        page.choose("#cameras", "0")
+        page.choose("#samples", "1")
+        page.choose("#background", "#ffffff")
+        page.choose("#exposure", "0")
+        page.still(PATIENCE)
+
+
+def assert_within_one_level(page: Page, image: np.ndarray) -> None:
+    difference = np.abs(page.screenshot().astype(int) - levels(image))
+    assert difference.max() <= 1
+    assert (difference > 0).mean() < 0.05
+
+
+def test_the_image_is_that_of_render(page, mesh, cameras):
+    assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
+
+
+def test_samples_are_those_of_render(page, mesh, cameras):
+    page.choose("#samples", "2")
+    page.still(PATIENCE)
+    assert page.text("#status") == "exact, 4 samples per pixel"
+    assert_within_one_level(page, ms.render(mesh, cameras[0], samples=2).color)
+    assert np.abs(page.screenshot().astype(int) - levels(ms.render(mesh, cameras[0]).color)).max() > 5
+
+
+def test_cameras_of_the_list_are_reached_exactly(page, mesh, cameras):
+    page.choose("#cameras", "2")
+    page.still(PATIENCE)
+    assert_within_one_level(page, ms.render(mesh, cameras[2]).color)
+
+
+def test_background_and_exposure(page, mesh, cameras):
+    page.choose("#background", "#204060")
+    page.still(PATIENCE)
+    background = np.array([0x20, 0x40, 0x60]) / 255
+    drawn = ms.render(mesh, cameras[0], background=background)
+    assert_within_one_level(page, drawn.color)
+    page.choose("#exposure", "1")
+    page.still(PATIENCE)
+    alpha = drawn.alpha[..., None]
+    own = (drawn.color - (1 - alpha) * background) / np.maximum(alpha, 1e-6)
+    brighter = linear_to_srgb(2 * srgb_to_linear(own.clip(0, 1)))
+    expected = levels(alpha * brighter + (1 - alpha) * background)
+    assert np.abs(page.screenshot().astype(int) - expected).max() <= 2
+
+
+def test_the_crop_box_leaves_the_same_triangles_as_the_option(page, mesh, cameras):
+    page.choose("#crop-x0", "90")
+    page.still(PATIENCE)
+    words = page.text("#cropText").split()
+    part = cropped(mesh, tuple(float(word) for word in words[1:]))
+    count = len(mesh.faces)
+    assert 0 < len(part.faces) < count
+    assert page.statistics()["triangles"] == f"{len(part.faces):,} of {count:,}"
+    assert_within_one_level(page, ms.render(part, cameras[0]).color)
+    page.run("document.getElementById('uncrop').click()")
+    page.still(PATIENCE)
+    assert page.statistics()["triangles"] == f"{count:,}"
+
+
+def test_splats_stand_left_of_the_divider_and_the_exact_mesh_right_of_it(page, mesh, cloud, cameras):
+    page.run("document.querySelector('[value=both]').click()")
+    page.still(PATIENCE)
+    image = page.screenshot().astype(int)
+    half = WIDTH // 2
+    assert np.abs(image - levels(ms.render(mesh, cameras[0]).color))[:, half + 1 :].max() <= 1
+    splats = levels(ms.render_splats(cloud, cameras[0], sh_degree=0).color)
+    assert np.abs(image - splats)[:, : half - 1].mean() < 1
+    page.run("document.querySelector('[value=mesh]').click()")
+
+
+def layered(cloud: ms.GaussianCloud, camera: ms.Camera) -> ms.SplatMesh:
+    """Flat fans, each with another one of other colours just before it, both at the depth of one plane: so
+    those behind are drawn in front, as their faces come first."""
+    flat = ms.convert(cloud.select(np.arange(0, len(cloud), 2)), preset="paper")
+    towards = camera.center - flat.vertices
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    colors = np.concatenate([flat.colors, flat.colors])
+    colors[len(flat.colors) :, :3] = 1 - flat.colors[:, :3]
+    splat = np.concatenate([flat.face_splat, flat.face_splat])
+    order = np.argsort(splat, kind="stable")
+    return ms.SplatMesh(
+        np.concatenate([flat.vertices, flat.vertices + 1e-3 * towards]),
+        np.concatenate([flat.faces, flat.faces + len(flat.vertices)])[order],
+        colors,
+        face_splat=splat[order],
+        depth_group=splat[order],
+    )
+
+
+def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud, cameras):
+    odd = replace(layered(cloud, cameras[0]), blending="linear", filter_px2=0.5)
+    expected = levels(image_of(odd, cameras[0], (1, 1, 1))[0])
+    for plain in (
+        replace(odd, depth_group=None),
+        replace(odd, filter_px2=0),
+        replace(odd, blending="display"),
+    ):
+        other = levels(image_of(plain, cameras[0], (1, 1, 1))[0])
+        assert (np.abs(other - expected) > 1).any(axis=-1).mean() > 0.1
+    page = open_page(browser, write_page(odd, "odd", cameras=cameras))
+    difference = np.abs(page.screenshot().astype(int) - expected)
+    assert (difference > 1).any(axis=-1).mean() < 0.002
+    assert page.problems() == []
+    page.close()
