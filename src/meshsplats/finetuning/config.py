@@ -114,8 +114,8 @@ class FinetuneConfig:
     """opacity 'cutoff': triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
     a pixel, are removed. 0: none."""
     opaque_share: float = 1.0
-    """opacity 'cutoff': of the rest, only the triangles in front at most samples are kept, about this fraction
-    of the number at the start. 1: all."""
+    """opacity 'cutoff': budget of opaque triangles, as a fraction of the number at the start: about that many
+    stay, those in front at most samples. 1: all."""
     soft_share: float = 0.0
     """opacity 'cutoff': faint splats that opaque triangles cannot replace stay blended, with up to this
     fraction of the number of triangles at the start. 0: none."""
