@@ -95,7 +95,7 @@ ${MATRICES}
 const canvas = document.getElementById('c');
 window.draw = async (url, cameras, near, far, hash, sorted, antialias) => {
   canvas.width = cameras[0].width; canvas.height = cameras[0].height;
-  const engine = new BABYLON.Engine(canvas, antialias, { preserveDrawingBuffer: true, useHighPrecisionMatrix: true });
+  const engine = new BABYLON.Engine(canvas, antialias, { preserveDrawingBuffer: true, useHighPrecisionMatrix: true, useExactSrgbConversions: true });
   const scene = new BABYLON.Scene(engine);
   scene.useRightHandedSystem = true;
   scene.clearColor = new BABYLON.Color4(1, 1, 1, 1);

@@ -1,10 +1,12 @@
 """What web viewers make of our .glb files: PSNR against the exact image of the same mesh.
 
     npm install three babylonjs babylonjs-loaders puppeteer-core    (in some folder; Chromium installed)
-    python benchmarks/viewers/viewers.py SPLATS CAMERAS --node-folder FOLDER [--views 4] [--keep DIR]
+    python benchmarks/viewers/viewers.py SPLATS CAMERAS --node-folder FOLDER [--mesh MESH] [--views 4]
 
 Prints a table: each way of writing opacity, in each viewer, against the sorted mesh and against the splats
-it was made from. The table of docs/viewers.md comes from here.
+it was made from. With --mesh, a mesh of `finetune --opacity cutoff`, with and without MSAA, against our image
+with 2 x 2 samples a pixel, and against the splats' means over pixels. The tables of docs/viewers.md come from
+here.
 """
 
 from __future__ import annotations
@@ -19,14 +21,28 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from meshsplats import convert, load_cameras, load_gaussians, psnr, render, render_splats, save_mesh
+from meshsplats import (
+    convert,
+    draw_splats,
+    load_cameras,
+    load_gaussians,
+    load_mesh,
+    psnr,
+    render,
+    render_splats,
+    save_mesh,
+)
 
 WAYS = {
-    "three": {"blend": ("blend", False), "blend, alphaHash on": ("blend", True)},
-    "babylon": {"blend": ("blend", False)},
+    "three": {"blend": {"alpha": "blend"}, "blend, alphaHash on": {"alpha": "blend", "hash": True}},
+    "babylon": {"blend": {"alpha": "blend"}},
+}
+TUNED = {
+    viewer: {name: {"alpha": "hybrid", "antialias": name == "MSAA"} for name in ("1 sample", "MSAA")}
+    for viewer in WAYS
 }
 for _ways in WAYS.values():
-    _ways["mask"] = ("mask", False)
+    _ways["mask"] = {"alpha": "mask"}
 
 
 def main() -> None:
@@ -37,14 +53,20 @@ def main() -> None:
     parser.add_argument("cameras", type=Path)
     parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
     parser.add_argument("--views", type=int, default=4, help="number of cameras, the first ones of the file")
+    parser.add_argument(
+        "--mesh", type=Path, help="a mesh for depth buffers, in place of the converted splats"
+    )
     parser.add_argument("--keep", type=Path, help="keep files and images here")
     args = parser.parse_args()
 
     cloud = load_gaussians(args.splats)
-    mesh = convert(cloud)
+    mesh = load_mesh(args.mesh) if args.mesh else convert(cloud)
     cameras = load_cameras(args.cameras)[: args.views]
-    exact = [render(mesh, camera).color for camera in cameras]
-    splats = [render_splats(cloud, camera, sh_degree=0).color for camera in cameras]
+    exact = [render(mesh, camera, samples=2 if args.mesh else 1).color for camera in cameras]
+    if args.mesh:
+        splats = [draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras]
+    else:
+        splats = [render_splats(cloud, camera, sh_degree=0).color for camera in cameras]
     reach = np.linalg.norm(mesh.vertices, axis=1).max() + max(
         np.linalg.norm(np.linalg.inv(c.world_to_camera)[:3, 3]) for c in cameras
     )
@@ -54,11 +76,11 @@ def main() -> None:
         listed = json.loads(args.cameras.read_text())[: args.views]
         (folder / "cameras.json").write_text(json.dumps(listed))
         jobs = []
-        for viewer, ways in WAYS.items():
-            for name, (alpha, hashed) in ways.items():
-                glb = folder / f"{alpha}.glb"
+        for viewer, ways in (TUNED if args.mesh else WAYS).items():
+            for name, way in ways.items():
+                glb = folder / f"{way['alpha']}.glb"
                 if not glb.exists():
-                    save_mesh(mesh, glb, alpha=alpha)
+                    save_mesh(mesh, glb, alpha=way["alpha"])
                 jobs.append(
                     {
                         "viewer": viewer,
@@ -66,7 +88,8 @@ def main() -> None:
                         "glb": str(glb.resolve()),
                         "cameras": str((folder / "cameras.json").resolve()),
                         "out": str((folder / f"{viewer} {name}").resolve()),
-                        "hash": hashed,
+                        "hash": way.get("hash", False),
+                        "antialias": way.get("antialias", False),
                         "near": float(reach) / 1000,
                         "far": float(reach) * 2,
                     }
@@ -81,7 +104,7 @@ def main() -> None:
             check=True,
         )
         titles = dict(line.split("=") for line in done.stdout.splitlines() if "=" in line)
-        print(f"{args.splats.name}: {mesh.splat_count:,} splats, {len(mesh.faces):,} triangles")
+        print(f"{args.splats.name}: {mesh.splat_count or 0:,} splats, {len(mesh.faces):,} triangles")
         print("| viewer | alpha | against the exact mesh, dB | against the splats, dB |\n|---|---|---|---|")
         for job in jobs:
             images = [

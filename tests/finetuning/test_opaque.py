@@ -107,6 +107,31 @@ def test_visible_triangles_are_those_in_front():
     assert visible_faces(mesh, views, 0.6, 1).tolist() == [False, False, True]
 
 
+def test_with_a_budget_the_triangles_with_most_samples_stay():
+    view = camera(96, 48)
+    fans = [square(x, depth, 0.9) for x, depth in ((-1.2, 6), (0, 5), (1.4, 7))]
+    mesh = SplatMesh(
+        np.concatenate([f.vertices for f in fans]),
+        np.concatenate([f.faces + 4 * k for k, f in enumerate(fans)]),
+        np.concatenate([f.colors for f in fans]),
+    )
+    views = [View(view, ViewImage(np.zeros((48, 96, 3), np.float32)))]
+    for most, kept in ((6, [1, 1, 1]), (5, [1, 1, 0.5]), (4, [1, 1, 0]), (2, [0, 1, 0]), (0, [0, 0, 0])):
+        found = visible_faces(mesh, views, 0.2, 1, most)
+        assert found.reshape(3, 2).mean(axis=1).tolist() == kept
+    # A triangle with two corners above the cutoff becomes two when it is cut.
+    colors = mesh.colors.copy()
+    colors[5, 3] = 0
+    for most, count in ((3, 2), (2, 1)):
+        assert visible_faces(replace(mesh, colors=colors), views, 0.2, 1, most).sum() == count
+
+
+def test_a_run_keeps_its_budget(scene):
+    dataset, mesh = scene
+    tuned = finetune(mesh, dataset, steps=20, opacity="cutoff", opaque_share=0.1)
+    assert 0.05 * len(mesh.faces) < len(tuned.faces) <= 0.11 * len(mesh.faces)
+
+
 def test_a_vertex_with_a_gradient_of_its_colour_alone_moves(scene):
     _, mesh = scene
     for opacity, moves in (("cutoff", True), ("blended", False)):

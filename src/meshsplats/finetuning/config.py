@@ -113,6 +113,9 @@ class FinetuneConfig:
     hidden_hits: int = 1
     """opacity 'cutoff': triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
     a pixel, are removed. 0: none."""
+    opaque_share: float = 1.0
+    """opacity 'cutoff': budget of opaque triangles, as a fraction of the number at the start: about that many
+    stay, those in front at most samples. 1: all."""
     soft_share: float = 0.0
     """opacity 'cutoff': faint splats that opaque triangles cannot replace stay blended, with up to this
     fraction of the number of triangles at the start. 0: none."""
@@ -182,6 +185,7 @@ _OF_CUTOFF = (
     "expected_share",
     "settle_share",
     "hidden_hits",
+    "opaque_share",
     "soft_share",
     "soft_phase",
 )
@@ -220,6 +224,7 @@ _RANGES: list[Range] = [
     ("expected_share", 0, 1, False),
     ("settle_share", 0, 1, False),
     ("hidden_hits", 0, 10**9, True),
+    ("opaque_share", 0, 1, False),
     ("soft_share", 0, 1, False),
     ("soft_phase", 0.01, 0.99, False),
     ("point_share", 0, 1, False),
@@ -294,6 +299,7 @@ class FinetuneChanges(TypedDict, total=False):
     expected_share: float
     settle_share: float
     hidden_hits: int
+    opaque_share: float
     soft_share: float
     soft_phase: float
     point_share: float

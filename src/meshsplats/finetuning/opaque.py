@@ -65,10 +65,16 @@ def expected_error(
 
 
 def visible_faces(
-    mesh: SplatMesh, views: Sequence[View], cutoff: float, fewest: int, threads: int | None = None
+    mesh: SplatMesh,
+    views: Sequence[View],
+    cutoff: float,
+    fewest: int,
+    most: int | None = None,
+    threads: int | None = None,
 ) -> np.ndarray:
     """(f,) bool: the triangles that are in front, drawn with ``cutoff``, at ``fewest`` samples or more of all
-    ``views`` together: at most ``HIT_VIEWS`` of them, with ``HIT_SAMPLES`` x ``HIT_SAMPLES`` samples."""
+    ``views`` together: at most ``HIT_VIEWS`` of them, with ``HIT_SAMPLES`` x ``HIT_SAMPLES`` samples. If
+    ``cut_mesh`` makes more than ``most`` of them, only those with the most samples."""
     count = len(mesh.faces)
     # Every triangle has corners of its own with its index, in two digits that float32 interpolates exactly.
     indices = np.repeat(np.arange(count), 3)
@@ -86,4 +92,9 @@ def visible_faces(
         digits = np.rint(image.attributes["index"][image.alpha > 0.5]).astype(np.int64)
         found = digits[:, 0] + _ROOT * digits[:, 1]
         hits += np.bincount(found, minlength=count)
-    return hits >= fewest
+    keep = hits >= fewest
+    if most is not None:
+        order = np.argsort(-hits, kind="stable")
+        quadrilateral = (mesh.colors[mesh.faces, 3] >= cutoff).sum(axis=1) == 2
+        keep[order[np.cumsum(1 + quadrilateral[order]) > most]] = False
+    return keep

@@ -219,6 +219,8 @@ class TrainingLoop:
         self.report_cost = self.save_cost = self.step_cost = 0.0
         self.scored_views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
         self.quarter = int(MIN_PREVIEWS * self.fraction)
+        share = config.opaque_share
+        self.most_opaque = None if share == 1 else max(1, round(share * len(start.mesh.faces)))
         self.source = start.mesh if config.soft_share else None
         # A resumed run may have removed hidden triangles before its checkpoint.
         self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - config.settle_share
@@ -301,7 +303,8 @@ class TrainingLoop:
         fraction = opaque_fraction(self.config, self.fraction)
         due = self.config.opacity == "cutoff" and fraction >= 1 - self.config.settle_share
         now, self.settled = due and not self.settled, self.settled or due
-        return now and self.config.hidden_hits > 0 and not self._done()
+        removes = self.config.hidden_hits > 0 or self.most_opaque is not None
+        return now and removes and not self._done()
 
     def _remove_hidden(self) -> None:
         keep = visible_faces(
@@ -309,6 +312,7 @@ class TrainingLoop:
             self.dataset.train,
             self.config.cutoff,
             self.config.hidden_hits,
+            self.most_opaque,
             self.options.threads,
         )
         if keep.any():

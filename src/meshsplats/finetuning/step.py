@@ -194,7 +194,9 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
     target = target_of(view, config, step, points)
     if target.mask is not None and not target.mask.any():
         return None
-    samples = 1 if points else samples_of(view, config)
+    # Viewers shade a pixel once, with MSAA too: values at pixel centres must be right as well as means.
+    centers = points or (hybrid and config.samples is None and step % 2 == 1)
+    samples = 1 if centers else samples_of(view, config)
     ramp = None if hybrid else ramp_of(config, fraction)
     rendered = render_view(state, view, target.background, samples, ramp)
     image = rendered.color

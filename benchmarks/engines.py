@@ -1,0 +1,75 @@
+"""Meshes for depth buffers: PSNR at held-out cameras, near, middle and far, and processor time.
+
+    python benchmarks/engines.py --data DATA --scenes playbot guitar truck [--steps 400] [--views 100]
+        [--soft-share 0.05] [--opaque-share 1] [--hidden-hits 1] [--threads 1] [-o FOLDER]
+
+Trains on images of the splats at degree 0 and judges at DATA/cameras on white, against means over each pixel.
+benchmarks/viewers/viewers.py --mesh draws the meshes of FOLDER with three.js and Babylon.js.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+import meshsplats as ms
+
+SCENES = {
+    "playbot": "splats/playbot_lod3_31k_sh2.ply",
+    "guitar": "splats/guitar_sh0.ply",
+    "truck": "splats/tt_truck_sh0.ply",
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=[*SCENES])
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--views", type=int, default=100)
+    parser.add_argument("--soft-share", type=float, default=0.05)
+    parser.add_argument("--opaque-share", type=float, default=1.0)
+    parser.add_argument("--hidden-hits", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("-o", "--output", type=Path, help="folder for the meshes")
+    args = parser.parse_args()
+    config = ms.make_config(
+        steps=args.steps,
+        opacity="cutoff",
+        soft_share=args.soft_share,
+        opaque_share=args.opaque_share,
+        hidden_hits=args.hidden_hits,
+    )
+    print("| scene | triangles | opaque, blended | cameras | 1 x 1 | 2 x 2 | 4 x 4 | processor s |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in args.scenes:
+        start = time.process_time()
+        cloud = ms.load_gaussians(args.data / SCENES[name])
+        dataset = ms.splat_dataset(cloud, train=args.views, test=0, sh_degree=0)
+        mesh = ms.starting_mesh(cloud, [view.camera for view in dataset.train])
+        tuned = ms.finetune(mesh, dataset, config, run=ms.RunOptions(report_every=0, threads=args.threads))
+        seconds = time.process_time() - start
+        if args.output:
+            args.output.mkdir(exist_ok=True)
+            ms.save_mesh(tuned, args.output / f"{name}.npz")
+        solid = int((tuned.colors[tuned.faces, 3] == 1).all(axis=1).sum())
+        sizes = f"{len(mesh.faces):,} | {solid:,}, {len(tuned.faces) - solid:,}"
+        for distance in ("close", "mid", "far"):
+            cameras = ms.load_cameras(args.data / "cameras" / f"{name}_{distance}.json")
+            truths = [ms.draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras]
+            scores = []
+            for samples in (1, 2, 4):
+                images = [ms.render(tuned, camera, samples=samples).color for camera in cameras]
+                pairs = zip(images, truths, strict=True)
+                scores.append(np.mean([ms.psnr(a.clip(0, 1), b.clip(0, 1)) for a, b in pairs]))
+            figures = " | ".join(f"{score:.2f}" for score in scores)
+            print(f"| {name} | {sizes} | {distance} | {figures} | {seconds:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
