@@ -113,9 +113,7 @@ def _roof(n: int, middle: np.ndarray, size: np.ndarray, rng: np.random.Generator
     spacing = np.sqrt(width * depth / max(n, 1))
     color = np.array([[0.32, 0.10, 0.06], [0.18, 0.18, 0.20], [0.30, 0.26, 0.20]])[rng.integers(3)]
     return Patch(
-        points=middle
-        + UP * height
-        + np.stack([points[:, 0], _ROUGHNESS * rng.random(n), points[:, 1]], axis=1),
+        points=middle + UP * height + np.stack([x, _ROUGHNESS * rng.random(n), z], axis=1),
         normals=np.broadcast_to(UP, (n, 3)),
         tangents=np.broadcast_to([1.0, 0, 0], (n, 3)),
         sigmas=np.broadcast_to(spacing * np.array([0.75, 0.75, 0.06]), (n, 3)),
