@@ -224,7 +224,8 @@ class _Build:
     def _check_start(self) -> None:
         """Notes what the run is about, or refuses to resume another one."""
         files = [[str(path), os.stat(path).st_size, os.stat(path).st_mtime_ns] for path in self._source.paths]
-        facts = {"files": files, "options": json.loads(json.dumps(asdict(self._options)))}
+        reading = [self._source.axes, self._source.strict]
+        facts = {"files": files, "reading": reading, "options": json.loads(json.dumps(asdict(self._options)))}
         before = self.journal.find("start")
         if before is None:
             self.journal.add("start", **facts)

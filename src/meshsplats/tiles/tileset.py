@@ -173,6 +173,11 @@ class Tile:
     is_file: bool = False
     """Whether the content is another tileset file."""
 
+    def corners(self) -> np.ndarray:
+        """(8, 3) float64 corners of its box, world frame."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return self.center + signs @ self.axes
+
     def load(self) -> SplatMesh:
         """The mesh of the tile in the world frame."""
         mesh = load_mesh(self.content)
@@ -266,8 +271,8 @@ class Tileset:
 
 
 def is_tileset(path: Path) -> bool:
-    """Whether ``path`` is a folder with a tileset.json."""
-    return path.is_dir() and (path / NAME).is_file()
+    """Whether ``path`` is a folder with a tileset.json, or that file."""
+    return path.joinpath(NAME).is_file() if path.is_dir() else path.name == NAME
 
 
 def _load(path: Path) -> dict[str, Any]:
