@@ -23,7 +23,7 @@ FLOORS = (
     ("conversion", "datasets", "viewer"),
     ("evaluation",),
     ("finetuning",),
-    ("levels", "prior"),
+    ("levels", "prior", "tiles"),
     ("blender",),
     ("cli",),
     ("__main__",),

@@ -134,3 +134,22 @@ def _every_third_bit(values: np.ndarray) -> np.ndarray:
     ]:
         v = (v | (v << np.uint64(shift))) & np.uint64(mask)
     return v
+
+
+def morton_codes(points: np.ndarray, low: np.ndarray, side: float, levels: int) -> np.ndarray:
+    """(n,) uint64 codes of the cells of an octree that ``points`` (n, 3) lie in.
+
+    Concretely, a code has three bits for each of the ``levels``, the coarsest on top: bit 0 is the half along
+    x, bit 1 along y, bit 2 along z.
+
+    Args:
+        points: points; those outside the root cell count as on its border.
+        low, side: (3,) least corner and side of the root cell.
+        levels: 1 to 21.
+    """
+    steps = (points.astype(np.float64) - low) * ((1 << levels) / side)
+    cells = np.clip(steps, 0, (1 << levels) - 1).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for axis in range(3):
+        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
+    return code

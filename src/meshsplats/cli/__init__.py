@@ -41,6 +41,7 @@ COMMANDS = {
     "finetune": ("meshsplats.cli.finetune:Finetune", "a mesh optimised to look like splats or photographs"),
     "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
     "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for smaller and smaller sizes"),
+    "tiles": ("meshsplats.cli.tiles:Tiles", "a 3D Tiles tileset of splats of any number"),
     "bake": ("meshsplats.cli.bake:Bake", "a mesh with its low-pass filter applied, for other programs"),
     "base": ("meshsplats.cli.base:Base", "a classical mesh of the surface that splats form"),
     "prior": ("meshsplats.cli.prior:Prior", "splats bound to a classical mesh, trained and edited with it"),

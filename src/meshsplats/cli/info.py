@@ -25,6 +25,7 @@ from meshsplats.formats.gaussians import splat_file, splat_format
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.tiles.tileset import Tileset, is_tileset
 
 SAMPLE = 4000
 """Number of splats that are converted to estimate the size of the mesh."""
@@ -32,7 +33,8 @@ SAMPLE = 4000
 
 @dataclass(frozen=True)
 class Info(Command):
-    """Describes a splat file, a mesh, a camera file, a model folder, or a data set of photographs."""
+    """Describes a splat file, a mesh, a tileset, a camera file, a model folder, or a data set of
+    photographs."""
 
     input: tyro.conf.Positional[Path]
     """The file or folder."""
@@ -52,6 +54,8 @@ class Info(Command):
 
 def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
     """Findings about ``path``, ready for JSON. Lengths are in scene units."""
+    if is_tileset(path):
+        return {"path": shown_path(path), "kind": "tileset", **_tileset(path)}
     layout = _layout(path)
     kind = "data set" if layout is not None else identify(path)
     found: dict[str, Any] = {"path": shown_path(path), "kind": kind}
@@ -153,6 +157,31 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
         "normals": mesh.normals is not None,
         "depth_groups": mesh.depth_group is not None,
         "attributes": list(mesh.attributes),
+    }
+
+
+def _tileset(path: Path) -> dict[str, Any]:
+    tileset = Tileset(path)
+    folder = path if path.is_dir() else path.parent
+    found = {"tiles": 0, "levels": 0, "triangles": 0, "largest_tile": 0}
+    todo = [(tileset.root, 1)]
+    while todo:
+        tile, level = todo.pop()
+        children = tileset.children(tile)
+        found["tiles"] += 1
+        found["levels"] = max(found["levels"], level)
+        found["largest_tile"] = max(found["largest_tile"], tile.triangles)
+        found["triangles"] += 0 if children else tile.triangles
+        todo += [(child, level + 1) for child in children]
+    corners = tileset.root.corners()
+    return {
+        "bytes": sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),
+        "splats": tileset.splats,
+        **found,
+        "geometric_error": float(f"{tileset.root.error:.6g}"),
+        "lower": _rounded(corners.min(axis=0)),
+        "upper": _rounded(corners.max(axis=0)),
+        "up": _rounded(tileset.up),
     }
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -36,6 +37,9 @@ from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, recorded_opti
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
+if TYPE_CHECKING:
+    from meshsplats.tiles.tileset import Tileset
+
 
 @dataclass(frozen=True)
 class _Files:
@@ -55,7 +59,7 @@ class _Files:
 
 @dataclass(frozen=True)
 class Render(Command):
-    """Renders splats or a mesh: one image (-o image.png), or a folder of images with a turntable.
+    """Renders splats, a mesh or a tileset: one image (-o image.png), or a folder of images with a turntable.
 
     Splats (.ply, or the folder of a trained model) are converted to a mesh first, with default settings;
     --as-splats renders them as 3D Gaussian Splatting does.
@@ -74,7 +78,7 @@ class Render(Command):
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
-    """Splats, a model folder, or a mesh."""
+    """Splats, a model folder, a mesh, or the folder of a tileset."""
     output: Output
     """A .png for one view, or a folder. Without other options: the front view, or an orbit of 60 views."""
     as_splats: bool = False
@@ -86,6 +90,9 @@ class Render(Command):
     cutoff: Number = None
     """Draw a mesh as a depth buffer does: opaque where its opacity is at least this, nothing elsewhere. 0 to
     1; default: blended."""
+    max_error: Number = None
+    """Tileset: draw tiles whose geometric error is at most this many pixels; 0 draws the finest ones.
+    Default: 1."""
     transparent: bool = False
     """No background: images with an alpha channel."""
     depth: Literal["none", "png", "npy"] = "none"
@@ -104,7 +111,9 @@ class Render(Command):
         single = self.output.suffix.lower() == ".png"
         self._check(single)
         start = time.perf_counter()
-        scene = self.part.of(load_scene(self.input, self.reading))
+        tileset = self._tileset()
+        # The coarsest tile says where a tileset is.
+        scene = tileset.root.load() if tileset else self.part.of(load_scene(self.input, self.reading))
         self._check_scene(scene)
         photographs = self.views.photographs()
         count = 1 if single else 60
@@ -120,7 +129,8 @@ class Render(Command):
         result: dict[str, Any] = {}
         unit = None
         if self.depth == "png" and isinstance(scene, SplatMesh):
-            result["depth_unit"] = unit = _depth_unit(scene, cameras)
+            points = tileset.root.corners() if tileset else scene.vertices
+            result["depth_unit"] = unit = _depth_unit(points, cameras)
         color = (0.0, 0.0, 0.0)
         if not self.transparent:
             kind = "splats" if isinstance(scene, GaussianCloud) else "mesh"
@@ -131,7 +141,7 @@ class Render(Command):
             result |= background.to_dict()
         if not single:
             _remove_older(self.output, files.every)
-        self._draw(scene, cameras, files, unit, color)
+        self._draw(tileset or scene, cameras, files, unit, color)
         if files.turntable:
             from meshsplats.images.reading import load_image
             from meshsplats.images.writing import save_animation
@@ -199,6 +209,20 @@ class Render(Command):
             raise UsageError("--device gpu draws meshes: leave out --as-splats")
         self.draw.check_device()
 
+    def _tileset(self) -> Tileset | None:
+        """The tileset of the input; None if it is something else. UsageError for options without effect."""
+        from meshsplats.tiles.tileset import Tileset, is_tileset
+
+        if not is_tileset(self.input):
+            if self.max_error is not None:
+                raise UsageError("--max-error is for tilesets")
+            return None
+        if self.max_error is not None and not 0 <= self.max_error < math.inf:
+            raise UsageError(f"--max-error must be a number of pixels, at least 0, got {self.max_error}")
+        if self.part.crop is not None:
+            raise UsageError("--crop has no effect on a tileset: give it to 'meshsplats tiles'")
+        return Tileset(self.input)
+
     def _check_scene(self, scene: GaussianCloud | SplatMesh) -> None:
         if isinstance(scene, SplatMesh) and self.as_splats:
             raise ValueError(f"{self.input} is a mesh: --as-splats needs a splat file")
@@ -207,7 +231,7 @@ class Render(Command):
 
     def _draw(
         self,
-        scene: GaussianCloud | SplatMesh,
+        scene: GaussianCloud | SplatMesh | Tileset,
         cameras: Sequence[Camera],
         files: _Files,
         unit: float | None,
@@ -217,13 +241,18 @@ class Render(Command):
         from meshsplats.images.writing import save_array, save_depth_png, save_image, straight_rgba
         from meshsplats.rendering import render, render_splats
         from meshsplats.rendering.samples import needed_samples
+        from meshsplats.tiles.drawing import MAX_ERROR, render_tiles, samples_for
+        from meshsplats.tiles.tileset import Tileset
 
         # A mesh for linear light is blended in it and encoded for display afterwards.
         linear = isinstance(scene, SplatMesh) and scene.blending == "linear"
         if linear:
             background = tuple(srgb_to_linear(np.array(background)).tolist())
         samples = self.draw.samples
-        if samples is None:
+        most = MAX_ERROR if self.max_error is None else self.max_error
+        if samples is None and isinstance(scene, Tileset):
+            samples = samples_for(scene, cameras, most)
+        elif samples is None:
             samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
         options: dict[str, Any] = {
             "background": background,
@@ -235,15 +264,12 @@ class Render(Command):
             if isinstance(scene, GaussianCloud):
                 drawn = render_splats(scene, camera, sh_degree=degree, **options)
             else:
-                drawn = render(
-                    scene,
-                    camera,
-                    max_layers=layers,
-                    depth=bool(files.depths),
-                    cutoff=self.cutoff,
-                    device=self.draw.device,
-                    **options,
-                )
+                options |= {"max_layers": layers, "depth": bool(files.depths), "cutoff": self.cutoff}
+                options["device"] = self.draw.device
+                if isinstance(scene, Tileset):
+                    drawn = render_tiles(scene, camera, max_error=most, **options)
+                else:
+                    drawn = render(scene, camera, **options)
             if not files.images[i].parent.exists():
                 files.images[i].parent.mkdir()  # not before there is something to write
             image = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color
@@ -259,10 +285,9 @@ class Render(Command):
                 save_depth_png(files.depths[i], mean, unit)
 
 
-def _depth_unit(scene: GaussianCloud | SplatMesh, cameras: Sequence[Camera]) -> float:
-    """Scene units per step of a 16-bit depth image: the farthest vertex of all views fits."""
-    assert isinstance(scene, SplatMesh)
-    corners = scene.vertices if len(scene.vertices) else np.zeros((1, 3), np.float32)
+def _depth_unit(points: np.ndarray, cameras: Sequence[Camera]) -> float:
+    """Scene units per step of a 16-bit depth image: the farthest of ``points`` (n, 3) in all views fits."""
+    corners = points if len(points) else np.zeros((1, 3), np.float32)
     farthest = max(
         float((corners @ c.world_to_camera[2, :3] + c.world_to_camera[2, 3]).max()) for c in cameras
     )

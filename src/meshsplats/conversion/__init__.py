@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from meshsplats.conversion.merging import simplify
 from meshsplats.conversion.options import PRESETS, ConversionOptions, Preset, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
 from meshsplats.conversion.selection import disc_areas, inside_box, mean_shadow, most_important
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import Look
 
@@ -87,7 +87,7 @@ def convert(
     """
     given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
-    filter_px2 = _filter_of(cloud, chosen)
+    filter_px2 = filter_of(cloud.kernel, chosen)
     direction = guess_up(None, cameras) if up is None else unit_up(up)
     rows = _worth_drawing(cloud, chosen)
     part = cloud
@@ -103,17 +103,12 @@ def convert(
         rows, cloud = np.arange(count, dtype=np.int32), viewed.cloud
     part = viewed.cloud
 
-    axes = _axis_order(part, chosen)
-    sigma, opacity = _drawn_gaussians(part, chosen, viewed.pixel, axes)
-    areas = disc_areas(sigma)
-    shadow = mean_shadow(areas)
-    shapes, choice = _shapes(sigma, chosen)
-
-    keep = areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(part), bool)
+    fans = Fans.of(part, chosen, viewed.pixel)
+    keep = fans.areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(part), bool)
     if not keep.any():
         raise ValueError(f"none of the {len(part)} splats has a visible area")
     if count < len(part):
-        importance = opacity * shadow
+        importance = fans.opacity * fans.shadow
         if chosen.footprint == "cameras" and viewed.pixel is not None:
             importance = importance / np.square(viewed.pixel)
         # Splats without area come last.
@@ -124,46 +119,93 @@ def convert(
     if chosen.colors == "cameras" and part.sh_degree > 0 and viewed.coverage is not None:
         colors = viewed.coverage.mean_colors(part.sh)
 
-    def assembled(shapes: list[Shape], choice: np.ndarray, keep: np.ndarray) -> SplatMesh:
-        drawn = opacity
-        if chosen.compensation:
-            drawn = drawn * _missing(areas, shadow, shapes, choice) ** np.float32(chosen.compensation)
-        everything = bool(keep.all())
-        kept = np.flatnonzero(keep)
-        pick = (lambda array: array) if everything else (lambda array: np.take(array, kept, axis=0))
-        counts = np.array([len(shape.pattern.faces) for shape in shapes])
-        vertices, faces, rgba = build(
-            shapes,
-            pick(choice),
-            pick(part.means),
-            pick(part.quaternions),
-            pick(axes),
-            pick(sigma),
-            pick(colors),
-            pick(drawn),
-        )
-        owners = np.repeat(pick(rows), counts[pick(choice)])
+    def assembled(fans: Fans, keep: np.ndarray) -> SplatMesh:
+        kept = None if keep.all() else np.flatnonzero(keep)
+        vertices, faces, rgba, owners = fans.build(part, rows, colors, chosen.compensation, kept)
         return SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction, filter_px2=filter_px2)
 
-    mesh = assembled(shapes, choice, keep)
+    mesh = assembled(fans, keep)
     if chosen.detail == "cameras":
         wanted: Look = "splats" if chosen.footprint == "filter" else chosen.look or "area"
         shown = visibility(mesh, cloud.means, whole.cloud, cameras or (), wanted)
         visible = keep & ~shown.hidden[rows]
         keep = visible if visible.any() else keep
         budget = len(mesh.faces) if chosen.max_triangles is None else chosen.max_triangles
+        choice = fans.choice.copy()
         choice[keep] = choose_levels(shown.need[rows[keep]], budget)
-        mesh = assembled([_ellipse(sides, rings, chosen) for sides, rings in LEVELS], choice, keep)
+        levels = [_ellipse(sides, rings, chosen) for sides, rings in LEVELS]
+        mesh = assembled(fans._replace(shapes=levels, choice=choice), keep)
     return mesh
 
 
-def _filter_of(cloud: GaussianCloud, options: ConversionOptions) -> float:
-    """``filter_px2`` of the mesh: variance in square pixels, 0 for none."""
+class Fans(NamedTuple):
+    """How n splats become triangles."""
+
+    shapes: list[Shape]
+    choice: np.ndarray
+    """(n,) index of each splat's shape."""
+    axes: np.ndarray
+    """(n, 3) the splat's axes in the order in which the ellipses use them."""
+    sigma: np.ndarray
+    """(n, 3) standard deviations along them after the low-pass filter, scene units."""
+    opacity: np.ndarray
+    """(n,) opacities after the filter."""
+    areas: np.ndarray
+    """(n, 3) as from ``disc_areas``."""
+    shadow: np.ndarray
+    """(n,) as from ``mean_shadow``."""
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud, options: ConversionOptions, pixel: np.ndarray | None) -> Fans:
+        """The fans of ``cloud``. ``pixel``: (n,) size of a pixel at each splat, None without a footprint."""
+        axes = _axis_order(cloud, options)
+        sigma, opacity = _drawn_gaussians(cloud, options, pixel, axes)
+        areas = disc_areas(sigma)
+        shapes, choice = _shapes(sigma, options)
+        return cls(shapes, choice, axes, sigma, opacity, areas, mean_shadow(areas))
+
+    def build(
+        self,
+        cloud: GaussianCloud,
+        rows: np.ndarray,
+        colors: np.ndarray,
+        compensation: float | None,
+        kept: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices (v, 3), faces (f, 3), colours (v, 4) and the splat of each face (f,), from ``rows`` (n,).
+
+        ``kept``: indices of the splats that get triangles, all by default.
+        """
+        drawn = self.opacity
+        if compensation:
+            drawn = drawn * _missing(self.areas, self.shadow, self.shapes, self.choice) ** np.float32(
+                compensation
+            )
+
+        def pick(array: np.ndarray) -> np.ndarray:
+            return array if kept is None else np.take(array, kept, axis=0)
+
+        counts = np.array([len(shape.pattern.faces) for shape in self.shapes])
+        vertices, faces, rgba = build(
+            self.shapes,
+            pick(self.choice),
+            pick(cloud.means),
+            pick(cloud.quaternions),
+            pick(self.axes),
+            pick(self.sigma),
+            pick(colors),
+            pick(drawn),
+        )
+        return vertices, faces, rgba, np.repeat(pick(rows), counts[pick(self.choice)])
+
+
+def filter_of(kernel: Kernel, options: ConversionOptions) -> float:
+    """``filter_px2`` of the mesh of splats of that kernel: variance in square pixels, 0 for none."""
     if options.footprint != "filter":
         return 0.0
-    if cloud.kernel != "3dgs":
+    if kernel != "3dgs":
         raise ValueError(
-            f"footprint='filter' draws as 3DGS does, but these splats are of kernel {cloud.kernel!r}, which"
+            f"footprint='filter' draws as 3DGS does, but these splats are of kernel {kernel!r}, which"
             " filters in another way: choose another footprint, or none"
         )
     return DRAWN_PX2 if options.footprint_px2 is None else float(options.footprint_px2)

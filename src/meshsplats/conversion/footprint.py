@@ -53,21 +53,32 @@ clouds with far more detail than such images can show reach it."""
 _CHUNK = 1 << 14
 
 
+def origin_step(count: int) -> int:
+    """Of ``count`` splats, every so many-th decides the origin."""
+    return max(1, count // 1000)
+
+
+def origin_of(means: np.ndarray) -> np.ndarray:
+    """(3,) float64 mean of ``means`` (n, 3), 0 if there are none."""
+    return means.mean(axis=0, dtype=np.float64) if len(means) else np.zeros(3)
+
+
 class CameraCoverage:
     """How many pixels of each camera a unit of area at each splat covers: weights (f / d)^2.
 
     Args:
         means: (n, 3) float32 centres of the splats.
         cameras: at least one; of more than ``MAX_CAMERAS``, some are chosen.
+        origin: (3,) of the whole scene, where ``means`` are a part of it; see ``origin_of``.
     """
 
-    def __init__(self, means: np.ndarray, cameras: Sequence[Camera]) -> None:
+    def __init__(
+        self, means: np.ndarray, cameras: Sequence[Camera], origin: np.ndarray | None = None
+    ) -> None:
         self.cameras = [cameras[i] for i in spread_indices(len(cameras), MAX_CAMERAS)]
         self.means = means
         # Relative to an origin among the splats: positions far from zero lose digits in float32.
-        self.origin = (
-            means[:: max(1, len(means) // 1000)].mean(axis=0, dtype=np.float64) if len(means) else np.zeros(3)
-        )
+        self.origin = origin_of(means[:: origin_step(len(means))]) if origin is None else origin
 
     def _each(self, part: slice) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
         """For each camera: (3, k) offsets from its centre to the splats ``part`` in the world frame, (k,)
@@ -206,12 +217,17 @@ def pixel_sizes(
         )
     sizes = np.where(seen, sizes, np.median(sizes[seen]))
     if options.footprint == "framing":
-        # One point in ``step`` lies sqrt(step) times as far from the next, on a surface.
         step = -(-len(cloud) // SAMPLE)
-        typical = np.median(spacing(cloud.means[::step])) / np.sqrt(step)
-        if typical > 0:  # splats all in one spot have no spacing
-            np.minimum(sizes, np.float32(FRAMING_SPACING * typical), out=sizes)
+        np.minimum(sizes, largest_pixel(cloud.means[::step], step), out=sizes)
     return sizes
+
+
+def largest_pixel(means: np.ndarray, step: int) -> np.float32:
+    """Largest pixel for 'framing', scene units, by ``means`` (n, 3) of every ``step``-th splat."""
+    # One point in ``step`` lies sqrt(step) times as far from the next, on a surface.
+    typical = np.median(spacing(means)) / np.sqrt(step)
+    # Splats all in one spot have no spacing.
+    return np.float32(FRAMING_SPACING * typical) if typical > 0 else np.float32(np.inf)
 
 
 def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str) -> np.ndarray:

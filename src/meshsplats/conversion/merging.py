@@ -116,9 +116,28 @@ def simplify(
     """
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
         raise ValueError(f"count must be a whole number of splats, at least 1, got {count!r}")
+    return cloud if count >= len(cloud) else merge(cloud, count, low_pass, cameras, threads).cloud
+
+
+class Merged(NamedTuple):
+    """Fewer splats, and what became of the old ones."""
+
+    cloud: GaussianCloud
+    group: np.ndarray
+    """(n,) row of ``cloud`` that each old splat has become part of."""
+    masses: np.ndarray
+    """(n,) float64 masses of the old splats, >= 0."""
+
+
+def merge(
+    cloud: GaussianCloud,
+    count: int,
+    low_pass: float | np.ndarray | None = None,
+    cameras: Sequence[Camera] | None = None,
+    threads: int | None = None,
+) -> Merged:
+    """``simplify`` for ``count`` less than the number of splats, which it has checked."""
     n = len(cloud)
-    if count >= n:
-        return cloud
     if n > np.iinfo(np.int32).max:
         raise ValueError(f"at most 2^31 - 1 splats can be merged, got {n}")
     if low_pass is None:
@@ -130,7 +149,7 @@ def simplify(
     area = mean_shadow(disc_areas(_drawn(cloud.scales, width, cloud.kernel)))
     masses = np.where(cloud.opacities < MIN_OPACITY, 0, optical_depth(cloud.opacities) * area)
     group = _groups(cloud, masses, width, int(count), threads or processors())
-    return _merged(cloud, masses, width, group)
+    return Merged(_merged(cloud, masses, width, group), group, masses)
 
 
 def optical_depth(opacity: np.ndarray) -> np.ndarray:

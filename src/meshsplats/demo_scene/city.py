@@ -17,7 +17,7 @@ import numpy as np
 
 from meshsplats.demo_scene import GOLDEN_ANGLE, UP, quaternions_of_frames
 from meshsplats.demo_scene._light import Patch, column, diffuse, spherical_harmonics, unit
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import SH_C0, GaussianCloud
 
 LOT = 20.0
 """Side of a lot, scene units."""
@@ -25,6 +25,8 @@ LOT_SPLATS = 20_000
 """Splats of a lot; the last one has the rest."""
 SHARES = {"walls": 0.42, "roof": 0.10, "trees": 0.18}
 """Share of each part in the splats of a lot; the ground takes the rest."""
+_ROUGHNESS = 0.01
+"""Depth of surfaces: where splats shared a plane, rounding would decide which of them is in front."""
 _NO_BLOCKERS = (np.empty((0, 3)), np.empty(0), np.empty(0))
 
 
@@ -63,7 +65,11 @@ def _lot(n: int, corner: np.ndarray, degree: int, rng: np.random.Generator) -> G
         _ground(n - sum(counts.values()), rng),
     ]
     patches = [patch for patch in patches if len(patch.points)]
-    sh = np.concatenate([spherical_harmonics(p, diffuse(p, _NO_BLOCKERS)) for p in patches])
+    colors = [diffuse(patch, _NO_BLOCKERS) for patch in patches]
+    if degree:
+        sh = np.concatenate([spherical_harmonics(p, c) for p, c in zip(patches, colors, strict=True)])
+    else:
+        sh = ((np.concatenate(colors) - 0.5) / SH_C0)[:, None]
     frames = np.concatenate(
         [np.stack([p.tangents, np.cross(p.normals, p.tangents), p.normals], axis=2) for p in patches]
     )
@@ -84,7 +90,7 @@ def _walls(n: int, middle: np.ndarray, size: np.ndarray, tone: np.ndarray, rng: 
     along, up = rng.uniform(-0.5, 0.5, n) * lengths[wall], rng.uniform(0, height, n)
     directions = np.array([[1.0, 0, 0], [0, 0, 1.0], [-1.0, 0, 0], [0, 0, -1.0]])
     normals = np.array([[0, 0, -1.0], [1.0, 0, 0], [0, 0, 1.0], [-1.0, 0, 0]])[wall]
-    away = np.array([depth, width, depth, width])[wall] / 2
+    away = np.array([depth, width, depth, width])[wall] / 2 - _ROUGHNESS * rng.random(n)
     points = middle + directions[wall] * column(along) + normals * column(away) + UP * column(up)
     window = (np.abs(along % 2.0 - 1) < 0.6) & (np.abs(up % 3.0 - 1.7) < 0.8) & (up < height - 0.6)
     albedo = np.where(window[:, None], [0.03, 0.06, 0.10], np.clip(tone, 0.05, 0.9))
@@ -103,11 +109,11 @@ def _walls(n: int, middle: np.ndarray, size: np.ndarray, tone: np.ndarray, rng: 
 
 def _roof(n: int, middle: np.ndarray, size: np.ndarray, rng: np.random.Generator) -> Patch:
     width, height, depth = size
-    points = np.stack([*(rng.uniform(-0.5, 0.5, (2, n)) * [[width], [depth]])], axis=1)
+    x, z = rng.uniform(-0.5, 0.5, (2, n)) * [[width], [depth]]
     spacing = np.sqrt(width * depth / max(n, 1))
     color = np.array([[0.32, 0.10, 0.06], [0.18, 0.18, 0.20], [0.30, 0.26, 0.20]])[rng.integers(3)]
     return Patch(
-        points=middle + UP * height + np.stack([points[:, 0], np.zeros(n), points[:, 1]], axis=1),
+        points=middle + UP * height + np.stack([x, _ROUGHNESS * rng.random(n), z], axis=1),
         normals=np.broadcast_to(UP, (n, 3)),
         tangents=np.broadcast_to([1.0, 0, 0], (n, 3)),
         sigmas=np.broadcast_to(spacing * np.array([0.75, 0.75, 0.06]), (n, 3)),
@@ -149,7 +155,7 @@ def _ground(n: int, rng: np.random.Generator) -> Patch:
     colors = np.array([[0.05, 0.05, 0.055], [0.36, 0.34, 0.31], [0.07, 0.15, 0.035], [0.75, 0.75, 0.70]])
     spacing = LOT / np.sqrt(max(n, 1))
     return Patch(
-        points=np.stack([x, 0.01 * rng.random(n), z], axis=1),
+        points=np.stack([x, _ROUGHNESS * rng.random(n), z], axis=1),
         normals=np.broadcast_to(UP, (n, 3)),
         tangents=np.broadcast_to([1.0, 0, 0], (n, 3)),
         sigmas=np.broadcast_to(spacing * np.array([0.7, 0.7, 0.06]), (n, 3)),

@@ -109,7 +109,7 @@ class SplatStream:
             raise ValueError(f"block must be a number of splats, at least 1, got {block!r}")
         self.paths = tuple(Path(path) for path in paths)
         """The files, in their order."""
-        self.block, self._strict, self._axes = int(block), strict, axes
+        self.block, self.strict, self.axes = int(block), strict, axes
 
     def __iter__(self) -> Iterator[GaussianCloud]:
         for path in self.paths:
@@ -136,13 +136,13 @@ class SplatStream:
             else:
                 readers = iter([])
                 to_y_down = turn = HALF_TURN_Z
-            if self._axes != "auto":
-                to_y_down = turn if self._axes == "y-up" else np.eye(3)
+            if self.axes != "auto":
+                to_y_down = turn if self.axes == "y-up" else np.eye(3)
             for reader in readers:
-                for block in reader.blocks(self.block, strict=self._strict):
+                for block in reader.blocks(self.block, strict=self.strict):
                     yield transformed(block, to_y_down)
         if kind == "gltf":
-            cloud = read_splat_gltf(path, strict=self._strict)
+            cloud = read_splat_gltf(path, strict=self.strict)
             for start in range(0, len(cloud), self.block):
                 part = np.arange(start, min(start + self.block, len(cloud)))
                 yield transformed(cloud.select(part), to_y_down)
@@ -304,6 +304,8 @@ def splat_file(path: Path) -> Path:
             return max(iterations)[1]
         if (folder / "point_cloud.ply").is_file():
             return folder / "point_cloud.ply"
+    if (path / "tileset.json").is_file():
+        raise FileFormatError(f"{path}: a tileset, not splats; render and info take it")
     photographs = [n for n in ("transforms.json", "transforms_train.json", "sparse") if (path / n).exists()]
     if photographs:
         raise FileFormatError(

@@ -163,6 +163,12 @@ def _side_by_side(header: _Header, streams: dict[str, Any], where: object) -> It
                 for name, stream in streams.items()
             }
             yield m, partial(_fill, header, part)
+        for name, stream in streams.items():
+            # At the end of a Zstandard frame stands its checksum; gzip's was checked by the first pass.
+            if isinstance(stream, _Inflater):
+                continue
+            if _exactly(stream, 1, name, where, optional=True):
+                raise FileFormatError(f"{where}: the stream of {name} is longer than its header says")
     finally:
         _close(streams)
 
@@ -219,8 +225,8 @@ class _Frame(io.RawIOBase):
         super().close()
 
 
-def _exactly(stream: Any, count: int, name: str, where: object) -> bytes:
-    """``count`` bytes of the unpacked ``stream`` of an attribute."""
+def _exactly(stream: Any, count: int, name: str, where: object, *, optional: bool = False) -> bytes:
+    """``count`` bytes of the unpacked ``stream`` of an attribute; none at its end, if ``optional``."""
     parts, missing = [], count
     errors: tuple[type[BaseException], ...] = (EOFError, MemoryError, *_unpacking_errors())
     while missing:
@@ -228,6 +234,8 @@ def _exactly(stream: Any, count: int, name: str, where: object) -> bytes:
             found = stream.read(min(missing, _PIECE))
         except errors as error:
             raise FileFormatError(f"{where}: the stream of {name} is broken: {str(error)[:100]}") from None
+        if not found and optional:
+            break
         if not found:
             raise FileFormatError(f"{where}: the stream of {name} is truncated")
         parts.append(found)

@@ -1,0 +1,138 @@
+"""``meshsplats tiles``: splats of any number as a 3D Tiles tileset."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from meshsplats.cli.arguments import Command
+from meshsplats.cli.common import Box, Count, Number, Output, SplatOptions, Text, check_outputs, parse_up
+from meshsplats.cli.messages import Terminated, UsageError, say
+from meshsplats.cli.records import CONFIGURATION, beside, write_configuration
+from meshsplats.conversion import ConversionOptions
+
+if TYPE_CHECKING:
+    from meshsplats.tiles.building import TileOptions
+
+
+@dataclass(frozen=True)
+class Tiles(Command):
+    """A 3D Tiles tileset of splats of any number: an octree of .glb files, fine ones for near and merged ones
+    for far, that viewers and engines (CesiumJS, Unreal, Unity, Omniverse) load as they need them.
+
+    Memory stays below 2 GB for any number of splats. An interrupted run is continued by --resume.
+    """
+
+    CONFIGURABLE = True
+
+    input: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT...", help_behavior_hint="")]
+    ]
+    """Splat file, or the folder of a trained model; several of them; a folder of splat files."""
+    output: Output
+    """Folder for the tileset; it appears when it is complete. Until then, FOLDER.partial."""
+    max_triangles: int = 1 << 16
+    """Maximum number of triangles of a tile."""
+    preset: Literal["default", "paper"] = "default"
+    """default: calibrated to look like the splats; paper: the conversion of the MeshSplats paper."""
+    look: Annotated[
+        Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
+    ] = None
+    """area: for programs that take several samples a pixel; splats: as splat viewers show them. Default:
+    area."""
+    min_opacity: Number = None
+    """Leave out splats of less opacity than this. Default: 1/255; paper: 0."""
+    crop: Box = None
+    """Only splats with their centre in this box, in the coordinates of the file."""
+    up: Text = None
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: -y."""
+    lit: bool = False
+    """A material that takes light and shadow, not one that shows the colours as they are."""
+    resume: bool = False
+    """Continue an interrupted run of the same command, from FOLDER.partial."""
+    reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """Maximum number of threads. Default: all processors."""
+    json: bool = False
+    """Print the result as JSON."""
+    force: bool = False
+    """Replace an older tileset, and begin again where a partial one is left."""
+
+    def execute(self) -> None:
+        from meshsplats.formats.gaussians import stream_gaussians
+        from meshsplats.tiles.building import JOURNAL, build_tiles
+
+        options = self._checked()
+        config = beside(self.output, CONFIGURATION)
+        check_outputs([config], self.force or self.resume)
+        start = time.perf_counter()
+        source = stream_gaussians(self.input, strict=self.reading.strict, axes=self.reading.axes)
+        try:
+            with _progress() as show:
+                found = build_tiles(
+                    source,
+                    self.output,
+                    options,
+                    resume=self.resume,
+                    replace_old=self.force,
+                    threads=self.threads,
+                    on_progress=show,
+                )
+        except (KeyboardInterrupt, Terminated, OSError):
+            if self.output.with_name(f"{self.output.name}.partial").joinpath(JOURNAL).is_file():
+                say("what is done stays: the same command with --resume continues")
+            raise
+        write_configuration(config, "tiles", self)
+        seconds = time.perf_counter() - start
+        if self.json:
+            result = {"tileset": str(self.output / "tileset.json"), **asdict(found)}
+            print(json.dumps(result | {"seconds": round(seconds, 2)}, indent=1))
+            return
+        print(
+            f"{found.splats:,} splats -> {found.triangles:,} triangles in {found.tiles:,} tiles of"
+            f" {found.levels} levels, {found.bytes / 1e6:,.1f} MB, in {seconds:.1f} s"
+        )
+        print(f"{self.output / 'tileset.json'}: geometric error of the root {found.error:.3g}")
+
+    def resolved(self) -> dict[str, Any]:
+        return asdict(self._checked().resolved())
+
+    def _checked(self) -> TileOptions:
+        """The options of the library; UsageError or ValueError where they are wrong."""
+        from meshsplats.tiles.building import TileOptions
+
+        if not self.input:
+            raise UsageError("give a splat file or a folder of them")
+        if self.output.suffix:
+            raise UsageError(f"-o must name a folder, got {self.output.name!r}")
+        if self.resume and self.force:
+            raise UsageError("--resume continues, --force starts again: give one of them")
+        conversion = ConversionOptions(look=self.look, min_opacity=self.min_opacity, crop=self.crop)
+        options = TileOptions(self.max_triangles, self.preset, conversion, lit=self.lit)
+        if self.up is not None:
+            x, y, z = (float(u) for u in parse_up(self.up))
+            options = TileOptions(self.max_triangles, self.preset, conversion, (x, y, z), self.lit)
+        options.resolved()
+        return options
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None] | None]:
+    """Shows progress on stderr, where that is a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("tiles", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

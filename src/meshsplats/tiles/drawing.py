@@ -1,0 +1,202 @@
+"""Images of a tileset: the tiles that a camera needs, in bounded memory."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from meshsplats._arrays import subsample
+from meshsplats.camera import Camera
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import Rendering, render
+from meshsplats.rendering.samples import CAMERAS, needed_samples
+from meshsplats.tiles.tileset import Tile, Tileset
+
+MAX_ERROR = 1.0
+"""Screen-space error in pixels up to which a tile is drawn."""
+MAX_TRIANGLES = 4_000_000
+"""Triangles that are in memory together, in about 60 bytes each."""
+SMALLEST = 64
+"""Side in pixels below which an image is not divided."""
+
+
+def choose_tiles(
+    tileset: Tileset, camera: Camera, *, max_error: float = MAX_ERROR, most: int | None = None
+) -> tuple[list[Tile], float]:
+    """The tiles that ``camera`` needs, in the order of the octree, and their largest error in pixels.
+
+    The screen-space error of a tile is its geometric error at the nearest point of its box. A tile of more
+    than ``max_error`` is replaced by its children, those of the largest error first, as long as there are at
+    most ``most`` triangles. Tiles outside the image are left out.
+    """
+    if not max_error >= 0:
+        raise ValueError(f"max_error must be a number of pixels, at least 0, got {max_error}")
+    order = count()
+    queue: list[tuple[float, int, tuple[int, ...], Tile]] = []
+    chosen: list[tuple[tuple[int, ...], Tile]] = []
+    triangles = 0
+
+    def add(tile: Tile, place: tuple[int, ...]) -> None:
+        nonlocal triangles
+        if not reaches(camera, tile):
+            return
+        triangles += tile.triangles
+        pixels = screen_error(camera, tile)
+        if pixels > max_error and tile.children:
+            heapq.heappush(queue, (-pixels, next(order), place, tile))
+        else:
+            chosen.append((place, tile))
+
+    add(tileset.root, ())
+    worst = 0.0
+    while queue:
+        pixels, _, place, tile = heapq.heappop(queue)
+        children = tileset.children(tile)
+        if most is not None and triangles + sum(child.triangles for child in children) > most:
+            chosen.append((place, tile))
+            worst = max(worst, -pixels)
+            continue
+        triangles -= tile.triangles
+        for i, child in enumerate(children):
+            add(child, (*place, i))
+    chosen.sort(key=lambda entry: entry[0])
+    tiles = [tile for _, tile in chosen]
+    return tiles, max([worst, *(screen_error(camera, tile) for tile in tiles)])
+
+
+def screen_error(camera: Camera, tile: Tile) -> float:
+    """Geometric error of a tile in pixels, at the point of its box that is nearest to the camera."""
+    offset = camera.center - tile.center
+    lengths = np.maximum(np.linalg.norm(tile.axes, axis=1), 1e-30)
+    along = (tile.axes / lengths[:, None]) @ offset
+    outside = np.maximum(np.abs(along) - lengths, 0)
+    distance = max(float(np.linalg.norm(outside)), camera.near)
+    return tile.error * max(camera.fx, camera.fy) / distance
+
+
+def reaches(camera: Camera, tile: Tile) -> bool:
+    """Whether the box of a tile may reach into the image: it is outside none of the planes of the frustum."""
+    rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    center, axes = rotation @ tile.center + shift, tile.axes @ rotation.T
+    planes = np.array(
+        [
+            [0, 0, 1],
+            [camera.fx, 0, camera.cx],
+            [-camera.fx, 0, camera.width - camera.cx],
+            [0, camera.fy, camera.cy],
+            [0, -camera.fy, camera.height - camera.cy],
+        ],
+        np.float64,
+    )
+    limits = np.array([camera.near, 0, 0, 0, 0])
+    return bool((planes @ center + np.abs(planes @ axes.T).sum(axis=1) >= limits).all())
+
+
+def render_tiles(
+    tileset: Tileset,
+    camera: Camera,
+    *,
+    max_error: float = MAX_ERROR,
+    max_triangles: int = MAX_TRIANGLES,
+    **options: Any,
+) -> Rendering:
+    """The image of a tileset: that of the mesh of the tiles that the camera needs.
+
+    An image that needs more triangles than fit into memory is rendered in parts, which need fewer of them
+    each.
+
+    Args:
+        tileset: the tileset.
+        camera: viewpoint, lens and size of the image.
+        max_error: screen-space error in pixels up to which a tile is drawn; 0 draws the leaves.
+        max_triangles: triangles that are in memory together. A part of the image of ``SMALLEST`` pixels that
+            needs more is drawn with the error that they allow.
+        options: those of ``render``, other than ``attributes``.
+
+    Raises:
+        ValueError: an option out of its range.
+        FileFormatError: a tile is broken.
+    """
+    tiles, _ = choose_tiles(tileset, camera, max_error=max_error)
+    if sum(tile.triangles for tile in tiles) <= max_triangles:
+        return render(join_tiles(tileset, tiles), camera, **options)
+    if max(camera.width, camera.height) <= SMALLEST:
+        tiles, _ = choose_tiles(tileset, camera, max_error=max_error, most=max_triangles)
+        return render(join_tiles(tileset, tiles), camera, **options)
+    axis = int(camera.width >= camera.height)
+    middle = (camera.height, camera.width)[axis] // 2
+    parts = []
+    background = np.asarray(options.pop("background", (1, 1, 1)), np.float32)
+    for start, part in zip((0, middle), _halves(camera, axis, middle), strict=True):
+        own = background
+        if background.ndim == 3:
+            own = (
+                background[start : start + part.height]
+                if axis == 0
+                else background[:, start : start + part.width]
+            )
+        parts.append(
+            render_tiles(
+                tileset, part, max_error=max_error, max_triangles=max_triangles, background=own, **options
+            )
+        )
+    return _side_by_side(parts, axis)
+
+
+def samples_for(tileset: Tileset, cameras: Sequence[Camera], max_error: float = MAX_ERROR) -> int:
+    """Side of the grid of samples in each pixel that the tiles need; see ``needed_samples``."""
+    found = 1
+    for camera in subsample(cameras, CAMERAS):
+        tiles, _ = choose_tiles(tileset, camera, max_error=max_error, most=MAX_TRIANGLES // 8)
+        found = max(found, needed_samples(join_tiles(tileset, tiles), [camera]))
+    return found
+
+
+def join_tiles(tileset: Tileset, tiles: Sequence[Tile]) -> SplatMesh:
+    """The triangles of ``tiles`` as one mesh. ``face_splat`` numbers its splats anew."""
+    v, f = sum(tile.vertices for tile in tiles), sum(tile.triangles for tile in tiles)
+    if max(v, f) > np.iinfo(np.int32).max:
+        raise ValueError(f"{f:,} triangles are more than a mesh can number")
+    vertices, colors = np.empty((v, 3), np.float32), np.empty((v, 4), np.float32)
+    faces, owners = np.empty((f, 3), np.int32), np.empty(f, np.int32)
+    first = first_face = first_splat = 0
+    for tile in tiles:
+        mesh = tile.load()
+        if mesh.face_splat is None:
+            raise ValueError(f"{tile.content}: another program has altered the tile: it has no splat indices")
+        own, own_faces = slice(first, first + tile.vertices), slice(first_face, first_face + tile.triangles)
+        vertices[own], colors[own] = mesh.vertices, mesh.colors
+        faces[own_faces] = mesh.faces + np.int32(first)
+        steps = np.cumsum(np.diff(mesh.face_splat, prepend=mesh.face_splat[:1]) > 0, dtype=np.int32)
+        owners[own_faces] = steps + np.int32(first_splat)
+        first, first_face = first + tile.vertices, first_face + tile.triangles
+        first_splat += int(steps[-1]) + 1 if len(steps) else 0
+    return SplatMesh(vertices, faces, colors, face_splat=owners, up=tileset.up)
+
+
+def _halves(camera: Camera, axis: int, middle: int) -> tuple[Camera, Camera]:
+    """Cameras of the upper and the lower (``axis`` 0) or the left and the right part of the image."""
+    if axis == 0:
+        return replace(camera, height=middle), replace(
+            camera, height=camera.height - middle, cy=camera.cy - middle
+        )
+    return replace(camera, width=middle), replace(camera, width=camera.width - middle, cx=camera.cx - middle)
+
+
+def _side_by_side(parts: Sequence[Rendering], axis: int) -> Rendering:
+    def joined(name: str) -> Any:
+        arrays = [getattr(part, name) for part in parts]
+        return None if arrays[0] is None else np.concatenate(arrays, axis=axis)
+
+    return Rendering(
+        joined("color"),
+        joined("alpha"),
+        joined("depth"),
+        joined("normals"),
+        fragments=sum(part.fragments for part in parts),
+    )

@@ -1,0 +1,338 @@
+"""tileset.json of 3D Tiles 1.1: writing an octree of tiles, and reading it again.
+
+Specification: https://docs.ogc.org/cs/22-025r4/22-025r4.html. Boxes are in the frame of the tileset, whose z
+axis points up. Every third level of the octree is the root of a tileset file of its own, in a folder of its
+own, so that no file grows with the scene.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from meshsplats._files.atomic import write_text
+from meshsplats.errors import FileFormatError
+from meshsplats.formats.gltf.scene import rotation_matrix
+from meshsplats.formats.gltf.writer import up_quaternion
+from meshsplats.formats.meshes import load_mesh
+from meshsplats.mesh import SplatMesh
+
+NAME = "tileset.json"
+LEVELS_PER_FILE = 3
+GROW = 1e-6
+"""Boxes are larger than their content by this share, so that rounding leaves nothing outside."""
+_MAX_BYTES = 64 << 20
+_MAX_TILES = 1 << 22
+_MAX_DEPTH = 64
+_PLAIN = re.compile(r"[^/\\:\0?#]{1,255}(/[^/\\:\0?#]{1,255}){0,15}")
+_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""Viewers turn glTF, whose y axis points up, so."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """A tile as it is written."""
+
+    key: str
+    """Path in the octree, a digit a level."""
+    low: list[float]
+    """Least corner of everything in the tile and below it, in the frame of the tileset."""
+    high: list[float]
+    error: float
+    """Geometric error, scene units; 0 for a leaf."""
+    splats: int
+    triangles: int
+    vertices: int
+    children: list[str]
+    """Keys."""
+
+
+def tile_frame(up: np.ndarray) -> np.ndarray:
+    """(3, 3) float64 rotation from the world frame to that of a tileset, in which ``up`` (3,) is +z: that of
+    a GLB's node and of viewers together."""
+    return _TO_Z_UP @ rotation_matrix(up_quaternion(up))[:3, :3]
+
+
+def tile_path(key: str) -> str:
+    """Name of the GLB of a tile in the folder of the tileset."""
+    return "/".join([*_folders(key), f"{key[len(_group(key)) :] or 'root'}.glb"])
+
+
+def write_tilesets(folder: Path, nodes: dict[str, Node], root: str, up: np.ndarray, splats: int) -> None:
+    """Writes the tileset files of ``nodes`` (by key) below ``root``; that of the root last."""
+    note = {"up": [float(x) for x in up], "splats": splats}
+    files = [key for key in sorted(nodes) if key != root and _starts_file(key, nodes, root)]
+    for key in [*files, root]:
+        own = "" if key == root else _group(key)
+        tile = _tile(nodes[key], nodes, own)
+        box = np.array(nodes[key].high) - np.array(nodes[key].low)
+        document = {
+            "asset": {"version": "1.1", "generator": _generator()},
+            "geometricError": max(nodes[key].error, float(np.linalg.norm(box)) if key == root else 0.0),
+            "root": {"refine": "REPLACE", **tile},
+        }
+        if key == root:
+            document["extras"] = {"meshsplats": note}
+        path = folder.joinpath(*_folders(own), NAME)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n")
+
+
+def _generator() -> str:
+    from meshsplats import __version__
+
+    return f"MeshSplats {__version__}"
+
+
+def _group(key: str) -> str:
+    """The part of a key that names the folder of its tileset file."""
+    return key[: len(key) // LEVELS_PER_FILE * LEVELS_PER_FILE]
+
+
+def _folders(key: str) -> list[str]:
+    group = _group(key)
+    return [group[i : i + LEVELS_PER_FILE] for i in range(0, len(group), LEVELS_PER_FILE)]
+
+
+def _starts_file(key: str, nodes: dict[str, Node], root: str) -> bool:
+    """Whether a tile is the root of a tileset file: its folder is not that of the tile above."""
+    above = _above(key, nodes)
+    return _group(key) != ("" if above == root else _group(above))
+
+
+def _above(key: str, nodes: dict[str, Node]) -> str:
+    return next(key[:n] for n in range(len(key) - 1, -1, -1) if key[:n] in nodes)
+
+
+def _tile(node: Node, nodes: dict[str, Node], group: str) -> dict[str, Any]:
+    """The entry of a tile in the file of the folder ``group``."""
+    tile: dict[str, Any] = {
+        "boundingVolume": {"box": _box(node)},
+        "geometricError": node.error,
+        "content": {"uri": _relative(tile_path(node.key), group)},
+        "extras": {"splats": node.splats, "triangles": node.triangles, "vertices": node.vertices},
+    }
+    children = []
+    for key in node.children:
+        if _group(key) == group:
+            children.append(_tile(nodes[key], nodes, group))
+        else:
+            uri = _relative("/".join([*_folders(key), NAME]), group)
+            children.append(
+                {
+                    "boundingVolume": {"box": _box(nodes[key])},
+                    "geometricError": nodes[key].error,
+                    "content": {"uri": uri},
+                }
+            )
+    return tile | ({"children": children} if children else {})
+
+
+def _relative(path: str, group: str) -> str:
+    """``path``, which lies below the folder of ``group``, as that folder sees it."""
+    prefix = "".join(f"{part}/" for part in _folders(group))
+    assert path.startswith(prefix)
+    return path[len(prefix) :]
+
+
+def _box(node: Node) -> list[float]:
+    low, high = np.array(node.low), np.array(node.high)
+    center, half = (low + high) / 2, (high - low) / 2
+    half = half + GROW * max(float(half.max()), float(np.abs(center).max()), 1e-30)
+    axes = np.diag(half)
+    return [float(x) for x in (*center, *axes.ravel())]
+
+
+# ---- Reading
+
+
+@dataclass(eq=False)
+class Tile:
+    """A tile as it is read."""
+
+    center: np.ndarray
+    """(3,) float64 centre of its box, world frame."""
+    axes: np.ndarray
+    """(3, 3) float64 rows: half the edges of its box, world frame."""
+    error: float
+    """Geometric error, scene units."""
+    content: Path
+    """A mesh, or another tileset file."""
+    splats: int
+    triangles: int
+    vertices: int
+    children: list[Tile] = field(default_factory=list)
+    is_file: bool = False
+    """Whether the content is another tileset file."""
+
+    def corners(self) -> np.ndarray:
+        """(8, 3) float64 corners of its box, world frame."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return self.center + signs @ self.axes
+
+    def load(self) -> SplatMesh:
+        """The mesh of the tile in the world frame."""
+        mesh = load_mesh(self.content)
+        if len(mesh.faces) != self.triangles or len(mesh.vertices) != self.vertices:
+            raise FileFormatError(
+                f"{self.content}: {len(mesh.faces):,} triangles and {len(mesh.vertices):,} vertices, the"
+                f" tileset says {self.triangles:,} and {self.vertices:,}"
+            )
+        return mesh
+
+
+class Tileset:
+    """A tileset that ``build_tiles`` has written; tileset files inside are read when they are needed.
+
+    Args:
+        path: the folder, or its tileset.json.
+
+    Raises:
+        FileFormatError: the file is broken, or of another program.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path) / NAME if Path(path).is_dir() else Path(path)
+        document = _load(self.path)
+        note = _object(_object(document, "extras", self.path), "meshsplats", self.path)
+        up = _numbers(note.get("up"), 3, "the up direction", self.path)
+        if not up.any():
+            raise FileFormatError(f"{self.path}: the up direction must not be 0")
+        self.up = up / np.linalg.norm(up)
+        """(3,) float64 unit direction that points up in the world frame."""
+        self.splats = _whole(note.get("splats"), "splats", self.path)
+        """Count of the splats in all leaves."""
+        self.error = _error(document, self.path)
+        """Geometric error without any tile, scene units."""
+        self._to_world = tile_frame(self.up).T
+        self._count = 0
+        self.root = self._tile(_object(document, "root", self.path), self.path, 0)
+
+    def children(self, tile: Tile) -> list[Tile]:
+        """The tiles that take the place of ``tile``; none for a leaf."""
+        return [self._opened(child) for child in tile.children]
+
+    def tiles(self) -> Iterator[Tile]:
+        """Every tile, each before those below it."""
+        todo = [self.root]
+        while todo:
+            tile = todo.pop()
+            yield tile
+            todo += reversed(self.children(tile))
+
+    def _opened(self, tile: Tile) -> Tile:
+        if not tile.is_file:
+            return tile
+        document = _load(tile.content)
+        root = self._tile(_object(document, "root", tile.content), tile.content, 0)
+        if root.is_file:
+            raise FileFormatError(f"{tile.content}: its root must have a mesh, not another tileset")
+        return root
+
+    def _tile(self, entry: dict[str, Any], file: Path, depth: int) -> Tile:
+        self._count += 1
+        if depth > _MAX_DEPTH or self._count > _MAX_TILES:
+            raise FileFormatError(f"{file}: tiles are nested too deeply, or too many")
+        if entry.get("refine", "REPLACE") != "REPLACE" or "transform" in entry or "implicitTiling" in entry:
+            raise FileFormatError(f"{file}: only explicit tiles that replace their parents are read")
+        box = _numbers(_object(entry, "boundingVolume", file).get("box"), 12, "a bounding box", file)
+        uri = _object(entry, "content", file).get("uri")
+        content = _beside(file, uri)
+        is_file = content.suffix == ".json"
+        extras = {} if is_file else _object(entry, "extras", file)
+        children = entry.get("children", [])
+        if not isinstance(children, list) or not all(isinstance(child, dict) for child in children):
+            raise FileFormatError(f"{file}: children of a tile must be a list of objects")
+        if is_file and children:
+            raise FileFormatError(f"{file}: a tile whose content is a tileset must have no children")
+        tile = Tile(
+            center=self._to_world @ box[:3],
+            axes=box[3:].reshape(3, 3) @ self._to_world.T,
+            error=_error(entry, file),
+            content=content,
+            splats=0 if is_file else _whole(extras.get("splats"), "splats", file),
+            triangles=0 if is_file else _whole(extras.get("triangles"), "triangles", file),
+            vertices=0 if is_file else _whole(extras.get("vertices"), "vertices", file),
+            children=[self._tile(child, file, depth + 1) for child in children],
+            is_file=is_file,
+        )
+        worst = max((child.error for child in tile.children), default=0.0)
+        if worst > tile.error:
+            raise FileFormatError(f"{file}: a tile of error {worst:g} below one of {tile.error:g}")
+        return tile
+
+
+def is_tileset(path: Path) -> bool:
+    """Whether ``path`` is a folder with a tileset.json, or that file."""
+    return path.joinpath(NAME).is_file() if path.is_dir() else path.name == NAME
+
+
+def _load(path: Path) -> dict[str, Any]:
+    with open(path, "rb") as file:
+        raw = file.read(_MAX_BYTES + 1)
+    if len(raw) > _MAX_BYTES:
+        raise FileFormatError(f"{path}: a tileset file of more than {_MAX_BYTES:,} bytes; refused")
+    try:
+        document = json.loads(raw)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: no tileset file: {str(error)[:100]}") from None
+    if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
+        raise FileFormatError(f"{path}: no tileset file: it has no object 'asset'")
+    version = document["asset"].get("version")
+    if version != "1.1":
+        raise FileFormatError(f"{path}: 3D Tiles of version {str(version)[:20]!r}; 1.1 is read")
+    return document
+
+
+def _object(owner: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
+    value = owner.get(key)
+    if isinstance(value, dict):
+        return value
+    if key in ("extras", "meshsplats"):
+        raise FileFormatError(
+            f"{path}: a tileset of another program; only those of 'meshsplats tiles' are read"
+        )
+    raise FileFormatError(f"{path}: {key!r} must be an object, got {str(value)[:40]}")
+
+
+def _numbers(value: Any, count: int, what: str, path: Path) -> np.ndarray:
+    good = isinstance(value, list) and len(value) == count
+    if not good or not all(_is_number(x) and abs(x) < 1e30 for x in value):
+        raise FileFormatError(f"{path}: {what} must be {count} numbers, got {str(value)[:60]}")
+    return np.array(value, np.float64)
+
+
+def _error(owner: dict[str, Any], path: Path) -> float:
+    value = owner.get("geometricError")
+    if not _is_number(value) or not 0 <= value < 1e30:
+        raise FileFormatError(f"{path}: geometricError must be a number >= 0, got {str(value)[:40]}")
+    return float(value)
+
+
+def _whole(value: Any, what: str, path: Path) -> int:
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 40:
+        return value
+    raise FileFormatError(f"{path}: the count of {what} must be a whole number, got {str(value)[:40]}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _beside(file: Path, uri: Any) -> Path:
+    """The file that ``uri`` names, below the folder of ``file``."""
+    name = unquote(uri) if isinstance(uri, str) else ""
+    if not _PLAIN.fullmatch(name) or any(part in (".", "..") for part in name.split("/")):
+        raise FileFormatError(f"{file}: it refers to {str(uri)[:80]!r}, no path below its folder; refused")
+    path = file.parent / name
+    if path.suffix not in (".glb", ".json"):
+        raise FileFormatError(f"{file}: tiles must be .glb files, got {str(uri)[:80]!r}")
+    return path
