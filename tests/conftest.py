@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -20,6 +23,13 @@ def shared_data(path: str) -> Path:
     if not found.exists():
         pytest.skip(f"real data not here: {found} (set MESHSPLATS_SHARED_DATA to its folder)")
     return found
+
+
+def words_of(command: str) -> list[str]:
+    """The arguments of a command as the shell of this system splits it."""
+    if sys.platform != "win32":
+        return shlex.split(command)
+    return [inner or word for inner, word in re.findall(r'"([^"]*)"|(\S+)', command)]
 
 
 def make_link(link: Path, target: Path) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
-import shlex
 
 import numpy as np
 import pytest
 from _splats import few_splats
-from conftest import make_link
+from conftest import make_link, words_of
 from PIL import Image
 
 import meshsplats
@@ -167,7 +166,7 @@ def test_the_next_command_compares_what_was_made(splats, tmp_path, capsys, optio
     cloud = load_gaussians(splats)
     save_cameras(orbit(cloud, 2, width=40, height=40, elevation=60), tmp_path / "cameras.json")
     assert run(splats, "-o", "made.usdc" if not options else "made.npz", "--preset", "paper", *options) == 0
-    command = shlex.split(re.search(r"next: meshsplats (.*)", capsys.readouterr().out)[1])
+    command = words_of(re.search(r"next: meshsplats (.*)", capsys.readouterr().out)[1])
     assert main([*command, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     axes = options[1] if options[:1] == ["--axes"] else "auto"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _photographs import write_photographs
+from conftest import words_of
 
 from meshsplats._files.locks import locked
 from meshsplats.cameras.files import load_cameras, save_cameras
@@ -83,7 +83,7 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
 def printed_score(out: str, capsys) -> tuple[float, float]:
     """Of what was held out, as ``finetune`` printed it and as the command scores that it names."""
     printed = float(re.search(r"held out: .* -> ([\d.]+) dB", out)[1])
-    command = shlex.split(re.search(r"next: meshsplats (.*)", out)[1])
+    command = words_of(re.search(r"next: meshsplats (.*)", out)[1])
     assert main([*command, "--strips", "0", "--json"]) == 0
     methods = json.loads(capsys.readouterr().out)["scenes"][0]["methods"]
     return printed, methods["mesh"]["mean"]["psnr"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from _photographs import write_photographs
 import meshsplats
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import COMMANDS, main
+from meshsplats.cli import COMMANDS, main, messages
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import parse_color, parse_up
 from meshsplats.demo_scene import make_scene
@@ -119,6 +120,34 @@ def test_errors_are_one_line(monkeypatch, capsys, error, code, line):
         assert printed["path"] == getattr(error, "filename", None)
         with pytest.raises(type(error)):
             main(["raises", "--debug"])
+
+
+@pytest.mark.parametrize(
+    ("platform", "word", "written"),
+    [
+        ("linux", "my scan.ply", "'my scan.ply'"),
+        ("linux", "torch>=2.4", "'torch>=2.4'"),
+        ("linux", "a/b.ply", "a/b.ply"),
+        ("win32", r"C:\scans\a.ply", r"C:\scans\a.ply"),
+        ("win32", r"C:\my scans\a.ply", r'"C:\my scans\a.ply"'),
+        ("win32", "C:\\my scans\\", '"C:\\my scans\\\\"'),
+        ("win32", "torch>=2.4", '"torch>=2.4"'),
+        ("win32", "", '""'),
+    ],
+)
+def test_commands_are_quoted_for_the_shell_of_the_system(monkeypatch, platform, word, written):
+    monkeypatch.setattr(sys, "platform", platform)
+    assert messages.quoted(word) == written
+    assert messages.command_line(["meshsplats", Path("info"), word]) == f"meshsplats info {written}"
+
+
+def test_a_folder_in_place_of_a_file_is_named_as_one(monkeypatch, tmp_path):
+    """Windows says that the permission is denied."""
+    error = PermissionError(errno.EACCES, "Permission denied", str(tmp_path))
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert messages.one_line(error) == f"{tmp_path}: Is a directory"
+    other = PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "a"))
+    assert messages.one_line(other) == f"{tmp_path / 'a'}: Permission denied"
 
 
 def test_bugs_are_not_hidden(monkeypatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from meshsplats.cli.common import (
     load_scene,
     size_of,
 )
-from meshsplats.cli.messages import UsageError
+from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.mesh import SplatMesh
 
 
@@ -80,4 +79,4 @@ class Base(Command):
         print(f"{self.output} ({len(base.faces):,} triangles, {size_of(self.output)}) in {seconds:.1f} s")
         splats = ["--splats", str(self.input), *self.reading.again()]
         source = ["--data", "photos/"] if isinstance(scene, SplatMesh) else splats
-        print(f"next: {shlex.join(['meshsplats', 'prior', str(self.output), *source, '-o', 'prior.npz'])}")
+        print(f"next: {command_line(['meshsplats', 'prior', self.output, *source, '-o', 'prior.npz'])}")

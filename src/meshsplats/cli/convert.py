@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -42,6 +41,7 @@ from meshsplats.cli.messages import (
     NO_SPACE,
     OK,
     UsageError,
+    command_line,
     error_record,
     exit_code,
     flag,
@@ -446,13 +446,13 @@ class Convert(Command):
         part of them was converted."""
         folder, source = self.output.with_suffix(""), shown_path(self.input[0])
         if self.conversion.crop is not None or source == "-":
-            return shlex.join(["meshsplats", "render", str(self.output), "-o", f"{folder}-images"])
+            return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
         if self.data is not None:
             words += ["--data", self.data]
         elif cameras:
             words += ["--cameras", source if self.cameras is None else self.cameras]
-        return shlex.join(map(str, [*words, *self.reading.again(), "-o", f"{folder}-compare"]))
+        return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
 
 
 def _counts(result: dict[str, Any]) -> str:

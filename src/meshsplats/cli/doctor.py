@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import platform
 import re
-import shlex
 import sys
 from dataclasses import dataclass
 from importlib import metadata
@@ -14,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from meshsplats.cli.arguments import Command
+from meshsplats.cli.messages import quoted
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,7 @@ def examine() -> dict[str, Any]:
         "required": libraries.pop("", {}),
         "extras": libraries,
         "to_install": {
-            extra: " ".join(
-                shlex.quote(needed[extra][name]) for name, version in found.items() if not version
-            )
+            extra: " ".join(quoted(needed[extra][name]) for name, version in found.items() if not version)
             for extra, found in libraries.items()
             if None in found.values()
         },

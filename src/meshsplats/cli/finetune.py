@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import tyro
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import Output, check_mesh_suffix, load_scene
+from meshsplats.cli.messages import command_line
 from meshsplats.cli.training import (
     Plan,
     RunFiles,
@@ -119,7 +119,7 @@ class Finetune(TrainingCommand):
         target, dataset, folder = self.target, plan.dataset, self.output.with_suffix("")
         if self.conversion.crop is not None or (target.data is None and not dataset.test):
             words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]
-            return [f"next: {shlex.join(map(str, words))}"]
+            return [f"next: {command_line(words)}"]
         words = ["meshsplats", "evaluate", self.output]
         if target.data is not None:
             words += ["--data", target.data]
@@ -135,7 +135,7 @@ class Finetune(TrainingCommand):
             words += ["--background", "black"]
         words += ["--samples", samples_of(dataset.train[0], config)]
         words += ["-o", f"{folder}-evaluation"]
-        return [f"next: {shlex.join(map(str, words))}"]
+        return [f"next: {command_line(words)}"]
 
     def _converted(self, cloud: GaussianCloud, dataset: Dataset) -> SplatMesh:
         preset = self.preset if self.start == "same" else self.start

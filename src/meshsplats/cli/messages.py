@@ -5,8 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import shlex
 import signal
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 from meshsplats.errors import DeviceError
@@ -85,7 +88,10 @@ def shown_path(path: str | os.PathLike[str]) -> str:
 def one_line(error: object) -> str:
     """Message of ``error`` in one line, with the path of the file that it is about."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        text = f"{os.fsdecode(error.filename)}: {error.strerror}"
+        reason = error.strerror
+        if sys.platform == "win32" and isinstance(error, PermissionError) and os.path.isdir(error.filename):
+            reason = os.strerror(errno.EISDIR)  # Windows says "Permission denied"
+        text = f"{os.fsdecode(error.filename)}: {reason}"
     else:
         text = str(error)
     if isinstance(error, MemoryError) and not text:
@@ -93,6 +99,21 @@ def one_line(error: object) -> str:
     if _standard_input is not None:
         text = text.replace(_standard_input, "standard input")
     return " ".join(text.split()) or type(error).__name__
+
+
+def command_line(words: Iterable[object]) -> str:
+    """A command as the shell of this system takes it."""
+    return " ".join(quoted(str(word)) for word in words)
+
+
+def quoted(word: str) -> str:
+    """An argument of a command, in quotes where the shell of this system needs them. Those of Windows know no
+    single quotes, and a backslash is part of a path there."""
+    if sys.platform != "win32":
+        return shlex.quote(word)
+    if re.fullmatch(r"[\w@+=:,./\\~-]+", word):
+        return word
+    return '"' + re.sub(r"(\\+)$", r"\1\1", word) + '"'
 
 
 def say(text: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -13,7 +12,7 @@ import tyro
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cli.common import File, Number, Output
-from meshsplats.cli.messages import UsageError
+from meshsplats.cli.messages import UsageError, quoted
 from meshsplats.cli.training import (
     Plan,
     RunFiles,
@@ -139,7 +138,7 @@ class Prior(TrainingCommand):
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
         return [
             f"next: edit {self.input}, moving its vertices, and",
-            f"  meshsplats deform {shlex.quote(str(files.mesh))} --base edited.obj -o edited.glb",
+            f"  meshsplats deform {quoted(str(files.mesh))} --base edited.obj -o edited.glb",
         ]
 
     def _dataset(self, base: BaseMesh, config: FinetuneConfig, earlier: Checkpoint | None) -> Dataset:
