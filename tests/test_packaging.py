@@ -85,7 +85,9 @@ def test_every_module_imports():
                 importlib.import_module(module.name)
 
 
-def test_package_holds_its_core_and_its_type_marker():
+def test_package_holds_its_core_its_kernels_and_its_type_marker():
+    for name in ("common", "lists", "raster"):
+        assert (Path(meshsplats.__file__).parent / "webgpu" / f"{name}.wgsl").is_file()
     assert library.library_path("baseline") is not None
     assert (Path(meshsplats.__file__).parent / "py.typed").is_file()
     assert "baseline" in library.available_variants()
