@@ -47,6 +47,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.autograd import rasterize as rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
+    from meshsplats.viewer.page import PageOptions, make_page
 
 try:
     __version__ = version("meshsplats")
@@ -84,6 +85,7 @@ _HOME = {
     "meshsplats.rendering.autograd": ("rasterize",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
+    "meshsplats.viewer.page": ("PageOptions", "make_page"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
@@ -102,6 +104,7 @@ __all__ = [
     "Interrupted",
     "MeshPrior",
     "MissingDependencyError",
+    "PageOptions",
     "Progress",
     "Rendering",
     "Report",
@@ -129,6 +132,7 @@ __all__ = [
     "look_around",
     "look_at",
     "make_config",
+    "make_page",
     "needed_samples",
     "orbit",
     "psnr",

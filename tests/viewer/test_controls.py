@@ -60,7 +60,7 @@ def _first_view(request):
     )
     page.choose("#background", "#ffffff")
     page.choose("#exposure", "0")
-    page.choose("#cameras", "0")
+    page.run("document.querySelector('#home').click()")
     page.still(PATIENCE)
 
 
