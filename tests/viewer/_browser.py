@@ -195,7 +195,8 @@ class Page:
     def choose(self, selector: str, value: str) -> None:
         """Sets a select, slider or colour, as a user's hand does: nothing happens where it has the value."""
         self.run(
-            f"(e => {{ if (e.value === {json.dumps(value)}) return; e.value = {json.dumps(value)}; for (const name of ['input', 'change'])"
+            f"(e => {{ if (e.value === {json.dumps(value)}) return; e.value = {json.dumps(value)};"
+            " for (const name of ['input', 'change'])"
             " e.dispatchEvent(new Event(name, {bubbles: true})); })"
             f"(document.querySelector({json.dumps(selector)}))"
         )
