@@ -6,10 +6,15 @@ import os
 import re
 import shlex
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from _browser import Browser
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("repeatable")
@@ -40,3 +45,36 @@ def make_link(link: Path, target: Path) -> None:
         pytest.skip(f"no symbolic links here: {error}")
     if not link.is_symlink():
         pytest.skip("symbolic links are not recognised here")
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    """A headless Chromium, for the tests of the viewer; skips where there is none."""
+    from _browser import PROGRAM, Browser
+
+    if PROGRAM is None:
+        pytest.skip("Chromium is not installed here (the variable CHROMIUM names it)")
+    if not hasattr(os, "posix_spawn"):
+        pytest.skip("Chromium is driven through pipes, which needs a POSIX system")
+    try:
+        running = Browser()
+        running.send("Browser.getVersion", timeout=120)
+    except (OSError, TimeoutError, ConnectionError) as error:
+        pytest.skip(f"Chromium does not start here: {error}")
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="session")
+def write_page(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+    """Writes the page of a mesh under a name and returns its address on the disk."""
+    from meshsplats.viewer.page import make_page
+
+    folder = tmp_path_factory.mktemp("pages")
+
+    def write(mesh: Any, name: str = "scene", **arguments: Any) -> str:
+        path = folder / f"{name}.html"
+        path.write_text(make_page(mesh, **arguments).html, encoding="utf-8")
+        return path.as_uri()
+
+    return write

@@ -53,6 +53,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.autograd import rasterize as rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
+    from meshsplats.viewer.page import PageOptions, make_page
 
 try:
     __version__ = version("meshsplats")
@@ -92,6 +93,7 @@ _HOME = {
     "meshsplats.rendering.autograd": ("rasterize",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
+    "meshsplats.viewer.page": ("PageOptions", "make_page"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
@@ -110,6 +112,7 @@ __all__ = [
     "Interrupted",
     "MeshPrior",
     "MissingDependencyError",
+    "PageOptions",
     "Progress",
     "Rendering",
     "Report",
@@ -138,6 +141,7 @@ __all__ = [
     "look_around",
     "look_at",
     "make_config",
+    "make_page",
     "needed_samples",
     "orbit",
     "psnr",

@@ -19,6 +19,8 @@ import numpy as np
 from PIL import Image
 
 PROGRAM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+PATIENCE = 400
+"""Seconds for an answer: busy processors compile shaders for minutes."""
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--no-first-run", "--hide-scrollbars"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync", "--mute-audio"),
@@ -139,7 +141,7 @@ class Page:
         self.send("Page.navigate", url=url)
         self.wait("document.readyState === 'complete' && location.href !== 'about:blank'")
 
-    def send(self, method: str, timeout: float = 400, **parameters: Any) -> dict:
+    def send(self, method: str, timeout: float = PATIENCE, **parameters: Any) -> dict:
         return self.browser.send(method, self.session, timeout, **parameters)
 
     def size(self, width: int, height: int, ratio: float = 1, mobile: bool = False) -> None:
@@ -191,9 +193,10 @@ class Page:
         self.send("Input.dispatchKeyEvent", type="keyUp", key=key, modifiers=modifiers, **named)
 
     def choose(self, selector: str, value: str) -> None:
-        """Sets a select, slider or colour, as a user's hand does."""
+        """Sets a select, slider or colour, as a user's hand does: nothing happens where it has the value."""
         self.run(
-            f"(e => {{ e.value = {json.dumps(value)}; for (const name of ['input', 'change'])"
+            f"(e => {{ if (e.value === {json.dumps(value)}) return; e.value = {json.dumps(value)};"
+            " for (const name of ['input', 'change'])"
             " e.dispatchEvent(new Event(name, {bubbles: true})); })"
             f"(document.querySelector({json.dumps(selector)}))"
         )

@@ -11,16 +11,31 @@ from urllib.parse import unquote, urlparse
 import numpy as np
 import pytest
 from _browser import Browser, Page
-from conftest import levels
+from _pages import levels, still_life
 from test_page import HOSTILE, block
 
 import meshsplats as ms
 from meshsplats.viewer.page import PageOptions, _read, make_page
-from meshsplats.viewer.quantise import unpack_mesh
+from meshsplats.viewer.quantise import pack_splats, unpack_mesh
 
 NO_WEBGPU = "Object.defineProperty(Navigator.prototype, 'gpu', { get: () => undefined });"
 WIDTH, HEIGHT = 200, 160
 PATIENCE = 120
+
+
+@pytest.fixture(scope="module")
+def cloud() -> ms.GaussianCloud:
+    return still_life()[0]
+
+
+@pytest.fixture(scope="module")
+def mesh() -> ms.SplatMesh:
+    return still_life()[1]
+
+
+@pytest.fixture(scope="module")
+def cameras() -> list[ms.Camera]:
+    return still_life()[2]
 
 
 def open_page(browser: Browser, url: str, width: int = WIDTH, height: int = HEIGHT, **more) -> Page:
@@ -60,7 +75,7 @@ def _first_view(request):
     )
     page.choose("#background", "#ffffff")
     page.choose("#exposure", "0")
-    page.choose("#cameras", "0")
+    page.run("document.querySelector('#home').click()")
     page.still(PATIENCE)
 
 
@@ -519,8 +534,8 @@ def test_a_damaged_page_says_so(browser, write_page, mesh, tmp_path):
     page.close()
 
 
-def test_the_page_decodes_what_python_decodes(browser, mesh):
-    """Bit for bit, with and without fans."""
+def test_the_page_decodes_what_python_decodes(browser, mesh, cloud):
+    """Meshes bit for bit, with and without fans; splats nearly."""
     page = browser.page("about:blank#decoding", WIDTH, HEIGHT)
     source = re.sub(r"^export ", "", _read("scene.js"), flags=re.MULTILINE)
     page.run(
@@ -537,6 +552,21 @@ def test_the_page_decodes_what_python_decodes(browser, mesh):
         assert faces == back.faces.ravel().tolist()
         assert splat == (None if back.face_splat is None else back.face_splat.tolist())
         assert group == (None if back.depth_group is None else back.depth_group.tolist())
+
+    page.run(
+        "window.splats = async text => { const s = decodeSplats(await unpack(text));"
+        " return [s.means, s.covariances, s.colors].map(a => [...a]); }; 0"
+    )
+    found = page.run(f"splats('{base64.b64encode(pack_splats(cloud)).decode()}')")
+    means, upper, colors = (np.array(values).reshape(len(cloud), -1) for values in found)
+    assert np.abs(means - cloud.means).max() < 1e-3
+    axes = cloud.rotations * cloud.scales[:, None]
+    covariances = axes @ axes.transpose(0, 2, 1)
+    rows, columns = np.triu_indices(3)
+    size = covariances.trace(axis1=1, axis2=2)[:, None]
+    assert (np.abs(upper - covariances[:, rows, columns]) / size).max() < 0.02
+    assert np.abs(colors[:, :3] - 255 * cloud.colors).max() <= 0.501
+    assert np.abs(colors[:, 3] - 255 * cloud.opacities).max() <= 0.501
     page.close()
 
 

@@ -448,7 +448,7 @@ def _sample(mesh: SplatMesh) -> SplatMesh:
 def pack_splats(cloud: GaussianCloud) -> bytes:
     """``cloud`` in about 18 bytes a splat, for comparison in the viewer: colours of degree 0.
 
-    Centres in steps of the radius times 2^-15, standard deviations to 0.8 %, rotations to 0.2 degrees,
+    Centres in steps of the radius times 2^-15, standard deviations to 0.6 %, rotations to 0.2 degrees,
     colours and opacities in 255 levels.
 
     Raises ValueError for a cloud without splats.
