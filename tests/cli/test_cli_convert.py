@@ -19,6 +19,7 @@ from meshsplats.cli import main, toml
 from meshsplats.conversion import convert, simplify
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
+from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
@@ -293,6 +294,36 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
     assert "--alpha mask or hybrid, and --compression are for .glb" in capsys.readouterr().err
+
+
+def test_smooth_normals_are_those_of_the_surface(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(600, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turns = np.column_stack([1 + directions[:, 2], -directions[:, 1], directions[:, 0], np.zeros(600)])
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    tilted = turns + 0.3 * rng.normal(size=turns.shape)
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    ball = meshsplats.GaussianCloud(
+        directions, tilted, np.tile([0.1, 0.1, 0.01], (600, 1)), np.full(600, 0.9), np.zeros((600, 1, 3))
+    )
+    save_gaussians(ball, tmp_path / "ball.ply")
+    out = tmp_path / "m.glb"
+    agreement = []
+    for options in ((), ("--smooth",)):
+        command = ("--alpha", "opaque", "--lit", *options, "--no-sidecar", "--force")
+        assert run(tmp_path / "ball.ply", "-o", out, *command) == 0
+        document = GltfDocument(out)
+        normals = document.floats(
+            document.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"], "NORMAL"
+        )
+        outward = load_mesh(out).vertices
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        agreement.append(np.median(np.einsum("ij,ij->i", normals, outward)))
+    assert agreement[1] > 0.97 > abs(agreement[0])
+    capsys.readouterr()
+    assert run(tmp_path / "ball.ply", "-o", tmp_path / "b.glb", "--smooth") == 2
+    assert "--smooth has no effect without --lit" in capsys.readouterr().err
 
 
 def test_hybrid_is_for_meshes_with_solid_triangles(splats, tmp_path, capsys):

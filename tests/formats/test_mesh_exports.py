@@ -13,6 +13,7 @@ from _meshes import random_mesh
 
 from meshsplats import DataWarning, FileFormatError, MissingDependencyError, SplatMesh, load_mesh, save_mesh
 from meshsplats.colors import srgb_to_linear
+from meshsplats.formats.gltf.document import GltfDocument
 
 MESH = random_mesh(np.random.default_rng(0), 20, 30)
 
@@ -164,18 +165,22 @@ def gltfpack():
     return place
 
 
-def test_compressed_glb(tmp_path):
+@pytest.mark.parametrize(
+    ("alpha", "solid", "modes"),
+    [("blend", 0, ["BLEND"]), ("opaque", 400, ["OPAQUE"]), ("hybrid", 150, ["OPAQUE", "BLEND"])],
+)
+def test_compressed_glb(tmp_path, alpha, solid, modes):
     """Unpacked by another program, every triangle is back within the stated error."""
     tool = Path(gltfpack()).with_name("gltf-transform")
     if not tool.exists():
         pytest.skip("gltf-transform, which unpacks, is not beside gltfpack (npm install @gltf-transform/cli)")
     rng = np.random.default_rng(1)
     corners = rng.random((400, 1, 3)) * [10, 5, 1] + rng.normal(size=(400, 3, 3)) * 0.05
-    mesh = SplatMesh(
-        corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3), rng.random((1200, 4)), np.arange(400)
-    )
-    save_mesh(mesh, tmp_path / "plain.glb")
-    save_mesh(mesh, tmp_path / "m.glb", compression="meshopt")
+    colors = rng.random((1200, 4))
+    colors[: 3 * solid, 3] = 1
+    mesh = SplatMesh(corners.reshape(-1, 3), np.arange(1200).reshape(-1, 3), colors, np.arange(400))
+    save_mesh(mesh, tmp_path / "plain.glb", alpha=alpha)
+    save_mesh(mesh, tmp_path / "m.glb", alpha=alpha, compression="meshopt")
     assert (tmp_path / "m.glb").stat().st_size < (tmp_path / "plain.glb").stat().st_size
     with pytest.raises(FileFormatError, match="gltf-transform"):
         load_mesh(tmp_path / "m.glb")
@@ -183,6 +188,8 @@ def test_compressed_glb(tmp_path):
         [tool, "copy", tmp_path / "m.glb", tmp_path / "back.glb"], check=True, capture_output=True, timeout=60
     )
     back = load_mesh(tmp_path / "back.glb")
+    materials = GltfDocument(tmp_path / "back.glb").json["materials"]
+    assert sorted(m.get("alphaMode", "OPAQUE") for m in materials) == sorted(modes)
 
     def in_order(vertices, m):
         """Corners with colours, triangles in the order of their centres along x."""

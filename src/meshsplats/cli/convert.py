@@ -119,6 +119,9 @@ class Convert(Command):
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else -y."""
     lit: bool = False
     """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
+    smooth: bool = False
+    """With --lit: normals of the surface that the splats form, in place of the triangles' own, which look
+    mottled under light."""
     color_type: Literal["uint16", "float32"] = "uint16"
     """.glb: storage of colours."""
     alpha: Literal["blend", "mask", "opaque", "hybrid"] = "blend"
@@ -193,6 +196,8 @@ class Convert(Command):
         glb, usd = "glb" in kinds, any(kind.startswith("usd") for kind in kinds)
         if self.lit and not (glb or usd):
             raise UsageError(f"--lit is for .glb and .usd files: .{kinds[0]} has no material")
+        if self.smooth and not self.lit:
+            raise UsageError("--smooth has no effect without --lit")
         only_glb = self.color_type != "uint16" or self.alpha in _GLB_ALPHA or self.compression != "none"
         if not glb and only_glb:
             raise UsageError("--color-type, --alpha mask or hybrid, and --compression are for .glb files")
@@ -292,7 +297,7 @@ class Convert(Command):
         times.append(time.perf_counter())
         up = None if self.up is None else parse_up(self.up)
         mesh = convert(cloud, self.conversion, preset=self.preset, cameras=cameras, up=up)
-        mesh = self._cut(mesh)
+        mesh = self._with_normals(self._cut(mesh), cameras)
         times.append(time.perf_counter())
         self._write(mesh, job)
         times.append(time.perf_counter())
@@ -317,7 +322,8 @@ class Convert(Command):
             alone = replace(alone, color_type="uint16", compression="none")
             if self.alpha in _GLB_ALPHA:
                 alone = replace(alone, alpha="blend", cutoff=None)
-        return alone if suffix == ".glb" or suffix.startswith(".usd") else replace(alone, lit=False)
+        lit = suffix == ".glb" or suffix.startswith(".usd")
+        return alone if lit else replace(alone, lit=False, smooth=False)
 
     def _merges(self) -> bool:
         """Whether splats are merged to keep a limit."""
@@ -331,6 +337,12 @@ class Convert(Command):
         if self.alpha != "opaque":
             return mesh
         return cut_mesh(mesh, CUTOFF if self.cutoff is None else self.cutoff)
+
+    def _with_normals(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
+        """``mesh`` with smooth normals if they are asked for."""
+        from meshsplats.blender.normals import shading_normals
+
+        return replace(mesh, normals=shading_normals(mesh, cameras)) if self.smooth else mesh
 
     def _write(self, mesh: SplatMesh, job: Job) -> None:
         from meshsplats.formats.meshes import save_mesh
@@ -377,7 +389,7 @@ class Convert(Command):
         mesh = load_mesh(job.source)
         if self.up is not None:
             mesh = replace(mesh, up=unit_up(parse_up(self.up)))
-        mesh = self._cut(mesh)
+        mesh = self._with_normals(self._cut(mesh))
         times.append(time.perf_counter())
         self._write(mesh, job)
         times.append(time.perf_counter())
