@@ -195,7 +195,7 @@ def _large_parts(
     return vertices[kept], faces, cells[kept]
 
 
-def _smooth(values: np.ndarray, faces: np.ndarray, times: int = 1) -> np.ndarray:
+def _smooth(values: np.ndarray, faces: np.ndarray, times: int = 4) -> np.ndarray:
     """Unit vectors (n, 3) averaged with those of the vertices beside them, ``times`` over."""
     for _ in range(times):
         total = values.astype(np.float64)

@@ -24,7 +24,7 @@ SAMPLES = 12
 """Samples at each of the three corners that a point has."""
 _AGREE = 4
 """Power of the cosine between the normals of two points that share their light."""
-_WIDTH = 0.7
+_WIDTH = 1.0
 """Standard deviation of the Gaussian that removes noise, in spacings of the points."""
 
 
