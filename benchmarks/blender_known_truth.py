@@ -23,7 +23,7 @@ from meshsplats import GaussianCloud, convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import meshes, rendering, scene, versions
 from meshsplats.blender.inside.host import bpy
-from meshsplats.colors import linear_to_srgb
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import SH_C0
 from meshsplats.images.writing import save_image, strip
@@ -144,7 +144,8 @@ def main() -> None:
         layers, limit = subject.count(mesh, [view], options)
         arrays, facts = subject.prepare(mesh, [view], options, layers)
         if target is None:
-            made = scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
+            bare = replace(scene.Subject(**arrays, **facts), surface_vertices=None)
+            made = scene.build(bare, [view], options, limit, edges=False)
             made.obj.hide_render = True
             ground = shot(made)
             add_truth(obj, folder / "spot_texture.png", made.obj)
@@ -157,7 +158,15 @@ def main() -> None:
         for material in ("plain diffuse", "--lit"):
             taken = scene.Subject(**arrays, **facts)
             if material == "plain diffuse":
-                taken = replace(taken, normals=None, faces=mesh.faces, self_shadow=0.0)
+                plain = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
+                taken = replace(
+                    taken,
+                    colors=plain,
+                    normals=None,
+                    faces=mesh.faces,
+                    self_shadow=0.0,
+                    surface_vertices=None,
+                )
             drawn = shot(scene.build(taken, [view], options, limit, edges=False))
             dark = (drawn.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
             cow = covered > 0.98

@@ -223,6 +223,34 @@ class SetUpStage(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class BakeLight(bpy.types.Operator):
+    """Gather the light of the scene on its lit splat meshes, which then show it without noise. Do so again
+    after lamps, sky or other objects have changed"""
+
+    bl_idname = "scene.meshsplats_bake_light"
+    bl_label = "Bake Light"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's own form
+
+    live: BoolProperty(
+        name="Live",
+        description="Lamps light the splats in every image, slower and with noise; baked light is dropped",
+        default=False,
+    )
+
+    def execute(self, context):
+        from meshsplats.blender.inside import baking, objects
+
+        lit = [obj for obj in objects.splat_objects(context.scene) if obj.data[objects.LIT]]
+        if not lit:
+            self.report({"ERROR"}, "there is no lit splat mesh in the scene: choose Lit for one first")
+            return {"CANCELLED"}
+        if self.live:
+            baking.forget(lit)
+        elif not baking.bake(context.scene, lit):
+            self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
+        return {"FINISHED"}
+
+
 class FollowBase(bpy.types.Operator):
     """Move the splats to their base now; after edits and on each frame this happens by itself"""
 
@@ -305,7 +333,17 @@ class FitLevel(ChainOperator, bpy.types.Operator):
         return level
 
 
-CLASSES = (ConvertAgain, ConvertSplats, SetShading, SetUpRender, SetUpStage, FollowBase, ShowLevel, FitLevel)
+CLASSES = (
+    ConvertAgain,
+    ConvertSplats,
+    SetShading,
+    SetUpRender,
+    SetUpStage,
+    BakeLight,
+    FollowBase,
+    ShowLevel,
+    FitLevel,
+)
 
 
 def register():

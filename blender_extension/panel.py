@@ -5,6 +5,7 @@ import bpy
 
 from .import_operator import ImportMeshSplats
 from .object_operators import (
+    BakeLight,
     ConvertAgain,
     ConvertSplats,
     FitLevel,
@@ -43,6 +44,9 @@ class MeshSplatsPanel(bpy.types.Panel):
         row = layout.row(align=True)
         for lights in ("sun", "noon", "overcast", "studio"):
             row.operator(SetUpStage.bl_idname, text=lights.capitalize()).lights = lights
+        row = layout.row(align=True)
+        row.operator(BakeLight.bl_idname, text="Bake Light").live = False
+        row.operator(BakeLight.bl_idname, text="Live Light").live = True
         layout.label(text="Render settings")
         row = layout.row(align=True)
         row.operator(SetUpRender.bl_idname, text="Exact").shading = "unlit"

@@ -14,7 +14,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, save_mesh
 from meshsplats.blender import LevelMeshes, LightOptions, SceneOptions, draw, subject
-from meshsplats.blender.inside import levels, meshes, objects, rendering, stage, versions
+from meshsplats.blender.inside import levels, materials, meshes, objects, rendering, stage, versions
 from meshsplats.blender.inside import scene as build_scene
 from meshsplats.cameras.trajectories import dome, orbit
 from meshsplats.cli import main
@@ -143,8 +143,8 @@ def test_imported_levels_stand_in_one_place(chain, scene, lit):
     assert len(levels.chains(scene)) == 2
 
 
-def test_shadow_casters_of_eevee_hide_with_their_level(chain):
-    options = SceneOptions(light=LightOptions(), engine="eevee")
+def test_stand_ins_hide_with_their_level_and_each_level_is_baked(chain):
+    options = SceneOptions(light=LightOptions())
     subjects = []
     for mesh, size in zip(chain.meshes, SIZES, strict=True):
         arrays, facts = subject.prepare(mesh, [], options, 10)
@@ -155,7 +155,11 @@ def test_shadow_casters_of_eevee_hide_with_their_level(chain):
         levels.show(found, i)
         bpy.context.view_layer.update()
         shown = {obj.name for obj in built.scene.objects if obj.name.startswith("ball") and obj.visible_get()}
-        assert shown == {f"ball level {i}", f"ball level {i} shadow"}
+        assert shown == {f"ball level {i}", f"ball level {i} stand-in"}
+        light = built.scene.objects[f"ball level {i}"].data.attributes[materials.LIGHT]
+        values = np.empty(4 * len(light.data), np.float32)
+        light.data.foreach_get("color", values)
+        assert 0.2 < values.reshape(-1, 4)[:, :3].mean() < 0.9
 
 
 def test_a_chain_of_one_level_is_a_chain(tmp_path, chain):

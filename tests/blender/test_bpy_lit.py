@@ -46,7 +46,8 @@ def ball(tmp_path_factory):
     options = SceneOptions(light=LightOptions(sun=(100, 40), bounces=1), samples=24)
     made = built(mesh, view, options)
     splats = shot(made, view, folder / "splats.exr")
-    made.obj.hide_render = True
+    for obj in (made.obj, *made.obj.children):
+        obj.hide_render = True
     ground = shot(made, view, folder / "ground.exr")
     bpy.ops.mesh.primitive_uv_sphere_add(segments=128, ring_count=64, radius=1)
     true = bpy.context.object

@@ -17,7 +17,8 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, orbit, render, save_cameras, save_mesh
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import materials, rendering, scene, stage
+from meshsplats.blender.inside import materials, rendering, scene, stage, stand_ins
+from meshsplats.colors import srgb_to_linear
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "mitsuba" / "render.py"
 SAMPLES = 48
@@ -49,7 +50,10 @@ def test_mitsuba_and_cycles_agree(tmp_path):
     layers, limit = subject.count(mesh, [view], options)
     arrays, facts = subject.prepare(mesh, [view], options, layers)
     facts["self_shadow"] = 0.0
-    del arrays["normals"]
+    # Without a stand-in, lamps light the layers in every image.
+    for name in ("normals", *stand_ins.ARRAYS):
+        del arrays[name]
+    arrays["colors"] = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
     built = scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
     stage.even_world((0.35, 0.35, 0.35))  # seen as it shines
     # Mitsuba's ground does not fade into the background.

@@ -67,7 +67,7 @@ def test_one_click_sets_everything_up(empty, lights):
         setting.set_up(empty, [obj], lights)
     names = sorted(o.name for o in empty.objects)
     lamps = {"sun": ["Sun"], "noon": ["Sun"], "overcast": [], "studio": ["Fill", "Sun"]}[lights]
-    assert names == sorted(["ball", "Camera", "Ground", *lamps])
+    assert names == sorted(["ball", "ball light points", "ball stand-in", "Camera", "Ground", *lamps])
     ground = empty.objects["Ground"]
     np.testing.assert_allclose(ground.location, (10, -3, 2), atol=0.12)
     assert empty.camera is empty.objects["Camera"]

@@ -9,6 +9,7 @@ import pytest
 from _blender_scenes import ball_splats, sheets
 
 from meshsplats import convert
+from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.subject import lit_arrays
 from meshsplats.colors import srgb_to_linear
@@ -68,7 +69,10 @@ def test_lit_faces_wind_towards_their_normals_and_colours_are_linear():
     facing = (np.cross(b - a, c - a) * arrays["normals"][arrays["faces"]].sum(axis=1)).sum(axis=1)
     assert (facing >= 0).all()
     assert (np.sort(arrays["faces"], axis=1) == np.sort(mesh.faces, axis=1)).all()
-    assert np.allclose(arrays["colors"][:, :3], srgb_to_linear(mesh.colors[:, :3]))
-    assert (arrays["colors"][:, 3] == mesh.colors[:, 3]).all()
+    plain = linear_colors(mesh, steps=0)
+    assert np.allclose(plain[:, :3], srgb_to_linear(mesh.colors[:, :3]))
+    assert (plain[:, 3] == mesh.colors[:, 3]).all()
+    assert np.abs(arrays["colors"] - plain).mean() < 0.1, "fitted to blending in linear light"
+    assert (arrays["colors"] != plain).any()
     assert 0 < distance < 1
     assert (lit_arrays(replace(mesh, blending="linear"))[0]["colors"] == mesh.colors).all()

@@ -71,8 +71,8 @@ def test_named_lights_and_what_is_said_instead():
 @pytest.mark.parametrize(
     ("layers", "options", "seconds"),
     [
-        (10, SceneOptions(light=LightOptions(), samples=10, threads=2), 1e6 * 10 * 37e-6 / 2),
-        (10, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 390e-6),
+        (10, SceneOptions(light=LightOptions(), samples=10, threads=2), (1e6 * 10 * 12e-6 + 8) / 2),
+        (10, SceneOptions(light=LightOptions(), samples=10, threads=1, denoise=True), 1e6 * 140e-6 + 8),
         (10, SceneOptions(threads=1), 1e6 * 10 * 11e-6),
         (10, SceneOptions(engine="eevee"), None),
     ],

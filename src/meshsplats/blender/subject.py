@@ -10,11 +10,12 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
+from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
+from meshsplats.blender.stand_in import stand_in
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
-from meshsplats.colors import srgb_to_linear
 from meshsplats.mesh import SplatMesh
 
 _FLOOR = 0.002
@@ -22,12 +23,6 @@ _FLOOR = 0.002
 
 SELF_SHADOW = 3.0
 """Distance within which layers do not shade each other, in spacings of the splats."""
-
-_CASTS = 0.25
-"""Opacity from which a splat casts a shadow in EEVEE."""
-_SUNK = 1.0
-"""Depth of the shadow caster below the surface, in spacings: deeper, thin parts lose their shadow; shallower,
-the surface shadows itself."""
 
 
 def count(mesh: SplatMesh, cameras: Sequence[Camera], options: SceneOptions) -> tuple[int, int]:
@@ -73,10 +68,12 @@ def prepare(
     if mesh.face_splat is not None:
         arrays["face_splat"] = mesh.face_splat
     if options.light is not None:
+        arrays["display"] = mesh.colors
         lit, facts["self_shadow"] = lit_arrays(mesh, cameras, threads=options.threads)
         arrays |= lit
-        if options.engine == "eevee":
-            arrays |= _caster(mesh, lit["normals"], facts["self_shadow"] * _SUNK / SELF_SHADOW)
+        if mesh.binding is None:
+            made, facts["light_spacing"] = stand_in_arrays(mesh, lit, cameras, threads=options.threads)
+            arrays |= made
     return arrays, facts
 
 
@@ -96,19 +93,33 @@ def lit_arrays(
         ``colors`` (v, 4) in linear light, ``normals`` (v, 3), and ``faces`` (f, 3) wound to face outwards;
         and the distance, scene units, within which layers must not shade each other.
     """
-    colors = mesh.colors
-    if mesh.blending == "display":
-        colors = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
+    colors = linear_colors(mesh, cameras, threads=threads)
     normals = shading_normals(mesh, cameras, threads=threads)
     arrays = {"colors": colors, "normals": normals, "faces": _facing_out(mesh, normals)}
     return arrays, SELF_SHADOW * typical_spacing(mesh)
 
 
-def _caster(mesh: SplatMesh, normals: np.ndarray, depth: float) -> dict[str, np.ndarray]:
-    """``caster_vertices``, ``caster_faces``: a solid mesh without faint splats, a little below the surface,
-    that casts the shadow in EEVEE. Its shadow maps have no self-shadow distance."""
-    faces = mesh.faces[mesh.colors[mesh.faces, 3].max(axis=1) > _CASTS]
-    return {"caster_vertices": mesh.vertices - np.float32(depth) * normals, "caster_faces": faces}
+def stand_in_arrays(
+    mesh: SplatMesh,
+    lit: dict[str, np.ndarray],
+    cameras: Sequence[Camera] = (),
+    *,
+    threads: int | None = None,
+) -> tuple[dict[str, np.ndarray], float]:
+    """The stand-in of ``mesh`` by the names that ``inside.scene.Subject`` has for its arrays, and the
+    distance of its points, scene units; ``lit`` as from ``lit_arrays``. Empty where nothing is solid."""
+    found = stand_in(mesh, lit["normals"], lit["colors"], cameras, threads=threads)
+    if found is None:
+        return {}, 0.0
+    return {
+        "surface_vertices": found.vertices,
+        "surface_faces": found.faces,
+        "surface_colors": found.colors,
+        "fine_faces": found.fine,
+        "light_points": found.points,
+        "light_normals": found.normals,
+        "light_point_of": found.point_of,
+    }, found.size
 
 
 def _facing_out(mesh: SplatMesh, normals: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from meshsplats.errors import MissingDependencyError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior.color_projection import colors_from_views
-from meshsplats.rendering import render
+from meshsplats.rendering import Rendering, render
 
 MAX_RESOLUTION = 512
 """Maximum number of voxels along the longest side of the grid."""
@@ -29,7 +29,7 @@ _OUTLIERS = 0.002
 """Share of the opacity that may lie beyond each side of the box, so that floaters do not enlarge it."""
 _MARGIN = 0.05
 """Margin around the box, relative to its longest side."""
-_MIN_PART = 0.01
+MIN_PART = 0.01
 """Connected parts with a smaller volume, relative to the largest part, are removed."""
 
 
@@ -86,20 +86,16 @@ def base_surface(
 
         # As wide as viewers draw splats: gaps between them would be holes in the surface.
         mesh = convert(mesh, cameras=placed, look="splats")
-    low, voxel, shape = _grid(scene, resolution)
-    total, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    grid = grid_around(scene, resolution)
     views = []
-    for camera in placed:
-        drawn = render(mesh, camera, background=(0, 0, 0), depth=True, threads=threads)
-        _integrate(total, weight, drawn.mean_depth(min_alpha=_SOLID), camera, low, voxel)
+
+    def keep(camera: Camera, drawn: Rendering) -> None:
         views.append(View(camera, ViewImage(np.clip(drawn.color, 0, 1), drawn.alpha)))
         if progress is not None:
             progress()
-    field = np.where(weight > 0, total / np.where(weight > 0, weight, 1), -1)
-    for axis in range(3):  # the surface is closed at the border of the grid
-        sides = np.moveaxis(field, axis, 0)
-        sides[0] = sides[-1] = 1
-    vertices, triangles = isosurface(field, faces)
+
+    vertices, triangles = isosurface(signed_distances(mesh, placed, grid, threads=threads, each=keep), faces)
+    low, voxel, _ = grid
     if not len(triangles):
         raise ValueError("the images show nothing solid: this makes bases of objects, not of haze")
     points = (low + voxel * vertices).astype(np.float32)
@@ -108,10 +104,52 @@ def base_surface(
     return BaseMesh(points, triangles, colors, up=guess_up(scene))
 
 
+class Grid(NamedTuple):
+    """A grid of points around a scene, in its frame and units."""
+
+    low: np.ndarray
+    """(3,) float64 the lowest corner."""
+    voxel: float
+    """Distance of neighbouring points."""
+    shape: tuple[int, ...]
+    """Number of points along each axis."""
+
+
+def signed_distances(
+    mesh: SplatMesh,
+    cameras: Sequence[Camera],
+    grid: Grid,
+    *,
+    behind: float = 1.0,
+    threads: int | None = None,
+    each: Callable[[Camera, Rendering], object] | None = None,
+) -> np.ndarray:
+    """(x, y, z) float32 truncated signed distances to the surface of ``mesh`` at the points of ``grid``.
+
+    The unit is ``TRUNCATION`` voxels; positive outside. Points that no camera sees count as interior, and
+    those on the border of the grid as exterior, so that the surface is closed. ``each`` is called with every
+    camera and its image on black.
+
+    ``behind`` is the weight of distances behind a surface. Points near a sheet without thickness are as far
+    in front of it for some cameras as behind it for others: with 1 a sheet leaves noise, with less nothing.
+    """
+    total, weight = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
+    for camera in cameras:
+        drawn = render(mesh, camera, background=(0, 0, 0), depth=True, threads=threads)
+        _integrate(total, weight, drawn.mean_depth(min_alpha=_SOLID), camera, grid, behind)
+        if each is not None:
+            each(camera, drawn)
+    field = np.where(weight > 0, total / np.where(weight > 0, weight, 1), -1)
+    for axis in range(3):
+        sides = np.moveaxis(field, axis, 0)
+        sides[0] = sides[-1] = 1
+    return field
+
+
 def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """The surface where ``field``, an (x, y, z) grid, is 0.
 
-    The triangles face the positive side. Parts of the interior with less than ``_MIN_PART`` of the volume of
+    The triangles face the positive side. Parts of the interior with less than ``MIN_PART`` of the volume of
     the largest part are removed. ``faces`` is the approximate maximum number of triangles; 0: no maximum.
 
     Returns:
@@ -122,7 +160,7 @@ def isosurface(field: np.ndarray, faces: int = 0) -> tuple[np.ndarray, np.ndarra
     sizes = np.bincount(part.ravel())
     if len(sizes) == 1 or sizes[0] == 0:  # all exterior, or all interior
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    small = sizes < _MIN_PART * sizes[1:].max()
+    small = sizes < MIN_PART * sizes[1:].max()
     small[0] = False
     vertices, triangles, _, _ = marching_cubes(
         np.where(small[part], -field, field), 0.0, gradient_direction="descent", allow_degenerate=False
@@ -144,8 +182,11 @@ def _libraries() -> tuple[Callable[..., Any], ...]:
     return label, marching_cubes, simplify
 
 
-def _grid(scene: GaussianCloud | SplatMesh, resolution: int) -> tuple[np.ndarray, float, tuple[int, ...]]:
-    """Lowest corner (3,), side of a voxel and number of grid points of the box around ``scene``."""
+def grid_around(scene: GaussianCloud | SplatMesh, resolution: int) -> Grid:
+    """The grid around ``scene`` without its floaters, ``resolution`` voxels along the longest side.
+
+    Raises ValueError for a scene that is empty or has no extent.
+    """
     bounds = scene_bounds(scene)
     if not len(bounds.points):
         raise ValueError("the scene is empty")
@@ -160,13 +201,14 @@ def _grid(scene: GaussianCloud | SplatMesh, resolution: int) -> tuple[np.ndarray
         raise ValueError("the scene has no extent")
     low, high = low - _MARGIN * longest, high + _MARGIN * longest
     voxel = float((high - low).max()) / resolution
-    return low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 1)
+    return Grid(low, voxel, tuple(int(n) for n in np.ceil((high - low) / voxel) + 1))
 
 
 def _integrate(
-    total: np.ndarray, weight: np.ndarray, depth: np.ndarray, camera: Camera, low: np.ndarray, voxel: float
+    total: np.ndarray, weight: np.ndarray, depth: np.ndarray, camera: Camera, grid: Grid, behind: float
 ) -> None:
     """Adds the truncated distances of one (h, w) ``depth`` image to the grid, slab by slab."""
+    low, voxel, _ = grid
     matrix = camera.world_to_camera
     y, z = np.meshgrid(*(low[k] + voxel * np.arange(total.shape[k]) for k in (1, 2)), indexing="ij")
     for i in range(total.shape[0]):
@@ -180,8 +222,9 @@ def _integrate(
         at = np.where(seen, row, 0).astype(np.intp), np.where(seen, column, 0).astype(np.intp)
         distance = (depth[at] - place[2]) / (TRUNCATION * voxel)
         observed = seen & (distance >= -1)
-        total[i] += np.where(observed, np.minimum(distance, 1), 0)
-        weight[i] += observed
+        share = np.where(distance < 0, behind, 1)
+        total[i] += np.where(observed, share * np.minimum(distance, 1), 0)
+        weight[i] += observed * share
 
 
 def _vertex_binding(points: np.ndarray, faces: np.ndarray) -> Binding:

@@ -10,6 +10,11 @@ from meshsplats.blender.inside.meshes import COLOR, NORMAL
 
 SELF_SHADOW = "Self-shadow distance"
 """Name and label of the node with the distance within which layers do not shade each other."""
+BAKED = "Baked light"
+"""Name and label of the node that is 1 where the splats glow with the light of ``LIGHT``, 0 where the lamps
+of the scene light them."""
+LIGHT = "Light"
+"""Attribute with the linear RGB of the light on a white matt surface there."""
 
 
 class _Tree:
@@ -98,7 +103,57 @@ def lit(
     distance.outputs[0].default_value = self_shadow
     seen = tree.math("GREATER_THAN", 1, 5, path.outputs["Ray Length"], distance.outputs[0])
     alpha = tree.math("MULTIPLY", 2, 5, color.outputs["Alpha"], seen)
-    _translucent(tree, material, alpha, shader)
+    baked = tree.node("ShaderNodeValue", 0, 8, name=BAKED, label=BAKED)
+    baked.outputs[0].default_value = 0
+    light = tree.node("ShaderNodeAttribute", 0, 0, attribute_name=LIGHT)
+    product = tree.node("ShaderNodeVectorMath", 1, 0, operation="MULTIPLY")
+    tree.link(color.outputs["Color"], product.inputs[0])
+    tree.link(light.outputs["Color"], product.inputs[1])
+    glow = tree.node("ShaderNodeEmission", 3, 0)
+    tree.link(product.outputs[0], glow.inputs["Color"])
+    both = tree.node("ShaderNodeMixShader", 4, 0)
+    tree.link(baked.outputs[0], versions.socket(both.inputs, "Fac", "Factor"))
+    tree.link(shader, both.inputs[1])
+    tree.link(glow.outputs[0], both.inputs[2])
+    _translucent(tree, material, alpha, both.outputs[0])
+    return material
+
+
+def set_baked(material: Any, baked: bool) -> None:
+    """Has the lit ``material`` show baked light, or that of the scene's lamps."""
+    node = material.node_tree.nodes.get(BAKED) if material is not None and material.node_tree else None
+    if node is not None:
+        node.outputs[0].default_value = float(baked)
+
+
+def stand_in(name: str = "Stand-in", *, fine: bool = False, self_shadow: float = 0.0) -> Any:
+    """The surface that takes the place of the splats for light: matt, in the linear colours of ``COLOR``.
+
+    Light that leaves through it from below passes, so that places under it are lit like those above.
+    ``fine``: splats instead, translucent and seen from both sides, which rays that start within
+    ``self_shadow`` ignore.
+    """
+    material = bpy.data.materials.new(name)
+    tree = _Tree(material)
+    color = tree.node("ShaderNodeAttribute", 0, 1, attribute_name=COLOR)
+    surface = tree.node("ShaderNodeBsdfDiffuse", 1, 1)
+    tree.link(color.outputs["Color"], surface.inputs["Color"])
+    clear = tree.node("ShaderNodeBsdfTransparent", 1, 2)
+    mix = tree.node("ShaderNodeMixShader", 2, 1)
+    out = tree.node("ShaderNodeOutputMaterial", 3, 1)
+    if fine:
+        path = tree.node("ShaderNodeLightPath", 0, 3)
+        seen = tree.math("GREATER_THAN", 1, 3, path.outputs["Ray Length"], self_shadow)
+        share = tree.math("MULTIPLY", 2, 3, color.outputs["Alpha"], seen)
+        first, second = clear, surface
+    else:
+        share = tree.node("ShaderNodeNewGeometry", 0, 3).outputs["Backfacing"]
+        first, second = surface, clear
+    tree.link(share, versions.socket(mix.inputs, "Fac", "Factor"))
+    tree.link(first.outputs[0], mix.inputs[1])
+    tree.link(second.outputs[0], mix.inputs[2])
+    tree.link(mix.outputs[0], out.inputs["Surface"])
+    versions.set_if_there(material, use_transparent_shadow=True)
     return material
 
 

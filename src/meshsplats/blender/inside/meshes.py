@@ -12,6 +12,8 @@ from meshsplats.cameras.framing import SAMPLE
 
 COLOR = "Color"
 """Attribute with RGBA: display values where the image is unlit, linear light where it is lit."""
+DISPLAY = "DisplayColor"
+"""Attribute of a lit mesh: the RGBA that the unlit one has in ``COLOR``."""
 NORMAL = "splat_normal"
 """Attribute with the shading normal, in the object's own frame."""
 SPLAT = "splat"
@@ -28,9 +30,11 @@ def make_mesh(
     *,
     normals: np.ndarray | None = None,
     face_splat: np.ndarray | None = None,
+    display: np.ndarray | None = None,
     edges: bool = True,
 ) -> Any:
-    """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored unchanged.
+    """A bpy mesh of (v, 3) float32 vertices, (f, 3) int32 faces and (v, 4) float32 colours, stored unchanged,
+    as are the unlit ones, ``display`` (v, 4).
 
     ``edges`` False skips the edges and, without ``normals``, shades flat: renderers need no edges, an unlit
     material no normals, and both take as long as all the rest.
@@ -38,6 +42,9 @@ def make_mesh(
     mesh = make_plain(name, vertices, faces)
     color = mesh.attributes.new(COLOR, "FLOAT_COLOR", "POINT")
     color.data.foreach_set("color", np.ascontiguousarray(colors, np.float32).ravel())
+    if display is not None:
+        attribute = mesh.attributes.new(DISPLAY, "FLOAT_COLOR", "POINT")
+        attribute.data.foreach_set("color", np.ascontiguousarray(display, np.float32).ravel())
     if normals is not None:
         attribute = mesh.attributes.new(NORMAL, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", np.ascontiguousarray(normals, np.float32).ravel())

@@ -8,11 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import foreign, frame, levels, materials, meshes, priors, rendering, versions
+from meshsplats.blender.inside import (
+    foreign,
+    frame,
+    levels,
+    materials,
+    meshes,
+    priors,
+    rendering,
+    stand_ins,
+    versions,
+)
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
-from meshsplats.blender.subject import lit_arrays, lowest
+from meshsplats.blender.subject import lit_arrays, lowest, stand_in_arrays
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.baking import bake_filter
 from meshsplats.mesh import Blending, SplatMesh
@@ -41,7 +51,10 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
     arrays: dict[str, Any] = {"faces": mesh.faces, "colors": mesh.colors, "normals": None, "self_shadow": 0.0}
     if lit:
         made, arrays["self_shadow"] = lit_arrays(mesh)
-        arrays |= made
+        arrays |= made | {"display": mesh.colors}
+        if mesh.binding is None:
+            found, arrays["light_spacing"] = stand_in_arrays(mesh, made)
+            arrays |= found
     # Splats on a base keep the base's frame.
     origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
     return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh), "origin": origin}
@@ -60,6 +73,7 @@ def add(prepared: dict[str, Any], name: str, collection: Any) -> Any:
     rotation = frame.to_blender(prepared["mesh"].up)
     obj = meshes.make_object(_data(prepared, name), name, rotation, collection)
     obj.location = (rotation @ prepared["origin"]).tolist()
+    _give_stand_in(obj, prepared)
     if prepared["mesh"].binding is not None:
         priors.give_base(obj, prepared["mesh"].binding, collection)
     bpy.context.view_layer.objects.active = obj
@@ -97,9 +111,28 @@ def count_layers(objs: Iterable[Any]) -> int:
 def replace_mesh(obj: Any, prepared: dict[str, Any]) -> None:
     """Gives ``obj`` another mesh and material; its transform, parent, modifiers and name stay."""
     old = obj.data
-    obj.data = _data(prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}, old.name)
+    prepared = prepared | {"origin": np.array(old.get(ORIGIN, (0, 0, 0)))}
+    obj.data = _data(prepared, old.name)
+    stand_ins.remove(obj)
+    _give_stand_in(obj, prepared)
     if old.users == 0:
         bpy.data.meshes.remove(old)
+
+
+def _give_stand_in(obj: Any, prepared: dict[str, Any]) -> None:
+    if "surface_vertices" not in prepared:
+        return
+    origin = prepared["origin"].astype(np.float32)
+    arrays = {name: prepared[name] for name in stand_ins.ARRAYS}
+    for name in ("surface_vertices", "light_points"):
+        arrays[name] = arrays[name] - origin
+    stand_ins.add(
+        obj,
+        arrays,
+        prepared["light_spacing"],
+        self_shadow=prepared["self_shadow"],
+        home=obj.users_collection[0] if obj.users_collection else bpy.context.scene.collection,
+    )
 
 
 def _data(prepared: dict[str, Any], name: str) -> Any:
@@ -111,6 +144,7 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
         prepared["colors"],
         normals=prepared["normals"],
         face_splat=mesh.face_splat,
+        display=prepared.get("display"),
     )
     if mesh.binding is not None:
         priors.store(data, mesh.binding)
@@ -155,9 +189,10 @@ def as_splat_mesh(obj: Any) -> SplatMesh:
     if len(faces) != 3 * len(data.polygons):
         raise ValueError("the object has faces that are not triangles: triangulate it first")
     colors = np.empty(4 * len(data.vertices), np.float32)
-    data.attributes[meshes.COLOR].data.foreach_get("color", colors)
+    shown = meshes.DISPLAY if meshes.DISPLAY in data.attributes else meshes.COLOR
+    data.attributes[shown].data.foreach_get("color", colors)
     colors = np.clip(colors.reshape(-1, 4), 0, 1)
-    if data[LIT] and not data[LINEAR]:
+    if data[LIT] and not data[LINEAR] and shown == meshes.COLOR:
         from meshsplats.colors import linear_to_srgb
 
         colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)

@@ -14,6 +14,10 @@ import numpy as np
 from meshsplats.blender.inside import versions
 from meshsplats.blender.inside.host import bpy
 
+_FEW = 16
+"""Layers that every ray passes in denoised images. On playbot at 240 x 135 pixels, 16 samples: 4.8 instead of
+6.6 s, and 26.6 instead of 26.8 dB."""
+
 
 def exact_settings(scene: Any, engine: str, *, linear: bool = False) -> None:
     """Settings that render colours unchanged: no dither, one sample at each pixel's centre, no view
@@ -56,8 +60,9 @@ def lit_settings(
     cycles = scene.cycles
     cycles.samples = samples
     cycles.use_adaptive_sampling = False
-    cycles.pixel_filter_type = "BLACKMAN_HARRIS"
-    cycles.filter_width = 1.5
+    # The mean over a pixel, as in ``render``: wider filters blur the detail of splats.
+    cycles.pixel_filter_type = "BOX"
+    cycles.filter_width = 1.0
     cycles.max_bounces = max(bounces, 8)
     cycles.diffuse_bounces = bounces
     cycles.glossy_bounces = max(bounces, 4)
@@ -67,16 +72,17 @@ def lit_settings(
     cycles.use_denoising = denoise
     # The light tree skips lights behind a triangle, though its smoothed normal may face them.
     cycles.use_light_tree = False
-    _layers(scene, limit)
+    # Denoised, rays that have lost most of their light may end by chance: in half of the time.
+    _layers(scene, limit, least=_FEW if denoise else limit)
     scene.eevee.taa_render_samples = samples
     scene.render.filter_size = 1.5
     versions.set_if_there(scene.eevee, use_shadows=True, use_raytracing=raytracing)
 
 
-def _layers(scene: Any, limit: int) -> None:
-    # A ray that passes more layers than the limit turns black. A minimum below it would end rays by chance.
+def _layers(scene: Any, limit: int, least: int | None = None) -> None:
+    # A ray that passes more layers than the limit turns black. Beyond the minimum, it may end by chance.
     scene.cycles.transparent_max_bounces = limit
-    scene.cycles.min_transparent_bounces = limit
+    scene.cycles.min_transparent_bounces = limit if least is None else min(least, limit)
 
 
 def _common(scene: Any, engine: str, view: str) -> None:

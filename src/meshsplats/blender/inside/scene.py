@@ -8,7 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import frame, levels, materials, meshes, objects, rendering, stage, versions
+from meshsplats.blender.inside import (
+    baking,
+    frame,
+    levels,
+    materials,
+    meshes,
+    objects,
+    rendering,
+    stage,
+    stand_ins,
+    versions,
+)
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.options import LightOptions, SceneOptions
 from meshsplats.camera import Camera
@@ -45,10 +56,17 @@ class Subject:
     """(v, 3) float32 unit shading normals, if lit."""
     face_splat: np.ndarray | None = None
     """(f,) int32."""
-    caster_vertices: np.ndarray | None = None
-    """(w, 3) float32 stand-in that casts the shadow in EEVEE."""
-    caster_faces: np.ndarray | None = None
-    """(g, 3) int32."""
+    display: np.ndarray | None = None
+    """(v, 4) float32 RGBA as composited unlit, if lit."""
+    surface_vertices: np.ndarray | None = None
+    """(w, 3) float32; this and the following are the fields of ``StandIn``, if lit and solid."""
+    surface_faces: np.ndarray | None = None
+    surface_colors: np.ndarray | None = None
+    fine_faces: np.ndarray | None = None
+    light_points: np.ndarray | None = None
+    light_normals: np.ndarray | None = None
+    light_point_of: np.ndarray | None = None
+    light_spacing: float = 0.0
     screen_size: int = 0
     """Of a level of detail: side in pixels of the images for which it was made; else 0."""
     name: str = "Splats"
@@ -133,6 +151,8 @@ def build(
     if made:
         stage.aim(scene, cameras[0], made[0])
     bpy.context.view_layer.objects.active = obj
+    if light is not None:
+        baking.bake(scene, objects.splat_objects(scene))
     return Built(scene, obj, made, rotation)
 
 
@@ -146,6 +166,7 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
         subject.colors,
         normals=subject.normals,
         face_splat=subject.face_splat,
+        display=subject.display,
         edges=edges,
     )
     obj = meshes.make_object(mesh, subject.name, rotation, home)
@@ -168,16 +189,14 @@ def _add_splats(subject: Subject, options: SceneOptions, rotation: np.ndarray, e
         smooth=subject.normals is not None,
     )
     mesh.materials.append(material)
-    if subject.caster_vertices is not None and subject.caster_faces is not None:
-        caster = meshes.make_plain(f"{subject.name} shadow", subject.caster_vertices, subject.caster_faces)
-        if edges:
-            caster.update(calc_edges=True)
-        caster.materials.append(materials.plain("Shadow", stage.GREY))
-        stand_in = meshes.make_object(caster, caster.name, rotation, home)
-        stand_in.visible_camera = False
-        stand_in.parent = obj
-        stand_in.matrix_parent_inverse = obj.matrix_world.inverted()
-        obj.visible_shadow = False
+    if subject.surface_vertices is not None:
+        stand_ins.add(
+            obj,
+            {name: getattr(subject, name) for name in stand_ins.ARRAYS},
+            subject.light_spacing,
+            self_shadow=subject.self_shadow,
+            home=home,
+        )
     return obj
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats.blender.inside import meshes, objects, scene, stage
+from meshsplats.blender.inside import baking, meshes, objects, scene, stage
 from meshsplats.blender.options import LIGHTS, LightOptions
 from meshsplats.cameras.framing import scene_bounds, weighted_quantile
 from meshsplats.cameras.trajectories import orbit
@@ -45,4 +45,5 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     floor = np.array([bounds.center[0], bounds.center[1], low])
     scene.surround(floor, bounds.radius, light, viewer, (1.0, 1.0, 1.0))
     objects.render_settings(view, objs, True, light)
+    baking.bake(view, objs)
     return light

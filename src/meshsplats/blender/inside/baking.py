@@ -1,0 +1,211 @@
+"""Light from a scene's lamps and sky, gathered by Cycles at points and carried to the splats.
+
+The splats then glow with their colour times that light. Their image has no noise of its own, and takes as
+long as an unlit one; the light stays as it was when it was gathered.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.inside import levels, materials, meshes, versions
+from meshsplats.blender.inside.host import bpy
+from meshsplats.blender.inside.materials import LIGHT
+
+POINT = "light_point"
+"""Attribute of the splats: index of the point whose light each vertex takes."""
+POINTS = "meshsplats_light_points"
+"""Property of the splats' object: name of the object of the points."""
+SIZE = "meshsplats_spacing"
+"""Property of the points' mesh: distance of neighbouring points, scene units."""
+SAMPLES = 12
+"""Samples at each of the three corners that a point has."""
+_AGREE = 4
+"""Power of the cosine between the normals of two points that share their light."""
+_WIDTH = 1.0
+"""Standard deviation of the Gaussian that removes noise, in spacings of the points."""
+
+
+def make_points(name: str, points: np.ndarray, normals: np.ndarray, size: float) -> Any:
+    """A bpy mesh with a small triangle at each of the ``points`` (n, 3), facing along ``normals`` (n, 3), a
+    fifth of ``size`` wide."""
+    helper = np.where(np.abs(normals[:, :1]) < 0.7, [1.0, 0, 0], [0, 1.0, 0])
+    first = np.cross(normals, helper)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    second = np.cross(normals, first)
+    angles = np.radians([0, 120, 240])
+    corners = points[:, None] + 0.1 * size * (
+        np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
+    )
+    mesh = meshes.make_plain(name, corners.reshape(-1, 3), np.arange(3 * len(points)).reshape(-1, 3))
+    mesh.update(calc_edges=True)
+    mesh.attributes.new(LIGHT, "FLOAT_COLOR", "CORNER")
+    mesh.color_attributes.active_color = mesh.color_attributes[LIGHT]
+    mesh[SIZE] = float(size)
+    mesh.materials.append(materials.plain("Light points", (1.0, 1.0, 1.0)))
+    return mesh
+
+
+def points_of(obj: Any) -> Any:
+    """The object of the points of the splats ``obj``, or None."""
+    return bpy.data.objects.get(obj.get(POINTS, "")) if obj is not None else None
+
+
+def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
+    """Gathers the light of ``scene`` on the splat objects ``objs`` and shows them in it.
+
+    Everything in the scene lights them and casts shadows on them, their own stand-ins, too. The render
+    settings stay as they are. Needs Cycles.
+
+    Objects without points (``stand_ins.add``) are left out. Of a chain of levels of detail, each is lit as if
+    it were the visible one.
+
+    Returns:
+        The number of objects that were lit.
+    """
+    targets = {obj.name: target for obj in objs if (target := points_of(obj)) is not None}
+    chosen = [obj for obj in objs if obj.name in targets]
+    if not chosen:
+        return 0
+    with _settings(scene, samples), _visible([(obj, True) for obj in chosen]):
+        for obj in chosen:
+            target = targets[obj.name]
+            chain = levels.chain_of(obj)
+            before = None if chain is None else levels.visible_level(chain)
+            if before is not None:
+                levels.show(chain, obj[levels.LEVEL])
+            with _visible([(target, False)]):
+                _bake(target)
+            if before is not None:
+                levels.show(chain, before)
+            show(obj.data, smoothed(target.data))
+    return len(chosen)
+
+
+def forget(objs: list[Any]) -> None:
+    """Has the lamps of the scene light the splat objects ``objs`` in every image, instead of baked light."""
+    for obj in objs:
+        for material in obj.data.materials:
+            materials.set_baked(material, False)
+
+
+def show(data: Any, light: np.ndarray) -> None:
+    """Gives the splats ``data`` the ``light`` (n, 3) of their points, and switches their material to it."""
+    index = np.empty(len(data.vertices), np.int32)
+    data.attributes[POINT].data.foreach_get("value", index)
+    values = np.ones((len(index), 4), np.float32)
+    values[:, :3] = light[index]
+    attribute = data.attributes.get(LIGHT) or data.attributes.new(LIGHT, "FLOAT_COLOR", "POINT")
+    attribute.data.foreach_set("color", values.ravel())
+    for material in data.materials:
+        materials.set_baked(material, True)
+    data.update()
+
+
+def smoothed(data: Any) -> np.ndarray:
+    """(n, 3) float64 linear RGB of the light on the points' mesh ``data``, without noise: means over points
+    within a spacing or two whose normals agree."""
+    light = np.empty(12 * len(data.polygons), np.float32)
+    data.attributes[LIGHT].data.foreach_get("color", light)
+    light = light.reshape(-1, 3, 4)[:, :, :3].mean(axis=1, dtype=np.float64)
+    places = np.empty(9 * len(data.polygons), np.float32)
+    data.vertices.foreach_get("co", places)
+    corners = places.reshape(-1, 3, 3).astype(np.float64)
+    centers = corners.mean(axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return mean_light(centers, normals, light, float(data[SIZE]))
+
+
+def mean_light(centers: np.ndarray, normals: np.ndarray, light: np.ndarray, size: float) -> np.ndarray:
+    """(n, 3) ``light`` (n, 3) averaged over points nearer than about two ``size`` whose ``normals`` (n, 3)
+    agree."""
+    steps = np.clip((centers - centers.min(axis=0)) / size, 0, 2**20 - 4).astype(np.int64) + 1
+    keys = steps[:, 0] << 42 | steps[:, 1] << 21 | steps[:, 2]
+    order = np.argsort(keys, kind="stable")
+    ranked = keys[order]
+    total, weights = light.copy(), np.ones(len(light))
+    for step in ((x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)):
+        first = np.searchsorted(ranked, keys + step)
+        # Points that share a cell have normals in different octants: eight at most.
+        for k in range(8):
+            at = np.minimum(first + k, len(ranked) - 1)
+            near = order[at]
+            row = np.flatnonzero((first + k < len(ranked)) & (ranked[at] == keys + step))
+            row = row[near[row] != row]
+            if not len(row):
+                break
+            other = near[row]
+            away = np.square(centers[other] - centers[row]).sum(axis=1) / (_WIDTH * size) ** 2
+            cosine = np.maximum(np.einsum("ij,ij->i", normals[row], normals[other]), 0)
+            weight = np.exp(-away / 2) * cosine**_AGREE
+            total[row] += weight[:, None] * light[other]
+            weights[row] += weight
+    return total / weights[:, None]
+
+
+def _bake(target: Any) -> None:
+    layer = bpy.context.view_layer
+    active, selected = layer.objects.active, list(bpy.context.selected_objects)
+    for obj in selected:
+        obj.select_set(False)
+    try:
+        target.select_set(True)
+        layer.objects.active = target
+        bpy.ops.object.bake(
+            type="DIFFUSE",
+            pass_filter={"DIRECT", "INDIRECT"},
+            target="VERTEX_COLORS",
+            use_clear=True,
+            use_selected_to_active=False,
+        )
+    finally:
+        target.select_set(False)
+        for obj in selected:
+            obj.select_set(True)
+        layer.objects.active = active
+
+
+class _settings:
+    """Cycles, ready to bake, and afterwards the settings from before."""
+
+    def __init__(self, scene: Any, samples: int) -> None:
+        self.scene = scene
+        versions.enable_cycles()
+        self.new = [
+            (scene.render, "engine", versions.engine_name("cycles")),
+            (scene.cycles, "samples", samples),
+            (scene.cycles, "use_denoising", False),
+            (scene.cycles, "use_adaptive_sampling", False),
+        ]
+
+    def __enter__(self) -> None:
+        self.old = []
+        for owner, name, value in self.new:
+            self.old.append((owner, name, getattr(owner, name)))
+            setattr(owner, name, value)
+
+    def __exit__(self, *_: object) -> None:
+        for owner, name, value in reversed(self.old):
+            setattr(owner, name, value)
+
+
+class _visible:
+    """Objects hidden from renders, or shown in renders and in the viewport, and afterwards as before."""
+
+    def __init__(self, hidden: list[tuple[Any, bool]]) -> None:
+        self.hidden = hidden
+
+    def __enter__(self) -> None:
+        self.old = [(obj, obj.hide_render, obj.hide_viewport) for obj, _ in self.hidden]
+        for obj, hide in self.hidden:
+            obj.hide_render = hide
+            if not hide:
+                obj.hide_viewport = False
+        bpy.context.view_layer.update()
+
+    def __exit__(self, *_: object) -> None:
+        for obj, render, viewport in self.old:
+            obj.hide_render, obj.hide_viewport = render, viewport

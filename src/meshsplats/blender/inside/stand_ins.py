@@ -1,0 +1,92 @@
+"""The surface that takes the place of lit splats for light (``blender.stand_in``), as objects of a Blender
+file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from meshsplats.blender.inside import baking, materials, meshes
+from meshsplats.blender.inside.host import bpy
+
+ARRAYS = (
+    *("surface_vertices", "surface_faces", "surface_colors", "fine_faces"),
+    *("light_points", "light_normals", "light_point_of"),
+)
+"""Fields of ``StandIn``, as ``subject.stand_in_arrays`` names them."""
+STAND_IN = "meshsplats_stand_in"
+"""Property of the objects made here: True."""
+
+
+def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow: float, home: Any) -> None:
+    """Gives the splats ``obj`` a stand-in: children of ``obj`` in the collection ``home``.
+
+    Cameras, mirrors and glass see the splats. Shadows, bounced light and occlusion come from the stand-in.
+
+    Args:
+        arrays: those of ``ARRAYS``, in the frame of the object.
+        size: distance of neighbouring points, scene units.
+        self_shadow: rays that start within this distance of the fine faces ignore them.
+    """
+    faces, colors, fine = arrays["surface_faces"], arrays["surface_colors"], arrays["fine_faces"]
+    rgba = np.column_stack([colors, np.ones(len(colors), np.float32)])
+    surface = meshes.make_mesh(f"{obj.name} stand-in", arrays["surface_vertices"], faces, rgba)
+    surface.polygons.foreach_set("use_smooth", np.ones(len(faces), bool))
+    surface.materials.append(materials.stand_in())
+    _child(obj, surface, home)
+    if fine.any():
+        data = obj.data
+        corners = np.empty(len(data.loops), np.int32)
+        data.loops.foreach_get("vertex_index", corners)
+        used, index = np.unique(corners.reshape(-1, 3)[fine], return_inverse=True)
+        co = np.empty(3 * len(data.vertices), np.float32)
+        data.vertices.foreach_get("co", co)
+        rgba = np.empty(4 * len(data.vertices), np.float32)
+        data.attributes[meshes.COLOR].data.foreach_get("color", rgba)
+        thin = meshes.make_mesh(
+            f"{obj.name} stand-in, fine",
+            co.reshape(-1, 3)[used],
+            index.reshape(-1, 3).astype(np.int32),
+            rgba.reshape(-1, 4)[used],
+        )
+        thin.materials.append(materials.stand_in("Stand-in, fine", fine=True, self_shadow=self_shadow))
+        _child(obj, thin, home)
+    points = baking.make_points(
+        f"{obj.name} light points", arrays["light_points"], arrays["light_normals"], size
+    )
+    target = _child(obj, points, home)
+    target.visible_diffuse = target.visible_shadow = False
+    target.visible_volume_scatter = True  # Cycles leaves out what no ray at all can see
+    target.hide_select = False
+    target.hide_render = target.hide_viewport = True
+    obj[baking.POINTS] = target.name
+    index_of = obj.data.attributes.new(baking.POINT, "INT", "POINT")
+    index_of.data.foreach_set("value", np.ascontiguousarray(arrays["light_point_of"], np.int32))
+    obj.visible_shadow = obj.visible_diffuse = False
+
+
+def _child(obj: Any, mesh: Any, home: Any) -> Any:
+    """A child of ``obj`` at its place, invisible to cameras, mirrors and glass."""
+    child = bpy.data.objects.new(mesh.name, mesh)
+    child[STAND_IN] = True
+    for way in ("camera", "glossy", "transmission", "volume_scatter"):
+        setattr(child, f"visible_{way}", False)
+    child.parent = obj
+    child.display_type = "WIRE"
+    child.hide_select = True
+    home.objects.link(child)
+    return child
+
+
+def remove(obj: Any) -> None:
+    """Removes the stand-in of ``obj``, which then casts its own shadow."""
+    for child in [c for c in obj.children if c.get(STAND_IN)]:
+        mesh = child.data
+        bpy.data.objects.remove(child)
+        if mesh.users == 0:
+            bpy.data.meshes.remove(mesh)
+    if baking.POINTS in obj:
+        del obj[baking.POINTS]
+    obj.visible_shadow = obj.visible_diffuse = True

@@ -1,0 +1,132 @@
+# ruff: noqa: E402
+"""Light baked on a stand-in surface and shown by the splats."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test-blender")
+
+from _blender_scenes import ball_splats
+
+from meshsplats import convert, orbit, render
+from meshsplats.blender import LightOptions, SceneOptions, subject
+from meshsplats.blender.inside import baking, materials, objects, rendering, scene, stage
+from meshsplats.colors import linear_to_srgb
+
+SIDE = 48
+
+
+def built(mesh, view, light, samples=4):
+    options = SceneOptions(light=light, samples=samples)
+    layers, limit = subject.count(mesh, [view], options)
+    arrays, facts = subject.prepare(mesh, [view], options, layers)
+    return scene.build(scene.Subject(**arrays, **facts), [view], options, limit, edges=False)
+
+
+def shot(made, path):
+    rendering.render_to(made.scene, path)
+    return rendering.read_pixels(path)[..., :3]
+
+
+@pytest.fixture(scope="module")
+def ball():
+    cloud, _ = ball_splats(1500, noise=0.1)
+    mesh = convert(cloud, mode="flat")
+    return mesh, orbit(mesh, 1, elevation=20, azimuth=30, width=SIDE, height=SIDE)[0]
+
+
+def light_of(obj):
+    attribute = obj.data.attributes[materials.LIGHT]
+    values = np.empty(4 * len(attribute.data), np.float32)
+    attribute.data.foreach_get("color", values)
+    return values.reshape(-1, 4)[:, :3]
+
+
+def test_even_light_shows_the_unlit_image(ball, tmp_path):
+    mesh, view = ball
+    made = built(mesh, view, LightOptions(sun_strength=0, sky=1, ground="none", exposure=0))
+    lit = linear_to_srgb(np.clip(shot(made, tmp_path / "lit.exr"), 0, 1))
+    unlit = render(mesh, view, samples=2)
+    inside = unlit.alpha > 0.02
+    assert np.sqrt(np.square(lit - unlit.color)[inside].mean()) < 0.04
+    assert np.abs(light_of(made.obj) - 1).max() < 0.03, "nothing shades a ball"
+
+
+def test_the_image_of_the_splats_has_no_noise(ball, tmp_path):
+    mesh, view = ball
+    made = built(mesh, view, LightOptions(ground="none"))
+    images = []
+    for seed in (0, 1):
+        made.scene.cycles.seed = seed
+        images.append(shot(made, tmp_path / "a.exr"))
+    # Deep inside the silhouette, where samples of a pixel differ in position only.
+    solid = render(mesh, view).alpha > 0.995
+    assert np.abs(images[0] - images[1])[solid].mean() < 0.01
+    baking.forget([made.obj])
+    live = []
+    for seed in (0, 1):
+        made.scene.cycles.seed = seed
+        live.append(shot(made, tmp_path / "a.exr"))
+    assert np.abs(live[0] - live[1])[solid].mean() > 0.03, "lamps in every image do make noise"
+    # The same light, but for the noise.
+    assert np.mean(live)[None] == pytest.approx(np.mean(images), rel=0.08)
+
+
+def test_lamps_and_other_objects_light_and_shade_the_splats(ball):
+    mesh, view = ball
+    made = built(mesh, view, LightOptions(sun=(0, 89), sky=0, ground="none"))
+    before = light_of(made.obj)
+    top = -mesh.vertices[:, 1]  # y points down in the file
+    cap = top > 0.9
+    assert before[cap].mean() == pytest.approx(2.5 / np.pi * top[cap].mean(), rel=0.05)
+    assert before[top < -0.3].max() < 0.02
+    bpy.ops.mesh.primitive_cube_add(size=0.8, location=(0, 0, 2))
+    samples = made.scene.cycles.samples
+    assert baking.bake(made.scene, [made.obj]) == 1
+    after = light_of(made.obj)
+    across = np.abs(mesh.vertices[:, [0, 2]]).max(axis=1)
+    assert after[(top > 0.5) & (across < 0.25)].max() < 0.05, "in the shadow of the cube"
+    sunny = (top > 0.3) & (across > 0.6)
+    np.testing.assert_allclose(after[sunny].mean(), before[sunny].mean(), rtol=0.05)
+    assert made.scene.cycles.samples == samples
+    assert not made.obj.hide_render
+    assert baking.points_of(made.obj).hide_render
+
+
+def test_the_unlit_mesh_comes_back_unchanged(ball):
+    mesh, _ = ball
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    obj = objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
+    assert baking.points_of(obj) is not None
+    assert not obj.visible_shadow
+    again = objects.as_splat_mesh(obj)
+    assert (again.colors == mesh.colors).all()
+    objects.replace_mesh(obj, objects.prepare(again, False))
+    assert obj.visible_shadow
+    assert not obj.children
+    assert baking.points_of(obj) is None
+    assert baking.bake(bpy.context.scene, [obj]) == 0
+
+
+def test_the_stand_in_is_seen_by_light_alone(ball, tmp_path):
+    """A mirror shows the splats, the ground their shadow, and no camera the surface itself."""
+    mesh, view = ball
+    made = built(mesh, view, LightOptions(ground="none"))
+    made.obj.hide_render = True
+    seen = shot(made, tmp_path / "a.exr")
+    made.obj.hide_render = False
+    for child in made.obj.children:
+        child.hide_render = True
+    bare = shot(made, tmp_path / "b.exr")
+    assert np.ptp(seen) < 1e-3, "the background alone"
+    assert np.ptp(bare) > 0.2
+    home = stage.collection("ground")
+    stage.add_ground(np.array([0.0, 0, -1.2]), 1.0, False, home)
+    without = shot(made, tmp_path / "c.exr")
+    for child in made.obj.children:
+        child.hide_render = child.name.endswith("points")
+    shadowed = shot(made, tmp_path / "d.exr")
+    floor = render(mesh, view).alpha < 0.01
+    assert (shadowed[floor] < 0.6 * without[floor]).mean() > 0.02, "the stand-in alone casts the shadow"

@@ -1,0 +1,125 @@
+"""The surface that takes the place of lit splats, and colours for linear light; NumPy alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _blender_scenes import ball_splats
+
+from meshsplats import GaussianCloud, convert, orbit, render
+from meshsplats.blender.linear import linear_colors
+from meshsplats.blender.normals import shading_normals
+from meshsplats.blender.stand_in import stand_in, surface_net
+from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.evaluation.metrics import psnr
+
+
+def ball_field(count: int = 24, radius: float = 8.0) -> np.ndarray:
+    steps = np.arange(count) - (count - 1) / 2
+    return np.sqrt(sum(s**2 for s in np.meshgrid(steps, steps, steps, indexing="ij"))) - radius
+
+
+def volume(vertices, faces) -> float:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def test_surface_net_is_closed_faces_out_and_has_the_volume_of_the_field():
+    vertices, faces, cells = surface_net(ball_field())
+    assert np.abs(np.linalg.norm(vertices - 11.5, axis=1) - 8).max() < 0.15
+    assert np.isclose(volume(vertices, faces), 4 / 3 * np.pi * 8**3, rtol=0.02)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forward, backward = (np.unique(e, axis=0, return_counts=True) for e in (edges, edges[:, ::-1]))
+    assert (forward[0] == backward[0]).all()
+    assert (forward[1] == backward[1]).all(), "each edge is passed as often one way as the other"
+    assert (np.abs(vertices - cells - 0.5) <= 0.5).all(), "a vertex lies in its cell"
+
+
+def test_surface_net_leaves_small_parts_out():
+    field = ball_field()
+    field[1, 1, 1] = -0.2
+    alone = surface_net(ball_field())
+    assert len(surface_net(field)[0]) == len(alone[0])
+    assert len(surface_net(np.ones((4, 4, 4)))[1]) == 0
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """A ball of splats with a floater and a stray hair: a column of splats that stands out of it."""
+    cloud, _ = ball_splats(3000)
+    hair = np.column_stack([np.zeros((40, 2)), np.linspace(1.02, 1.6, 40)])
+    added = np.concatenate([hair, [[0.0, -2.6, 0]]])
+    more = GaussianCloud(
+        np.concatenate([cloud.means, added]),
+        np.concatenate([cloud.quaternions, np.tile([1.0, 0, 0, 0], (41, 1))]),
+        np.concatenate([cloud.scales, np.full((41, 3), 0.006)]),
+        np.concatenate([cloud.opacities, np.full(41, 0.9)]),
+        np.concatenate([cloud.sh, np.zeros((41, 1, 3))]),
+    )
+    mesh = convert(more, mode="flat")
+    normals = shading_normals(mesh)
+    colors = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
+    return mesh, stand_in(mesh, normals, colors, resolution=48)
+
+
+def test_stand_in_is_the_surface_that_the_splats_form(ball):
+    _, made = ball
+    radii = np.linalg.norm(made.vertices, axis=1)
+    assert np.abs(radii - 1).max() < 0.03
+    assert 0.95 < volume(made.vertices, made.faces) / (4 / 3 * np.pi) < 1.05
+    red = made.vertices[:, 1] < -0.65
+    assert made.colors[red, 0].mean() > 3 * made.colors[red, 2].mean()
+    grey = made.colors[(made.vertices[:, 1] > -0.3) & (made.vertices[:, 2] < 0.8)]
+    assert np.abs(grey - srgb_to_linear(np.float32(0.7))).max() < 0.01
+
+
+def test_splats_take_the_light_at_their_foot(ball):
+    mesh, made = ball
+    near = np.linalg.norm(mesh.vertices, axis=1) < 1.01
+    points, normals = made.points[made.point_of[near]], made.normals[made.point_of[near]]
+    assert np.linalg.norm(points - mesh.vertices[near], axis=1).max() < 0.2
+    assert np.abs(np.linalg.norm(points, axis=1) - 1).max() < 0.03
+    outward = points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.einsum("ij,ij->i", outward, normals).min() > 0.9
+
+
+def test_thin_parts_cast_their_own_shadow_and_floaters_none(ball):
+    mesh, made = ball
+    centers = np.zeros((mesh.face_splat.max() + 1, 3))
+    for k in range(3):
+        corners = mesh.vertices[mesh.faces].mean(axis=1)[:, k]
+        centers[:, k] = np.bincount(mesh.face_splat, corners) / np.bincount(mesh.face_splat)
+    fine = np.unique(mesh.face_splat[made.fine])
+    hair = np.flatnonzero(centers[:, 2] > 1.25)
+    assert np.isin(hair, fine).all()
+    assert (np.linalg.norm(centers[fine], axis=1) > 1.02).all(), "not those of the ball"
+    assert centers[fine][:, 1].min() > -2, "not the floater"
+
+
+def test_nothing_solid_has_no_stand_in():
+    cloud, _ = ball_splats(200)
+    mesh = convert(replace(cloud, opacities=np.full(200, 0.05)), mode="flat")
+    assert stand_in(mesh, shading_normals(mesh), mesh.colors, resolution=16) is None
+
+
+def test_linear_colors_show_in_linear_light_what_display_blending_shows():
+    rng = np.random.default_rng(0)
+    cloud, _ = ball_splats(800)
+    colors = rng.uniform(0.05, 0.95, (800, 1, 3))
+    mesh = convert(
+        replace(cloud, opacities=rng.uniform(0.2, 0.8, 800), sh=(colors - 0.5) / 0.28209479), mode="flat"
+    )
+    view = orbit(mesh, 1, azimuth=50, width=96, height=96)[0]
+    target = render(mesh, view, samples=2)
+
+    def error(linear):
+        drawn = render(replace(mesh, colors=linear), view, samples=2).color
+        return psnr(np.clip(linear_to_srgb(drawn), 0, 1), target.color)
+
+    before = error(linear_colors(mesh, steps=0))
+    assert error(linear_colors(mesh, steps=36)) > before + 3
+    assert error(linear_colors(mesh, [view], steps=36)) > before + 5
+    kept = replace(mesh, blending="linear")
+    assert linear_colors(kept) is kept.colors
