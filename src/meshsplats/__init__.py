@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         save_gaussians,
         stream_gaussians,
     )
-    from meshsplats.formats.meshes import load_mesh, save_mesh
+    from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.images.writing import save_image
     from meshsplats.mesh import SplatMesh
@@ -87,7 +87,7 @@ _HOME = {
     "meshsplats.formats.gaussians": (
         *("SplatStream", "load_gaussians", "save_gaussian_blocks", "save_gaussians", "stream_gaussians"),
     ),
-    "meshsplats.formats.meshes": ("load_mesh", "save_mesh"),
+    "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
     "meshsplats.gaussians": ("GaussianCloud",),
     "meshsplats.images.writing": ("save_image",),
     "meshsplats.mesh": ("SplatMesh",),
@@ -161,6 +161,7 @@ __all__ = [
     "save_gaussians",
     "save_image",
     "save_mesh",
+    "save_mesh_blocks",
     "simplify",
     "splat_dataset",
     "ssim",
