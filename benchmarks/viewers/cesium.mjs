@@ -17,7 +17,8 @@ const [tileset, image, error = '2', range = '2.2'] = process.argv.slice(2);
 const cesium = path.join(process.cwd(), 'node_modules', 'cesium', 'Build', 'Cesium');
 
 const PAGE = `<!doctype html><link rel="icon" href="data:,">
-<style>html, body, #c { margin: 0; width: 100%; height: 100% }</style><div id="c"></div>
+<link rel="stylesheet" href="/cesium/Widgets/CesiumWidget/CesiumWidget.css">
+<style>html, body, #c { margin: 0; width: 100%; height: 100%; overflow: hidden }</style><div id="c"></div>
 <script>window.CESIUM_BASE_URL = '/cesium/';</script>
 <script src="/cesium/Cesium.js"></script>
 <script>
