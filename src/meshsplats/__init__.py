@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.cameras.files import load_cameras, save_cameras
     from meshsplats.cameras.trajectories import dome, look_around, look_at, orbit
     from meshsplats.conversion import ConversionOptions, bake_filter, convert, simplify
+    from meshsplats.conversion.streaming import convert_blocks
     from meshsplats.datasets.folder import load_dataset
     from meshsplats.datasets.splat_targets import splat_dataset
     from meshsplats.datasets.views import Dataset, View, ViewImage
@@ -43,7 +44,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         save_gaussians,
         stream_gaussians,
     )
-    from meshsplats.formats.meshes import load_mesh, save_mesh
+    from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.images.writing import save_image
     from meshsplats.mesh import SplatMesh
@@ -53,6 +54,9 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.autograd import rasterize as rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
+    from meshsplats.tiles.building import TileOptions, build_tiles
+    from meshsplats.tiles.drawing import render_tiles
+    from meshsplats.tiles.tileset import Tileset
     from meshsplats.viewer.page import PageOptions, make_page
 
 try:
@@ -66,6 +70,7 @@ _HOME = {
     "meshsplats.cameras.files": ("load_cameras", "save_cameras"),
     "meshsplats.cameras.trajectories": ("dome", "look_around", "look_at", "orbit"),
     "meshsplats.conversion": ("ConversionOptions", "bake_filter", "convert", "simplify"),
+    "meshsplats.conversion.streaming": ("convert_blocks",),
     "meshsplats.datasets.folder": ("load_dataset",),
     "meshsplats.datasets.splat_targets": ("splat_dataset",),
     "meshsplats.datasets.views": ("Dataset", "View", "ViewImage"),
@@ -83,7 +88,7 @@ _HOME = {
     "meshsplats.formats.gaussians": (
         *("SplatStream", "load_gaussians", "save_gaussian_blocks", "save_gaussians", "stream_gaussians"),
     ),
-    "meshsplats.formats.meshes": ("load_mesh", "save_mesh"),
+    "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
     "meshsplats.gaussians": ("GaussianCloud",),
     "meshsplats.images.writing": ("save_image",),
     "meshsplats.mesh": ("SplatMesh",),
@@ -93,6 +98,9 @@ _HOME = {
     "meshsplats.rendering.autograd": ("rasterize",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
+    "meshsplats.tiles.building": ("TileOptions", "build_tiles"),
+    "meshsplats.tiles.drawing": ("render_tiles",),
+    "meshsplats.tiles.tileset": ("Tileset",),
     "meshsplats.viewer.page": ("PageOptions", "make_page"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
@@ -119,13 +127,17 @@ __all__ = [
     "RunOptions",
     "SplatMesh",
     "SplatStream",
+    "TileOptions",
+    "Tileset",
     "View",
     "ViewImage",
     "__version__",
     "bake_filter",
     "bind",
+    "build_tiles",
     "compare",
     "convert",
+    "convert_blocks",
     "cut_mesh",
     "dome",
     "draw_splats",
@@ -147,11 +159,13 @@ __all__ = [
     "psnr",
     "render",
     "render_splats",
+    "render_tiles",
     "save_cameras",
     "save_gaussian_blocks",
     "save_gaussians",
     "save_image",
     "save_mesh",
+    "save_mesh_blocks",
     "simplify",
     "splat_dataset",
     "ssim",

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import tyro
@@ -26,6 +26,9 @@ from meshsplats.evaluation.backgrounds import Background
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+
+if TYPE_CHECKING:
+    from meshsplats.formats.gaussians import SplatStream
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
@@ -69,6 +72,12 @@ class SplatOptions:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
+
+    def stream(self, path: Path) -> SplatStream:
+        """The splats of a file in blocks."""
+        from meshsplats.formats.gaussians import stream_gaussians
+
+        return stream_gaussians(path, strict=self.strict, axes=self.axes)
 
     def again(self) -> list[str]:
         """The words with which another command reads the file with the same axes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -61,7 +61,7 @@ from meshsplats.mesh import SplatMesh, checked_cutoff
 _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect with --as-splats."""
 _FOR_SPLATS = (
-    *("input", "output", "cameras", "data", "formats", "as_splats", "no_preview", "no_sidecar"),
+    *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
     *("conversion", "reading", "json", "force"),
 )
 """Options of the command that have one."""
@@ -137,6 +137,9 @@ class Convert(Command):
     --crop, --min-opacity and --max-splats leave."""
     fidelity: Count = None
     """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
+    stream: bool = False
+    """Convert in blocks, so that memory does not grow with the file: into a .ply mesh, or with --as-splats
+    into a .ply of splats, without a preview. The result is the same."""
     no_preview: bool = False
     """Write no preview."""
     no_sidecar: bool = False
@@ -156,7 +159,8 @@ class Convert(Command):
         formats = self._formats(folder)
         self._check(formats or [self.output.suffix.lower()[1:]])
         found = sources(self.input)
-        todo = jobs(found, self.output, formats, preview=not self.no_preview, sidecars=not self.no_sidecar)
+        preview = not (self.no_preview or self.stream)
+        todo = jobs(found, self.output, formats, preview=preview, sidecars=not self.no_sidecar)
         cameras = self._cameras()
         if not folder:
             self._print_result(self._convert(todo[0], cameras), todo[0], cameras)
@@ -190,6 +194,8 @@ class Convert(Command):
         """UsageError or ValueError for options that contradict each other or have no effect."""
         if self.fidelity is not None and self.fidelity < 1:
             raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
+        if self.stream:
+            self._check_stream(kinds)
         if self.as_splats:
             self._check_splat_options()
             return
@@ -271,7 +277,11 @@ class Convert(Command):
             kind = identify(job.source)
             if kind == "cameras" or (kind == "mesh" and self.as_splats):
                 raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
-            if self.as_splats:
+            if self.stream and kind == "mesh":
+                raise FileFormatError(f"{job.source}: a mesh; --stream is for splats")
+            if self.stream:
+                result = self._stream_splats(job) if self.as_splats else self._stream_mesh(job, cameras)
+            elif self.as_splats:
                 result = self._save_splats(job, cameras)
             elif kind == "mesh":
                 result = self._save_again(job)
@@ -313,6 +323,60 @@ class Convert(Command):
             "seconds": {"read": read, "convert": made, "save": saved},
             "fidelity": self._fidelity(cloud, mesh, cameras),
         }
+
+    def _check_stream(self, kinds: Sequence[str]) -> None:
+        """UsageError or ValueError for what needs the whole scene in memory."""
+        from meshsplats.conversion.streaming import refuse_whole
+
+        if tuple(kinds) != ("ply",):
+            raise UsageError("--stream writes .ply; for other programs, 'meshsplats tiles' makes .glb tiles")
+        if self.fidelity is not None or self.alpha != "blend":
+            raise UsageError("--fidelity and --alpha need the whole mesh in memory: leave out --stream")
+        refuse_whole(self._resolved(sources(self.input)))
+
+    def _stream_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
+        """The splats of ``job`` as a mesh, in blocks."""
+        from meshsplats.conversion.streaming import convert_blocks
+        from meshsplats.formats.meshes import save_mesh_blocks
+
+        start = time.perf_counter()
+        if cameras is None:
+            cameras = cameras_beside(job.source) or []
+        up = None if self.up is None else parse_up(self.up)
+        source = _Counted(self.reading.stream(job.source))
+        parts = convert_blocks(source, self.conversion, preset=self.preset, cameras=cameras, up=up)
+        (path,) = job.outputs
+        vertices, triangles, converted = save_mesh_blocks(parts, path)
+        return {
+            "splats": source.count,
+            "converted": converted,
+            "merged": False,
+            "triangles": triangles,
+            "vertices": vertices,
+            "seconds": {"convert": round(time.perf_counter() - start, 4)},
+            "fidelity": None,
+        }
+
+    def _stream_splats(self, job: Job) -> dict[str, Any]:
+        """The splats of ``job`` as a .ply, in blocks."""
+        from meshsplats.conversion.streaming import worth_drawing
+        from meshsplats.formats.gaussians import save_gaussian_blocks
+
+        start = time.perf_counter()
+        source = _Counted(self.reading.stream(job.source))
+        count, degree, kernels = 0, 0, set()
+        for block in source:
+            count += len(worth_drawing(block, self.conversion))
+            degree = max(degree, block.sh_degree)
+            kernels.add(block.kernel)
+        if not count:
+            raise ValueError(f"{job.source}: none of the {source.count:,} splats is left")
+        kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
+        kept = (block.select(worth_drawing(block, self.conversion)) for block in source)
+        (path,) = job.outputs
+        save_gaussian_blocks(kept, path, count, degree=degree, kernel=kernel)
+        seconds = round(time.perf_counter() - start, 4)
+        return {"read": source.count, "written": count, "seconds": seconds}
 
     def _alone(self, job: Job, path: Path) -> Convert:
         """The command that writes ``path`` of ``job`` alone."""
@@ -465,6 +529,20 @@ class Convert(Command):
         elif cameras:
             words += ["--cameras", source if self.cameras is None else self.cameras]
         return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
+
+
+class _Counted:
+    """A stream of splats that counts them."""
+
+    def __init__(self, stream: Iterable[GaussianCloud]) -> None:
+        self._stream = stream
+        self.count = 0
+
+    def __iter__(self) -> Iterator[GaussianCloud]:
+        self.count = 0
+        for block in self._stream:
+            self.count += len(block)
+            yield block
 
 
 def _counts(result: dict[str, Any]) -> str:

@@ -243,9 +243,7 @@ def convert_blocks(
 def refuse_whole(options: ConversionOptions) -> None:
     """Raises ValueError for resolved ``options`` that need all splats in memory."""
     if options.max_splats is not None or options.max_triangles is not None:
-        raise ValueError(
-            "max_splats and max_triangles need all splats in memory: simplify them, or use convert"
-        )
+        raise ValueError("limits on splats or triangles need all splats in memory: use convert")
     if options.detail == "cameras":
         raise ValueError("detail='cameras' needs all splats in memory: use convert")
     if options.footprint == "density":

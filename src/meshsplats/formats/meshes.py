@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from meshsplats.formats.gltf.reader import read_gltf
 from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
 from meshsplats.formats.npz import read_npz, write_npz
 from meshsplats.formats.obj.mesh import read_obj, write_obj
-from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_ply
+from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_blocks, write_mesh_ply
 from meshsplats.formats.sniff import Content
 from meshsplats.formats.usd.reader import read_usd
 from meshsplats.formats.usd.writer import write_usd
@@ -170,6 +170,30 @@ def save_mesh(
         target, needs=expected_bytes(mesh, suffix, compressed="compression" in options)
     ) as temporary:
         writer(mesh, temporary, **options)
+
+
+def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -> tuple[int, int, int]:
+    """Writes one mesh that comes in ``parts``, as from ``convert_blocks``, to a `.ply` file, whole or not at
+    all; the file is that of ``save_mesh`` for the whole mesh.
+
+    Memory holds one part at a time; the disk holds the data twice while they are put together.
+
+    Args:
+        parts: meshes, each with vertex indices of its own, all with the same optional arrays.
+        path: the file, whose name ends in .ply.
+
+    Returns:
+        Counts of vertices, triangles and splats.
+
+    Raises:
+        ValueError: another suffix, no parts, or more than a mesh can number.
+        OSError: the file cannot be written.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".ply":
+        raise ValueError(f"parts of meshes are written as .ply, got {target.name!r}: for others, build tiles")
+    with atomic_path(target) as temporary:
+        return write_mesh_blocks(parts, temporary)
 
 
 def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False) -> int:

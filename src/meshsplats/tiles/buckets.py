@@ -70,7 +70,7 @@ def cloud_of(records: np.ndarray, kernel: Kernel) -> GaussianCloud:
 class Buckets:
     """Files of records in a folder, each the splats of a cell, in the order of their rows."""
 
-    def __init__(self, folder: Path, cube: Cube, journal: Journal, bucket: int = BUCKET) -> None:
+    def __init__(self, folder: Path, cube: Cube, journal: Journal, bucket: int) -> None:
         self._folder, self._cube, self._journal, self._bucket = folder, cube, journal, bucket
 
     def fill(self, records: Iterable[np.ndarray], count: int) -> None:

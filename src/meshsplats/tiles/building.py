@@ -28,7 +28,7 @@ from meshsplats.formats.gaussians import SplatStream
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
-from meshsplats.tiles.buckets import DEPTH, RECORD, Buckets, Cube, cloud_of, records_of
+from meshsplats.tiles.buckets import BUCKET, DEPTH, RECORD, Buckets, Cube, cloud_of, records_of
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.tileset import Node, tile_frame, tile_path, write_tilesets
 
@@ -192,7 +192,7 @@ class _Build:
         self._kernel = scene.kernel
         self._pixels = ScenePixels(scene, self._conversion, None, self._up)
         self._cube = Cube(scene.low, scene.high)
-        buckets = Buckets(self._work / "splats", self._cube, self.journal)
+        buckets = Buckets(self._work / "splats", self._cube, self.journal, BUCKET)
         buckets.fill(self._records(), scene.kept)
         cells = buckets.cells()
         done = {line["key"]: line["splats"] for line in self.journal.steps if line["step"] == "cell"}

@@ -21,7 +21,7 @@ MAX_ERROR = 1.0
 """Screen-space error in pixels up to which a tile is drawn."""
 MAX_TRIANGLES = 4_000_000
 """Triangles that are in memory together, in about 60 bytes each."""
-SMALLEST = 64
+SMALLEST = 16
 """Side in pixels below which an image is not divided."""
 
 

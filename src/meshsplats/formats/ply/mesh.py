@@ -9,9 +9,12 @@ begin with ``meshsplats`` hold the rest.
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 from urllib.parse import quote, unquote
 
 import numpy as np
@@ -33,58 +36,112 @@ _COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diff
 
 def write_mesh_ply(mesh: SplatMesh, path: Path) -> None:
     """Writes ``mesh`` to ``path`` exactly. ValueError for more than ``MAX_PROPERTIES`` columns per vertex."""
-    check_attribute_names(mesh)
-    up = " ".join(repr(float(u)) for u in mesh.up)
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        "comment meshsplats 1",
-        f"comment meshsplats up {up}",
-        f"comment meshsplats blending {mesh.blending}",
-    ]
-    if mesh.filter_px2:
-        header.append(f"comment meshsplats filter_px2 {mesh.filter_px2!r}")
-    columns = [mesh.vertices]
-    names = ["x", "y", "z"]
-    if mesh.normals is not None:
-        columns.append(mesh.normals)
-        names += ["nx", "ny", "nz"]
-    columns.append(mesh.colors)
-    names += ["red", "green", "blue", "alpha"]
-    extras = mesh.extras().items()
-    tables = {field.name: values for field, values in extras if field.per == "vertex"}
-    for name, values in mesh.attributes.items():
-        stored = _ATTRIBUTE + quote(name, safe="")
-        tables[stored] = values
-        header.append(f"comment meshsplats attribute {stored} {'-' if values.ndim == 1 else values.shape[1]}")
-    for stored, values in tables.items():
-        names += _properties(stored, None if values.ndim == 1 else values.shape[1])
-        columns.append(values.reshape(len(values), -1) if values.size else values.reshape(len(values), 0))
-    if len(names) > MAX_PROPERTIES:
-        raise ValueError(f"{len(names)} columns per vertex are more than {MAX_PROPERTIES}; save as .npz")
-    header.append(f"element vertex {len(mesh.vertices)}")
-    header += [f"property float {name}" for name in names]
-    header.append(f"element face {len(mesh.faces)}")
-    header.append("property list uchar int vertex_indices")
-    fields: list[tuple[str, str] | tuple[str, str, int]] = [("n", "u1"), ("corners", "<i4", 3)]
-    numbers = {field.name: values for field, values in extras if field.per == "face"}
-    for name in numbers:
-        header.append(f"property int {name}")
-        fields.append((name, "<i4"))
+    layout = _Layout(mesh)
     with open(path, "wb") as file:
-        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        file.write(layout.header(len(mesh.vertices), len(mesh.faces)))
+        layout.write_vertices(mesh, file)
+        layout.write_faces(mesh, file, 0)
+
+
+def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int, int]:
+    """Writes one mesh that comes in ``parts``, each with vertex indices of its own; the file is that of
+    ``write_mesh_ply`` for all of them together.
+
+    Returns counts of vertices, triangles and splats. Raises ValueError if there are no parts, or more than a
+    mesh can number.
+    """
+    vertices = faces = splats = 0
+    layout: _Layout | None = None
+    with (
+        tempfile.TemporaryFile(dir=path.parent) as first,
+        tempfile.TemporaryFile(dir=path.parent) as second,
+        open(path, "wb") as file,
+    ):
+        for part in parts:
+            layout = layout or _Layout(part)
+            layout.write_vertices(part, first)
+            layout.write_faces(part, second, vertices)
+            vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
+            splats += part.splat_count or 0
+            if max(vertices, faces) > np.iinfo(np.int32).max:
+                raise ValueError(f"{path}: more than 2^31 - 1 vertices or triangles; build a tileset instead")
+        if layout is None:
+            raise ValueError(f"{path}: no mesh to write")
+        file.write(layout.header(vertices, faces))
+        for spooled in (first, second):
+            spooled.seek(0)
+            shutil.copyfileobj(spooled, file, 1 << 20)
+    return vertices, faces, splats
+
+
+class _Layout:
+    """Elements and properties of the file of a mesh, and of others with the same optional arrays."""
+
+    def __init__(self, mesh: SplatMesh) -> None:
+        check_attribute_names(mesh)
+        up = " ".join(repr(float(u)) for u in mesh.up)
+        self._head = [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment meshsplats 1",
+            f"comment meshsplats up {up}",
+            f"comment meshsplats blending {mesh.blending}",
+        ]
+        if mesh.filter_px2:
+            self._head.append(f"comment meshsplats filter_px2 {mesh.filter_px2!r}")
+        self._names = ["x", "y", "z"]
+        if mesh.normals is not None:
+            self._names += ["nx", "ny", "nz"]
+        self._names += ["red", "green", "blue", "alpha"]
+        for name, values in mesh.attributes.items():
+            width = "-" if values.ndim == 1 else values.shape[1]
+            self._head.append(f"comment meshsplats attribute {_stored(name)} {width}")
+        for stored, values in _tables(mesh).items():
+            self._names += _properties(stored, None if values.ndim == 1 else values.shape[1])
+        if len(self._names) > MAX_PROPERTIES:
+            count = len(self._names)
+            raise ValueError(f"{count} columns per vertex are more than {MAX_PROPERTIES}; save as .npz")
+        self._numbers = [field.name for field, _ in mesh.extras().items() if field.per == "face"]
+
+    def header(self, vertices: int, faces: int) -> bytes:
+        lines = [*self._head, f"element vertex {vertices}"]
+        lines += [f"property float {name}" for name in self._names]
+        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
+        lines += [f"property int {name}" for name in self._numbers]
+        return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+    def write_vertices(self, mesh: SplatMesh, file: IO[bytes]) -> None:
+        columns = [mesh.vertices, *([] if mesh.normals is None else [mesh.normals]), mesh.colors]
+        for values in _tables(mesh).values():
+            columns.append(values.reshape(len(values), -1) if values.size else values.reshape(len(values), 0))
         for start in range(0, len(mesh.vertices), _ROWS):
             part = slice(start, start + _ROWS)
             rows = np.concatenate([c[part] for c in columns], axis=1).astype("<f4", copy=False)
             file.write(rows.data)
+
+    def write_faces(self, mesh: SplatMesh, file: IO[bytes], first: int) -> None:
+        """``first``: index of the mesh's first vertex in the file."""
+        fields: list[tuple[str, str] | tuple[str, str, int]] = [("n", "u1"), ("corners", "<i4", 3)]
+        fields += [(name, "<i4") for name in self._numbers]
         for start in range(0, len(mesh.faces), _ROWS):
             part = slice(start, start + _ROWS)
             faces = np.empty(len(mesh.faces[part]), np.dtype(fields))
             faces["n"] = 3
-            faces["corners"] = mesh.faces[part]
-            for name, values in numbers.items():
-                faces[name] = values[part]
+            faces["corners"] = mesh.faces[part] + np.int32(first)
+            for name in self._numbers:
+                faces[name] = getattr(mesh, name)[part]
             file.write(faces.data)
+
+
+def _stored(name: str) -> str:
+    """Name in the file of an attribute."""
+    return _ATTRIBUTE + quote(name, safe="")
+
+
+def _tables(mesh: SplatMesh) -> dict[str, np.ndarray]:
+    """Arrays of vertices that only this project reads, by their names in the file."""
+    extras = {field.name: values for field, values in mesh.extras().items() if field.per == "vertex"}
+    return extras | {_stored(name): values for name, values in mesh.attributes.items()}
 
 
 def _properties(name: str, columns: int | None) -> tuple[str, ...]:

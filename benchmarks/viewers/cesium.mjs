@@ -1,0 +1,85 @@
+// Shows a tileset in CesiumJS in a headless Chromium, and saves an image.
+//
+//   node cesium.mjs TILESET_FOLDER IMAGE.png [MAXIMUM_SCREEN_SPACE_ERROR] [RANGE]
+//
+// Runs in a folder where `npm install cesium puppeteer-core` was run; CHROMIUM names the browser. RANGE: distance of
+// the camera in radii of the tileset. Prints the tiles that were loaded and their triangles.
+
+import fs from 'fs';
+import http from 'http';
+import path from 'path';
+import { createRequire } from 'module';
+import { pathToFileURL } from 'url';
+
+const require = createRequire(path.join(process.cwd(), 'index.js'));
+const { default: puppeteer } = await import(pathToFileURL(require.resolve('puppeteer-core')).href);
+const [tileset, image, error = '2', range = '2.2'] = process.argv.slice(2);
+const cesium = path.join(process.cwd(), 'node_modules', 'cesium', 'Build', 'Cesium');
+
+const PAGE = `<!doctype html><link rel="icon" href="data:,">
+<link rel="stylesheet" href="/cesium/Widgets/CesiumWidget/CesiumWidget.css">
+<style>html, body, #c { margin: 0; width: 100%; height: 100%; overflow: hidden }</style><div id="c"></div>
+<script>window.CESIUM_BASE_URL = '/cesium/';</script>
+<script src="/cesium/Cesium.js"></script>
+<script>
+window.show = async (error, range) => {
+  Cesium.Ion.defaultAccessToken = undefined;
+  const viewer = new Cesium.CesiumWidget('c', {
+    baseLayer: false, globe: false, skyBox: false, skyAtmosphere: false, msaaSamples: 4,
+    contextOptions: { webgl: { preserveDrawingBuffer: true } },
+  });
+  viewer.scene.backgroundColor = Cesium.Color.WHITE;
+  const tileset = await Cesium.Cesium3DTileset.fromUrl('/tileset/tileset.json', { maximumScreenSpaceError: error });
+  viewer.scene.primitives.add(tileset);
+  const sphere = tileset.boundingSphere;
+  viewer.camera.lookAt(
+    sphere.center, new Cesium.HeadingPitchRange(0, Cesium.Math.toRadians(-25), range * sphere.radius));
+  const failures = [];
+  tileset.tileFailed.addEventListener(event => failures.push(event.url + ': ' + event.message));
+  await new Promise(done => {
+    let calm = 0;
+    viewer.scene.postRender.addEventListener(() => {
+      calm = tileset.tilesLoaded ? calm + 1 : 0;
+      if (calm > 5) done();
+    });
+  });
+  const statistics = tileset.statistics;
+  return {
+    version: Cesium.VERSION, failures, selected: statistics.selected,
+    loaded: statistics.numberOfLoadedTilesTotal, triangles: statistics.numberOfTrianglesSelected,
+  };
+};
+</script>`;
+
+const TYPES = { '.js': 'text/javascript', '.json': 'application/json', '.css': 'text/css', '.wasm': 'application/wasm' };
+const server = http.createServer((request, response) => {
+  const url = decodeURIComponent(request.url.split('?')[0]);
+  try {
+    if (url === '/') {
+      response.setHeader('content-type', 'text/html');
+      response.end(PAGE);
+      return;
+    }
+    const [, root, ...rest] = url.split('/');
+    const file = path.join({ cesium, tileset }[root], ...rest);
+    response.setHeader('content-type', TYPES[path.extname(file)] ?? 'application/octet-stream');
+    response.end(fs.readFileSync(file));
+  } catch {
+    response.statusCode = 404;
+    response.end();
+  }
+}).listen(0);
+const browser = await puppeteer.launch({
+  executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
+  headless: true,
+  protocolTimeout: 900000,
+  args: ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader'],
+});
+const page = await browser.newPage();
+page.on('pageerror', problem => console.error(String(problem)));
+await page.setViewport({ width: 480, height: 360 });
+await page.goto('http://localhost:' + server.address().port + '/');
+console.log(JSON.stringify(await page.evaluate((e, r) => window.show(e, r), Number(error), Number(range))));
+await page.screenshot({ path: image });
+await browser.close();
+server.close();
