@@ -2,10 +2,10 @@
 
     python benchmarks/webgpu.py [--scenes 160k 1M 4M] [--mesh FILE --side 400] [--repeat 3]
 
-Prints a Markdown table: difference from the core (PSNR, pixels off by more than 1e-3), tests of a triangle at a
-sample per blended fragment, walks through a tile list per tile, samples whose first queue was too short,
-dispatches of a frame, megabytes of buffers, and medians of wall time and processor time in milliseconds. Times
-on a software adapter (named in the first line) say nothing about a GPU.
+Prints a Markdown table: difference from the core (PSNR, pixels off by more than 1e-3), tests of a triangle at
+a sample per blended fragment, walks through a tile list per tile, samples whose first queue was too short,
+dispatches of a frame, megabytes of buffers, and medians of wall time and processor time in milliseconds.
+Times on a software adapter (named in the first line) say nothing about a GPU.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scenes", nargs="*", default=["160k", "1M"], choices=list(SCENES))
     parser.add_argument("--mesh", type=Path, nargs="*", default=[])
     parser.add_argument("--side", type=int, default=400)

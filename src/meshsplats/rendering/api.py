@@ -91,9 +91,9 @@ def render(
     elsewhere: each sample has the colour of the nearest opaque fragment, or of the background. This is the
     image of a depth buffer with an alpha test, or with triangles that were cut at the level set of c.
 
-    ``device="gpu"`` draws the same image on the best GPU of the machine (extra ``gpu``), in single precision
-    throughout: a few samples that lie within rounding of an edge differ. It never falls back to the CPU. The
-    mesh of the last call stays on the GPU.
+    ``device="gpu"`` draws the same image on the best GPU of the machine (extra ``gpu``): a few samples
+    differ, where two triangles are within rounding of one depth. It never falls back to the CPU. The mesh of
+    the last call stays on the GPU.
 
     Args:
         mesh: the triangles.

@@ -30,19 +30,77 @@ fn rotate(d: vec3f) -> vec3f {
   return vec3f(dot(frame.right.xyz, d), dot(frame.down.xyz, d), dot(frame.forward.xyz, d));
 }
 fn world(i: u32) -> vec3f { return vec3f(vertices[3u * i], vertices[3u * i + 1u], vertices[3u * i + 2u]); }
-// The difference first: both are near each other, so little is lost.
-fn to_camera(p: vec3f) -> vec3f { return rotate((p - frame.center.xyz) - frame.center_rest.xyz); }
-fn project_point(c: vec3f) -> vec4f {
-  if (!(c.z >= frame.near)) {
-    return vec4f(fma(frame.lens.x, c.x, frame.lens.z * c.z), fma(frame.lens.y, c.y, frame.lens.w * c.z), 0.0, c.z);
-  }
-  let w = 1.0 / c.z;
-  return vec4f(fma(frame.lens.x, c.x * w, frame.lens.z), fma(frame.lens.y, c.y * w, frame.lens.w), w, c.z);
+
+// Positions in the image are computed with twice the precision: a sample of a tiny triangle is easily on the wrong
+// side of an edge. A vec2f stands for the sum of its two numbers (Dekker 1971). Compilers may take a + b - a for b, but
+// not across integers: `kept` has the value of x.
+fn kept(x: f32) -> f32 { return bitcast<f32>(bitcast<u32>(x) ^ bitcast<u32>(frame.right.w)); }
+fn sum_of(a: f32, b: f32) -> vec2f {
+  let s = kept(a + b);
+  let t = kept(s - a);
+  return vec2f(s, (a - kept(s - t)) + (b - t));
+}
+fn product_of(a: f32, b: f32) -> vec2f {
+  let p = kept(a * b);
+  let a1 = bitcast<f32>(bitcast<u32>(a) & 0xfffff000u);  // products of halves are exact
+  let b1 = bitcast<f32>(bitcast<u32>(b) & 0xfffff000u);
+  let a2 = kept(a - a1);
+  let b2 = kept(b - b1);
+  return vec2f(p, ((kept(a1 * b1) - p) + kept(a1 * b2) + kept(a2 * b1)) + a2 * b2);
+}
+fn add_pairs(a: vec2f, b: vec2f) -> vec2f {
+  let s = sum_of(a.x, b.x);
+  return sum_of(s.x, s.y + (a.y + b.y));
+}
+fn multiply_pairs(a: vec2f, b: vec2f) -> vec2f {
+  let p = product_of(a.x, b.x);
+  return sum_of(p.x, p.y + (a.x * b.y + a.y * b.x));
+}
+fn along(axis: vec4f, rest: vec4f, x: vec2f, y: vec2f, z: vec2f) -> vec2f {
+  let xy = add_pairs(multiply_pairs(vec2f(axis.x, rest.x), x), multiply_pairs(vec2f(axis.y, rest.y), y));
+  return add_pairs(xy, multiply_pairs(vec2f(axis.z, rest.z), z));
+}
+
+struct Point { x: vec2f, y: vec2f, z: vec2f };
+// In camera space.
+fn precise_point(p: vec3f) -> Point {
+  let x = add_pairs(sum_of(p.x, -frame.center.x), vec2f(-frame.center_rest.x, 0.0));
+  let y = add_pairs(sum_of(p.y, -frame.center.y), vec2f(-frame.center_rest.y, 0.0));
+  let z = add_pairs(sum_of(p.z, -frame.center.z), vec2f(-frame.center_rest.z, 0.0));
+  return Point(
+    along(frame.right, frame.right_rest, x, y, z), along(frame.down, frame.down_rest, x, y, z),
+    along(frame.forward, frame.forward_rest, x, y, z));
+}
+fn to_camera(p: vec3f) -> vec3f {
+  let c = precise_point(p);
+  return vec3f(c.x.x, c.y.x, c.z.x);
+}
+// (x, y) in the image of a point beyond the near plane: x.x + x.y, y.x + y.y.
+struct Place { x: vec2f, y: vec2f, w: f32 };
+fn place_of(c: Point) -> Place {
+  let w = 1.0 / c.z.x;
+  let error = product_of(w, c.z.x);
+  let inverse = sum_of(w, w * (((1.0 - error.x) - error.y) - w * c.z.y));
+  return Place(
+    add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.x, frame.lens_rest.x), c.x), inverse), vec2f(frame.lens.z, frame.lens_rest.z)),
+    add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.y, frame.lens_rest.y), c.y), inverse), vec2f(frame.lens.w, frame.lens_rest.w)),
+    w);
+}
+fn pack_place(p: Place) -> vec4f {
+  let x = vec2f(p.x.x, p.y.x);
+  return vec4f(x, p.w, pack_rest(x, vec2f(p.x.y, p.y.y)));
 }
 
 @compute @workgroup_size(256)
 fn project(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x < frame.vertices) { projected_out[id.x] = project_point(to_camera(world(id.x))); }
+  if (id.x >= frame.vertices) { return; }
+  let p = precise_point(world(id.x));
+  let c = vec3f(p.x.x, p.y.x, p.z.x);
+  if (c.z >= frame.near) {
+    projected_out[id.x] = pack_place(place_of(p));
+  } else {
+    projected_out[id.x] = vec4f(fma(frame.lens.xy, c.xy, frame.lens.zw * c.z), 0.0, c.z);
+  }
 }
 
 // ------------------------------------------------------------------------------------------------ low-pass filter
@@ -130,7 +188,7 @@ fn widen(@builtin(global_invocation_id) id: vec3u) {
   let scale = 1.0 / sqrt(b.x + b.z + 2.0 * d);
   let a = vec3f(b.x + d, b.y, b.z + d) * scale;
   if (!(a.x + abs(a.y) + a.z < MAX_TRANSFORM)) { return; }
-  let start = project_point(origin).xy;
+  let start = place_of(precise_point(first));
   for (var f = begin; f < end; f++) {
     for (var k = 0u; k < 3u; k++) {
       let i = mesh[3u * f + k];
@@ -138,7 +196,9 @@ fn widen(@builtin(global_invocation_id) id: vec3u) {
       let q = vec2f(dot(axis, p), axis.x * p.y - axis.y * p.x) - mean;
       let r = mean + vec2f(a.x * q.x + a.y * q.y, a.y * q.x + a.z * q.y);
       let moved = middle + vec2f(axis.x * r.x - axis.y * r.y, axis.y * r.x + axis.x * r.y);
-      projected_out[i] = vec4f(start + moved, projected_out[i].zw);
+      let x = add_pairs(start.x, vec2f(moved.x, 0.0));
+      let y = add_pairs(start.y, vec2f(moved.y, 0.0));
+      projected_out[i] = pack_place(Place(x, y, projected_out[i].z));
     }
   }
 }

@@ -153,7 +153,11 @@ fn edge(p: vec4f, q: vec4f, o: vec2f) -> Edge {
   var k = q;
   var s = 1.0;
   if (swapped) { j = q; k = p; s = -1.0; }
-  if (p.z > 0.0 && q.z > 0.0) { return Edge(s * (j.y - k.y), s * (k.x - j.x), j.x - o.x, j.y - o.y, 0.0); }
+  if (p.z > 0.0 && q.z > 0.0) {
+    let start = (j.xy - o) + rest_of(j);
+    let step = (k.xy - j.xy) + (rest_of(k) - rest_of(j));
+    return Edge(-s * step.y, s * step.x, start.x, start.y, 0.0);
+  }
   let u = homogeneous(j);
   let v = homogeneous(k);
   let n = cross(vec3f(u.xy - o * u.z, u.z), vec3f(v.xy - o * v.z, v.z));
@@ -186,8 +190,16 @@ fn covers(slot: u32, p: vec2f) -> bool {
 
 // Sets up a face in a slot, for the tile with the corner o; false if it covers no sample of it.
 fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
-  let i = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
-  let p = array<vec4f, 3>(projected[i.x], projected[i.y], projected[i.z]);
+  var i = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
+  var p = array<vec4f, 3>(projected[i.x], projected[i.y], projected[i.z]);
+  // The nearest corner first: add_fragment adds to its 1 / z, with the same bits for any first corner.
+  if (p[1].z > p[0].z && p[1].z >= p[2].z) {
+    i = i.yzx;
+    p = array<vec4f, 3>(p[1], p[2], p[0]);
+  } else if (p[2].z > p[0].z && p[2].z > p[1].z) {
+    i = i.zxy;
+    p = array<vec4f, 3>(p[2], p[0], p[1]);
+  }
   let visible = vec3<bool>(p[0].z > 0.0, p[1].z > 0.0, p[2].z > 0.0);
   if (!any(visible)) { return false; }
   var box = vec2u(0xffffffffu);
@@ -216,8 +228,8 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
   var farthest = min(min(p[0].z, p[1].z), p[2].z);
   var nearest = max(max(p[0].z, p[1].z), p[2].z);
   if (all(visible)) {
-    let u = p[1].xy - p[0].xy;
-    let w = p[2].xy - p[0].xy;
+    let u = (p[1].xy - p[0].xy) + (rest_of(p[1]) - rest_of(p[0]));
+    let w = (p[2].xy - p[0].xy) + (rest_of(p[2]) - rest_of(p[0]));
     let d = u.x * w.y - w.x * u.y;
     if (!(abs(d) > 1e-30)) { return false; }
     if (d < 0.0) { flip = -1.0; }
@@ -231,10 +243,11 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
     if (!(abs(det) > 1e-30)) { return false; }
     if (det < 0.0) { flip = -1.0; }
     inverse = 1.0 / abs(det);
+    let z = vec3f(depth_of(p[0]), depth_of(p[1]), depth_of(p[2]));
     scale = vec3f(
-      select(1.0, p[1].w * p[2].w, visible.y && visible.z), select(1.0, p[2].w * p[0].w, visible.z && visible.x),
-      select(1.0, p[0].w * p[1].w, visible.x && visible.y));
-    farthest = 1.0 / max(max(p[0].w, p[1].w), p[2].w);
+      select(1.0, z.y * z.z, visible.y && visible.z), select(1.0, z.z * z.x, visible.z && visible.x),
+      select(1.0, z.x * z.y, visible.x && visible.y));
+    farthest = 1.0 / max(max(z.x, z.y), z.z);
     nearest = 1.0 / frame.near;
   }
   var bits = face;
@@ -283,7 +296,8 @@ fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32) {
   let inverse = ends[slot].w;
   var depth = 0.0;  // 1 / z
   if (inverse == 0.0) {
-    depth = sum / (e.x + e.y + e.z);
+    // Differences of 1 / z are small and nearly exact, so little is lost.
+    depth = scale.x + (e.y * (scale.y - scale.x) + e.z * (scale.z - scale.x)) / (e.x + (e.y + e.z));
   } else {
     depth = sum * inverse;
     if (depth > scale.w) { return; }  // nearer than the near plane

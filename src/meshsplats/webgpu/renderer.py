@@ -472,7 +472,8 @@ def frame_uniform(
     center = camera.center
     data[12:15] = center
     data[16:19] = center - data[12:15]
-    data[20:24] = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) * s
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) * s
+    data[20:24] = lens
     data[24:28] = camera.near, settings.min_transmittance, settings.cutoff, settings.filter_px2 * s * s
     words[28:32] = w, h, _tiles(w), _tiles(h)
     words[32:36] = counts["vertices"], counts["faces"], counts["runs"], counts["fans"]
@@ -480,6 +481,9 @@ def frame_uniform(
     words[39] = BUDGET if settings.budget is None else settings.budget
     words[40:43] = offsets
     words[43] = s
+    for i in range(3):
+        data[44 + 4 * i : 47 + 4 * i] = camera.world_to_camera[i, :3] - data[4 * i : 4 * i + 3]
+    data[56:60] = lens - data[20:24]
     return data
 
 
