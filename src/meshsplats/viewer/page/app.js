@@ -211,8 +211,7 @@ class App {
     });
     this.crop = new CropBox(settings.extent, this.mesh, this.splats, kept => {
       this.kept = kept;
-      this.sorted?.crop(kept);
-      this.exact?.crop(kept);
+      this.cropped = true; // the renderers hear of it before the next frame, never within one
       this.changed();
     });
     element("crop").addEventListener("toggle", () => this.changed());
@@ -244,10 +243,11 @@ class App {
       const now = await new Promise(requestAnimationFrame);
       this.#advance(performance.now(), Math.min(100, now - before) / 1000);
       before = now;
+      const wasExact = Boolean(this.exact);
       try {
         await this.#frame(now);
       } catch (error) {
-        if (!this.exact || !this.sorted) {
+        if (!wasExact || !this.sorted) {
           this.say(`Drawing failed: ${error.message}`);
           document.body.dataset.state = "failed";
           return;
@@ -292,6 +292,8 @@ class App {
     const quiet = performance.now() - this.changedAt >= QUIET && !this.#moves();
     if (this.dirty) {
       this.dirty = false;
+      if (this.cropped) for (const renderer of [this.sorted, this.exact]) renderer?.crop(this.kept);
+      this.cropped = false;
       this.passes = 0;
       this.finished = false;
       this.#measure();
@@ -386,7 +388,7 @@ class App {
       ...(splats ? { splats: shown ? `${number(shown.splats.length)} of ${number(splats.count)}` : number(splats.count) } : {}),
       image: `${width} × ${height}`,
       "exact frame": this.exactTook === undefined ? "–" : `${number(this.exactTook)} ms`,
-      "graphics": exact ? this.exact.name : this.sorted?.name ?? "",
+      "graphics": (exact ? this.exact?.name : this.sorted?.name) ?? "",
       "first picture": `${number(Number(document.body.dataset.firstPicture))} ms`,
       position: point(view.position),
       direction: point(view.forward),
