@@ -286,3 +286,7 @@ def test_only_fans_that_beat_opaque_triangles_stay_blended():
     hybrid = with_soft_splats(core, start, views, 0.5)
     assert hybrid.face_splat[is_blended(hybrid)].tolist() == [1] * len(fans[1].faces)
     assert not is_blended(with_soft_splats(core, start, views, 0.4)).any()
+    # Where the opaque triangles are right, none.
+    views = [View(view, ViewImage(render(core, view, background=(1, 1, 1)).color))]
+    assert softness(core, start, views)[1] < 0
+    assert not is_blended(with_soft_splats(core, start, views, 0.5)).any()
