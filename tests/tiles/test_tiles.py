@@ -32,6 +32,7 @@ from meshsplats.cli import main
 from meshsplats.conversion import ConversionOptions
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.tiles import buckets, building
+from meshsplats.tiles import tileset as tilesets
 from meshsplats.tiles.building import TileOptions, build_tiles
 from meshsplats.tiles.drawing import choose_tiles, reaches, render_tiles, screen_error
 from meshsplats.tiles.journal import Journal
@@ -50,8 +51,9 @@ def splats(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch):
-    """Cells of few splats in memory, so that a small scene needs several."""
+    """Cells of few splats and files of few levels, so that a small scene needs several."""
     monkeypatch.setattr(building, "BUCKET", 3000)
+    monkeypatch.setattr(tilesets, "LEVELS_PER_FILE", 2)
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +61,7 @@ def tileset(splats, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tiles") / "tileset"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(building, "BUCKET", 3000)
+        patch.setattr(tilesets, "LEVELS_PER_FILE", 2)
         build_tiles(stream_gaussians(splats, block=1000), folder, SMALL)
     return folder
 
@@ -248,8 +251,8 @@ def test_a_run_that_fails_anywhere_is_resumed(splats, tileset, tmp_path, monkeyp
 RUN = """
 import sys
 from meshsplats import stream_gaussians
-from meshsplats.tiles import building
-building.BUCKET = 3000
+from meshsplats.tiles import building, tileset
+building.BUCKET, tileset.LEVELS_PER_FILE = 3000, 2
 source, out, resume = sys.argv[1:]
 building.build_tiles(
     stream_gaussians(source), out, building.TileOptions(max_triangles=4096), resume=resume == "resume"

@@ -1,8 +1,8 @@
 """tileset.json of 3D Tiles 1.1: writing an octree of tiles, and reading it again.
 
 Specification: https://docs.ogc.org/cs/22-025r4/22-025r4.html. Boxes are in the frame of the tileset, whose z
-axis points up. Every third level of the octree is the root of a tileset file of its own, in a folder of its
-own, so that no file grows with the scene.
+axis points up. On every third level of the octree, tiles with children are the roots of tileset files, each
+in a folder of its own, so that no file grows with the scene.
 """
 
 from __future__ import annotations
@@ -103,9 +103,10 @@ def _folders(key: str) -> list[str]:
 
 
 def _starts_file(key: str, nodes: dict[str, Node], root: str) -> bool:
-    """Whether a tile is the root of a tileset file: its folder is not that of the tile above."""
+    """Whether a tile is the root of a tileset file: it has children, and its folder is not that of the tile
+    above."""
     above = _above(key, nodes)
-    return _group(key) != ("" if above == root else _group(above))
+    return bool(nodes[key].children) and _group(key) != ("" if above == root else _group(above))
 
 
 def _above(key: str, nodes: dict[str, Node]) -> str:
@@ -122,7 +123,7 @@ def _tile(node: Node, nodes: dict[str, Node], group: str) -> dict[str, Any]:
     }
     children = []
     for key in node.children:
-        if _group(key) == group:
+        if _group(key) == group or not nodes[key].children:
             children.append(_tile(nodes[key], nodes, group))
         else:
             uri = _relative("/".join([*_folders(key), NAME]), group)
