@@ -29,7 +29,7 @@ RESOLUTION = 96
 VIEWS = 40
 _SIDE = 288
 """Side in pixels of the depth images."""
-_BEHIND = 0.3
+_BEHIND = 0.7
 """Weight of distances behind a surface: sheets without thickness count as thin parts."""
 _NEAR = 2
 """Distance in voxels, along each axis, within which a splat has its foot on the surface."""
