@@ -250,10 +250,11 @@ class Render(Command):
             background = tuple(srgb_to_linear(np.array(background)).tolist())
         samples = self.draw.samples
         most = MAX_ERROR if self.max_error is None else self.max_error
-        if samples is None and isinstance(scene, Tileset):
-            samples = samples_for(scene, cameras, most)
-        elif samples is None:
-            samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
+        if samples is None:
+            if isinstance(scene, Tileset):
+                samples = samples_for(scene, cameras, most)
+            else:
+                samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
         options: dict[str, Any] = {
             "background": background,
             "samples": samples,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -262,7 +262,7 @@ class _Piece:
     def select(self, index: np.ndarray) -> _Piece:
         if len(index) == len(self.rows):
             return self
-        own = {name: np.take(getattr(self.fans, name), index, axis=0) for name in _PER_SPLAT}
+        own: dict[str, Any] = {name: np.take(getattr(self.fans, name), index, axis=0) for name in _PER_SPLAT}
         return _Piece(
             self.cloud.select(index), self.rows[index], self.colors[index], self.fans._replace(**own)
         )
@@ -271,7 +271,9 @@ class _Piece:
     def together(pieces: Sequence[_Piece]) -> _Piece:
         if len(pieces) == 1:
             return pieces[0]
-        own = {name: np.concatenate([getattr(p.fans, name) for p in pieces]) for name in _PER_SPLAT}
+        own: dict[str, Any] = {
+            name: np.concatenate([getattr(p.fans, name) for p in pieces]) for name in _PER_SPLAT
+        }
         return _Piece(
             joined([p.cloud for p in pieces]),
             np.concatenate([p.rows for p in pieces]),

@@ -200,8 +200,8 @@ class _Build:
         for cell, files in cells.items():
             if cell not in done:
                 records = buckets.read(files)
-                nodes, merged = self._subtree(cell, records)
-                self._keep(cell, nodes, merged)
+                own, merged = self._subtree(cell, records)
+                self._keep(cell, own, merged)
                 done[cell] = len(records)
                 self.journal.add("cell", key=cell, splats=done[cell])
             buckets.remove(files)

@@ -312,7 +312,7 @@ def _numbers(value: Any, count: int, what: str, path: Path) -> np.ndarray:
 
 
 def _error(owner: dict[str, Any], path: Path) -> float:
-    value = owner.get("geometricError")
+    value: Any = owner.get("geometricError")
     if not _is_number(value) or not 0 <= value < 1e30:
         raise FileFormatError(f"{path}: geometricError must be a number >= 0, got {str(value)[:40]}")
     return float(value)
