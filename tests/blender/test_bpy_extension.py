@@ -152,10 +152,10 @@ def test_a_whole_session(packed, tmp_path):
             "hidden": [True, True, False],
             "poll": False,
         }
-    assert report["levels"] == [
-        "chain",
-        ["chain.001 level 0", ["chain.001 level 0"], False],
-        ["chain.001 level 1", ["chain.001 level 1"], True],
+    assert report["levels"][0] == "chain"
+    assert report["levels"][1:] == [
+        [name, [name, f"{name} stand-in", f"{name} light points"], visible]
+        for name, visible in (("chain.001 level 0", False), ("chain.001 level 1", True))
     ]
     assert report["level_triangles"] == [3200, 800]
     names = ["chain.001 level 0", "chain.001 level 1"]

@@ -88,7 +88,9 @@ def test_a_saved_file_shows_the_finest_and_switches_to_the_others(tmp_path, chai
     assert found.name == "ball"
     names = [f"ball level {i}" for i in range(3)]
     assert [child.name for child in found.children] == names
-    assert [[obj.name for obj in child.objects] for child in found.children] == [[name] for name in names]
+    added = ["", " stand-in", " light points"] if light else [""]
+    of_levels = [[obj.name for obj in child.objects] for child in found.children]
+    assert of_levels == [[name + suffix for suffix in added] for name in names]
     assert visible(scene) == ([names[0]], [names[0]])
     assert result["layers"] == max(obj.data[objects.LAYERS] for obj in levels.objects_of(found))
     for i in (0, 2, 1):

@@ -62,7 +62,7 @@ def test_lit_file_has_everything_in_named_collections(tmp_path):
     scene = bpy.context.scene
     named = {c.name: sorted(o.name for o in c.objects) for c in scene.collection.children}
     assert named == {
-        "Splats": ["Splats"],
+        "Splats": ["Splats", "Splats light points", "Splats stand-in"],
         "Cameras": ["view_0000"],
         "Lights": ["Sun"],
         "Surroundings": ["Glass ball", "Ground", "Mirror"],

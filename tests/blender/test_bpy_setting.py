@@ -113,7 +113,7 @@ def test_the_ground_fades_into_the_background(tmp_path, background):
     """No hard horizon: from the ground's colour to the background's it takes many rows, in small steps."""
     mesh, _ = plate(0.5)
     small = SplatMesh(mesh.vertices * 0.3, mesh.faces, mesh.colors, normals=mesh.normals)
-    camera = look_at((0, -0.5, -3), (-0.7, -0.3, 0), width=16, height=160, fov=6.6)  # 60 degrees high
+    camera = look_at((0, -0.5, -3), (-0.7, -0.3, 0), width=24, height=240, fov=6.6)  # 60 degrees high
     options = SceneOptions(light=LightOptions(), samples=32, background=background, denoise=True)
     draw(small, [camera], images=[tmp_path / "a.png"], options=options)
     column = load_image(tmp_path / "a.png").mean(axis=(1, 2))
