@@ -98,7 +98,8 @@ test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest
 
 # One wheel serves all versions of Python.
-build/wheel/made: $(BUILD_INPUTS) $(shell find src -name '*.py') | $(BIN)/python
+PACKAGE_FILES := $(foreach kind,py wgsl js html css,$(shell find src -name '*.$(kind)'))
+build/wheel/made: $(BUILD_INPUTS) $(PACKAGE_FILES) | $(BIN)/python
 	@echo 'Compiling the core: about a minute'
 	@rm -f $(@D)/*.whl
 	@$(PIP) wheel --no-deps --config-settings=build-dir=build/for-wheel --wheel-dir $(@D) .

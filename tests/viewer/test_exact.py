@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +15,8 @@ import meshsplats as ms
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.rendering.looks import image_of
+from meshsplats.viewer.page import _read
+from meshsplats.webgpu.renderer import DrawSettings, frame_uniform
 
 PATIENCE = 400
 """Seconds for shaders that a busy processor compiles."""
@@ -129,6 +133,25 @@ def test_splats_stand_left_of_the_divider_and_the_exact_mesh_right_of_it(page, m
     splats = levels(ms.render_splats(cloud, cameras[0], sh_degree=0).color)
     assert np.abs(image - splats)[:, : half - 1].mean() < 1
     page.run("document.querySelector('[value=mesh]').click()")
+
+
+def test_the_page_writes_the_uniform_of_the_python_host(browser, cameras):
+    """Bit for bit, with the parts of positions that float32 rounds off."""
+    view = cameras[1]
+    counts = {"vertices": 70, "faces": 60, "runs": 10, "fans": 9, "groups": 8}
+    pinhole = {"rows": view.world_to_camera[:3].tolist(), "center": view.center.tolist()} | {
+        name: getattr(view, name) for name in ("fx", "fy", "cx", "cy", "near", "width", "height")
+    }
+    arguments = (pinhole, counts, 4000, [180, 190, 250], 0.7)
+    page = browser.page("about:blank#uniform", WIDTH, HEIGHT)
+    source = re.sub(r"^export ", "", _read("exact.js"), flags=re.MULTILINE)
+    written = page.run(f"{source}; [...new Uint32Array(frameUniform(...{json.dumps(arguments)}).buffer)]")
+    page.close()
+    settings = DrawSettings(filter_px2=0.7, budget=40000)
+    expected = frame_uniform(view, settings, counts, 4000, [180, 190, 250])
+    assert written == expected.view(np.uint32).tolist()
+    rest = expected[[*range(44, 47), *range(48, 51), *range(52, 55), *range(56, 58)]]
+    assert (rest != 0).sum() > 5
 
 
 def layered(cloud: ms.GaussianCloud, camera: ms.Camera) -> ms.SplatMesh:

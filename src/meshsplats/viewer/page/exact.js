@@ -199,8 +199,9 @@ export class ExactRenderer {
     this.#show(pinhole, { first, background, gain }, false);
   }
 
-  #prepare({ width, height, rows, center, fx, fy, cx, cy, near }, filterScale) {
-    const across = Math.ceil(width / TILE), down = Math.ceil(height / TILE), { counts } = this;
+  #prepare(pinhole, filterScale) {
+    const { width, height } = pinhole, { counts } = this;
+    const across = Math.ceil(width / TILE), down = Math.ceil(height / TILE);
     if (across * down > MOST_TILES || width * height > WINDOW) throw new Error("the image is too large");
     counts.tiles = across * down;
     const blocks = Math.ceil(this.capacity / 2048);
@@ -211,14 +212,9 @@ export class ExactRenderer {
     this.#allocate("lists", 16 * (counts.tiles + 1));
     this.#allocate("again", 16 * (counts.tiles + 1));
     this.#allocate("samples", 32 * width * height);
-    const floats = new Float32Array(64), words = new Uint32Array(floats.buffer);
-    rows.forEach((row, k) => floats.set(row.slice(0, 3), 4 * k));
-    floats.set(center, 12);
-    floats.set(center.map((value, k) => value - floats[12 + k]), 16);
-    floats.set([fx, fy, cx, cy, near, 1e-6, -1, this.mesh.filter * filterScale * filterScale], 20);
-    words.set([width, height, across, down, counts.vertices, counts.faces, counts.runs, counts.fans], 28);
-    words.set([counts.groups, this.capacity, 0, BUDGET, ...this.offsets, 1], 36);
-    this.device.queue.writeBuffer(this.buffers.frame, 0, floats);
+    const filter = this.mesh.filter * filterScale * filterScale;
+    const frame = frameUniform(pinhole, counts, this.capacity, this.offsets, filter);
+    this.device.queue.writeBuffer(this.buffers.frame, 0, frame);
   }
 
   // Runs steps and returns the counters.
@@ -298,6 +294,24 @@ export class ExactRenderer {
     paint.end();
     device.queue.submit([encoder.finish()]);
   }
+}
+
+// The uniform `frame` of docs/webgpu.md, one sample a pixel: 64 words, the last four unused. filter: variance in square
+// samples. Each value of the pinhole is split into the nearest float32 and that of the rest.
+export function frameUniform({ width, height, rows, center, fx, fy, cx, cy, near }, counts, capacity, offsets, filter) {
+  const floats = new Float32Array(64), words = new Uint32Array(floats.buffer);
+  const split = (values, high, low) => {
+    floats.set(values, high);
+    floats.set(values.map(value => value - Math.fround(value)), low);
+  };
+  rows.forEach((row, k) => split(row.slice(0, 3), 4 * k, 44 + 4 * k));
+  split(center, 12, 16);
+  split([fx, fy, cx, cy], 20, 56);
+  floats.set([near, 1e-6, -1, filter], 24);
+  words.set([width, height, Math.ceil(width / TILE), Math.ceil(height / TILE)], 28);
+  words.set([counts.vertices, counts.faces, counts.runs, counts.fans], 32);
+  words.set([counts.groups, capacity, 0, BUDGET, ...offsets, 1], 36);
+  return floats;
 }
 
 // Runs of up to 8 consecutive triangles: of one splat, or, without splats, such that each has a vertex of the one
