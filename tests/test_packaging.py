@@ -173,7 +173,8 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
     # blender needs an environment of its own; tests/blender runs it.
     assert {command[1] for command in commands} >= set(cli.COMMANDS) - {"blender"}
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.ply").write_bytes(scene_file.read_bytes())
+    for name in ("scene.ply", "city.ply"):
+        (tmp_path / name).write_bytes(scene_file.read_bytes())
     for command in commands:
         small = ["--width", "48"] if command[1] in ("render", "compare") and "--width" not in command else []
         if command[1] == "finetune":
