@@ -142,12 +142,12 @@ def test_the_page_writes_the_uniform_of_the_python_host(browser, cameras):
     pinhole = {"rows": view.world_to_camera[:3].tolist(), "center": view.center.tolist()} | {
         name: getattr(view, name) for name in ("fx", "fy", "cx", "cy", "near", "width", "height")
     }
-    arguments = (pinhole, counts, 4000, [180, 190, 250], 0.7)
+    arguments = (pinhole, counts, 4000, [180, 190, 250], 0.7, 60000)
     page = browser.page("about:blank#uniform", WIDTH, HEIGHT)
     source = re.sub(r"^export ", "", _read("exact.js"), flags=re.MULTILINE)
     written = page.run(f"{source}; [...new Uint32Array(frameUniform(...{json.dumps(arguments)}).buffer)]")
     page.close()
-    settings = DrawSettings(filter_px2=0.7, budget=40000)
+    settings = DrawSettings(filter_px2=0.7, budget=60000)
     expected = frame_uniform(view, settings, counts, 4000, [180, 190, 250])
     assert written == expected.view(np.uint32).tolist()
     rest = expected[[*range(44, 47), *range(48, 51), *range(52, 55), *range(56, 58)]]

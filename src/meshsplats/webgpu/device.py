@@ -27,9 +27,11 @@ CORE_LIMITS = {
 }
 """What every device has."""
 
-SOFTWARE_BUDGET, BUDGET = 40_000, 4_000_000
-"""Loop iterations of one walk through a tile list. Drivers end what runs too long, some without an error:
-lavapipe cuts loops after 65,535 iterations of an invocation."""
+BUDGET = 4_000_000
+"""Loop iterations of one walk through a tile list. Drivers end what runs too long, some without an error."""
+SOFTWARE_BUDGETS = (60_000, 150_000)
+"""The same for software drivers, one after the other until all tiles are finished. lavapipe cuts loops after
+65,535 iterations of an invocation; they are counted high, so the first is never cut, the second seldom."""
 
 
 class Device:
@@ -40,7 +42,7 @@ class Device:
         self.info: dict[str, str] = {key: str(value) for key, value in dict(adapter.info).items()}
         self.device: Any = adapter.request_device_sync(required_limits=CORE_LIMITS)
         self.binding_limit = CORE_BINDING
-        self.budget = SOFTWARE_BUDGET if self.info["adapter_type"] == "CPU" else BUDGET
+        self.budgets = SOFTWARE_BUDGETS if self.info["adapter_type"] == "CPU" else (BUDGET,)
         self._pipelines: dict[tuple[Any, ...], Any] = {}
         self._modules: dict[tuple[Any, ...], Any] = {}
 

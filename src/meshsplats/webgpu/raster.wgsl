@@ -127,7 +127,7 @@ fn insert(q: f32, face: u32, value: vec4f) {
 
 // Notes a fragment that lies behind the full queue.
 fn drop(q: f32, face: u32) {
-  if (hidden()) { return; }
+  if (limit_q < 0.0 && hidden()) { return; }  // a limit only comes nearer
   limit_q = q;
   limit_face = face;
 }
@@ -476,7 +476,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
   if (again) {
     atomicAdd(&open_count, 1u);
     atomicMin(&begin_again, clean);
-    if (advanced || clean > item.y) { atomicOr(&moved, 1u); }
+    if (advanced) { atomicOr(&moved, 1u); }
   }
   if (!(whole && ended)) { atomicOr(&broken, 1u); }
   if (was_open && !again) { atomicOr(&moved, 1u); }
@@ -498,7 +498,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
     atomicAdd(&counters[12], 1u);
   } else if (left == 0u) {
     atomicAdd(&counters[2], 1u);
-  } else if (atomicLoad(&moved) == 0u) {
+  } else if (atomicLoad(&moved) == 0u && atomicLoad(&begin_again) <= item.y) {
     atomicAdd(&counters[9], 1u);
   } else {
     if (item.w == 0u) { atomicAdd(&counters[11], left); }

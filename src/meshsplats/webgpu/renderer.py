@@ -238,14 +238,25 @@ class MeshRenderer:
         images.values = None if values is None else np.zeros((h, w, values.shape[1]), np.float32)
         if not len(self.mesh.faces):
             return images
+        budgets = self.device.budgets if settings.budget is None else (settings.budget,)
         with self._lock:
             self._prepare_filter(settings)
             waiting = [(0, 0, w, h)]
             while waiting:
                 window = waiting.pop()
-                if not self._fits(window, settings.samples) or not self._draw_window(
-                    camera, window, settings, images, values
-                ):
+                if not self._fits(window, settings.samples):
+                    waiting += _halves(window)
+                    continue
+                for budget in budgets:
+                    try:
+                        drawn = self._draw_window(
+                            camera, window, replace(settings, budget=budget), images, values
+                        )
+                        break
+                    except DeviceError:
+                        if budget == budgets[-1]:
+                            raise
+                if not drawn:
                     waiting += _halves(window)
             images.work.bytes = sum(buffer.size for buffer in self._buffers.values())
         return images
@@ -350,8 +361,6 @@ class MeshRenderer:
         self._allocate("samples", 32 * w * h)
         if s > 1:
             self._allocate("pixels", 16 * camera.width * camera.height)
-        if settings.budget is None:
-            settings = replace(settings, budget=self.device.budget)
         frame = frame_uniform(camera, settings, counts, self._capacity, self._offsets)
         self.device.device.queue.write_buffer(self._buffers["frame"], 0, frame)
         return counts
@@ -379,7 +388,7 @@ class MeshRenderer:
             steps = kernels.again_steps()
         raise DeviceError(
             f"the GPU did not finish {counts['tiles'] - int(counters[2]):,} of {counts['tiles']:,} tiles"
-            f" ({self.device.name}): use device='cpu', or a smaller image"
+            f" ({self.device.name}): use device='cpu'"
         )
 
     def _counters(self) -> np.ndarray:

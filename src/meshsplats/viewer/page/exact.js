@@ -3,7 +3,9 @@
 
 const TILE = 8, RUN = 8, WINDOW = 1 << 22;
 const FIRST_PAIRS = 1 << 18, MOST_PAIRS = 16e6, MOST_RUNS = 1 << 24, MOST_TILES = 65535;
-const BUDGET = 40000; // loop iterations of one walk through a tile list
+// Loop iterations of one walk through a tile list, one limit after the other until all tiles are finished. Software
+// drivers cut loops after 65,535 iterations; walks are counted high, so the first is safe, and the second mostly.
+const BUDGETS = [60000, 150000, 4000000];
 const ROUNDS = 1000; // most repetitions of a frame's last steps
 const NONE = 0xffffffff;
 
@@ -64,7 +66,8 @@ export class ExactRenderer {
     const device = await adapter.requestDevice({ requiredLimits: { maxStorageBufferBindingSize, maxBufferSize } });
     const self = new ExactRenderer();
     const { vendor, architecture, description } = adapter.info ?? {};
-    Object.assign(self, { canvas, mesh, kernels, device, buffers: {}, groupsOfBindings: new Map(), capacity: FIRST_PAIRS });
+    Object.assign(self, { canvas, mesh, kernels, device, buffers: {}, groupsOfBindings: new Map() });
+    Object.assign(self, { capacity: FIRST_PAIRS, budget: BUDGETS[0] });
     self.name = description || [vendor, architecture].filter(Boolean).join(" ") || "WebGPU";
     self.most = Math.min(maxStorageBufferBindingSize, maxBufferSize);
     device.lost.then(info => { if (info.reason !== "destroyed") lost(info.message || "no reason given"); });
@@ -178,7 +181,7 @@ export class ExactRenderer {
       return;
     }
     this.#prepare(pinhole, filterScale);
-    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1;
+    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1, level = BUDGETS.indexOf(this.budget);
     for (let round = 0; ; round++) {
       const counters = await this.#run(steps);
       if (this.problem) throw new Error(this.problem);
@@ -191,7 +194,13 @@ export class ExactRenderer {
       }
       if (counters[2] === this.counts.tiles) break;
       if (counters[9] || counters[12] || walks === counters[3] || round > ROUNDS) {
-        throw new Error("the graphics device did not finish the image");
+        if (++level === BUDGETS.length) throw new Error("the graphics device did not finish the image");
+        this.budget = BUDGETS[level];
+        this.#prepare(pinhole, filterScale);
+        steps = [...this.kernels.lists, ...this.kernels.raster];
+        walks = -1;
+        round = 0;
+        continue;
       }
       walks = counters[3];
       steps = this.kernels.again;
@@ -213,7 +222,7 @@ export class ExactRenderer {
     this.#allocate("again", 16 * (counts.tiles + 1));
     this.#allocate("samples", 32 * width * height);
     const filter = this.mesh.filter * filterScale * filterScale;
-    const frame = frameUniform(pinhole, counts, this.capacity, this.offsets, filter);
+    const frame = frameUniform(pinhole, counts, this.capacity, this.offsets, filter, this.budget);
     this.device.queue.writeBuffer(this.buffers.frame, 0, frame);
   }
 
@@ -298,7 +307,9 @@ export class ExactRenderer {
 
 // The uniform `frame` of docs/webgpu.md, one sample a pixel: 64 words, the last four unused. filter: variance in square
 // samples. Each value of the pinhole is split into the nearest float32 and that of the rest.
-export function frameUniform({ width, height, rows, center, fx, fy, cx, cy, near }, counts, capacity, offsets, filter) {
+export function frameUniform(
+  { width, height, rows, center, fx, fy, cx, cy, near }, counts, capacity, offsets, filter, budget,
+) {
   const floats = new Float32Array(64), words = new Uint32Array(floats.buffer);
   const split = (values, high, low) => {
     floats.set(values, high);
@@ -310,7 +321,7 @@ export function frameUniform({ width, height, rows, center, fx, fy, cx, cy, near
   floats.set([near, 1e-6, -1, filter], 24);
   words.set([width, height, Math.ceil(width / TILE), Math.ceil(height / TILE)], 28);
   words.set([counts.vertices, counts.faces, counts.runs, counts.fans], 32);
-  words.set([counts.groups, capacity, 0, BUDGET, ...offsets, 1], 36);
+  words.set([counts.groups, capacity, 0, budget, ...offsets, 1], 36);
   return floats;
 }
 
