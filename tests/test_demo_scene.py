@@ -98,7 +98,7 @@ def test_quaternions_are_those_of_the_rotations():
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     n = len(q)
     cloud = GaussianCloud(np.zeros((n, 3)), q, np.ones((n, 3)), np.ones(n), np.zeros((n, 1, 3)))
-    found = demo_scene._quaternions(cloud.rotations.astype(np.float64))
+    found = demo_scene.quaternions_of_frames(cloud.rotations.astype(np.float64))
     np.testing.assert_allclose(np.abs((found * q).sum(axis=1)), 1, atol=1e-6)
 
 

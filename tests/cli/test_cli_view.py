@@ -137,12 +137,15 @@ def test_a_page_is_not_overwritten(folder, tmp_path, capsys):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent as a POSIX signal")
 def test_the_address_is_printed_and_answers_until_ctrl_c(folder):
+    # Tests that run in a shell's background ignore the signal, and processes inherit that.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
         [sys.executable, "-m", "meshsplats", "view", str(folder / "scene.ply"), "--no-open"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
+    signal.signal(signal.SIGINT, before)
     try:
         assert process.stdout is not None
         url = next(line.strip() for line in process.stdout if line.startswith("http://127.0.0.1:"))
