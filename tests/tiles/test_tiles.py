@@ -163,7 +163,7 @@ def test_leaves_hold_the_triangles_of_the_whole_mesh(splats, tileset):
     """Of each splat those that ``convert`` makes of the whole scene."""
     mesh = convert(load_gaussians(splats))
     starts = np.searchsorted(mesh.face_splat, np.arange(COUNT + 1))
-    for tile in Tileset(tileset).tiles():
+    for tile, _ in Tileset(tileset).tiles():
         if tile.children:
             continue
         part = load_mesh(tile.content)
@@ -413,7 +413,7 @@ def test_an_image_in_parts_is_the_same(tileset):
 def test_the_tiles_that_a_camera_needs(tileset):
     found = Tileset(tileset)
     camera = orbit(found.root.load(), 1, elevation=15, width=200, height=130)[0]
-    everything = list(found.tiles())
+    everything = [tile for tile, _ in found.tiles()]
     for most_error in (0.5, 2.0, 8.0):
         tiles, worst = choose_tiles(found, camera, max_error=most_error)
         assert worst <= most_error
@@ -500,6 +500,20 @@ def test_a_tileset_inside_itself_ends(tileset, tmp_path):
     with pytest.raises(FileFormatError, match="nested too deeply, or too many"):
         list(Tileset(broken(tileset, tmp_path, loop)).tiles())
     monkey.undo()
+
+
+def test_a_tileset_file_is_read_once(tileset, monkeypatch):
+    """However often tiles are chosen: many images must not exhaust the limit on tiles."""
+    load = tilesets._load
+    read: list[Path] = []
+    monkeypatch.setattr(tilesets, "_load", lambda path: read.append(path) or load(path))
+    found = Tileset(tileset)
+    first = [tile.content for tile, _ in found.tiles()]
+    assert len(read) > 1
+    count = found._count
+    assert [tile.content for tile, _ in found.tiles()] == first
+    assert len(read) == len(set(read))
+    assert found._count == count
 
 
 # ---- Commands

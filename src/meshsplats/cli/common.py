@@ -73,8 +73,8 @@ class SplatOptions:
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
 
-    def stream(self, path: Path) -> SplatStream:
-        """The splats of a file in blocks."""
+    def stream(self, path: Path | Sequence[Path]) -> SplatStream:
+        """The splats of a file, or of several, in blocks."""
         from meshsplats.formats.gaussians import stream_gaussians
 
         return stream_gaussians(path, strict=self.strict, axes=self.axes)

@@ -25,7 +25,7 @@ from meshsplats.formats.gaussians import splat_file, splat_format
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.tiles.tileset import Tileset, is_tileset
+from meshsplats.tiles import is_tileset
 
 SAMPLE = 4000
 """Number of splats that are converted to estimate the size of the mesh."""
@@ -161,18 +161,16 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
 
 
 def _tileset(path: Path) -> dict[str, Any]:
+    from meshsplats.tiles.tileset import Tileset
+
     tileset = Tileset(path)
     folder = path if path.is_dir() else path.parent
     found = {"tiles": 0, "levels": 0, "triangles": 0, "largest_tile": 0}
-    todo = [(tileset.root, 1)]
-    while todo:
-        tile, level = todo.pop()
-        children = tileset.children(tile)
+    for tile, level in tileset.tiles():
         found["tiles"] += 1
         found["levels"] = max(found["levels"], level)
         found["largest_tile"] = max(found["largest_tile"], tile.triangles)
-        found["triangles"] += 0 if children else tile.triangles
-        todo += [(child, level + 1) for child in children]
+        found["triangles"] += 0 if tile.children else tile.triangles
     corners = tileset.root.corners()
     return {
         "bytes": sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()),

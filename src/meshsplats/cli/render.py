@@ -211,7 +211,7 @@ class Render(Command):
 
     def _tileset(self) -> Tileset | None:
         """The tileset of the input; None if it is something else. UsageError for options without effect."""
-        from meshsplats.tiles.tileset import Tileset, is_tileset
+        from meshsplats.tiles import is_tileset
 
         if not is_tileset(self.input):
             if self.max_error is not None:
@@ -221,6 +221,8 @@ class Render(Command):
             raise UsageError(f"--max-error must be a number of pixels, at least 0, got {self.max_error}")
         if self.part.crop is not None:
             raise UsageError("--crop has no effect on a tileset: give it to 'meshsplats tiles'")
+        from meshsplats.tiles.tileset import Tileset
+
         return Tileset(self.input)
 
     def _check_scene(self, scene: GaussianCloud | SplatMesh) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from meshsplats.cameras.framing import DEFAULT_UP
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import Box, Count, Number, Output, SplatOptions, Text, check_outputs, parse_up
 from meshsplats.cli.messages import Terminated, UsageError, say
@@ -67,14 +68,13 @@ class Tiles(Command):
     """Replace an older tileset, and begin again where a partial one is left."""
 
     def execute(self) -> None:
-        from meshsplats.formats.gaussians import stream_gaussians
-        from meshsplats.tiles.building import JOURNAL, build_tiles
+        from meshsplats.tiles.building import JOURNAL, build_tiles, partial_folder
 
         options = self._checked()
         config = beside(self.output, CONFIGURATION)
         check_outputs([config], self.force or self.resume)
         start = time.perf_counter()
-        source = stream_gaussians(self.input, strict=self.reading.strict, axes=self.reading.axes)
+        source = self.reading.stream(self.input)
         try:
             with _progress() as show:
                 found = build_tiles(
@@ -87,7 +87,7 @@ class Tiles(Command):
                     on_progress=show,
                 )
         except (KeyboardInterrupt, Terminated, OSError):
-            if self.output.with_name(f"{self.output.name}.partial").joinpath(JOURNAL).is_file():
+            if (partial_folder(self.output) / JOURNAL).is_file():
                 say("what is done stays: the same command with --resume continues")
             raise
         write_configuration(config, "tiles", self)
@@ -116,10 +116,8 @@ class Tiles(Command):
         if self.resume and self.force:
             raise UsageError("--resume continues, --force starts again: give one of them")
         conversion = ConversionOptions(look=self.look, min_opacity=self.min_opacity, crop=self.crop)
-        options = TileOptions(self.max_triangles, self.preset, conversion, lit=self.lit)
-        if self.up is not None:
-            x, y, z = (float(u) for u in parse_up(self.up))
-            options = TileOptions(self.max_triangles, self.preset, conversion, (x, y, z), self.lit)
+        x, y, z = DEFAULT_UP if self.up is None else (float(u) for u in parse_up(self.up))
+        options = TileOptions(self.max_triangles, self.preset, conversion, (x, y, z), self.lit)
         options.resolved()
         return options
 

@@ -127,7 +127,7 @@ def build_tiles(
     chosen = options or TileOptions()
     conversion = chosen.resolved()
     target = Path(folder)
-    partial = target.with_name(f"{target.name}.partial")
+    partial = partial_folder(target)
     with locked(target.with_name(f".{target.name}.lock")) as ours:
         if not ours:
             raise FileExistsError(f"{partial}: another process is at work on this tileset")
@@ -144,6 +144,11 @@ def build_tiles(
             os.rename(partial / "tileset", target)
         shutil.rmtree(partial)
     return summary
+
+
+def partial_folder(folder: Path) -> Path:
+    """Where the tileset ``folder`` lies until it is complete."""
+    return folder.with_name(f"{folder.name}.partial")
 
 
 def _check_folders(target: Path, partial: Path, resume: bool, replace_old: bool) -> None:
@@ -208,7 +213,7 @@ class _Build:
             finished += done[cell]
             if self._on_progress:
                 self._on_progress(finished, scene.kept)
-        root = self._upper(sorted(cells))
+        root = self._root_of(self._upper(sorted(cells))).key
         nodes: dict[str, Node] = {}
         for path in sorted((self._work / "done").glob("*.json")):
             for fields in json.loads(path.read_text(encoding="utf-8")):
@@ -270,8 +275,9 @@ class _Build:
 
     def _subtree(self, key: str, records: np.ndarray) -> tuple[list[Node], np.ndarray]:
         """Writes the tiles of a cell; their nodes, its own last, and the splats that stand for it."""
-        order = np.lexsort((records["row"], self._cube.codes(records["means"])))
-        return self._tree(key, records[order], self._cube.codes(records["means"])[order])
+        codes = self._cube.codes(records["means"])
+        order = np.lexsort((records["row"], codes))
+        return self._tree(key, records[order], codes[order])
 
     def _tree(self, key: str, records: np.ndarray, codes: np.ndarray) -> tuple[list[Node], np.ndarray]:
         if len(records) <= self._most:
@@ -312,10 +318,7 @@ class _Build:
         records = records[np.argsort(records["row"], kind="stable")]
         cloud = cloud_of(records, self._kernel)
         node = self._write(key, cloud, records["row"], self._pixels.at(cloud.means), 0.0, [])
-        merged = np.zeros(len(records), _MERGED)
-        for name in RECORD.names or ():
-            merged[name] = records[name]
-        return [node], merged
+        return [node], _merged_from(records)
 
     def _inner(
         self, key: str, children: Sequence[Node], parts: Sequence[np.ndarray]
@@ -331,11 +334,9 @@ class _Build:
             own = self._pixels.at(cloud.means)
             pixel = np.zeros_like(pixel) if own is None else own
         result = merge(cloud, count, np.sqrt(FILTER_PX2) * pixel.astype(np.float64), threads=self._threads)
-        merged = np.zeros(len(result.cloud), _MERGED)
         first = np.unique(result.group, return_index=True)[1]
         rows = below["row"][first]
-        for name, values in zip(RECORD.names or (), _values(result.cloud, rows), strict=True):
-            merged[name] = values
+        merged = _merged_from(records_of(result.cloud, rows))
         weights, totals = _weights(result.group, result.masses)
         away = np.square(cloud.means.astype(np.float64) - result.cloud.means[result.group]).sum(axis=1)
         merged["spread"] = np.bincount(result.group, weights * (below["spread"] + away), len(rows))
@@ -391,20 +392,17 @@ class _Build:
         return self._work / "done" / f"cell-{cell}.merged"
 
     def _upper(self, cells: Sequence[str]) -> str:
-        """Writes the tiles above ``cells``, ascending; the key of the root of the tileset."""
-        top = _shared(cells)
+        """Writes the tiles above ``cells``, ascending; the cell that holds all of them."""
+        top = os.path.commonprefix(list(cells))  # noqa: RUF071 - a character is a level
         if len(cells) == 1:
-            return self._root_of(cells[0]).key
-        roots, parts = [], []
-        for octant in sorted({cell[len(top)] for cell in cells}):
-            within = [cell for cell in cells if cell.startswith(top + octant)]
-            self._upper(within)
-            place = within[0] if len(within) == 1 else _shared(within)
-            roots.append(self._root_of(place))
-            parts.append(place)
+            return top
+        parts = [
+            self._upper([cell for cell in cells if cell.startswith(top + octant)])
+            for octant in sorted({cell[len(top)] for cell in cells})
+        ]
         if top not in self.journal.keys("above"):
             merged = [np.fromfile(self._merged(place), _MERGED) for place in parts]
-            node, own = self._inner(top, roots, merged)
+            node, own = self._inner(top, [self._root_of(place) for place in parts], merged)
             self._keep(top, [node], own)
             self.journal.add("above", key=top)
         return top
@@ -415,9 +413,12 @@ class _Build:
         return Node(**nodes[-1])
 
 
-def _values(cloud: GaussianCloud, rows: np.ndarray) -> list[np.ndarray]:
-    """The columns of ``RECORD``."""
-    return [rows, cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, cloud.sh[:, 0]]
+def _merged_from(records: np.ndarray) -> np.ndarray:
+    """``records`` with a spread of 0."""
+    merged = np.zeros(len(records), _MERGED)
+    for name in RECORD.names or ():
+        merged[name] = records[name]
+    return merged
 
 
 def _weights(group: np.ndarray, masses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -428,13 +429,6 @@ def _weights(group: np.ndarray, masses: np.ndarray) -> tuple[np.ndarray, np.ndar
     own = totals[group]
     shares = np.divide(masses, own, out=np.zeros_like(masses), where=own > 0)
     return np.where(own > 0, shares, 1 / sizes[group]), totals
-
-
-def _shared(keys: Sequence[str]) -> str:
-    """The longest key that all of ``keys``, ascending, begin with."""
-    first, last = keys[0], keys[-1]
-    length = next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
-    return first[:length]
 
 
 def _height(nodes: dict[str, Node], key: str) -> int:

@@ -39,10 +39,10 @@ def choose_tiles(
     order = count()
     queue: list[tuple[float, int, tuple[int, ...], Tile]] = []
     chosen: list[tuple[tuple[int, ...], Tile]] = []
-    triangles = 0
+    triangles, worst = 0, 0.0
 
     def add(tile: Tile, place: tuple[int, ...]) -> None:
-        nonlocal triangles
+        nonlocal triangles, worst
         if not reaches(camera, tile):
             return
         triangles += tile.triangles
@@ -51,9 +51,9 @@ def choose_tiles(
             heapq.heappush(queue, (-pixels, next(order), place, tile))
         else:
             chosen.append((place, tile))
+            worst = max(worst, pixels)
 
     add(tileset.root, ())
-    worst = 0.0
     while queue:
         pixels, _, place, tile = heapq.heappop(queue)
         children = tileset.children(tile)
@@ -65,8 +65,7 @@ def choose_tiles(
         for i, child in enumerate(children):
             add(child, (*place, i))
     chosen.sort(key=lambda entry: entry[0])
-    tiles = [tile for _, tile in chosen]
-    return tiles, max([worst, *(screen_error(camera, tile) for tile in tiles)])
+    return [tile for _, tile in chosen], worst
 
 
 def screen_error(camera: Camera, tile: Tile) -> float:

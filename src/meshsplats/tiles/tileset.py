@@ -18,14 +18,15 @@ from urllib.parse import unquote
 
 import numpy as np
 
+from meshsplats import __version__
 from meshsplats._files.atomic import write_text
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
+from meshsplats.tiles import NAME
 
-NAME = "tileset.json"
 LEVELS_PER_FILE = 3
 GROW = 1e-6
 """Boxes are larger than their content by this share, so that rounding leaves nothing outside."""
@@ -75,7 +76,7 @@ def write_tilesets(folder: Path, nodes: dict[str, Node], root: str, up: np.ndarr
         tile = _tile(nodes[key], nodes, own)
         box = np.array(nodes[key].high) - np.array(nodes[key].low)
         document = {
-            "asset": {"version": "1.1", "generator": _generator()},
+            "asset": {"version": "1.1", "generator": f"MeshSplats {__version__}"},
             "geometricError": max(nodes[key].error, float(np.linalg.norm(box)) if key == root else 0.0),
             "root": {"refine": "REPLACE", **tile},
         }
@@ -84,12 +85,6 @@ def write_tilesets(folder: Path, nodes: dict[str, Node], root: str, up: np.ndarr
         path = folder.joinpath(*_folders(own), NAME)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n")
-
-
-def _generator() -> str:
-    from meshsplats import __version__
-
-    return f"MeshSplats {__version__}"
 
 
 def _group(key: str) -> str:
@@ -211,23 +206,23 @@ class Tileset:
         """(3,) float64 unit direction that points up in the world frame."""
         self.splats = _whole(note.get("splats"), "splats", self.path)
         """Count of the splats in all leaves."""
-        self.error = _error(document, self.path)
-        """Geometric error without any tile, scene units."""
+        _error(document, self.path)
         self._to_world = tile_frame(self.up).T
         self._count = 0
         self.root = self._tile(_object(document, "root", self.path), self.path, 0)
 
     def children(self, tile: Tile) -> list[Tile]:
-        """The tiles that take the place of ``tile``; none for a leaf."""
-        return [self._opened(child) for child in tile.children]
+        """The tiles that take the place of ``tile``; none for a leaf. A tileset file is read once."""
+        tile.children = [self._opened(child) for child in tile.children]
+        return tile.children
 
-    def tiles(self) -> Iterator[Tile]:
-        """Every tile, each before those below it."""
-        todo = [self.root]
+    def tiles(self) -> Iterator[tuple[Tile, int]]:
+        """Every tile and its level, 1 for the root; each before those below it."""
+        todo = [(self.root, 1)]
         while todo:
-            tile = todo.pop()
-            yield tile
-            todo += reversed(self.children(tile))
+            tile, level = todo.pop()
+            yield tile, level
+            todo += ((child, level + 1) for child in reversed(self.children(tile)))
 
     def _opened(self, tile: Tile) -> Tile:
         if not tile.is_file:
@@ -269,11 +264,6 @@ class Tileset:
         if worst > tile.error:
             raise FileFormatError(f"{file}: a tile of error {worst:g} below one of {tile.error:g}")
         return tile
-
-
-def is_tileset(path: Path) -> bool:
-    """Whether ``path`` is a folder with a tileset.json, or that file."""
-    return path.joinpath(NAME).is_file() if path.is_dir() else path.name == NAME
 
 
 def _load(path: Path) -> dict[str, Any]:
