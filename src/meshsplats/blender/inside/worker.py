@@ -136,8 +136,8 @@ def _for_painter(subject: Subject, camera: Camera) -> Subject:
     from meshsplats.blender.inside.meshes import far_to_near
 
     order = far_to_near(subject.vertices, subject.faces, camera.world_to_camera)
-    owners = None if subject.face_splat is None else subject.face_splat[order]
-    return replace(subject, faces=subject.faces[order], face_splat=owners)
+    of_faces = {"faces": subject.faces, "face_splat": subject.face_splat, "fine_faces": subject.fine_faces}
+    return replace(subject, **{name: a[order] for name, a in of_faces.items() if a is not None})
 
 
 if __name__ == "__main__":
