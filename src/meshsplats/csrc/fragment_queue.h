@@ -297,24 +297,31 @@ class FragmentQueue {
         indices = load_lanes(index);
     }
 
+    struct LaneFragment {
+        float key;
+        int32_t face;
+        int entry;
+        bool operator<(const LaneFragment &other) const {
+            return key != other.key ? key > other.key : face < other.face;
+        }
+    };
+
+    // The first n pending entries that cover a lane, nearest first.
+    void sort_lane(const int n, const int lane, std::vector<LaneFragment> &list) const {
+        list.clear();
+        for (int i = 0; i < n; ++i)
+            if (pending_[i].lanes & (1u << lane))
+                list.push_back({lane_of(key(i), lane), face(i), pending_[i].entry});
+        std::sort(list.begin(), list.end());
+    }
+
     // Sorts the list of each lane on its own, for very long lists.
     template <class Emit>
     void lane_by_lane(const int n, const LaneMask &active, Emit &emit) {
-        struct LaneFragment {
-            float key;
-            int32_t face;
-            int entry;
-        };
         std::vector<LaneFragment> list;
         for (int lane = 0; lane < LANES; ++lane) {
             const LaneMask bit = 1u << lane;
-            list.clear();
-            for (int i = 0; i < n; ++i)
-                if (pending_[i].lanes & bit)
-                    list.push_back({lane_of(key(i), lane), face(i), pending_[i].entry});
-            std::sort(list.begin(), list.end(), [](const LaneFragment &a, const LaneFragment &b) {
-                return a.key != b.key ? a.key > b.key : a.face < b.face;
-            });
+            sort_lane(n, lane, list);
             for (const LaneFragment &f : list) {
                 if (!(active & bit)) break;
                 emit(f.entry, bit);

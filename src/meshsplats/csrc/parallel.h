@@ -5,6 +5,7 @@
 #include <atomic>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -15,8 +16,7 @@ namespace ms {
 
 // Calls work(thread) once for each thread index in [0, threads), in parallel. Joins all threads, then
 // rethrows the first exception.
-template <class Work>
-void on_threads(int threads, Work work) {
+inline void on_threads(int threads, const std::function<void(int)> &work) {
     MS_ASSERT(threads >= 1);
     if (threads <= 1) return work(0);
     std::exception_ptr failure;
