@@ -30,7 +30,7 @@ _SIDE = 200
 _CAMERA_SIDE = 480
 """Longer side in samples, at most, of the images of given cameras: those of up to half of it have 2 x 2
 samples a pixel, larger ones one."""
-_RATE = 0.1
+_RATE = 0.3
 _FINAL = 0.1
 """Learning rate of the logarithms of factor and exponent, and what remains of it at the end."""
 _LIMIT = 2.0
