@@ -22,7 +22,7 @@ from meshsplats.blender.inside import (
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
-from meshsplats.blender.subject import lit_arrays, lowest, stand_in_arrays
+from meshsplats.blender.subject import lit_subject, lowest
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.baking import bake_filter
 from meshsplats.mesh import Blending, SplatMesh
@@ -50,11 +50,8 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
         mesh = bake_filter(mesh)
     arrays: dict[str, Any] = {"faces": mesh.faces, "colors": mesh.colors, "normals": None, "self_shadow": 0.0}
     if lit:
-        made, arrays["self_shadow"] = lit_arrays(mesh)
-        arrays |= made | {"display": mesh.colors}
-        if mesh.binding is None:
-            found, arrays["light_spacing"] = stand_in_arrays(mesh, made)
-            arrays |= found
+        made, facts = lit_subject(mesh)
+        arrays |= made | facts
     # Splats on a base keep the base's frame.
     origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
     return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh), "origin": origin}

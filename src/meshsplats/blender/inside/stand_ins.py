@@ -15,7 +15,7 @@ ARRAYS = (
     *("surface_vertices", "surface_faces", "surface_colors", "fine_faces"),
     *("light_points", "light_normals", "light_point_of"),
 )
-"""Fields of ``StandIn``, as ``subject.stand_in_arrays`` names them."""
+"""Fields of ``StandIn``, as ``subject.lit_subject`` names them."""
 STAND_IN = "meshsplats_stand_in"
 """Property of the objects made here: True."""
 
