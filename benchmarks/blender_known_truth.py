@@ -23,7 +23,8 @@ from meshsplats import GaussianCloud, convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
 from meshsplats.blender.inside import meshes, rendering, scene, versions
 from meshsplats.blender.inside.host import bpy
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.blender.linear import linear_colors
+from meshsplats.colors import linear_to_srgb
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import SH_C0
 from meshsplats.images.writing import save_image, strip
@@ -158,7 +159,7 @@ def main() -> None:
         for material in ("plain diffuse", "--lit"):
             taken = scene.Subject(**arrays, **facts)
             if material == "plain diffuse":
-                plain = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]])
+                plain = linear_colors(mesh, steps=0)
                 taken = replace(
                     taken,
                     colors=plain,
@@ -172,7 +173,7 @@ def main() -> None:
             cow = covered > 0.98
             rows.append(
                 f"| {kind} | {material} | {psnr(display(drawn), display(target)):.1f} dB |"
-                f" {psnr(display(drawn)[cow][None], display(target)[cow][None]):.1f} dB |"
+                f" {psnr(display(drawn), display(target), mask=cow):.1f} dB |"
                 f" {(dark & shade).sum() / max((dark | shade).sum(), 1):.2f} |"
                 f" {drawn[cow].mean() / target[cow].mean():.2f} |"
             )

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from meshsplats import convert, load_gaussians, orbit, render
+from meshsplats import convert, load_gaussians, orbit, psnr, render
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.options import LIGHTS
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
@@ -96,7 +96,7 @@ def main() -> None:
                 images.append(np.asarray(Image.open(target).convert("RGB"), np.float32) / 255)
             if name == "even":
                 fitted, gain = with_gain(images[-1], unlit, seen)
-                error = -10 * np.log10(np.square(fitted - unlit)[seen].mean())
+                error = psnr(fitted, unlit, mask=seen)
                 print(
                     f"| {subject_name(file)} | {error:.1f} dB | {gain:.2f} |"
                     f" {blotches(fitted, unlit, drawn.alpha > SOLID):.1%} |"

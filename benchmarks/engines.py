@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import meshsplats as ms
+from meshsplats.mesh import solid_faces
 
 SCENES = {
     "playbot": "splats/playbot_lod3_31k_sh2.ply",
@@ -57,7 +58,7 @@ def main() -> None:
         if args.output:
             args.output.mkdir(exist_ok=True)
             ms.save_mesh(tuned, args.output / f"{name}.npz")
-        solid = int((tuned.colors[tuned.faces, 3] == 1).all(axis=1).sum())
+        solid = int(solid_faces(tuned).sum())
         sizes = f"{len(mesh.faces):,} | {solid:,}, {len(tuned.faces) - solid:,}"
         for distance in ("close", "mid", "far"):
             cameras = ms.load_cameras(args.data / "cameras" / f"{name}_{distance}.json")

@@ -19,7 +19,6 @@ import numpy as np
 
 import meshsplats as ms
 from meshsplats.viewer.page import Page, make_page
-from meshsplats.viewer.quantise import unpack_mesh
 
 SIDES = (400, 800)
 
@@ -42,7 +41,6 @@ def main() -> None:
         start = time.process_time()
         page = make_page(mesh, splats=cloud, cameras=views)
         seconds = time.process_time() - start
-        back = unpack_mesh(page.mesh.data)
         cells = [
             path.stem,
             f"{len(mesh.faces):,}",
@@ -53,7 +51,7 @@ def main() -> None:
         ]
         for side in SIDES:
             camera = views[0].scaled(side / views[0].width)
-            one, other = (ms.render(each, camera).color for each in (mesh, back))
+            one, other = (ms.render(each, camera).color for each in (mesh, page.mesh.decoded))
             off = 255 * np.abs(one - other).max(axis=-1)
             cells.append(f"{off.max():.2f}, {(off > 0.5).sum()}, {ms.psnr(one, other):.1f}")
         print(f"| {' | '.join(cells)} |", flush=True)

@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from rendering import SCENES, random_fans
 
-from meshsplats import Camera, SplatMesh, load_mesh, orbit, render
+from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.renderer import DrawSettings, draw
 
@@ -39,13 +39,13 @@ def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> str:
         expected = render(mesh, view, background=(0, 0, 0))
         cores.append(1000 * (time.perf_counter() - start))
     error = np.abs(drawn.color - expected.color).max(axis=2)
-    mean = float(np.mean((drawn.color - expected.color.astype(np.float64)) ** 2))
+    likeness = psnr(drawn.color, expected.color)
     work = drawn.work
     values = (
         name,
         f"{len(mesh.faces):,}",
         f"{view.width} x {view.height}",
-        f"{-10 * np.log10(mean):.1f}" if mean else "same",
+        f"{likeness:.1f}" if np.isfinite(likeness) else "same",
         f"{int((error > 1e-3).sum())}",
         f"{work.tests / max(work.fragments, 1):.2f}",
         f"{work.walks / work.tiles:.3f}",

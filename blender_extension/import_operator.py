@@ -7,7 +7,7 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
-from .settings import CHOICES, Choices, copy_choices, draw_choices
+from .settings import CHOICES, Choices, SceneChoice, copy_choices, draw_choices
 from .work import Modal, Work, settle
 
 SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".npz", ".glb", ".gltf")
@@ -15,7 +15,7 @@ CHAIN = "levels.json"
 """Table of a chain of levels of detail, as ``meshsplats levels`` writes it."""
 
 
-class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
+class ImportMeshSplats(Modal, Choices, SceneChoice, bpy.types.Operator, ImportHelper):
     """Import Gaussian splats as a mesh, or a mesh or levels of detail made by MeshSplats"""
 
     bl_idname = "import_scene.meshsplats"
@@ -25,12 +25,6 @@ class ImportMeshSplats(Modal, Choices, bpy.types.Operator, ImportHelper):
     files: CollectionProperty(type=bpy.types.OperatorFileListElement, options={"SKIP_SAVE", "HIDDEN"})
     directory: StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE", "HIDDEN"})
     filter_glob: StringProperty(default=";".join([*(f"*{s}" for s in SUFFIXES), CHAIN]), options={"HIDDEN"})
-    set_up_scene: BoolProperty(
-        name="Set up Render",
-        description="Set bounce limits and colour management for these meshes",
-        default=True,
-    )
-
     at_origin: BoolProperty(
         name="Move to World Origin",
         description="Stand it on the centre of the grid. Otherwise it keeps the place that its file gives it,"

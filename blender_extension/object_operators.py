@@ -7,8 +7,8 @@ import warnings
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, StringProperty
 
-from .settings import CHOICES, Choices, copy_choices, draw_choices
-from .work import CloudWork, Modal, Work, settle
+from .settings import CHOICES, Choices, SceneChoice, copy_choices, draw_choices
+from .work import CloudWork, Modal, Work, settle, waiting
 
 SHADINGS = [("unlit", "Unlit", "Colours as they are"), ("lit", "Lit", "Light and shadow act on them")]
 
@@ -59,7 +59,7 @@ class ConvertAgain(Modal, bpy.types.Operator):
             self.report({"INFO"}, f"MeshSplats: {len(obj.data.polygons):,} triangles")
 
 
-class ConvertSplats(Modal, Choices, bpy.types.Operator):
+class ConvertSplats(Modal, Choices, SceneChoice, bpy.types.Operator):
     """Make a mesh of splats that Blender imported itself: it takes light, casts shadows and can be edited"""
 
     bl_idname = "object.meshsplats_from_splats"
@@ -68,11 +68,6 @@ class ConvertSplats(Modal, Choices, bpy.types.Operator):
 
     hide_splats: BoolProperty(
         name="Hide Splats", description="Hide the splats, whose place the mesh takes", default=True
-    )
-    set_up_scene: BoolProperty(
-        name="Set up Render",
-        description="Set bounce limits and colour management for these meshes",
-        default=True,
     )
 
     @classmethod
@@ -143,14 +138,15 @@ class SetShading(bpy.types.Operator):
 
         lit = self.shading == "lit"
         try:
-            for obj in levels.with_levels(context.object):
-                if objects.LIT in obj.data:
-                    objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), lit))
-                    obj.meshsplats.shading = self.shading
-                else:
-                    objects.dress(obj, lit)
-                    # One click: only these settings show the colours of imports correctly.
-                    objects.render_settings(context.scene, objects.splat_objects(context.scene), lit)
+            with waiting(context):
+                for obj in levels.with_levels(context.object):
+                    if objects.LIT in obj.data:
+                        objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), lit))
+                        obj.meshsplats.shading = self.shading
+                    else:
+                        objects.dress(obj, lit)
+                        # One click: only these settings show the colours of imports correctly.
+                        objects.render_settings(context.scene, objects.splat_objects(context.scene), lit)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -212,11 +208,12 @@ class SetUpStage(bpy.types.Operator):
 
         every = objects.splat_objects(context.scene)
         try:
-            for obj in every if self.make_lit else []:
-                if not obj.data[objects.LIT]:
-                    objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), True))
-                    obj.meshsplats.shading = "lit"
-            setting.set_up(context.scene, every, self.lights, camera=self.camera)
+            with waiting(context):
+                for obj in every if self.make_lit else []:
+                    if not obj.data[objects.LIT]:
+                        objects.replace_mesh(obj, objects.prepare(objects.as_splat_mesh(obj), True))
+                        obj.meshsplats.shading = "lit"
+                setting.set_up(context.scene, every, self.lights, camera=self.camera)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -246,7 +243,10 @@ class BakeLight(bpy.types.Operator):
             return {"CANCELLED"}
         if self.live:
             baking.forget(lit)
-        elif not baking.bake(context.scene, lit):
+            return {"FINISHED"}
+        with waiting(context):
+            count = baking.bake(context.scene, lit)
+        if not count:
             self.report({"WARNING"}, "MeshSplats: no light to bake: nothing solid, or a mesh prior")
         return {"FINISHED"}
 

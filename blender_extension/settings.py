@@ -53,6 +53,16 @@ class Choices:
     )
 
 
+class SceneChoice:
+    """Property of the operators that make splat meshes, for ``work.settle``."""
+
+    set_up_scene: BoolProperty(
+        name="Set up Render",
+        description="Set bounce limits and colour management for these meshes",
+        default=True,
+    )
+
+
 CHOICES = ("preset", "max_triangles", "min_opacity", "axes", "shading")
 
 

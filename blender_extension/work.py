@@ -4,6 +4,7 @@
 import threading
 import traceback
 import warnings
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 
@@ -197,6 +198,19 @@ class Modal:
 
     def cancelled(self):
         """Called when there is no result."""
+
+
+@contextmanager
+def waiting(context):
+    """The wait cursor, while an operator computes without a thread."""
+    window = None if bpy_background() else context.window
+    if window is not None:
+        window.cursor_modal_set("WAIT")
+    try:
+        yield
+    finally:
+        if window is not None:
+            window.cursor_modal_restore()
 
 
 def settle(operator, context, objs):

@@ -13,13 +13,13 @@ Needs the packages of ``tools/docs-requirements.txt``.
 from __future__ import annotations
 
 import argparse
-import ast
 import posixpath
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -62,26 +62,24 @@ REFERENCE = {
 # Pages
 
 
-def public_names() -> dict[str, str]:
-    """The names that ``import meshsplats`` offers, and the module of each."""
-    names: dict[str, str] = {}
-    tree = ast.parse((ROOT / "src/meshsplats/__init__.py").read_text(encoding="utf-8"))
-    for statement in tree.body:
-        if isinstance(statement, ast.If) and ast.unparse(statement.test) == "TYPE_CHECKING":
-            for line in statement.body:
-                if isinstance(line, ast.ImportFrom):
-                    names |= {alias.asname or alias.name: str(line.module) for alias in line.names}
-    return names
+@cache
+def public_names() -> frozenset[str]:
+    """The names that ``import meshsplats`` offers."""
+    sys.path.insert(0, str(ROOT / "src"))
+    from meshsplats import _MODULES
+
+    return frozenset(_MODULES)
 
 
+@cache
 def reference_pages() -> dict[str, str]:
     """Pages of the Python reference by name, without suffix."""
     names = public_names()
     listed = {name for group in REFERENCE.values() for name in group}
-    if unknown := sorted(listed - names.keys()):
+    if unknown := sorted(listed - names):
         raise SystemExit(f"tools/docs_site.py lists what meshsplats does not have: {', '.join(unknown)}")
     groups = dict(REFERENCE)
-    if rest := sorted(names.keys() - listed):
+    if rest := sorted(names - listed):
         groups["More"] = rest
     pages = {}
     for title, group in groups.items():
@@ -97,6 +95,7 @@ def reference_pages() -> dict[str, str]:
     return pages
 
 
+@cache
 def example_files() -> dict[str, str]:
     """The heading of each example, by its place in the repository."""
     files = sorted((ROOT / "examples").rglob("*.py"))
@@ -205,7 +204,9 @@ def problems_of(site: Path) -> list[str]:
         found = re.findall(pattern, sheet.read_text(encoding="utf-8"))
         problems += [f"{sheet.relative_to(site)} loads {link}" for link in found]
     anchors = set().union(*(page.anchors for page in pages.values()))
-    problems += [f"no entry for {name}" for name in public_names() if f"meshsplats.{name}" not in anchors]
+    problems += [
+        f"no entry for {name}" for name in sorted(public_names()) if f"meshsplats.{name}" not in anchors
+    ]
     return problems
 
 

@@ -99,9 +99,7 @@ def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
     if n == 1 or extent == 0:
         return np.zeros(n, np.float32)
     cells = ((points - low) * ((1 << levels) * (1 - 1e-9) / extent)).astype(np.uint64)
-    code = np.zeros(n, np.uint64)  # Morton order: cells of every level are runs of points
-    for axis in range(3):
-        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
+    code = _interleaved(cells)  # Morton order: cells of every level are runs of points
     order = np.argsort(code)  # points of one cell get one spacing: their order does not matter
     code = code[order]
     found = np.full(n, extent / np.sqrt(n), np.float32)
@@ -120,6 +118,14 @@ def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
     result = np.empty(n, np.float32)
     result[order] = found
     return result
+
+
+def _interleaved(cells: np.ndarray) -> np.ndarray:
+    """(n,) uint64 Morton codes of the indices (n, 3) of cells, 21 bits along each axis."""
+    code = np.zeros(len(cells), np.uint64)
+    for axis in range(3):
+        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
+    return code
 
 
 def _every_third_bit(values: np.ndarray) -> np.ndarray:
@@ -149,7 +155,4 @@ def morton_codes(points: np.ndarray, low: np.ndarray, side: float, levels: int) 
     """
     steps = (points.astype(np.float64) - low) * ((1 << levels) / side)
     cells = np.clip(steps, 0, (1 << levels) - 1).astype(np.uint64)
-    code = np.zeros(len(points), np.uint64)
-    for axis in range(3):
-        code |= _every_third_bit(cells[:, axis]) << np.uint64(axis)
-    return code
+    return _interleaved(cells)

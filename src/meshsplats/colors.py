@@ -32,6 +32,12 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     return _in_chunks(_encode, linear)
 
 
+def encoding_slope(linear: np.ndarray) -> np.ndarray:
+    """Derivative of ``linear_to_srgb``, float32; the slope of its linear part at 0 and below."""
+    power = np.maximum(linear, np.float32(0.0031308)) ** np.float32(1 / 2.4 - 1)
+    return np.where(linear <= np.float32(0.0031308), np.float32(12.92), np.float32(1.055 / 2.4) * power)
+
+
 def _decode(v: np.ndarray) -> np.ndarray:
     # The power is not used below the limit; the maximum avoids a negative base there.
     curve = np.power((np.maximum(v, np.float32(0)) + np.float32(0.055)) / np.float32(1.055), np.float32(2.4))

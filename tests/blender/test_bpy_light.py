@@ -12,7 +12,7 @@ from _blender_scenes import ball_splats
 
 from meshsplats import convert, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import baking, materials, objects, rendering, scene, stage, worker
+from meshsplats.blender.inside import baking, materials, meshes, objects, rendering, scene, stage, worker
 from meshsplats.colors import linear_to_srgb
 
 SIDE = 48
@@ -97,8 +97,7 @@ def test_lamps_and_other_objects_light_and_shade_the_splats(ball):
 
 def test_the_unlit_mesh_comes_back_unchanged(ball):
     mesh, _ = ball
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    obj = objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
+    obj = lit_ball(mesh)
     assert baking.points_of(obj) is not None
     assert not obj.visible_shadow
     again = objects.as_splat_mesh(obj)
@@ -108,6 +107,38 @@ def test_the_unlit_mesh_comes_back_unchanged(ball):
     assert not obj.children
     assert baking.points_of(obj) is None
     assert baking.bake(bpy.context.scene, [obj]) == 0
+
+
+def lit_ball(mesh):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return objects.add(objects.prepare(mesh, True), "ball", bpy.context.collection)
+
+
+def test_painted_colours_of_a_lit_mesh_are_kept(ball):
+    mesh, _ = ball
+    obj = lit_ball(mesh)
+    painted = meshes.read_colors(obj.data, meshes.COLOR)
+    painted[:10, :3] = (1.0, 0.5, 0.0)
+    painted[5:20, 3] = 0.25
+    obj.data.attributes[meshes.COLOR].data.foreach_set("color", painted.ravel())
+    unlit = objects.as_splat_mesh(obj).colors
+    expected = mesh.colors.copy()
+    expected[:10, :3] = linear_to_srgb(np.float32([1, 0.5, 0]))
+    expected[5:20, 3] = 0.25
+    assert np.array_equal(unlit, expected)
+
+
+def test_light_points_may_be_renamed_and_deleted(ball):
+    obj = lit_ball(ball[0])
+    points = baking.points_of(obj)
+    points.name = "points"
+    assert baking.points_of(obj) == points
+    for collection in points.users_collection:  # as the window deletes what a property refers to
+        collection.objects.unlink(points)
+    assert baking.points_of(obj) is None
+    assert baking.bake(bpy.context.scene, [obj]) == 0
+    bpy.data.objects.remove(points)
+    assert baking.points_of(obj) is None
 
 
 def test_the_stand_in_is_seen_by_light_alone(ball, tmp_path):

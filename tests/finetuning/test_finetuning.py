@@ -28,7 +28,6 @@ from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
     MIN_TRANSMITTANCE,
-    encoding_slope,
     importance,
     kept_faces,
     make_step,
@@ -109,7 +108,7 @@ def test_linear_light(scene):
 
 
 def test_the_slope_of_the_encoding_is_finite():
-    from meshsplats.colors import linear_to_srgb
+    from meshsplats.colors import encoding_slope, linear_to_srgb
 
     values = np.linspace(0.01, 1, 100)
     step = 1e-3

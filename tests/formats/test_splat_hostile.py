@@ -186,12 +186,12 @@ FILES = {
 
 DEEP = b'{"children":[' * 70 + b"]}" * 70
 FOLDERS = {
-    "not JSON": (SOG | {"meta.json": b'{"means": '}, "cannot be read"),
+    "not JSON": (SOG | {"meta.json": b'{"means": '}, "not a JSON file"),
     "an array": (
         SOG | {"meta.json": b'{"x": [], "means": []}'.replace(b"{", b" {", 1)},
         "give a number of splats|needs",
     ),
-    "deep": (SOG | {"meta.json": b'{"means": ' + b"[" * 200_000}, "cannot be read"),
+    "deep": (SOG | {"meta.json": b'{"means": ' + b"[" * 200_000}, "not a JSON file"),
     "version 3": (meta(version=3), "SOG version 3"),
     "no count": (meta(count=None), "number of splats .* got None"),
     "count of text": (meta(count="9"), "number of splats"),
@@ -226,8 +226,8 @@ FOLDERS = {
 }
 
 STREAMED = {
-    "not JSON": (streamed() | {"lod-meta.json": b'{"lodLevels": '}, "cannot be read"),
-    "deep": (streamed() | {"lod-meta.json": b'{"lodLevels": ' + b"[" * 200_000}, "cannot be read"),
+    "not JSON": (streamed() | {"lod-meta.json": b'{"lodLevels": '}, "not a JSON file"),
+    "deep": (streamed() | {"lod-meta.json": b'{"lodLevels": ' + b"[" * 200_000}, "not a JSON file"),
     "deep tree": (
         streamed() | {"lod-meta.json": b'{"lodLevels":1,"filenames":["a/meta.json"],"tree":%s}' % DEEP},
         "neither 'lods' nor 'children'",

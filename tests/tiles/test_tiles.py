@@ -485,7 +485,7 @@ def test_tiles_that_are_not_what_the_tileset_says(tileset, tmp_path):
     with pytest.raises(FileFormatError, match="the tileset says 7"):
         Tileset(copy).root.load()
     (copy / "tileset.json").write_bytes(b"[" * 10)
-    with pytest.raises(FileFormatError, match="no tileset file"):
+    with pytest.raises(FileFormatError, match="not a JSON file"):
         Tileset(copy)
 
 

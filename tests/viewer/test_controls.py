@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlparse
 import numpy as np
 import pytest
 from _browser import Browser, Page
-from _pages import levels, still_life
+from _pages import cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa: F401 - fixtures
 from test_page import HOSTILE, block
 
 import meshsplats as ms
@@ -21,21 +21,6 @@ from meshsplats.viewer.quantise import pack_splats, unpack_mesh
 NO_WEBGPU = "Object.defineProperty(Navigator.prototype, 'gpu', { get: () => undefined });"
 WIDTH, HEIGHT = 200, 160
 PATIENCE = 120
-
-
-@pytest.fixture(scope="module")
-def cloud() -> ms.GaussianCloud:
-    return still_life()[0]
-
-
-@pytest.fixture(scope="module")
-def mesh() -> ms.SplatMesh:
-    return still_life()[1]
-
-
-@pytest.fixture(scope="module")
-def cameras() -> list[ms.Camera]:
-    return still_life()[2]
 
 
 def open_page(browser: Browser, url: str, width: int = WIDTH, height: int = HEIGHT, **more) -> Page:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _browser import Browser, Page
-from _pages import HEIGHT, WIDTH, levels, still_life
+from _pages import HEIGHT, WIDTH, cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa: F401
 
 import meshsplats as ms
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
@@ -20,21 +20,6 @@ from meshsplats.webgpu.renderer import DrawSettings, frame_uniform
 
 PATIENCE = 400
 """Seconds for shaders that a busy processor compiles."""
-
-
-@pytest.fixture(scope="module")
-def cloud() -> ms.GaussianCloud:
-    return still_life()[0]
-
-
-@pytest.fixture(scope="module")
-def mesh() -> ms.SplatMesh:
-    return still_life()[1]
-
-
-@pytest.fixture(scope="module")
-def cameras() -> list[ms.Camera]:
-    return still_life()[2]
 
 
 def open_page(browser: Browser, url: str) -> Page:

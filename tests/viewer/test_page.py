@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from _pages import still_life
+from _pages import cameras_fixture, cloud_fixture, mesh_fixture  # noqa: F401 - fixtures
 
 import meshsplats as ms
 from meshsplats.viewer import page as pages
@@ -20,21 +20,6 @@ from meshsplats.viewer.quantise import unpack_mesh
 from meshsplats.webgpu import kernels
 
 HOSTILE = '</script><script>alert(1)</script><img src=x onerror="alert(2)">{{script}}<!--'
-
-
-@pytest.fixture(scope="module")
-def cloud() -> ms.GaussianCloud:
-    return still_life()[0]
-
-
-@pytest.fixture(scope="module")
-def mesh() -> ms.SplatMesh:
-    return still_life()[1]
-
-
-@pytest.fixture(scope="module")
-def cameras() -> list[ms.Camera]:
-    return still_life()[2]
 
 
 def block(text: str, name: str) -> str:

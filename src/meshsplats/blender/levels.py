@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from meshsplats.cameras.files import read_json
+from meshsplats._json import read_json
 from meshsplats.errors import FileFormatError
 from meshsplats.mesh import SplatMesh
 

@@ -13,14 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats.blender.normals import views_around
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import guess_up
-from meshsplats.cameras.trajectories import dome
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.finetuning.adam import RowAdam
-from meshsplats.finetuning.step import encoding_slope
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering import render
+from meshsplats.rendering import Rendering, render
 from meshsplats.rendering.backward import TapedRendering
 
 STEPS = 72
@@ -70,6 +68,7 @@ def linear_colors(
     views, given = around + near, {id(camera) for camera in near}
     rng = np.random.default_rng(0)
     order: list[int] = []
+    targets: dict[int, Rendering] = {}
     for step in range(steps):
         if not order:
             order = rng.permutation(len(views)).tolist()
@@ -77,7 +76,11 @@ def linear_colors(
         background = _BACKGROUNDS[step % 3]
         colors, exponent = _with(plain, clear, values, owner)
         samples = 2 if id(camera) in given and 2 * max(camera.width, camera.height) <= _CAMERA_SIDE else 1
-        target = render(mesh, camera, background=background, samples=samples, threads=threads).color
+        seen = targets.get(id(camera))
+        if seen is None:
+            seen = render(mesh, camera, background=(0, 0, 0), samples=samples, threads=threads)
+            targets[id(camera)] = seen
+        target = seen.color + (1 - seen.alpha)[:, :, None] * np.array(background, np.float32)
         drawn = TapedRendering(
             mesh.vertices,
             mesh.faces,
@@ -118,6 +121,5 @@ def _with(
 
 def _views(mesh: SplatMesh, cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
     """Cameras around ``mesh``, and as many of the given ones, some of them repeated."""
-    views = dome(mesh, _VIEWS, whole=True, up=guess_up(mesh), width=_SIDE, height=_SIDE)
     given = [camera.within(_CAMERA_SIDE) for camera in subsample(cameras or (), _VIEWS)]
-    return views, given * (max(1, _VIEWS // len(given)) if given else 0)
+    return views_around(mesh, _VIEWS, _SIDE), given * (max(1, _VIEWS // len(given)) if given else 0)

@@ -71,7 +71,7 @@ def shading_normals(
         smooth[part] = total
     flipped = np.einsum("ij,ij->i", normals, smooth) < 0
     smooth[flipped & (side != 0)] *= -1
-    return _to_vertices(mesh, owner, _unit(smooth, normals))
+    return _to_vertices(mesh, owner, unit(smooth, normals))
 
 
 def typical_spacing(mesh: SplatMesh, centers: np.ndarray | None = None) -> float:
@@ -98,7 +98,8 @@ def _symmetric(six: np.ndarray) -> np.ndarray:
     return full
 
 
-def _unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
+    """(n, 3) ``vectors`` (n, 3) with length 1; ``instead``, (3,) or (n, 3), for those without length."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), instead)
 
@@ -165,14 +166,21 @@ class _Neighbours:
             yield part, total
 
 
+def views_around(
+    mesh: SplatMesh, count: int, side: int, cameras: Sequence[Camera] = (), most: int = 1
+) -> list[Camera]:
+    """``count`` square cameras all around ``mesh``, and ``most`` of ``cameras`` at most, evenly chosen; their
+    images have at most ``side`` pixels a side."""
+    views = dome(mesh, count, whole=True, up=guess_up(mesh), width=side, height=side)
+    return views + [camera.within(side) for camera in subsample(cameras or (), most)]
+
+
 def _seen_from(
     mesh: SplatMesh, centers: np.ndarray, tolerance: float, cameras: Sequence[Camera], threads: int | None
 ) -> np.ndarray:
     """(n, 3) sum of the unit directions from each centre to the cameras that see it; zero where none does."""
-    views = dome(mesh, VIEWS, whole=True, up=guess_up(mesh), width=_SIDE, height=_SIDE)
-    views += [camera.within(_SIDE) for camera in subsample(cameras or (), 16)]
     seen = np.zeros_like(centers)
-    for camera in views:
+    for camera in views_around(mesh, VIEWS, _SIDE, cameras, 16):
         surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)
         positions, z = camera.project(centers)
         rows = np.flatnonzero(camera.in_image(positions))
@@ -189,4 +197,4 @@ def _to_vertices(mesh: SplatMesh, owner: np.ndarray, normals: np.ndarray) -> np.
     for corner in range(3):
         for axis in range(3):
             sums[:, axis] += np.bincount(mesh.faces[:, corner], normals[owner, axis], len(sums))
-    return _unit(sums, np.broadcast_to(mesh.up.astype(np.float64), sums.shape)).astype(np.float32)
+    return unit(sums, np.broadcast_to(mesh.up.astype(np.float64), sums.shape)).astype(np.float32)

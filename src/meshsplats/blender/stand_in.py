@@ -14,12 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
-from meshsplats._geometry import spacing, vertex_normals
+from meshsplats._geometry import vertex_normals
+from meshsplats.blender.normals import typical_spacing, unit, views_around
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import guess_up
-from meshsplats.cameras.trajectories import dome
 from meshsplats.conversion.cleaning import find
 from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.prior.surface import MIN_PART, Grid, grid_around, signed_distances
@@ -91,8 +89,7 @@ def stand_in(
         grid = grid_around(mesh, resolution)
     except ValueError:  # no extent
         return None
-    placed = dome(mesh, VIEWS, whole=True, up=guess_up(mesh), width=_SIDE, height=_SIDE)
-    placed += [camera.within(_SIDE) for camera in subsample(cameras or (), 8)]
+    placed = views_around(mesh, VIEWS, _SIDE, cameras, 8)
     field = signed_distances(mesh, placed, grid, behind=_BEHIND, threads=threads)
     vertices, faces, cells = surface_net(field)
     if not len(faces):
@@ -123,7 +120,7 @@ def stand_in(
         place_of[rows] = feet.projected(mesh.vertices[rows].astype(np.float64), own[there])
         normal_of[rows] = outward[own[there]]
     # A point for each cell of half a voxel, or of the splats' own spacing where they are farther apart.
-    size = max(grid.voxel / 2, min(grid.voxel, float(np.median(spacing(splats.centers.astype(np.float32))))))
+    size = max(grid.voxel / 2, min(grid.voxel, typical_spacing(mesh, splats.centers)))
     points, ways, point_of = _clustered(place_of, normal_of, size)
     return StandIn(
         surface,
@@ -204,8 +201,7 @@ def _smooth(values: np.ndarray, faces: np.ndarray, times: int = 4) -> np.ndarray
                 total[:, axis] += 0.5 * np.bincount(
                     faces[:, corner], values[faces[:, corner - 1], axis], len(values)
                 )
-        length = np.linalg.norm(total, axis=1, keepdims=True)
-        values = np.where(length > 1e-12, total / np.maximum(length, 1e-12), values)
+        values = unit(total, values)
     return values
 
 
@@ -340,6 +336,4 @@ def _clustered(
         np.stack([np.bincount(index, values[:, k], count) for k in range(3)], axis=1) / held
         for values in (places, normals)
     )
-    length = np.linalg.norm(way, axis=1, keepdims=True)
-    way = np.where(length > 1e-6, way / np.maximum(length, 1e-6), np.array([0.0, 0, 1]))
-    return mean, way, index.astype(np.int32)
+    return mean, unit(way, np.array([0.0, 0, 1])), index.astype(np.int32)

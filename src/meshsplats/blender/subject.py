@@ -10,10 +10,8 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._geometry import direction
 from meshsplats.blender.layers import PROBE_SIDE, bounce_limit, count_layers, most_layers
-from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.options import MAX_LAYERS, SceneOptions
-from meshsplats.blender.stand_in import stand_in
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import Bounds, front_axes, scene_bounds, weighted_quantile
 from meshsplats.mesh import SplatMesh
@@ -68,12 +66,8 @@ def prepare(
     if mesh.face_splat is not None:
         arrays["face_splat"] = mesh.face_splat
     if options.light is not None:
-        arrays["display"] = mesh.colors
-        lit, facts["self_shadow"] = lit_arrays(mesh, cameras, threads=options.threads)
-        arrays |= lit
-        if mesh.binding is None:
-            made, facts["light_spacing"] = stand_in_arrays(mesh, lit, cameras, threads=options.threads)
-            arrays |= made
+        lit, of_light = lit_subject(mesh, cameras, threads=options.threads)
+        return arrays | lit, facts | of_light
     return arrays, facts
 
 
@@ -82,6 +76,19 @@ def lowest(bounds: Bounds, up: np.ndarray) -> float:
     heights = bounds.points @ up
     weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(heights))
     return weighted_quantile(heights, weights, _FLOOR)
+
+
+def lit_subject(
+    mesh: SplatMesh, cameras: Sequence[Camera] = (), *, threads: int | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Arrays and facts that a lit mesh has besides or instead of those of an unlit one, by the names of
+    ``inside.scene.Subject``. A mesh prior, whose shape changes, has no stand-in."""
+    lit, self_shadow = lit_arrays(mesh, cameras, threads=threads)
+    arrays, facts = lit | {"display": mesh.colors}, {"self_shadow": self_shadow}
+    if mesh.binding is None:
+        made, facts["light_spacing"] = _stand_in_arrays(mesh, lit, cameras, threads=threads)
+        arrays |= made
+    return arrays, facts
 
 
 def lit_arrays(
@@ -93,13 +100,15 @@ def lit_arrays(
         ``colors`` (v, 4) in linear light, ``normals`` (v, 3), and ``faces`` (f, 3) wound to face outwards;
         and the distance, scene units, within which layers must not shade each other.
     """
+    from meshsplats.blender.linear import linear_colors
+
     colors = linear_colors(mesh, cameras, threads=threads)
     normals = shading_normals(mesh, cameras, threads=threads)
     arrays = {"colors": colors, "normals": normals, "faces": _facing_out(mesh, normals)}
     return arrays, SELF_SHADOW * typical_spacing(mesh)
 
 
-def stand_in_arrays(
+def _stand_in_arrays(
     mesh: SplatMesh,
     lit: dict[str, np.ndarray],
     cameras: Sequence[Camera] = (),
@@ -108,6 +117,8 @@ def stand_in_arrays(
 ) -> tuple[dict[str, np.ndarray], float]:
     """The stand-in of ``mesh`` by the names that ``inside.scene.Subject`` has for its arrays, and the
     distance of its points, scene units; ``lit`` as from ``lit_arrays``. Empty where nothing is solid."""
+    from meshsplats.blender.stand_in import stand_in
+
     found = stand_in(mesh, lit["normals"], lit["colors"], cameras, threads=threads)
     if found is None:
         return {}, 0.0

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from meshsplats._files.atomic import write_text
+from meshsplats._json import read_json
 from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
 
-MAX_FILE_BYTES = 16 << 20
 """Larger camera files are refused."""
 MAX_CAMERAS = 20_000
 
@@ -48,18 +48,6 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
             f"{path}: {len(entries)} cameras, more than the {MAX_CAMERAS} that are accepted"
         )
     return [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
-
-
-def read_json(path: Path) -> Any:
-    """The content of a file of cameras or levels. FileFormatError if it is not JSON or too large."""
-    with open(path, "rb") as file:
-        text = file.read(MAX_FILE_BYTES + 1)
-    if len(text) > MAX_FILE_BYTES:
-        raise FileFormatError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, the limit for such a file")
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not a JSON file ({str(error)[:120]})") from None
 
 
 def save_cameras(cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:

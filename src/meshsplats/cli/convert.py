@@ -404,9 +404,11 @@ class Convert(Command):
 
     def _with_normals(self, mesh: SplatMesh, cameras: Sequence[Camera] = ()) -> SplatMesh:
         """``mesh`` with smooth normals if they are asked for."""
+        if not self.smooth:
+            return mesh
         from meshsplats.blender.normals import shading_normals
 
-        return replace(mesh, normals=shading_normals(mesh, cameras)) if self.smooth else mesh
+        return replace(mesh, normals=shading_normals(mesh, cameras))
 
     def _write(self, mesh: SplatMesh, job: Job) -> None:
         from meshsplats.formats.meshes import save_mesh

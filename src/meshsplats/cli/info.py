@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import tyro
 
+from meshsplats._json import read_json
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras, read_json
+from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions, cameras_beside

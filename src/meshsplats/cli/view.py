@@ -165,13 +165,12 @@ class View(Command):
         """Sizes, and the errors that quantisation makes."""
         from meshsplats.cameras.trajectories import orbit
         from meshsplats.rendering import render
-        from meshsplats.viewer.quantise import unpack_mesh
 
         camera = (
             cameras[0].within(SIDE) if cameras else orbit(mesh, 1, azimuth=30, width=SIDE, height=SIDE)[0]
         )
         packed = page.mesh
-        images = [render(each, camera, samples=2).color for each in (mesh, unpack_mesh(packed.data))]
+        images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
         return {
             "triangles": len(mesh.faces),
             "splats": 0 if splats is None else len(splats),

@@ -19,7 +19,13 @@ from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, CameraCoverag
 from meshsplats.conversion.merging import simplify
 from meshsplats.conversion.options import PRESETS, ConversionOptions, Preset, make_options
 from meshsplats.conversion.profiles import Profile, fidelity, fit_profile
-from meshsplats.conversion.selection import disc_areas, inside_box, mean_shadow, most_important
+from meshsplats.conversion.selection import (
+    disc_areas,
+    mean_shadow,
+    most_important,
+    refuse_empty_box,
+    within,
+)
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import Look
@@ -243,17 +249,15 @@ def _worth_drawing(cloud: GaussianCloud, options: ConversionOptions) -> np.ndarr
     """(k,) int32 rows of the splats that are inside the crop box and opaque enough, ascending."""
     if len(cloud) == 0:
         raise ValueError("the cloud has no splats: there is nothing to convert")
-    keep = np.ones(len(cloud), bool)
-    if options.crop is not None:
-        keep = inside_box(cloud, options.crop)
-    if options.min_opacity:
-        most = float(cloud.opacities[keep].max())
-        keep &= cloud.opacities >= options.min_opacity
-        if not keep.any():
-            raise ValueError(
-                f"no splat is left: the greatest opacity is {most:.4g},"
-                f" below min_opacity {options.min_opacity:.4g}"
-            )
+    keep = within(cloud, options.crop, options.min_opacity)
+    if not keep.any():
+        if options.crop is not None:
+            refuse_empty_box(cloud, options.crop)
+        most = float(cloud.opacities[within(cloud, options.crop, None)].max())
+        raise ValueError(
+            f"no splat is left: the greatest opacity is {most:.4g},"
+            f" below min_opacity {options.min_opacity:.4g}"
+        )
     return np.flatnonzero(keep).astype(np.int32)
 
 

@@ -49,10 +49,9 @@ def choose_splats(
 
     Raises ValueError if no splat is left.
     """
-    keep = np.ones(len(cloud), bool) if crop is None else inside_box(cloud, crop)
-    if min_opacity is not None:
-        keep &= cloud.opacities >= min_opacity
-    rows = np.flatnonzero(keep)
+    rows = np.flatnonzero(within(cloud, crop, min_opacity))
+    if crop is not None and not len(rows):
+        refuse_empty_box(cloud, crop)
     if max_splats is not None and max_splats < len(rows):
         importance = cloud.opacities[rows] * mean_shadow(disc_areas(cloud.scales[rows]))
         rows = rows[most_important(importance, max_splats)]
@@ -61,23 +60,33 @@ def choose_splats(
     return cloud.select(rows)
 
 
-def inside_box(cloud: GaussianCloud, crop: tuple[float, ...]) -> np.ndarray:
-    """(n,) bool: centres inside the box x0 y0 z0 x1 y1 z1, borders included. ValueError if there are none."""
-    box = np.asarray(crop, np.float64)
-    found = inside(cloud.means, crop)
-    if not found.any():
-        low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
-        raise ValueError(
-            f"the crop box {_point(box[:3])} to {_point(box[3:])} holds none of the {len(cloud)} splats:"
-            f" their centres lie in {_point(low)} to {_point(high)}"
-        )
-    return found
+def within(cloud: GaussianCloud, crop: Sequence[float] | None, min_opacity: float | None) -> np.ndarray:
+    """(n,) bool: splats whose centre lies ``inside`` the box ``crop`` and whose opacity is at least
+    ``min_opacity``. None: no such limit."""
+    keep = np.ones(len(cloud), bool)
+    if crop is not None:
+        keep &= inside(cloud.means, crop)
+    if min_opacity:
+        keep &= cloud.opacities >= min_opacity
+    return keep
 
 
 def inside(points: np.ndarray, box: Sequence[float]) -> np.ndarray:
     """(n,) bool: ``points`` (n, 3) inside the ``box`` x0 y0 z0 x1 y1 z1, borders included."""
     corners = np.asarray(box, np.float64)
     return np.all((points >= corners[:3]) & (points <= corners[3:]), axis=1)
+
+
+def refuse_empty_box(cloud: GaussianCloud, crop: Sequence[float]) -> None:
+    """Raises ValueError if no centre lies in the box ``crop``, x0 y0 z0 x1 y1 z1."""
+    if inside(cloud.means, crop).any():
+        return
+    low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
+    box = np.asarray(crop, np.float64)
+    raise ValueError(
+        f"the crop box {_point(box[:3])} to {_point(box[3:])} holds none of the {len(cloud)} splats:"
+        f" their centres lie in {_point(low)} to {_point(high)}"
+    )
 
 
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:

@@ -25,7 +25,8 @@ from meshsplats.conversion.footprint import (
     origin_step,
 )
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
-from meshsplats.conversion.selection import inside
+from meshsplats.conversion.selection import within
+from meshsplats.formats.splats._cloud_builder import joined
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 
@@ -43,10 +44,8 @@ the same numbers as in a conversion of the whole."""
 class Survey:
     """What the conversion of a part needs to know of the whole scene."""
 
-    read: int
-    """Count of all splats."""
     kept: int
-    """Count of those that are converted: inside the crop box and opaque enough."""
+    """Count of the splats that are converted: inside the crop box and opaque enough."""
     kernel: Kernel
     low: np.ndarray
     """(3,) float64 least coordinates of the centres that are kept."""
@@ -92,31 +91,17 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
         passed += len(part)
     if passed != kept:
         raise ValueError(f"the splats changed while they were read: {kept:,} before, {passed:,} now")
-    return Survey(
-        read, kept, kernel, low, high, joined(samples), step, origin_of(np.concatenate(near_origin))
-    )
+    return Survey(kept, kernel, low, high, joined(samples), step, origin_of(np.concatenate(near_origin)))
 
 
 def worth_drawing(block: GaussianCloud, options: ConversionOptions) -> np.ndarray:
-    """(k,) rows of the splats that are inside the crop box, opaque enough and not without area."""
-    keep = np.ones(len(block), bool)
-    if options.crop is not None:
-        keep &= inside(block.means, options.crop)
-    if options.min_opacity:
-        keep &= block.opacities >= options.min_opacity
-    return np.flatnonzero(keep)
+    """(k,) rows of the splats that are inside the crop box and opaque enough, ascending."""
+    return np.flatnonzero(within(block, options.crop, options.min_opacity))
 
 
 def flattened(cloud: GaussianCloud) -> GaussianCloud:
     """``cloud`` with its harmonics of degree 0 alone."""
     return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
-
-
-def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
-    """One cloud of several of one degree and kernel."""
-    names = ("means", "quaternions", "scales", "opacities", "sh")
-    arrays = {name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in names}
-    return GaussianCloud(**arrays, kernel=clouds[0].kernel)
 
 
 class ScenePixels:
@@ -215,17 +200,13 @@ def convert_blocks(
     pixels = ScenePixels(scene, chosen, cameras, direction)
     if pixels.has_unseen:
         pixels.unseen = _median_seen(source, chosen, pixels)
-    coverage = None
-    if cameras and chosen.colors == "cameras":
-        coverage = CameraCoverage(scene.sample.means, cameras, scene.origin)
 
     def pieces() -> Iterator[_Piece]:
         for block, rows in _aligned(source, chosen, scene.kernel):
             fans = Fans.of(block, chosen, pixels.at(block.means))
             colors = block.colors
-            if coverage is not None and block.sh_degree:
-                coverage.means = block.means
-                colors = coverage.mean_colors(block.sh)
+            if cameras and chosen.colors == "cameras" and block.sh_degree:
+                colors = CameraCoverage(block.means, cameras, scene.origin).mean_colors(block.sh)
             keep = fans.areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(block), bool)
             yield _Piece(flattened(block), rows, colors, fans).select(np.flatnonzero(keep))
 
@@ -317,23 +298,12 @@ def _aligned(
             count += len(rows)
         passed += len(block)
         while count >= BLOCK:
-            cloud, own = joined(_one_degree(held)), np.concatenate(numbers)
+            cloud, own = joined(held), np.concatenate(numbers)
             yield cloud.select(np.arange(BLOCK)), own[:BLOCK]
             held, numbers = [cloud.select(np.arange(BLOCK, count))], [own[BLOCK:]]
             count -= BLOCK
     if count:
-        yield joined(_one_degree(held)), np.concatenate(numbers)
-
-
-def _one_degree(clouds: Sequence[GaussianCloud]) -> Sequence[GaussianCloud]:
-    """``clouds`` of the greatest degree among them; what they lack of it is 0."""
-    width = max(cloud.sh.shape[1] for cloud in clouds)
-    return [
-        cloud
-        if cloud.sh.shape[1] == width
-        else replace(cloud, sh=np.pad(cloud.sh, [(0, 0), (0, width - cloud.sh.shape[1]), (0, 0)]))
-        for cloud in clouds
-    ]
+        yield joined(held), np.concatenate(numbers)
 
 
 def _median_seen(
@@ -345,8 +315,10 @@ def _median_seen(
     the bits and one of the lower half for the two bins in the middle find them in two passes.
     """
 
+    flat = replace(options, colors="degree0")
+
     def blocks() -> Iterator[np.ndarray]:
-        for block, _ in _aligned(source, options, "3dgs"):
+        for block, _ in _aligned(source, flat, "3dgs"):
             yield pixels.seen(block.means)
 
     upper = np.zeros(1 << 16, np.int64)

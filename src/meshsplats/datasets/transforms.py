@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._json import read_json
 from meshsplats.camera import MAX_SIDE
-from meshsplats.cameras.files import read_json
 from meshsplats.datasets.image_files import Frame, find
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import FileFormatError

@@ -12,7 +12,7 @@ table top is the plane y = 0 and the vase is 1.07 units tall.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +42,12 @@ TABLE_RADIUS = 1.45
 def make_scene(count: int = 20_000, seed: int = 0) -> GaussianCloud:
     """The still life as ``count`` splats.
 
-    Parameters
-    ----------
-    count: number of splats, at least 200. The more there are, the smaller they get: surfaces stay closed.
-    seed: of the random leaves, flowers and small irregularities; the same seed gives the same scene.
+    Args:
+        count: number of splats, at least 200. The more there are, the smaller they get: surfaces stay closed.
+        seed: of the random leaves, flowers and small irregularities; the same seed gives the same scene.
 
-    Returns
-    -------
-    GaussianCloud with spherical harmonics of degree 3 and kernel '3dgs'.
+    Returns:
+        A cloud with spherical harmonics of degree 3 and kernel '3dgs'.
 
     Raises ValueError if ``count`` is below 200.
     """
@@ -67,11 +65,16 @@ def make_scene(count: int = 20_000, seed: int = 0) -> GaussianCloud:
     patches.append(_table(count - sum(len(p.points) for p in patches), rng))
     blockers = _blockers(leaves)
     sh = np.concatenate([spherical_harmonics(p, diffuse(p, blockers)) for p in patches])
+    return splats_of(patches, np.concatenate([p.points for p in patches]), sh)
+
+
+def splats_of(patches: Sequence[Patch], means: np.ndarray, sh: np.ndarray) -> GaussianCloud:
+    """The splats of ``patches`` at ``means`` (n, 3) with the harmonics ``sh`` (n, k, 3)."""
     frames = np.concatenate(
         [np.stack([p.tangents, np.cross(p.normals, p.tangents), p.normals], axis=2) for p in patches]
     )
     return GaussianCloud(
-        means=np.concatenate([p.points for p in patches]),
+        means=means,
         quaternions=quaternions_of_frames(frames),
         scales=np.concatenate([p.sigmas for p in patches]),
         opacities=np.concatenate([p.opacities for p in patches]),

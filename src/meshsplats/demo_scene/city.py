@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats.demo_scene import GOLDEN_ANGLE, UP, quaternions_of_frames
+from meshsplats.demo_scene import GOLDEN_ANGLE, UP, splats_of
 from meshsplats.demo_scene._light import Patch, column, diffuse, spherical_harmonics, unit
 from meshsplats.gaussians import SH_C0, GaussianCloud
 
@@ -70,16 +70,8 @@ def _lot(n: int, corner: np.ndarray, degree: int, rng: np.random.Generator) -> G
         sh = np.concatenate([spherical_harmonics(p, c) for p, c in zip(patches, colors, strict=True)])
     else:
         sh = ((np.concatenate(colors) - 0.5) / SH_C0)[:, None]
-    frames = np.concatenate(
-        [np.stack([p.tangents, np.cross(p.normals, p.tangents), p.normals], axis=2) for p in patches]
-    )
-    return GaussianCloud(
-        means=corner + np.concatenate([p.points for p in patches]),
-        quaternions=quaternions_of_frames(frames),
-        scales=np.concatenate([p.sigmas for p in patches]),
-        opacities=np.concatenate([p.opacities for p in patches]),
-        sh=sh[:, : (degree + 1) ** 2],
-    )
+    means = corner + np.concatenate([p.points for p in patches])
+    return splats_of(patches, means, sh[:, : (degree + 1) ** 2])
 
 
 def _walls(n: int, middle: np.ndarray, size: np.ndarray, tone: np.ndarray, rng: np.random.Generator) -> Patch:

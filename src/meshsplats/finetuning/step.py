@@ -9,7 +9,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._core.kernels import compare_images
-from meshsplats.colors import linear_to_srgb, srgb_to_linear
+from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
@@ -138,12 +138,6 @@ def render_view(
         threads=state.threads,
     )
     return RenderedView(rendering, linear)
-
-
-def encoding_slope(linear: np.ndarray) -> np.ndarray:
-    """Derivative of ``colors.linear_to_srgb``, float32; the slope of its linear part at 0 and below."""
-    power = np.maximum(linear, np.float32(0.0031308)) ** np.float32(1 / 2.4 - 1)
-    return np.where(linear <= np.float32(0.0031308), np.float32(12.92), np.float32(1.055 / 2.4) * power)
 
 
 def loss_of(

@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, get_args
+from typing import BinaryIO, Literal, get_args
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from meshsplats.formats.gltf.splats import read_splat_gltf
 from meshsplats.formats.ply.compressed_splats import read_compressed_ply
 from meshsplats.formats.ply.splats import read_float_ply, write_float_blocks, write_float_ply
 from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats
+from meshsplats.formats.splats._cloud_builder import SplatReader
 from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
 from meshsplats.formats.splats.spz import open_spz, read_spz
@@ -59,30 +60,45 @@ def load_gaussians(
             says what is wrong and where.
         MissingDependencyError: SPZ 4 without Zstandard.
     """
-    if axes not in get_args(Axes):
-        raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+    _check_axes(axes)
     found = splat_file(Path(path))
     content = Content(found)
-    kind = content.splat_format()
-    to_y_down, turn = np.eye(3), HALF_TURN_X
+    kind, stored = content.splat_format(), None
     with content.open() as file:
-        if kind == "ply":
-            cloud = read_float_ply(file, content.ply_header, found).read(strict=strict)
-        elif kind == "compressed.ply":
-            cloud = read_compressed_ply(file, content.ply_header, found).read(strict=strict)
-        elif kind == "splat":
-            cloud = read_dot_splat(file, found).read(strict=strict)
+        reader = _reader(content, kind, file, found)
+        if reader is not None:
+            cloud = reader.read(strict=strict)
         elif kind == "spz":
-            cloud, to_y_down = read_spz(file.read(), found, Budget(found), strict=strict)
-        elif kind == "sog":
-            cloud = read_sog(found, Budget(found)).read(strict=strict)
+            cloud, stored = read_spz(file.read(), found, Budget(found), strict=strict)
         elif kind == "streamed sog":
             cloud = read_streamed_sog(found, strict=strict)
         else:
-            cloud, to_y_down, turn = read_splat_gltf(found, strict=strict), HALF_TURN_Z, HALF_TURN_Z
-    if axes != "auto":
-        to_y_down = turn if axes == "y-up" else np.eye(3)
-    return transformed(cloud, to_y_down)
+            cloud = read_splat_gltf(found, strict=strict)
+    return transformed(cloud, _to_y_down(kind, axes, stored))
+
+
+def _check_axes(axes: Axes) -> None:
+    if axes not in get_args(Axes):
+        raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+
+
+def _reader(content: Content, kind: SplatFormat, file: BinaryIO, path: Path) -> SplatReader | None:
+    """The reader of the formats that are read in the same way as a whole and in blocks."""
+    if kind == "ply":
+        return read_float_ply(file, content.ply_header, path)
+    if kind == "compressed.ply":
+        return read_compressed_ply(file, content.ply_header, path)
+    if kind == "splat":
+        return read_dot_splat(file, path)
+    return read_sog(path, Budget(path)) if kind == "sog" else None
+
+
+def _to_y_down(kind: SplatFormat, axes: Axes, stored: np.ndarray | None) -> np.ndarray:
+    """(3, 3) from the axes of a file to y down and z forward; ``stored``: what the file says itself."""
+    turn = HALF_TURN_Z if kind == "gltf" else HALF_TURN_X
+    if axes == "auto" and stored is not None:
+        return stored
+    return turn if axes == "y-up" or (axes == "auto" and kind == "gltf") else np.eye(3)
 
 
 class SplatStream:
@@ -103,8 +119,7 @@ class SplatStream:
         strict: bool = False,
         axes: Axes = "auto",
     ) -> None:
-        if axes not in get_args(Axes):
-            raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+        _check_axes(axes)
         if isinstance(block, bool) or not isinstance(block, (int, np.integer)) or block < 1:
             raise ValueError(f"block must be a number of splats, at least 1, got {block!r}")
         self.paths = tuple(Path(path) for path in paths)
@@ -117,27 +132,15 @@ class SplatStream:
 
     def _of(self, path: Path) -> Iterator[GaussianCloud]:
         content = Content(path)
-        kind = content.splat_format()
-        to_y_down, turn = np.eye(3), HALF_TURN_X
+        kind, stored = content.splat_format(), None
         with content.open() as file:
-            if kind == "ply":
-                readers = iter([read_float_ply(file, content.ply_header, path)])
-            elif kind == "compressed.ply":
-                readers = iter([read_compressed_ply(file, content.ply_header, path)])
-            elif kind == "splat":
-                readers = iter([read_dot_splat(file, path)])
-            elif kind == "spz":
-                reader, to_y_down = open_spz(path)
-                readers = iter([reader])
-            elif kind == "sog":
-                readers = iter([read_sog(path, Budget(path))])
-            elif kind == "streamed sog":
+            reader = _reader(content, kind, file, path)
+            if kind == "spz":
+                reader, stored = open_spz(path)
+            readers: Iterable[SplatReader] = () if reader is None else (reader,)
+            if kind == "streamed sog":
                 readers = (part for _, part, _ in streamed_parts(path))
-            else:
-                readers = iter([])
-                to_y_down = turn = HALF_TURN_Z
-            if self.axes != "auto":
-                to_y_down = turn if self.axes == "y-up" else np.eye(3)
+            to_y_down = _to_y_down(kind, self.axes, stored)
             for reader in readers:
                 for block in reader.blocks(self.block, strict=self.strict):
                     yield transformed(block, to_y_down)

@@ -249,7 +249,7 @@ class _Build:
             found = survey(self._source, self._conversion)
             with atomic_path(path) as temporary:
                 arrays = {
-                    "counts": np.array([found.read, found.kept, found.step]),
+                    "counts": np.array([found.kept, found.step]),
                     "bounds": np.stack([found.low, found.high, found.origin]),
                     "kernel": np.array(found.kernel),
                     "sample": records_of(found.sample, np.zeros(len(found.sample), np.int32)),
@@ -257,10 +257,10 @@ class _Build:
                 np.savez(temporary, **arrays)  # type: ignore[arg-type]
             self.journal.add("survey", kept=found.kept)
         with np.load(path) as stored:
-            read, kept, step = (int(n) for n in stored["counts"])
+            kept, step = (int(n) for n in stored["counts"])
             low, high, origin = stored["bounds"]
             kernel: Kernel = str(stored["kernel"])  # type: ignore[assignment]
-            return Survey(read, kept, kernel, low, high, cloud_of(stored["sample"], kernel), step, origin)
+            return Survey(kept, kernel, low, high, cloud_of(stored["sample"], kernel), step, origin)
 
     def _records(self) -> Iterator[np.ndarray]:
         passed = 0

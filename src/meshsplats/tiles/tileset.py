@@ -20,6 +20,7 @@ import numpy as np
 
 from meshsplats import __version__
 from meshsplats._files.atomic import write_text
+from meshsplats._json import read_json
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.writer import up_quaternion
@@ -267,14 +268,7 @@ class Tileset:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    with open(path, "rb") as file:
-        raw = file.read(_MAX_BYTES + 1)
-    if len(raw) > _MAX_BYTES:
-        raise FileFormatError(f"{path}: a tileset file of more than {_MAX_BYTES:,} bytes; refused")
-    try:
-        document = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: no tileset file: {str(error)[:100]}") from None
+    document = read_json(path, _MAX_BYTES)
     if not isinstance(document, dict) or not isinstance(document.get("asset"), dict):
         raise FileFormatError(f"{path}: no tileset file: it has no object 'asset'")
     version = document["asset"].get("version")

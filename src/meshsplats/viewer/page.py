@@ -13,18 +13,19 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import resources
 
 import numpy as np
 
+from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import guess_up, scene_bounds
+from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer.quantise import QuantisedMesh, pack_splats, quantise_mesh
-from meshsplats.webgpu import kernels
+from meshsplats.webgpu import device, kernels, renderer
 
 MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")
 """The scripts of the page, in the order in which they are joined."""
@@ -49,8 +50,6 @@ class PageOptions:
     """Display RGB, 0 to 1."""
     up: Sequence[float] | np.ndarray | None = None
     """(3,) direction that points up. None: by the cameras, else by the mesh."""
-    statistics: Mapping[str, str] = field(default_factory=dict)
-    """Further lines for the statistics."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +80,8 @@ def make_page(
     """
     options = options or PageOptions()
     packed = quantise_mesh(mesh)
-    views = list(cameras[:: max(1, -(-len(cameras) // MOST_CAMERAS))])
-    up = np.asarray(guess_up(mesh, views) if options.up is None else options.up, np.float64)
-    up = up / np.linalg.norm(up)
+    views = list(subsample(cameras, MOST_CAMERAS))
+    up = guess_up(mesh, views) if options.up is None else unit_up(options.up)
     if not views:
         views = [orbit(mesh, 1, azimuth=30, elevation=15, width=1000, height=1000, up=up)[0]]
     bounds = scene_bounds(mesh)
@@ -99,7 +97,6 @@ def make_page(
             "data": f"{packed.bytes_a_triangle:.1f} bytes a triangle",
             "position error": f"{packed.position_error:.2g}",
             "colour error": f"{packed.color_error:.2g} of 255",
-            **options.statistics,
         },
     }
     groups = mesh.depth_group is not None and bool((mesh.depth_group >= 0).any())
@@ -114,10 +111,19 @@ def make_page(
 
 
 def _kernels(groups: bool) -> dict[str, object]:
-    """The text of the kernels and the steps of a frame, for ``page/exact.js``. ``groups``: whether the mesh
-    has depth groups."""
+    """The text of the kernels, their limits and the steps of a frame, for ``page/exact.js``. ``groups``:
+    whether the mesh has depth groups."""
     return {
         "groups": groups,
+        "limits": {
+            "window": renderer.WINDOW_SAMPLES,
+            "firstPairs": renderer.FIRST_PAIRS,
+            "pairs": kernels.MAX_PAIRS,
+            "runs": kernels.MAX_RUNS,
+            "tiles": kernels.MAX_TILES,
+            "rounds": renderer.MAX_ROUNDS,
+            "budgets": [*device.SOFTWARE_BUDGETS, device.BUDGET],
+        },
         "digits": kernels.DIGITS,
         "lists": kernels.list_steps(),
         "raster": kernels.raster_steps(),
@@ -179,7 +185,7 @@ def _described(camera: Camera) -> dict[str, object]:
 
 def _extent(mesh: SplatMesh) -> list[list[float]]:
     """Ends of the crop box's sliders: what holds nearly all vertices, and a margin."""
-    low, high = np.quantile(mesh.vertices[:: max(1, len(mesh.vertices) // 200_000)], (0.002, 0.998), axis=0)
+    low, high = np.quantile(subsample(mesh.vertices, 200_000), (0.002, 0.998), axis=0)
     margin = 0.02 * (high - low) + 1e-3 * float((high - low).max() or 1)
     return [(low - margin).tolist(), (high + margin).tolist()]
 

@@ -76,11 +76,13 @@ are 1/1000 of a pixel there, the coarsest a quarter. Where layers nearly touch, 
 their order in a few pixels, by several levels."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class QuantisedMesh:
     """A mesh as packed data, and how far it is from the mesh it was made of."""
 
     data: bytes
+    decoded: SplatMesh
+    """The mesh in ``data``, as from ``unpack_mesh``."""
     triangles: int
     precision: Precision
     position_error: float
@@ -113,14 +115,15 @@ def quantise_mesh(mesh: SplatMesh, limit: float = BYTES_A_TRIANGLE) -> Quantised
         if len(pack_mesh(sample, precision, radius)) <= max(limit * len(sample.faces), SMALL * share):
             chosen = precision
             break
-    data = pack_mesh(mesh, chosen, radius)
-    back = unpack_mesh(data)
     order = _vertex_order(mesh)
+    data = _packed(mesh, order, chosen, radius)
+    back = unpack_mesh(data)
     vertices, colors = mesh.vertices[order], mesh.colors[order]
     position = float(np.abs(back.vertices.astype(np.float64) - vertices).max())
     levels = 255 * np.abs(back.colors.astype(np.float64) - colors).max(axis=0)
     return QuantisedMesh(
         data,
+        back,
         len(mesh.faces),
         chosen,
         position,
@@ -132,7 +135,11 @@ def quantise_mesh(mesh: SplatMesh, limit: float = BYTES_A_TRIANGLE) -> Quantised
 
 def pack_mesh(mesh: SplatMesh, precision: Precision, radius: float) -> bytes:
     """``mesh`` as a container. ``radius``: size of the scene, to which the steps of positions relate."""
-    order = _vertex_order(mesh)
+    return _packed(mesh, _vertex_order(mesh), precision, radius)
+
+
+def _packed(mesh: SplatMesh, order: np.ndarray, precision: Precision, radius: float) -> bytes:
+    """``pack_mesh``; ``order`` as from ``_vertex_order``."""
     vertices, colors = mesh.vertices[order].astype(np.float64), mesh.colors[order]
     renumber = np.zeros(len(mesh.vertices), np.int64)
     renumber[order] = np.arange(len(order))

@@ -6,6 +6,8 @@ long as an unlit one; the light stays as it was when it was gathered.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from meshsplats.blender.inside.materials import LIGHT
 POINT = "light_point"
 """Attribute of the splats: index of the point whose light each vertex takes."""
 POINTS = "meshsplats_light_points"
-"""Property of the splats' object: name of the object of the points."""
+"""Property of the splats' object: the object of the points."""
 SIZE = "meshsplats_spacing"
 """Property of the points' mesh: distance of neighbouring points, scene units."""
 SAMPLES = 12
@@ -49,8 +51,10 @@ def make_points(name: str, points: np.ndarray, normals: np.ndarray, size: float)
 
 
 def points_of(obj: Any) -> Any:
-    """The object of the points of the splats ``obj``, or None."""
-    return bpy.data.objects.get(obj.get(POINTS, "")) if obj is not None else None
+    """The object of the points of the splats ``obj``; None if there is none, or it was deleted."""
+    target = obj.get(POINTS) if obj is not None else None
+    # What is deleted in the window stays in the file while a property refers to it.
+    return target if target is not None and target.users_collection else None
 
 
 def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
@@ -69,14 +73,21 @@ def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
     chosen = [obj for obj in objs if obj.name in targets]
     if not chosen:
         return 0
-    with _settings(scene, samples), _visible([(obj, True) for obj in chosen]):
+    versions.enable_cycles()
+    settings = [
+        (scene.render, "engine", versions.engine_name("cycles")),
+        (scene.cycles, "samples", samples),
+        (scene.cycles, "use_denoising", False),
+        (scene.cycles, "use_adaptive_sampling", False),
+    ]
+    with _held(settings + [(obj, "hide_render", True) for obj in chosen]):
         for obj in chosen:
             target = targets[obj.name]
             chain = levels.chain_of(obj)
             before = None if chain is None else levels.visible_level(chain)
             if before is not None:
                 levels.show(chain, obj[levels.LEVEL])
-            with _visible([(target, False)]):
+            with _held([(target, "hide_render", False), (target, "hide_viewport", False)]):
                 _bake(target)
             if before is not None:
                 levels.show(chain, before)
@@ -168,44 +179,15 @@ def _bake(target: Any) -> None:
         layer.objects.active = active
 
 
-class _settings:
-    """Cycles, ready to bake, and afterwards the settings from before."""
-
-    def __init__(self, scene: Any, samples: int) -> None:
-        self.scene = scene
-        versions.enable_cycles()
-        self.new = [
-            (scene.render, "engine", versions.engine_name("cycles")),
-            (scene.cycles, "samples", samples),
-            (scene.cycles, "use_denoising", False),
-            (scene.cycles, "use_adaptive_sampling", False),
-        ]
-
-    def __enter__(self) -> None:
-        self.old = []
-        for owner, name, value in self.new:
-            self.old.append((owner, name, getattr(owner, name)))
+@contextmanager
+def _held(values: list[tuple[Any, str, Any]]) -> Iterator[None]:
+    """Properties hold other ``values``: owner, name, value. Afterwards they have those from before."""
+    old = [(owner, name, getattr(owner, name)) for owner, name, _ in values]
+    try:
+        for owner, name, value in values:
             setattr(owner, name, value)
-
-    def __exit__(self, *_: object) -> None:
-        for owner, name, value in reversed(self.old):
-            setattr(owner, name, value)
-
-
-class _visible:
-    """Objects hidden from renders, or shown in renders and in the viewport, and afterwards as before."""
-
-    def __init__(self, hidden: list[tuple[Any, bool]]) -> None:
-        self.hidden = hidden
-
-    def __enter__(self) -> None:
-        self.old = [(obj, obj.hide_render, obj.hide_viewport) for obj, _ in self.hidden]
-        for obj, hide in self.hidden:
-            obj.hide_render = hide
-            if not hide:
-                obj.hide_viewport = False
         bpy.context.view_layer.update()
-
-    def __exit__(self, *_: object) -> None:
-        for obj, render, viewport in self.old:
-            obj.hide_render, obj.hide_viewport = render, viewport
+        yield
+    finally:
+        for owner, name, value in reversed(old):
+            setattr(owner, name, value)

@@ -14,6 +14,8 @@ COLOR = "Color"
 """Attribute with RGBA: display values where the image is unlit, linear light where it is lit."""
 DISPLAY = "DisplayColor"
 """Attribute of a lit mesh: the RGBA that the unlit one has in ``COLOR``."""
+MADE = "LitColor"
+"""Attribute of a lit mesh: the RGBA that it was made with in ``COLOR``, so that painted colours show."""
 NORMAL = "splat_normal"
 """Attribute with the shading normal, in the object's own frame."""
 SPLAT = "splat"
@@ -45,6 +47,8 @@ def make_mesh(
     if display is not None:
         attribute = mesh.attributes.new(DISPLAY, "FLOAT_COLOR", "POINT")
         attribute.data.foreach_set("color", np.ascontiguousarray(display, np.float32).ravel())
+        attribute = mesh.attributes.new(MADE, "FLOAT_COLOR", "POINT")
+        attribute.data.foreach_set("color", np.ascontiguousarray(colors, np.float32).ravel())
     if normals is not None:
         attribute = mesh.attributes.new(NORMAL, "FLOAT_VECTOR", "POINT")
         attribute.data.foreach_set("vector", np.ascontiguousarray(normals, np.float32).ravel())
@@ -86,6 +90,13 @@ def make_object(mesh: Any, name: str, rotation: np.ndarray, collection: Any) -> 
     return obj
 
 
+def read_colors(mesh: Any, name: str) -> np.ndarray:
+    """(v, 4) float32 values of the colour attribute ``name``."""
+    colors = np.empty(4 * len(mesh.vertices), np.float32)
+    mesh.attributes[name].data.foreach_get("color", colors)
+    return colors.reshape(-1, 4)
+
+
 def set_faces(mesh: Any, faces: np.ndarray) -> None:
     """Reorders the faces of ``mesh``, which has no edges."""
     versions.set_corners(mesh, faces)
@@ -106,9 +117,7 @@ def world_points(obj: Any) -> np.ndarray:
     data.vertices.foreach_get("co", vertices)
     points = vertices.reshape(-1, 3).astype(np.float64)
     if COLOR in data.attributes and len(points):
-        colors = np.empty(4 * len(points), np.float32)
-        data.attributes[COLOR].data.foreach_get("color", colors)
-        points = points[colors[3::4] > _VISIBLE]
+        points = points[read_colors(data, COLOR)[:, 3] > _VISIBLE]
     points = points[:: -(-max(len(points), 1) // SAMPLE)]
     world = np.array(obj.matrix_world)
     return points @ world[:3, :3].T + world[:3, 3]

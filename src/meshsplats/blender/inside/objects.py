@@ -22,8 +22,9 @@ from meshsplats.blender.inside import (
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.layers import bounce_limit, most_layers
 from meshsplats.blender.options import LightOptions
-from meshsplats.blender.subject import lit_arrays, lowest, stand_in_arrays
+from meshsplats.blender.subject import lit_subject, lowest
 from meshsplats.cameras.framing import scene_bounds
+from meshsplats.colors import linear_to_srgb
 from meshsplats.conversion.baking import bake_filter
 from meshsplats.mesh import Blending, SplatMesh
 from meshsplats.prior.model import MeshPrior
@@ -50,11 +51,8 @@ def prepare(mesh: SplatMesh, lit: bool) -> dict[str, Any]:
         mesh = bake_filter(mesh)
     arrays: dict[str, Any] = {"faces": mesh.faces, "colors": mesh.colors, "normals": None, "self_shadow": 0.0}
     if lit:
-        made, arrays["self_shadow"] = lit_arrays(mesh)
-        arrays |= made | {"display": mesh.colors}
-        if mesh.binding is None:
-            found, arrays["light_spacing"] = stand_in_arrays(mesh, made)
-            arrays |= found
+        made, facts = lit_subject(mesh)
+        arrays |= made | facts
     # Splats on a base keep the base's frame.
     origin = np.zeros(3) if mesh.binding is not None or not len(mesh.faces) else foot(mesh)
     return arrays | {"mesh": mesh, "lit": lit, "layers": most_layers(mesh), "origin": origin}
@@ -176,6 +174,8 @@ def mark(data: Any, *, up: np.ndarray, origin: np.ndarray, lit: bool, linear: bo
 def as_splat_mesh(obj: Any) -> SplatMesh:
     """The unlit mesh that ``obj`` was made from, in the frame and colours of its file.
 
+    Where a lit mesh was painted, the new colour counts, as display values, and so does a new opacity.
+
     Raises:
         ValueError: not a mesh of triangles that MeshSplats made.
     """
@@ -188,14 +188,7 @@ def as_splat_mesh(obj: Any) -> SplatMesh:
     data.loops.foreach_get("vertex_index", faces)
     if len(faces) != 3 * len(data.polygons):
         raise ValueError("the object has faces that are not triangles: triangulate it first")
-    colors = np.empty(4 * len(data.vertices), np.float32)
-    shown = meshes.DISPLAY if meshes.DISPLAY in data.attributes else meshes.COLOR
-    data.attributes[shown].data.foreach_get("color", colors)
-    colors = np.clip(colors.reshape(-1, 4), 0, 1)
-    if data[LIT] and not data[LINEAR] and shown == meshes.COLOR:
-        from meshsplats.colors import linear_to_srgb
-
-        colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
+    colors = _unlit_colors(data)
     owner = None
     if meshes.SPLAT in data.attributes:
         owner = np.empty(len(data.polygons), np.int32)
@@ -217,6 +210,21 @@ def as_splat_mesh(obj: Any) -> SplatMesh:
         return found
     binding = priors.binding_of(obj)
     return replace(found, vertices=binding.positions(), normals=binding.normals(), binding=binding)
+
+
+def _unlit_colors(data: Any) -> np.ndarray:
+    """(v, 4) float32 RGBA of the mesh ``data`` as composited unlit."""
+    shown = meshes.read_colors(data, meshes.COLOR)
+    colors = np.clip(shown, 0, 1)
+    if not data[LIT]:
+        return colors
+    if not data[LINEAR]:
+        colors[:, :3] = np.clip(linear_to_srgb(colors[:, :3]), 0, 1)
+    if meshes.DISPLAY in data.attributes and meshes.MADE in data.attributes:
+        kept = shown == meshes.read_colors(data, meshes.MADE)
+        kept[:, :3] = kept[:, :3].all(axis=1, keepdims=True)
+        colors = np.where(kept, np.clip(meshes.read_colors(data, meshes.DISPLAY), 0, 1), colors)
+    return colors
 
 
 def render_settings(scene: Any, objs: list[Any], lit: bool, light: LightOptions | None = None) -> int:

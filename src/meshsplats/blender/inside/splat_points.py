@@ -19,11 +19,9 @@ KEYS = {"FLOAT_VECTOR": "vector", "FLOAT4": "vector", "FLOAT_COLOR": "color", "Q
 
 def is_splats(obj: Any) -> bool:
     """Whether ``obj`` is a point cloud with the attributes of splats."""
-    return obj is not None and obj.type == "POINTCLOUD" and _has_splats(obj.data)
-
-
-def _has_splats(data: Any) -> bool:
-    found = (data.attributes.get(name) for name in WIDTHS)
+    if obj is None or not hasattr(obj.data, "points"):
+        return False
+    found = (obj.data.attributes.get(name) for name in WIDTHS)
     return all(a is not None and a.domain == "POINT" and a.data_type in KEYS for a in found)
 
 
@@ -35,9 +33,10 @@ def cloud_of(obj: Any, depsgraph: Any) -> GaussianCloud:
         FileFormatError: no splat with finite values is there.
         ValueError: the modifiers leave no point cloud of splats.
     """
-    data = obj.evaluated_get(depsgraph).data
-    if not hasattr(data, "points") or not _has_splats(data):
+    evaluated = obj.evaluated_get(depsgraph)
+    if not is_splats(evaluated):
         raise ValueError(f"{obj.name}: its modifiers leave no splats")
+    data = evaluated.data
     count = len(data.points)
     builder = CloudBuilder(count, 1, obj.name)
     rows = builder.next(count)

@@ -15,7 +15,7 @@ ARRAYS = (
     *("surface_vertices", "surface_faces", "surface_colors", "fine_faces"),
     *("light_points", "light_normals", "light_point_of"),
 )
-"""Fields of ``StandIn``, as ``subject.stand_in_arrays`` names them."""
+"""Fields of ``StandIn``, as ``subject.lit_subject`` names them."""
 STAND_IN = "meshsplats_stand_in"
 """Property of the objects made here: True."""
 
@@ -43,13 +43,11 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
         used, index = np.unique(corners.reshape(-1, 3)[fine], return_inverse=True)
         co = np.empty(3 * len(data.vertices), np.float32)
         data.vertices.foreach_get("co", co)
-        rgba = np.empty(4 * len(data.vertices), np.float32)
-        data.attributes[meshes.COLOR].data.foreach_get("color", rgba)
         thin = meshes.make_mesh(
             f"{obj.name} stand-in, fine",
             co.reshape(-1, 3)[used],
             index.reshape(-1, 3).astype(np.int32),
-            rgba.reshape(-1, 4)[used],
+            meshes.read_colors(data, meshes.COLOR)[used],
         )
         thin.materials.append(materials.stand_in("Stand-in, fine", fine=True, self_shadow=self_shadow))
         _child(obj, thin, home)
@@ -61,7 +59,7 @@ def add(obj: Any, arrays: Mapping[str, np.ndarray], size: float, *, self_shadow:
     target.visible_volume_scatter = True  # Cycles leaves out what no ray at all can see
     target.hide_select = False
     target.hide_render = target.hide_viewport = True
-    obj[baking.POINTS] = target.name
+    obj[baking.POINTS] = target
     index_of = obj.data.attributes.new(baking.POINT, "INT", "POINT")
     index_of.data.foreach_set("value", np.ascontiguousarray(arrays["light_point_of"], np.int32))
     obj.visible_shadow = obj.visible_diffuse = False

@@ -229,9 +229,8 @@ def write_float_blocks(
                 rows = np.zeros((len(sh), len(names)), "<f4")
                 rows[:, :3] = cloud.means[part]
                 rows[:, 6:9] = sh[:, 0]
-                rest = rows[:, 9 : at["opacity"]].reshape(len(sh), 3, k - 1)
+                rest = rows[:, 9 : at["opacity"]].reshape(len(sh), 3, k - 1)  # a view of the rows
                 rest[:, :, : sh.shape[1] - 1] = sh[:, 1:].transpose(0, 2, 1)
-                rows[:, 9 : at["opacity"]] = rest.reshape(len(sh), -1)
                 opacities = cloud.opacities[part].astype(np.float64)
                 with np.errstate(divide="ignore"):
                     logits = np.log(opacities) - np.log1p(-opacities)

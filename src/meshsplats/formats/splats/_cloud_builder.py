@@ -162,12 +162,13 @@ class CloudBuilder:
         return dropped
 
 
-def joined(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCloud:
+def joined(clouds: Sequence[GaussianCloud], budget: Budget | None = None) -> GaussianCloud:
     """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one."""
     if len(clouds) == 1:
         return clouds[0]
     count, width = sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds)
-    budget.spend(4 * (11 + 3 * width) * count, f"its {count:,} splats together")
+    if budget is not None:
+        budget.spend(4 * (11 + 3 * width) * count, f"its {count:,} splats together")
     sh = np.zeros((count, width, 3), np.float32)
     start = 0
     for cloud in clouds:

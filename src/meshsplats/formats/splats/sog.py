@@ -8,7 +8,6 @@ maps them between a least and a largest value. Specification: developer.playcanv
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
 import warnings
@@ -22,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._json import json_object
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.sniff import Content
@@ -50,23 +50,6 @@ def read_sog(path: Path, budget: Budget, ranges: Sequence[tuple[int, int]] | Non
             return _Reader(_Archive(archive, path), path, budget).read(ranges)
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
-
-
-def json_object(raw: bytes, most: int, what: str, where: Path) -> dict[str, Any]:
-    """The object in the JSON file ``what`` of at most ``most`` bytes.
-
-    Raises:
-        FileFormatError: it is longer, or no object; the message begins with ``where``.
-    """
-    if len(raw) > most:
-        raise FileFormatError(f"{where}: {what} is longer than {most:,} bytes")
-    try:
-        found = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{where}: {what} cannot be read: {str(error)[:120]}") from None
-    if not isinstance(found, dict):
-        raise FileFormatError(f"{where}: {what} must be an object")
-    return found
 
 
 class _Folder:
@@ -136,7 +119,7 @@ class _Archive:
 class _Reader:
     def __init__(self, files: _Folder | _Archive, where: Path, budget: Budget) -> None:
         self._files, self._where, self._budget = files, where, budget
-        self._meta = json_object(files.read_meta(), _MAX_META_BYTES, "meta.json", where)
+        self._meta = json_object(files.read_meta(), _MAX_META_BYTES, f"{where}: meta.json")
 
     def _error(self, message: str) -> FileFormatError:
         return FileFormatError(f"{self._where}: {message}")

@@ -398,16 +398,25 @@ def _contents(
 
 def _zstd_stream(path: Path, at: int, length: int) -> Any:
     """The unpacked bytes of the Zstandard frame at a place of the file, as a file to be read."""
+    own, package = _zstandard(path)
+    if own is not None:
+        return own.ZstdFile(_Frame(path, at, length))
+    decompressor = package.ZstdDecompressor(max_window_size=1 << 27)
+    return decompressor.stream_reader(_Frame(path, at, length), closefd=True)
+
+
+def _zstandard(where: object) -> tuple[Any, Any]:
+    """The module of Python 3.14 and None, or else None and the package. MissingDependencyError without."""
     try:
-        zstd = importlib.import_module("compression.zstd")
+        return importlib.import_module("compression.zstd"), None
     except ImportError:
-        try:
-            zstandard = importlib.import_module("zstandard")
-        except ImportError:
-            raise _no_zstandard(path) from None
-        decompressor = zstandard.ZstdDecompressor(max_window_size=1 << 27)
-        return decompressor.stream_reader(_Frame(path, at, length), closefd=True)
-    return zstd.ZstdFile(_Frame(path, at, length))
+        pass
+    try:
+        return None, importlib.import_module("zstandard")
+    except ImportError:
+        raise MissingDependencyError(
+            f"{where}: SPZ version 4 needs the extra 'formats': pip install zstandard"
+        ) from None
 
 
 def _unpacking_errors() -> tuple[type[Exception], ...]:
@@ -416,31 +425,15 @@ def _unpacking_errors() -> tuple[type[Exception], ...]:
     return (zlib.error, *(module.ZstdError for module in loaded if module is not None))
 
 
-def _no_zstandard(where: object) -> MissingDependencyError:
-    return MissingDependencyError(f"{where}: SPZ version 4 needs the extra 'formats': pip install zstandard")
-
-
 def _unzstd(packed: bytes, size: int, name: str, where: object) -> bytes:
-    """Exactly ``size`` bytes of a Zstandard frame, through Python 3.14 or the package zstandard."""
-    error_type: type[Exception]
+    """Exactly ``size`` bytes of a Zstandard frame."""
+    own, package = _zstandard(where)
     try:
-        zstd = importlib.import_module("compression.zstd")
-    except ImportError:
-        try:
-            zstandard = importlib.import_module("zstandard")
-        except ImportError:
-            raise _no_zstandard(where) from None
-        error_type = zstandard.ZstdError
-        reader = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed)
-    else:
-        error_type = zstd.ZstdError
-        reader = None
-    try:
-        if reader is None:
-            out = zstd.ZstdDecompressor().decompress(packed, max_length=size + 1)
+        if own is not None:
+            out = own.ZstdDecompressor().decompress(packed, max_length=size + 1)
         else:
-            out = reader.read(size + 1)
-    except (error_type, MemoryError) as error:
+            out = package.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed).read(size + 1)
+    except ((own or package).ZstdError, MemoryError) as error:
         raise FileFormatError(f"{where}: the stream of {name} is broken: {error}") from None
     if len(out) != size:
         raise FileFormatError(f"{where}: the stream of {name} does not unpack to {size:,} bytes")

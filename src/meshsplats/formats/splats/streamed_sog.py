@@ -11,10 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from meshsplats._json import json_object
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.splats._cloud_builder import SplatReader, joined
-from meshsplats.formats.splats.sog import json_object, read_sog
+from meshsplats.formats.splats.sog import read_sog
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 _MAX_INDEX_BYTES = 64 << 20
@@ -63,7 +64,7 @@ class _Index:
         self._path = path
         with open(path, "rb") as file:
             raw = file.read(_MAX_INDEX_BYTES + 1)
-        self._document = json_object(raw, _MAX_INDEX_BYTES, "the index", path)
+        self._document = json_object(raw, _MAX_INDEX_BYTES, path)
         version = self._document.get("version", 1)
         if version != 1:
             raise self._error(f"streamed SOG of version {str(version)[:20]}, known is 1")

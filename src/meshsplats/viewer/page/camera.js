@@ -16,10 +16,6 @@ export class View {
   // distance: of the pivot before the camera.
   constructor(camera, up, distance) {
     this.up = up;
-    this.jump(camera, distance);
-  }
-
-  jump(camera, distance) {
     const m = camera.matrix;
     this.right = unit([m[0], m[1], m[2]]);
     this.forward = unit([m[8], m[9], m[10]]);

@@ -60,11 +60,8 @@ export class CropBox {
   }
 
   #kept() {
-    const { mesh, splats } = this, F = mesh.faces.length / 3;
-    this.fans ??= mesh.fans ?? Uint32Array.from({ length: F + 1 }, (_, i) => i);
-    this.middles ??= middlesOf(mesh, this.fans);
-    const fans = this.#within(this.middles), triangles = [];
-    for (const fan of fans) for (let f = this.fans[fan]; f < this.fans[fan + 1]; f++) triangles.push(f);
+    const { mesh, splats } = this, fans = this.#within(fanMiddles(mesh)), triangles = [];
+    for (const fan of fans) for (let f = mesh.fans[fan]; f < mesh.fans[fan + 1]; f++) triangles.push(f);
     return { fans, triangles: Uint32Array.from(triangles), splats: splats ? this.#within(splats.means) : new Uint32Array(0) };
   }
 
@@ -95,6 +92,12 @@ export class CropBox {
     }
     return lines.join("");
   }
+}
+
+// The middles of the mesh's own fans, computed once.
+export function fanMiddles(mesh) {
+  mesh.middles ??= middlesOf(mesh, mesh.fans);
+  return mesh.middles;
 }
 
 // The mean of each fan's triangle centres.

@@ -1,12 +1,7 @@
 // WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in the
 // page as Python wrote them; docs/webgpu.md says what a host has to do.
 
-const TILE = 8, RUN = 8, WINDOW = 1 << 22;
-const FIRST_PAIRS = 1 << 18, MOST_PAIRS = 16e6, MOST_RUNS = 1 << 24, MOST_TILES = 65535;
-// Loop iterations of one walk through a tile list, one limit after the other until all tiles are finished. Software
-// drivers cut loops after 65,535 iterations; walks are counted high, so the first is safe, and the second mostly.
-const BUDGETS = [60000, 150000, 4000000];
-const ROUNDS = 1000; // most repetitions of a frame's last steps
+const TILE = 8, RUN = 8;
 const NONE = 0xffffffff;
 
 // Sums frames and shows their mean over the background.
@@ -67,7 +62,7 @@ export class ExactRenderer {
     const self = new ExactRenderer();
     const { vendor, architecture, description } = adapter.info ?? {};
     Object.assign(self, { canvas, mesh, kernels, device, buffers: {}, groupsOfBindings: new Map() });
-    Object.assign(self, { capacity: FIRST_PAIRS, budget: BUDGETS[0] });
+    Object.assign(self, { capacity: kernels.limits.firstPairs, budget: kernels.limits.budgets[0] });
     self.name = description || [vendor, architecture].filter(Boolean).join(" ") || "WebGPU";
     self.most = Math.min(maxStorageBufferBindingSize, maxBufferSize);
     device.lost.then(info => { if (info.reason !== "destroyed") lost(info.message || "no reason given"); });
@@ -127,7 +122,7 @@ export class ExactRenderer {
     };
     const faces = pick(mesh.faces, 3), splat = pick(mesh.splat, 1), group = pick(mesh.group, 1);
     const runs = findRuns(faces, splat), F = faces.length / 3;
-    if (runs.length >= MOST_RUNS) throw new Error("the mesh has too many triangles for WebGPU");
+    if (runs.length >= this.kernels.limits.runs) throw new Error("the mesh has too many triangles for WebGPU");
     this.counts = { one: 1, vertices: mesh.vertices.length / 3, faces: F, runs: runs.length, fans: 0, groups: 0 };
     this.offsets = [3 * F, 0, 0];
     const parts = [faces, runs];
@@ -181,21 +176,24 @@ export class ExactRenderer {
       return;
     }
     this.#prepare(pinhole, filterScale);
-    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1, level = BUDGETS.indexOf(this.budget);
+    // Loop iterations of one walk through a tile list, one limit after the other until all tiles are finished. Software
+    // drivers cut loops after 65,535 iterations; walks are counted high, so the first is safe, and the second mostly.
+    const { budgets, pairs, rounds } = this.kernels.limits;
+    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1, level = budgets.indexOf(this.budget);
     for (let round = 0; ; round++) {
       const counters = await this.#run(steps);
       if (this.problem) throw new Error(this.problem);
       if (counters[0] > this.capacity) {
-        const most = Math.min(MOST_PAIRS, Math.floor(this.most / 8));
+        const most = Math.min(pairs, Math.floor(this.most / 8));
         if (counters[0] > most) throw new Error("the tile lists need more memory than WebGPU allows here");
         this.capacity = Math.min(most, Math.ceil(counters[0] * 1.25));
         this.#prepare(pinhole, filterScale);
         continue;
       }
       if (counters[2] === this.counts.tiles) break;
-      if (counters[9] || counters[12] || walks === counters[3] || round > ROUNDS) {
-        if (++level === BUDGETS.length) throw new Error("the graphics device did not finish the image");
-        this.budget = BUDGETS[level];
+      if (counters[9] || counters[12] || walks === counters[3] || round > rounds) {
+        if (++level === budgets.length) throw new Error("the graphics device did not finish the image");
+        this.budget = budgets[level];
         this.#prepare(pinhole, filterScale);
         steps = [...this.kernels.lists, ...this.kernels.raster];
         walks = -1;
@@ -209,9 +207,9 @@ export class ExactRenderer {
   }
 
   #prepare(pinhole, filterScale) {
-    const { width, height } = pinhole, { counts } = this;
+    const { width, height } = pinhole, { counts } = this, { tiles, window } = this.kernels.limits;
     const across = Math.ceil(width / TILE), down = Math.ceil(height / TILE);
-    if (across * down > MOST_TILES || width * height > WINDOW) throw new Error("the image is too large");
+    if (across * down > tiles || width * height > window) throw new Error("the image is too large");
     counts.tiles = across * down;
     const blocks = Math.ceil(this.capacity / 2048);
     this.#allocate("pairs_a", 8 * this.capacity);

@@ -37,13 +37,20 @@ export async function unpack(base64) {
   return { header, row, rows: (first, count) => Array.from({ length: count }, (_, k) => row(first + k)) };
 }
 
+// 0, 1, 2, ...
+export function counting(n) {
+  const values = new Uint32Array(n);
+  for (let i = 0; i < n; i++) values[i] = i;
+  return values;
+}
+
 // vertices (3 a vertex), colors (4), faces (3 a triangle), splat (1 a triangle) or null, group or null;
-// fans: first triangle of each fan, and their count at the end.
+// fans: first triangle of each fan, and their count at the end; without fans, each triangle is one.
 export function decodeMesh({ header, row, rows }) {
   const V = header.vertices, F = header.triangles;
   const mesh = {
     vertices: new Float32Array(3 * V), colors: new Float32Array(4 * V), faces: new Uint32Array(3 * F),
-    splat: null, group: null, fans: null, blending: header.blending, filter: header.filter, up: header.up,
+    splat: null, group: null, fans: null, blending: header.blending, filter: header.filter,
   };
   const steps = { ...header, row, rows, store: (v, x, y, z) => {
     mesh.vertices[3 * v] = x + header.origin[0];
@@ -56,6 +63,7 @@ export function decodeMesh({ header, row, rows }) {
     for (let c = 0; c < 3; c++) mesh.colors[4 * v + c] /= color;
     mesh.colors[4 * v + 3] /= alpha;
   }
+  mesh.fans ??= counting(F + 1);
   if (header.group >= 0) mesh.group = Int32Array.from(row(header.group));
   return mesh;
 }

@@ -1,7 +1,8 @@
 // WebGL2: the mesh with its triangles sorted by their centres, and the splats. Not exact, as triangles that
 // overlap in depth are not split, but quick, and it runs where WebGPU is missing.
 
-import { middlesOf } from "./crop.js";
+import { fanMiddles, middlesOf } from "./crop.js";
+import { counting } from "./scene.js";
 
 const WIDTH = 4096; // texels in a row of a data texture
 const LENS = `
@@ -143,14 +144,13 @@ export class SortedRenderer {
 
   #needMesh() {
     if (this.triangles) return this.triangles;
-    const { gl, mesh } = this, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
-    const fans = mesh.fans ?? Uint32Array.from({ length: F + 1 }, (_, i) => i);
+    const { gl, mesh } = this, { fans } = mesh, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
     this.programs.mesh = program(gl, MESH_VERTEX, MESH_FRAGMENT);
     const four = new Float32Array(4 * V), bytes = new Uint8Array(4 * V), corners = new Uint32Array(4 * F);
     for (let v = 0; v < V; v++) four.set(mesh.vertices.subarray(3 * v, 3 * v + 3), 4 * v);
     for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
     for (let f = 0; f < F; f++) for (let k = 0; k < 3; k++) corners[4 * f + k] = mesh.faces[3 * f + k];
-    const centers = middlesOf(mesh, Uint32Array.from({ length: F + 1 }, (_, i) => i)), middles = middlesOf(mesh, fans);
+    const middles = fanMiddles(mesh), centers = fans.length - 1 === F ? middles : middlesOf(mesh, counting(F + 1));
     this.triangles = {
       textures: {
         positions: texture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, four),
@@ -190,11 +190,11 @@ export class SortedRenderer {
     this.kept = kept;
     if (this.triangles) {
       const all = this.triangles;
-      all.fanItems = kept ? kept.fans : Uint32Array.from({ length: all.fans.length - 1 }, (_, i) => i);
-      all.items = kept ? kept.triangles : Uint32Array.from({ length: all.order.length }, (_, i) => i);
+      all.fanItems = kept ? kept.fans : counting(all.fans.length - 1);
+      all.items = kept ? kept.triangles : counting(all.order.length);
     }
     if (this.cloud) {
-      this.cloud.items = kept ? kept.splats : Uint32Array.from({ length: this.splats.count }, (_, i) => i);
+      this.cloud.items = kept ? kept.splats : counting(this.splats.count);
     }
   }
 
