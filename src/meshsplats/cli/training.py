@@ -79,9 +79,10 @@ else:
 
 @dataclass(frozen=True)
 class RunFiles:
-    """The files of a run. ``mesh`` is the result."""
+    """The files of a run. ``mesh`` is the result; with ``in_cells``, of a run in cells."""
 
     mesh: Path
+    in_cells: bool = False
 
     @property
     def config(self) -> Path:
@@ -108,15 +109,17 @@ class RunFiles:
 
     def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
         """OSError if something would be overwritten, cannot be written, or is missing for --resume."""
+        from meshsplats.finetuning.cells import RECORD
         from meshsplats.finetuning.journal import CHECKPOINT
 
-        checkpoint = self.folder / CHECKPOINT
+        checkpoint = self.folder / (RECORD if self.in_cells else CHECKPOINT)
         if resume and not checkpoint.is_file():
             raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to start again")
-        if checkpoint.exists() and not (resume or force):
-            raise FileExistsError(
-                f"{checkpoint} is left from an earlier run: --resume continues it, --force starts again"
-            )
+        for left in (self.folder / CHECKPOINT, self.folder / RECORD):
+            if left.exists() and not (resume or force):
+                raise FileExistsError(
+                    f"{left} is left from an earlier run: --resume continues it, --force starts again"
+                )
         if resume and self.mesh.exists() and not force:
             raise FileExistsError(
                 f"{self.mesh} exists: the run has ended, or there was one before;"
@@ -164,7 +167,8 @@ class Trained:
 class Plan:
     """An optimisation that is ready to run."""
 
-    mesh: SplatMesh
+    mesh: SplatMesh | None
+    """Before the first step; None if it is made in cells."""
     dataset: Dataset
     summary: str
     background: Background | None
@@ -214,6 +218,10 @@ class TrainingCommand(Command):
         """The preset with the explicit settings."""
         raise NotImplementedError
 
+    def files(self) -> RunFiles:
+        """The files of the run."""
+        return RunFiles(self.output)
+
     def check(self) -> None:
         """UsageError for options that contradict each other or have no effect."""
         self.target.check()
@@ -235,7 +243,7 @@ class TrainingCommand(Command):
         start = time.perf_counter() - STARTUP_SECONDS
         config = self.configured()
         self.check()
-        files = RunFiles(self.output)
+        files = self.files()
         files.check(self.inputs, resume=self.resume, force=self.force)
         earlier = self._earlier(files)
         plan = self.plan(config, earlier)
@@ -281,11 +289,13 @@ class TrainingCommand(Command):
         return type(self).__name__.lower()
 
     def _earlier(self, files: RunFiles) -> Checkpoint | None:
-        """Of a run that is resumed, the checkpoint without its arrays; None for one that starts."""
+        """Of a run that is resumed, the checkpoint without its arrays; None for one that starts, and for one
+        in cells, which have their own."""
         from meshsplats.finetuning.checkpoint import load_checkpoint
         from meshsplats.finetuning.journal import CHECKPOINT
 
-        return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if self.resume else None
+        whole = self.resume and not files.in_cells
+        return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if whole else None
 
     def _run_options(self, files: RunFiles, start: float) -> RunOptions:
         """Of a run whose command started at ``start`` by the performance counter."""
@@ -330,6 +340,9 @@ class TrainingCommand(Command):
         steps = lines[-1]["step"] if lines else 0
         total = seconds + (0 if earlier is None else earlier.seconds)
         resumed = "" if earlier is None else f", {seconds:.1f} s of it since it was resumed"
+        held_out = {"before": scores[0], "after": scores[-1]} if scores else None
+        if files.in_cells and held_out is not None:
+            held_out["before"] = None
         if self.json:
             result = {
                 "mesh": str(files.mesh),
@@ -337,13 +350,15 @@ class TrainingCommand(Command):
                 "seconds": round(total, 2),
                 "seconds_since_resumed": None if earlier is None else round(seconds, 2),
                 **trained.counts,
-                "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
+                "held_out_psnr": held_out,
                 "run": str(files.folder),
             }
             print(json.dumps(result, indent=1))
             return
         made = f"{files.mesh} ({size_of(files.mesh)}, {trained.summary})"
         quality = f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else ""
+        if len(scores) == 1:
+            quality = f"; held out: {scores[0]:.2f} dB"
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
         print(f"preview: {files.preview}; metrics: {files.folder}/metrics.jsonl")
 
@@ -381,10 +396,13 @@ def print_plan(plan: Plan, cache_bytes: int) -> None:
     from meshsplats.finetuning.memory import available_memory, check_memory, readable
 
     dataset = plan.dataset
-    needed, free = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes), available_memory()
     camera = dataset.train[0].camera
     views = f"{plural(len(dataset.train), 'training view')}, {len(dataset.test)} held out"
     views += f", of {camera.width} x {camera.height} pixels"
+    if plan.mesh is None:
+        say(f"{plan.summary}; {views}")
+        return
+    needed, free = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes), available_memory()
     memory = f"memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else "")
     say(f"{plan.summary}; {views}; {memory}")
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._arrays import checked_array, subsample
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import masked_ssim
@@ -113,6 +113,7 @@ def finetune(
     config: FinetuneConfig | None = None,
     *,
     run: RunOptions | None = None,
+    frozen: np.ndarray | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     **changes: Unpack[FinetuneChanges],
 ) -> SplatMesh:
@@ -126,13 +127,15 @@ def finetune(
     Args:
         config: the configuration; the preset 'default' by default.
         run: output folder, resumption from a checkpoint, logging and resources.
+        frozen: (v,) bool, True for vertices of ``mesh`` that keep their positions and colours; none by
+            default. Not with relocation or opacity 'cutoff'.
         on_progress: called after every step.
         changes: fields of ``FinetuneConfig`` in place of those of ``config``: ``finetune(mesh, data,
             minutes=2)``.
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: no training view, an empty mesh.
+        ValueError: no training view, an empty mesh, ``frozen`` of another shape.
         OtherRunError: the checkpoint is of another run.
         MemoryError: the estimated memory is not available; nothing was written.
         DivergenceError: the loss or a gradient is not finite; the message names the view.
@@ -143,10 +146,14 @@ def finetune(
         raise ValueError("the data set has no training views")
     if not len(mesh.faces):
         raise ValueError("the mesh has no triangles: there is nothing to fine-tune")
+    if frozen is not None:
+        frozen = checked_array("frozen", frozen, bool, (len(mesh.vertices),))
+        if config.relocate_share or config.opacity == "cutoff":
+            raise ValueError("frozen vertices are not for relocate_share and opacity 'cutoff'")
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     loop = TrainingLoop(
-        _run_start(mesh, dataset, config, run, journal), dataset, config, run, journal, on_progress
+        _run_start(mesh, dataset, config, run, journal, frozen), dataset, config, run, journal, on_progress
     )
     return loop.run()
 
@@ -169,15 +176,20 @@ class RunStart:
 
 
 def _run_start(
-    mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, options: RunOptions, journal: Journal | None
+    mesh: SplatMesh,
+    dataset: Dataset,
+    config: FinetuneConfig,
+    options: RunOptions,
+    journal: Journal | None,
+    frozen: np.ndarray | None,
 ) -> RunStart:
     """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
     if journal is None:
-        return RunStart(State.begin(mesh, views, config, options.threads), ("", ""), mesh)
-    fingerprints = mesh_fingerprint(mesh), dataset_fingerprint(dataset)
+        return RunStart(State.begin(mesh, views, config, options.threads, frozen), ("", ""), mesh)
+    fingerprints = mesh_fingerprint(mesh, frozen), dataset_fingerprint(dataset)
     if not options.resume:
-        state = State.begin(mesh, views, config, options.threads)
+        state = State.begin(mesh, views, config, options.threads, frozen)
         journal.begin(config.to_dict())
         return RunStart(state, fingerprints, mesh)
     total = config.total_steps(views)
@@ -343,13 +355,9 @@ class TrainingLoop:
         loss = float(np.mean(self.losses)) if self.losses else None
         mean_ssim = None
         if self.scored_views:
-            mesh = self.result()
-            scores = []
-            for view in self.scored_views:
-                image, target = np.clip(self._render(mesh, view), 0, 1), np.clip(view.image, 0, 1)
-                decibels = min(psnr(image, target, mask=view.mask), 200.0)
-                scores.append((decibels, masked_ssim(image, target, view.mask, self.options.threads)))
-            self.held_out, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))
+            self.held_out, mean_ssim = held_out_scores(
+                self.result(), self.scored_views, self.config, self.options.threads
+            )
         if self.journal is not None:
             self.journal.log_metrics(
                 self.step,
@@ -375,8 +383,7 @@ class TrainingLoop:
         self.journal.save_preview(self.step, np.clip(view.image, 0, 1), image)
 
     def _render(self, mesh: SplatMesh, view: View) -> np.ndarray:
-        samples, threads = samples_of(view, self.config), self.options.threads
-        return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
+        return _image_for(mesh, view, self.config, self.options.threads)
 
     def _save_checkpoint(self) -> None:
         self.save_time = time.perf_counter()
@@ -417,3 +424,21 @@ class TrainingLoop:
                 len(self.state.mesh.faces),
             )
         )
+
+
+def held_out_scores(
+    mesh: SplatMesh, views: Sequence[View], config: FinetuneConfig, threads: int | None
+) -> tuple[float, float]:
+    """Means of PSNR, in dB and at most 200, and SSIM of ``mesh`` in ``views``, at least one."""
+    scores = []
+    for view in views:
+        image, target = np.clip(_image_for(mesh, view, config, threads), 0, 1), np.clip(view.image, 0, 1)
+        decibels = min(psnr(image, target, mask=view.mask), 200.0)
+        scores.append((decibels, masked_ssim(image, target, view.mask, threads)))
+    mean_psnr, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))
+    return mean_psnr, mean_ssim
+
+
+def _image_for(mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None) -> np.ndarray:
+    samples = samples_of(view, config)
+    return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
