@@ -33,6 +33,7 @@ from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config, starting_mesh
 from meshsplats.finetuning.checkpoint import Checkpoint
+from meshsplats.finetuning.ranks import is_started_by_torchrun
 from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
@@ -61,8 +62,10 @@ class Finetune(TrainingCommand):
 
     COMMON = (
         *("input", "output", "preset", "opacity", "minutes", "steps", "data", "downscale", "cameras"),
-        *("width", "max_triangles", "cell_splats", "cluster", "threads", "resume", "force"),
+        *("width", "max_triangles", "threads", "resume", "force"),
     )
+
+    RANKS = True
 
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or, with --data, a mesh."""
@@ -144,6 +147,8 @@ class Finetune(TrainingCommand):
         from meshsplats.finetuning.cells import CellOptions, CellScene, check_for_cells, finetune_cells
         from meshsplats.finetuning.journal import Journal
 
+        if is_started_by_torchrun():
+            raise UsageError("--cell-splats is for --cluster, not for torchrun")
         if isinstance(scene, SplatMesh):
             raise UsageError(f"{self.input} is a mesh: --cell-splats divides splats")
         options = CellOptions(self.cell_splats or 0, self.conversion, self._start_preset)

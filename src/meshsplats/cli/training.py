@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -43,6 +44,7 @@ from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
 from meshsplats.finetuning.config import LENGTHS
+from meshsplats.finetuning.ranks import Ranks, joined_ranks
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -182,6 +184,8 @@ class TrainingCommand(Command):
 
     CONFIGURABLE = True
     EXCLUSIVE: ClassVar[tuple[tuple[str, ...], ...]] = (("epochs", "steps", "minutes"), ("data", "cameras"))
+    RANKS: ClassVar[bool] = False
+    """Whether torchrun may start several processes of it, which share the views."""
 
     input: tyro.conf.Positional[Path]
     """Input."""
@@ -238,17 +242,27 @@ class TrainingCommand(Command):
         return self.configured().to_dict()
 
     def execute(self) -> int:
+        with joined_ranks(self.threads) as (ranks, threads):
+            if ranks.count == 1:
+                return self._execute(self.configured(), ranks)
+            if not self.RANKS:
+                raise UsageError("torchrun is for meshsplats finetune")
+            command, config = replace(self, threads=threads), self.configured()
+            if config.batch == 1:
+                config = replace(config, batch=ranks.count)
+            return command._assist(config, ranks) if ranks.index else command._execute(config, ranks)
+
+    def _execute(self, config: FinetuneConfig, ranks: Ranks) -> int:
         from meshsplats.formats.meshes import save_mesh
 
         start = time.perf_counter() - STARTUP_SECONDS
-        config = self.configured()
         self.check()
         files = self.files()
         files.check(self.inputs, resume=self.resume, force=self.force)
         earlier = self._earlier(files)
         plan = self.plan(config, earlier)
         print_plan(plan, self.target.cache_bytes)
-        options = self._run_options(files, start)
+        options = self._run_options(files, start, ranks)
         try:
             with (
                 files.claimed(self.inputs, resume=self.resume, force=self.force),
@@ -269,6 +283,18 @@ class TrainingCommand(Command):
         if not self.json:
             for line in self.next_steps(files, config, plan):
                 print(line)
+        return 0
+
+    def _assist(self, config: FinetuneConfig, ranks: Ranks) -> int:
+        """Takes the part of a rank that is not the first: it writes nothing, and prints errors only."""
+        self.check()
+        files = self.files()
+        with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere), redirect_stdout(nowhere):
+            plan = self.plan(config, self._earlier(files))
+            try:
+                plan.optimise(self._run_options(files, time.perf_counter(), ranks), lambda progress: None)
+            except Interrupted as stop:
+                return 128 + stop.signal
         return 0
 
     def save_more(self, files: RunFiles, plan: Plan) -> None:
@@ -297,7 +323,7 @@ class TrainingCommand(Command):
         whole = self.resume and not files.in_cells
         return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if whole else None
 
-    def _run_options(self, files: RunFiles, start: float) -> RunOptions:
+    def _run_options(self, files: RunFiles, start: float, ranks: Ranks) -> RunOptions:
         """Of a run whose command started at ``start`` by the performance counter."""
         return RunOptions(
             folder=files.folder,
@@ -307,6 +333,7 @@ class TrainingCommand(Command):
             threads=self.threads,
             spent=time.perf_counter() - start,
             cache_bytes=self.target.cache_bytes,
+            ranks=ranks,
         )
 
     def _record_start(self, files: RunFiles) -> None:
