@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -15,7 +18,15 @@ from pathlib import Path
 import pytest
 from _photographs import write_photographs
 
-from meshsplats import convert, orbit, render_splats, save_gaussian_blocks, save_mesh, stream_gaussians
+from meshsplats import (
+    convert,
+    load_mesh,
+    orbit,
+    render_splats,
+    save_gaussian_blocks,
+    save_mesh,
+    stream_gaussians,
+)
 from meshsplats.cli import main
 from meshsplats.cluster import ANY_PORT, Shared, Workers, open_workers
 from meshsplats.demo_scene import make_scene
@@ -274,3 +285,89 @@ def test_a_configuration_file_names_no_cluster(splats, tmp_path, capsys):
     config.write_text(config.read_text().replace("[options]", '[options]\ncluster = "tcp://127.0.0.1:1"'))
     assert main(["render", str(splats), "-o", str(tmp_path / "b.png"), "--config", str(config)]) == 2
     assert "cluster" in capsys.readouterr().err
+
+
+# ---- Full disks, lost schedulers
+
+
+LIMITED = """
+import resource, signal, sys
+from meshsplats import stream_gaussians
+from meshsplats.tiles import building
+building.BUCKET = 3000
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), -1))
+try:
+    building.build_tiles(
+        stream_gaussians(sys.argv[1]), sys.argv[2], building.TileOptions(max_triangles=4096), resume=True
+    )
+except FileNotFoundError:
+    building.build_tiles(
+        stream_gaussians(sys.argv[1]), sys.argv[2], building.TileOptions(max_triangles=4096)
+    )
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
+def test_tiles_go_on_after_files_that_could_not_be_written(splats, tmp_path):
+    """Files of a limited size, as on a disk with little room: whole tiles only; all after a resumption."""
+    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
+    # The splats on their way into tiles fit, tiles do not.
+    largest = max(path.stat().st_size for path in (tmp_path / "here").rglob("*.glb"))
+    words = [sys.executable, "-c", LIMITED, str(splats), str(tmp_path / "there")]
+    found = subprocess.run([*words, str(largest - 1)], capture_output=True, text=True)
+    assert found.returncode == 1
+    assert "OSError" in found.stderr
+    assert not (tmp_path / "there").exists()
+    for path in (tmp_path / "there.partial" / "tileset").rglob("*.glb"):
+        load_mesh(path)
+    build_tiles(stream_gaussians(splats), tmp_path / "there", SMALL, resume=True)
+    assert digest(tmp_path / "there") == digest(tmp_path / "here")
+
+
+def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, tmp_path):
+    """A disk of one megabyte, where this machine lets us make one."""
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    small = tmp_path / "small"
+    small.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(small)]
+    mount = shutil.which("mount") and subprocess.run(command, capture_output=True)
+    if not mount or mount.returncode:
+        pytest.skip("no right to mount a disk here")
+    try:
+        with open_workers("local") as workers, pytest.raises(OSError) as caught:
+            build_tiles(stream_gaussians(splats), small / "tiles", SMALL, workers=workers)
+        assert caught.value.errno == errno.ENOSPC
+        assert "no space left" in str(caught.value)
+        for path in (small / "tiles.partial" / "tileset").rglob("*.glb"):
+            load_mesh(path)
+        subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
+        with open_workers("local") as workers:
+            build_tiles(stream_gaussians(splats), small / "tiles", SMALL, workers=workers, resume=True)
+        build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
+        assert digest(small / "tiles") == digest(tmp_path / "here")
+    finally:
+        subprocess.run(["umount", str(small)], check=True)
+
+
+def slow_then(folder, task):
+    (folder / str(task)).touch()
+    time.sleep(0.2)
+    return task
+
+
+def test_a_lost_scheduler_ends_the_run(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    import dask
+
+    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=ANY_PORT)
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        open_workers(cluster.scheduler_address) as workers,
+    ):
+        results = workers.run(partial(slow_then, tmp_path), list(range(50)))
+        next(results)
+        cluster.close()
+        with pytest.raises(ClusterError, match="the scheduler was lost"):
+            list(results)
+    assert len(list(tmp_path.iterdir())) < 50

@@ -11,7 +11,7 @@ import secrets
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -176,11 +176,15 @@ class _DaskWorkers(Workers):
         except dask.CancelledError as error:
             raise ClusterError(f"the scheduler was lost: {error}") from None
         finally:
-            self._client.cancel(list(indices), asynchronous=False)
+            with suppress(OSError, dask.CancelledError):  # without a scheduler there is nothing to cancel
+                self._client.cancel(list(indices), asynchronous=False)
 
     def _room(self, running: int) -> int:
         """How many more tasks to send, so that the workers have enough."""
-        threads = sum(self._client.nthreads().values())
+        try:
+            threads = sum(self._client.nthreads().values())
+        except OSError as error:
+            raise ClusterError(f"the scheduler was lost: {error}") from None
         return max(0, max(1, WAITING * threads) - running)
 
 

@@ -20,8 +20,6 @@ from meshsplats.errors import GET_TORCH, MissingDependencyError
 
 _STARTED = "TORCHELASTIC_RUN_ID"
 """Set by torchrun in each process that it starts."""
-_NUMBERS = 7
-"""Of a vertex: the gradients of position, colour and opacity."""
 
 
 class Part(NamedTuple):
@@ -55,7 +53,7 @@ class Ranks:
         return range(self.index * batch // self.count, (self.index + 1) * batch // self.count)
 
     def total(self, part: Part) -> Part:
-        """The sum of the parts of all ranks."""
+        """The sum of the parts of all ranks, in their order. May change the arrays of ``part``."""
         return part
 
     def any(self, flag: bool) -> bool:
@@ -110,18 +108,22 @@ class _TorchRanks(Ranks):
         self.index, self.count = distributed.get_rank(), distributed.get_world_size()
 
     def total(self, part: Part) -> Part:
-        rows = np.flatnonzero((part.vertices != 0).any(axis=1) | (part.colors != 0).any(axis=1))
-        values = np.empty((len(rows), _NUMBERS), np.float32)
-        values[:, :3], values[:, 3:] = part.vertices[rows], part.colors[rows]
+        # A vertex has a gradient only if its opacity has one.
+        rows = np.flatnonzero(part.colors[:, 3]).astype(np.int32)
         heads = self._gather(np.array([len(rows), part.loss, part.views, part.failed], np.float64))
         most = int(max(head[0] for head in heads))
-        all_rows = self._gather(_padded(rows.astype(np.int32), most))
-        all_values = self._gather(_padded(values, most))
-        vertices, colors = np.zeros_like(part.vertices), np.zeros_like(part.colors)
-        for head, found, added in zip(heads, all_rows, all_values, strict=True):
+        vertices, colors = part.vertices, part.colors
+        all_rows = self._gather(_padded(rows, most))
+        all_vertices, all_colors = (self._gather(_rows_of(array, rows, most)) for array in (vertices, colors))
+        if self.index > 1:  # to add to those of the first two, in whatever order, is to add in their order
+            vertices, colors = np.zeros_like(vertices), np.zeros_like(colors)
+        for i, head in enumerate(heads):
+            if i == self.index and i < 2:
+                continue
             count = int(head[0])
-            vertices[found[:count]] += added[:count, :3]
-            colors[found[:count]] += added[:count, 3:]
+            for array, added in ((vertices, all_vertices[i]), (colors, all_colors[i])):
+                where = all_rows[i][:count]
+                array[where] = _rows_of(array, where, count) + added[:count]
         loss, views = (float(sum(head[i] for head in heads)) for i in (1, 2))
         failed = next((int(head[3]) for head in heads if head[3]), 0)
         return Part(vertices, colors, loss, int(views), failed)
@@ -143,7 +145,16 @@ class _TorchRanks(Ranks):
 
 
 def _padded(array: np.ndarray, length: int) -> np.ndarray:
-    """``array`` with rows of 0 behind it, ``length`` in all."""
-    result = np.zeros((length, *array.shape[1:]), array.dtype)
+    """``array`` (n,) with 0 behind it, ``length`` in all."""
+    result = np.zeros(length, array.dtype)
     result[: len(array)] = array
+    return result
+
+
+def _rows_of(array: np.ndarray, rows: np.ndarray, length: int) -> np.ndarray:
+    """The ``rows`` of ``array`` with rows of 0 behind them, ``length`` in all."""
+    result = np.empty((length, *array.shape[1:]), array.dtype)
+    # Ten times as fast as indexing, without the check of each row.
+    np.take(array, rows, axis=0, out=result[: len(rows)], mode="clip")
+    result[len(rows) :] = 0
     return result

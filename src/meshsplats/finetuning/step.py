@@ -256,18 +256,24 @@ def _part(
     state: State, views: Sequence[View], indices: Sequence[int], step: int, fraction: float, share: range
 ) -> Part:
     """The sum over the places of a batch in ``share``."""
-    count = len(state.vertices)
-    total = Part(np.zeros((count, 3), np.float32), np.zeros((count, 4), np.float32), 0.0, 0, 0)
+    total = Part(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), 0.0, 0, 0)
     for place in share:
         found = view_gradients(state, views, indices[place], step + place, fraction)
         if found is None:
             continue
         if found.gradients is None or not found.finite:
-            return total._replace(failed=place + 1)
-        np.add(total.vertices, found.gradients.vertices, out=total.vertices)
-        np.add(total.colors, found.gradients.colors, out=total.colors)
+            total = total._replace(failed=place + 1)
+            break
+        if total.views:
+            np.add(total.vertices, found.gradients.vertices, out=total.vertices)
+            np.add(total.colors, found.gradients.colors, out=total.colors)
+        else:
+            total = total._replace(vertices=found.gradients.vertices, colors=found.gradients.colors)
         total = total._replace(loss=total.loss + found.loss, views=total.views + 1)
-    return total
+    if total.views:
+        return total
+    count = len(state.vertices)
+    return total._replace(vertices=np.zeros((count, 3), np.float32), colors=np.zeros((count, 4), np.float32))
 
 
 def view_gradients(
