@@ -16,7 +16,7 @@ LOWEST = (
 )
 """Rooms that import no other room."""
 FLOORS = (
-    ("_json", "binding", "camera", "gaussians"),
+    ("_json", "binding", "camera", "cluster", "gaussians"),
     ("base_mesh", "demo_scene", "images", "mesh"),
     ("cameras", "formats", "webgpu"),
     ("rendering",),

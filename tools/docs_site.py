@@ -29,7 +29,7 @@ NAVIGATION = {
     "Tutorials": ["docs/tutorials/from_a_splat_file", "docs/tutorials/from_photographs"],
     "Using it": [
         *("docs/pipelines", "docs/finetuning", "docs/levels", "docs/mesh-prior", "docs/datasets"),
-        *("docs/blender", "docs/viewers", "examples"),
+        *("docs/blender", "docs/viewers", "docs/cluster", "examples"),
     ],
     "Python": [],  # the reference
     "How it works": ["docs/method", "docs/conventions", "docs/architecture", "benchmarks/RESULTS"],

@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.camera import Camera
     from meshsplats.cameras.files import load_cameras, save_cameras
     from meshsplats.cameras.trajectories import dome, look_around, look_at, orbit
+    from meshsplats.cluster import Workers, open_workers
     from meshsplats.conversion import ConversionOptions, bake_filter, convert, simplify
     from meshsplats.conversion.streaming import convert_blocks
     from meshsplats.datasets.folder import load_dataset
@@ -69,6 +70,7 @@ _HOME = {
     "meshsplats.camera": ("Camera",),
     "meshsplats.cameras.files": ("load_cameras", "save_cameras"),
     "meshsplats.cameras.trajectories": ("dome", "look_around", "look_at", "orbit"),
+    "meshsplats.cluster": ("Workers", "open_workers"),
     "meshsplats.conversion": ("ConversionOptions", "bake_filter", "convert", "simplify"),
     "meshsplats.conversion.streaming": ("convert_blocks",),
     "meshsplats.datasets.folder": ("load_dataset",),
@@ -131,6 +133,7 @@ __all__ = [
     "Tileset",
     "View",
     "ViewImage",
+    "Workers",
     "__version__",
     "bake_filter",
     "bind",
@@ -155,6 +158,7 @@ __all__ = [
     "make_config",
     "make_page",
     "needed_samples",
+    "open_workers",
     "orbit",
     "psnr",
     "render",

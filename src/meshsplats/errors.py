@@ -35,3 +35,7 @@ class DivergenceError(ValueError):
 
 class DeviceError(RuntimeError):
     """The GPU failed, or cannot draw this; the message says what to do."""
+
+
+class ClusterError(RuntimeError):
+    """The workers of a cluster are lost; what finished tasks have written stays."""

@@ -30,7 +30,7 @@ from meshsplats.cli.messages import (
     read_from_standard_input,
     say,
 )
-from meshsplats.errors import DeviceError
+from meshsplats.errors import ClusterError, DeviceError
 
 COMMANDS = {
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
@@ -84,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         close_output()  # its reader has gone, `| head` say
         return FAILED
-    except (UsageError, ValueError, OSError, ImportError, MemoryError, DeviceError) as error:
+    except (UsageError, ValueError, OSError, ImportError, MemoryError, DeviceError, ClusterError) as error:
         if debug:
             raise
         if isinstance(error, OSError) and error.errno in DISK_FULL and error.filename is None:

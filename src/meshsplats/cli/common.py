@@ -19,7 +19,8 @@ from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome, look_around, orbit
-from meshsplats.cli.messages import UsageError, flag, one_line
+from meshsplats.cli.messages import UsageError, flag, one_line, say
+from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.backgrounds import Background
@@ -250,6 +251,24 @@ class PartOptions:
         from meshsplats.conversion.cleaning import cropped
 
         return cropped(scene, self.crop)
+
+
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Where the tasks of the command run."""
+
+    cluster: Annotated[str | None, tyro.conf.arg(metavar="{local,ADDRESS}", help_behavior_hint="")] = None
+    """Run tasks side by side: local, in processes on this machine; or on the Dask cluster at tcp://HOST:PORT,
+    whose workers have the same files at the same paths (extra cluster). --threads is then the maximum of a
+    task, by default 1."""
+
+    @contextmanager
+    def workers(self, threads: int | None) -> Iterator[Workers]:
+        """The workers, for the length of the block; ``threads``: maximum number of threads."""
+        with open_workers(self.cluster, threads) as found:
+            if self.cluster is not None:
+                say(f"cluster: {found}")
+            yield found
 
 
 def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,6 +18,7 @@ from meshsplats._arrays import spread_indices
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
+    ClusterOptions,
     Count,
     File,
     Folder,
@@ -128,6 +130,7 @@ class Evaluate(Command):
     amplify: float = 4.0
     """Factor of the error in the strips."""
     reading: SplatOptions = field(default_factory=SplatOptions)
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
     json: bool = False
@@ -176,6 +179,8 @@ class Evaluate(Command):
                 if getattr(self, name) is not None:
                     raise UsageError(f"{flag(name)} has no effect with --protocol")
             return
+        if self.cluster.cluster is not None:
+            raise UsageError("--cluster is for the scenes of --protocol")
         if self.tune is not None:
             raise UsageError("--tune is for --protocol; otherwise use meshsplats finetune, then evaluate")
         if not self.mesh and self.images is None and (self.splats is None or self.data is None):
@@ -251,7 +256,8 @@ class Evaluate(Command):
         with_strips = set(spread_indices(len(views), self.strips))
         names = view_names(len(views))
         folder.mkdir(exist_ok=True)
-        bar = iter(track(range(len(views)), "scoring", len(views)))
+        here = self.cluster.cluster is None  # workers share a terminal
+        bar = iter(track(range(len(views)), "scoring", len(views)) if here else range(len(views)))
         next(bar, None)
         count = 0
 
@@ -293,27 +299,31 @@ class Evaluate(Command):
         (folder,) = self.mesh
         self._check_outputs(self.output)
 
-        def score(scene: str, dataset: Dataset, background: Background, candidates: Candidates) -> Report:
-            mesh, splats, before = candidates
-            self.output.mkdir(exist_ok=True)
-            return self._score(self.output / scene, dataset, background, {"mesh": mesh}, splats, before)
-
-        result = run_benchmark(
-            benchmark,
-            folder,
-            self.data,
-            lambda source: load_scene(source, self.reading),
-            prepare=convert_scene if self.tune is None else self._tuned_candidates,
-            score=score,
-            background=None if self.background is None else parse_color(self.background),
-            downscale=self.downscale,
-            threads=self.threads,
-        )
+        with self.cluster.workers(self.threads) as workers:
+            task = replace(self, threads=workers.threads)
+            result = run_benchmark(
+                benchmark,
+                folder,
+                self.data,
+                partial(load_scene, reading=self.reading),
+                prepare=convert_scene if self.tune is None else task._tuned_candidates,
+                score=task._score_scene,
+                background=None if self.background is None else parse_color(self.background),
+                downscale=self.downscale,
+                workers=workers,
+            )
         write_json(self.output / RESULTS, result.means())
         write_json(self.output / PER_VIEW, result.per_view())
         write_json(self.output / REPORT, {"protocol": self.protocol, **result.to_dict()})
         _write_text(self.output / TABLE, result.table(_notes(result.reports)))
         return list(result.reports)
+
+    def _score_scene(
+        self, scene: str, dataset: Dataset, background: Background, candidates: Candidates
+    ) -> Report:
+        mesh, splats, before = candidates
+        self.output.mkdir(exist_ok=True)
+        return self._score(self.output / scene, dataset, background, {"mesh": mesh}, splats, before)
 
     def _tuned_candidates(self, scene: GaussianCloud | SplatMesh, dataset: Dataset) -> Candidates:
         from meshsplats.finetuning import starting_mesh

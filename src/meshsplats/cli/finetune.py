@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from meshsplats._arrays import subsample
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import Output, check_mesh_suffix, load_scene
-from meshsplats.cli.messages import command_line
+from meshsplats.cli.common import ClusterOptions, Count, Output, check_mesh_suffix, load_scene, plural
+from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
     Plan,
     RunFiles,
@@ -23,17 +25,23 @@ from meshsplats.cli.training import (
     over_background,
     views_for,
 )
+from meshsplats.cluster import Shared
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
+from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config, starting_mesh
 from meshsplats.finetuning.checkpoint import Checkpoint
+from meshsplats.finetuning.ranks import is_started_by_torchrun
+from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
+    from meshsplats.finetuning.cells import CellScene
+
     StartOptions = ConversionOptions
 else:
     StartOptions = as_cli_options(
@@ -57,6 +65,8 @@ class Finetune(TrainingCommand):
         *("width", "max_triangles", "threads", "resume", "force"),
     )
 
+    RANKS = True
+
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or, with --data, a mesh."""
     output: Output
@@ -67,27 +77,24 @@ class Finetune(TrainingCommand):
     """Conversion of splats; same: that of --preset. default: one ellipse of 8 triangles per splat. paper: the
     paper's conversion, also for published."""
     conversion: StartOptions = field(default_factory=StartOptions)
+    cell_splats: Count = None
+    """Tune splats in cells of at most N, in the memory of a cell, one after the other or by --cluster."""
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
+
+    def files(self) -> RunFiles:
+        return RunFiles(self.output, self.cell_splats is not None)
 
     def configured(self) -> FinetuneConfig:
         return make_config(self.preset, **self.explicit_settings())
 
     def check(self) -> None:
         check_mesh_suffix(self.output)
+        if self.cluster.cluster is not None and self.cell_splats is None:
+            raise UsageError("--cluster is for the cells of --cell-splats")
         super().check()
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
-        scene = load_scene(self.input, self.reading)
-        if isinstance(scene, GaussianCloud) and self.conversion.crop is not None:
-            # Cropped splats must not be in the targets; other selections leave gaps that the rest fills.
-            scene = choose_splats(scene, crop=self.conversion.crop)
-        dataset = self.target.make(
-            scene,
-            self.input,
-            default_background(config),
-            self.threads,
-            views_for(config, earlier),
-            self.preset,
-        )
+        scene, dataset = self._inputs(config, earlier)
         background = None
         if self.target.data is not None:
             whole = self.conversion.crop is None
@@ -96,6 +103,8 @@ class Finetune(TrainingCommand):
             dataset, background = over_background(
                 dataset, scene, config, self.input, self.threads, whole=whole
             )
+        if self.cell_splats is not None:
+            return self._plan_of_cells(config, scene, dataset, background)
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
         summary = f"{len(mesh.faces):,} triangles"
         if isinstance(scene, GaussianCloud) and (mesh.splat_count or 0) < len(scene):
@@ -109,6 +118,61 @@ class Finetune(TrainingCommand):
             return Trained(tuned, tuned, {"triangles": count}, f"{count:,} triangles", alpha)
 
         return Plan(mesh, dataset, summary, background, optimise)
+
+    def _inputs(
+        self, config: FinetuneConfig, earlier: Checkpoint | None
+    ) -> tuple[GaussianCloud | SplatMesh, Dataset]:
+        """The scene and its targets."""
+        scene = load_scene(self.input, self.reading)
+        if isinstance(scene, GaussianCloud) and self.conversion.crop is not None:
+            # Cropped splats must not be in the targets; other selections leave gaps that the rest fills.
+            scene = choose_splats(scene, crop=self.conversion.crop)
+        dataset = self.target.make(
+            scene,
+            self.input,
+            default_background(config),
+            self.threads,
+            views_for(config, earlier),
+            self.preset,
+        )
+        return scene, dataset
+
+    def _plan_of_cells(
+        self,
+        config: FinetuneConfig,
+        scene: GaussianCloud | SplatMesh,
+        dataset: Dataset,
+        background: Background | None,
+    ) -> Plan:
+        from meshsplats.finetuning.cells import CellOptions, CellScene, check_for_cells, finetune_cells
+        from meshsplats.finetuning.journal import Journal
+
+        if is_started_by_torchrun():
+            raise UsageError("--cell-splats is for --cluster, not for torchrun")
+        if isinstance(scene, SplatMesh):
+            raise UsageError(f"{self.input} is a mesh: --cell-splats divides splats")
+        options = CellOptions(self.cell_splats or 0, self.conversion, self._start_preset)
+        check_for_cells(config)
+        count = -(-len(scene) // options.splats)
+        color = None if background is None else background.color
+
+        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
+            with self.cluster.workers(self.threads) as workers:
+                command = replace(self, threads=workers.threads)
+                shared = Shared(partial(_cell_scene, command, color))
+                shared.hold(CellScene(scene, dataset))
+                mesh = finetune_cells(shared, config, options, run, workers=workers, on_progress=show).mesh()
+            if dataset.test:
+                views = subsample(dataset.test, SCORED_VIEWS)
+                journal = Journal(self.files().folder)
+                decibels, similarity = held_out_scores(mesh, views, config, self.threads)
+                last = max((line["step"] for line in journal.metrics()), default=0)
+                journal.log_metrics(last, psnr=decibels, ssim=similarity, triangles=len(mesh.faces))
+            triangles = len(mesh.faces)
+            return Trained(mesh, mesh, {"triangles": triangles, "cells": count}, f"{triangles:,} triangles")
+
+        summary = f"{len(scene):,} splats in {plural(count, 'cell')}"
+        return Plan(None, dataset, summary, background, optimise)
 
     def save_more(self, files: RunFiles, plan: Plan) -> None:
         if self.target.data is None and plan.dataset.test:
@@ -137,11 +201,23 @@ class Finetune(TrainingCommand):
         words += ["-o", f"{folder}-evaluation"]
         return [f"next: {command_line(words)}"]
 
+    @property
+    def _start_preset(self) -> str:
+        return self.preset if self.start == "same" else self.start
+
     def _converted(self, cloud: GaussianCloud, dataset: Dataset) -> SplatMesh:
-        preset = self.preset if self.start == "same" else self.start
         cameras = [view.camera for view in dataset.train]
         options = replace(self.conversion, crop=None)  # cropped already
-        return starting_mesh(cloud, cameras, options, preset=preset, look=dataset.look)
+        return starting_mesh(cloud, cameras, options, preset=self._start_preset, look=dataset.look)
+
+
+def _cell_scene(command: Finetune, background: tuple[float, float, float] | None) -> CellScene:
+    """The scene of a run in cells, in one of its processes; ``background`` of photographs."""
+    from meshsplats.finetuning.cells import CellScene
+
+    scene, dataset = command._inputs(command.configured(), None)
+    assert isinstance(scene, GaussianCloud)
+    return CellScene(scene, dataset if background is None else dataset.over(background))
 
 
 def _warn_of_the_rest(image: ViewImage) -> None:

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-from meshsplats.errors import DeviceError
+from meshsplats.errors import ClusterError, DeviceError
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of a full disk, as in ``_files.atomic``."""
@@ -50,7 +50,7 @@ def exit_code(error: BaseException) -> int:
         return EXISTS
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return NO_SPACE
-    return LACKING if isinstance(error, (ImportError, MemoryError, DeviceError)) else FAILED
+    return LACKING if isinstance(error, (ImportError, MemoryError, DeviceError, ClusterError)) else FAILED
 
 
 def error_record(error: BaseException) -> dict[str, Any]:

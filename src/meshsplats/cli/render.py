@@ -17,6 +17,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
+    ClusterOptions,
     DrawOptions,
     Number,
     Output,
@@ -34,6 +35,7 @@ from meshsplats.cli.common import (
 )
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, recorded_options, write_configuration
+from meshsplats.cluster import Shared
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -102,6 +104,7 @@ class Render(Command):
     """Format of the turntable of an orbit; png is an animated PNG."""
     fps: float = 15.0
     """Images per second of the turntable."""
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -122,10 +125,7 @@ class Render(Command):
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one .png: give -o a folder")
         files = self._files(single, len(cameras))
         check_outputs(files.every, self.force, None if single else self.output)
-        if isinstance(scene, GaussianCloud) and not self.as_splats:
-            from meshsplats.conversion import convert
-
-            scene = convert(scene)
+        scene = self._drawable(scene)
         result: dict[str, Any] = {}
         unit = None
         if self.depth == "png" and isinstance(scene, SplatMesh):
@@ -231,6 +231,18 @@ class Render(Command):
         if self.draw.sh_degree is not None and not self.as_splats:
             raise UsageError("--sh-degree is for splats: a mesh has one colour per vertex; add --as-splats")
 
+    def _drawable(self, scene: GaussianCloud | SplatMesh) -> GaussianCloud | SplatMesh:
+        """``scene``, converted if it is splats that are to be drawn as a mesh."""
+        if isinstance(scene, SplatMesh) or self.as_splats:
+            return scene
+        from meshsplats.conversion import convert
+
+        return convert(scene)
+
+    def load(self) -> GaussianCloud | SplatMesh | Tileset:
+        """What the images show, from the input."""
+        return self._tileset() or self._drawable(self.part.of(load_scene(self.input, self.reading)))
+
     def _draw(
         self,
         scene: GaussianCloud | SplatMesh | Tileset,
@@ -239,11 +251,10 @@ class Render(Command):
         unit: float | None,
         background: tuple[float, ...],
     ) -> None:
-        from meshsplats.colors import linear_to_srgb, srgb_to_linear
-        from meshsplats.images.writing import save_array, save_depth_png, save_image, straight_rgba
-        from meshsplats.rendering import render, render_splats
+        from meshsplats._files.atomic import write_bytes
+        from meshsplats.colors import srgb_to_linear
         from meshsplats.rendering.samples import needed_samples
-        from meshsplats.tiles.drawing import MAX_ERROR, render_tiles, samples_for
+        from meshsplats.tiles.drawing import MAX_ERROR, samples_for
         from meshsplats.tiles.tileset import Tileset
 
         # A mesh for linear light is blended in it and encoded for display afterwards.
@@ -257,35 +268,64 @@ class Render(Command):
                 samples = samples_for(scene, cameras, most)
             else:
                 samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
+        shared = Shared(self.load)
+        shared.hold(scene)
+        with self.cluster.workers(self.draw.threads) as workers:
+            frames = _Frames(self, shared, samples, background, linear, unit, most, workers.threads)
+            for i, (image, depth) in track(workers.run(frames.draw, cameras), "rendering", len(cameras)):
+                if not files.images[i].parent.exists():
+                    files.images[i].parent.mkdir()  # not before there is something to write
+                write_bytes(files.images[i], image)
+                if depth is not None:
+                    write_bytes(files.depths[i], depth)
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Draws the images, each in a task."""
+
+    command: Render
+    scene: Shared[GaussianCloud | SplatMesh | Tileset]
+    samples: int
+    background: tuple[float, ...]
+    linear: bool
+    unit: float | None
+    """Of 16-bit depth images; None for float arrays."""
+    max_error: float
+    threads: int | None
+
+    def draw(self, camera: Camera) -> tuple[bytes, bytes | None]:
+        """The contents of the files of a camera: image, and depth if there is one."""
+        from meshsplats.colors import linear_to_srgb
+        from meshsplats.images.writing import encode_array, encode_depth_png, encode_image, straight_rgba
+        from meshsplats.rendering import render, render_splats
+        from meshsplats.tiles.drawing import render_tiles
+        from meshsplats.tiles.tileset import Tileset
+
+        command, scene = self.command, self.scene.get()
+        draw = command.draw
         options: dict[str, Any] = {
-            "background": background,
-            "samples": samples,
-            "threads": self.draw.threads,
+            "background": self.background,
+            "samples": self.samples,
+            "threads": self.threads,
         }
-        layers, degree = self.draw.max_layers, self.draw.sh_degree
-        for i, camera in enumerate(track(cameras, "rendering", len(cameras))):
-            if isinstance(scene, GaussianCloud):
-                drawn = render_splats(scene, camera, sh_degree=degree, **options)
+        if isinstance(scene, GaussianCloud):
+            drawn = render_splats(scene, camera, sh_degree=draw.sh_degree, **options)
+        else:
+            options |= {"max_layers": draw.max_layers, "depth": command.depth != "none"}
+            options |= {"cutoff": command.cutoff, "device": draw.device}
+            if isinstance(scene, Tileset):
+                drawn = render_tiles(scene, camera, max_error=self.max_error, **options)
             else:
-                options |= {"max_layers": layers, "depth": bool(files.depths), "cutoff": self.cutoff}
-                options["device"] = self.draw.device
-                if isinstance(scene, Tileset):
-                    drawn = render_tiles(scene, camera, max_error=most, **options)
-                else:
-                    drawn = render(scene, camera, **options)
-            if not files.images[i].parent.exists():
-                files.images[i].parent.mkdir()  # not before there is something to write
-            image = straight_rgba(drawn.color, drawn.alpha) if self.transparent else drawn.color
-            if linear:
-                image[..., :3] = linear_to_srgb(image[..., :3])
-            save_image(files.images[i], image)
-            if drawn.depth is None:
-                continue
-            mean = drawn.mean_depth(empty=0)
-            if unit is None:
-                save_array(files.depths[i], mean)
-            else:
-                save_depth_png(files.depths[i], mean, unit)
+                drawn = render(scene, camera, **options)
+        image = straight_rgba(drawn.color, drawn.alpha) if command.transparent else drawn.color
+        if self.linear:
+            image[..., :3] = linear_to_srgb(image[..., :3])
+        content = encode_image("view.png", image)
+        if drawn.depth is None:
+            return content, None
+        mean = drawn.mean_depth(empty=0)
+        return content, encode_array(mean) if self.unit is None else encode_depth_png(mean, self.unit)
 
 
 def _depth_unit(points: np.ndarray, cameras: Sequence[Camera]) -> float:

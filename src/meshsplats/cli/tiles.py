@@ -15,10 +15,21 @@ import tyro
 
 from meshsplats.cameras.framing import DEFAULT_UP
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import Box, Count, Number, Output, SplatOptions, Text, check_outputs, parse_up
+from meshsplats.cli.common import (
+    Box,
+    ClusterOptions,
+    Count,
+    Number,
+    Output,
+    SplatOptions,
+    Text,
+    check_outputs,
+    parse_up,
+)
 from meshsplats.cli.messages import Terminated, UsageError, say
 from meshsplats.cli.records import CONFIGURATION, beside, write_configuration
 from meshsplats.conversion import ConversionOptions
+from meshsplats.errors import ClusterError
 
 if TYPE_CHECKING:
     from meshsplats.tiles.building import TileOptions
@@ -60,6 +71,7 @@ class Tiles(Command):
     resume: bool = False
     """Continue an interrupted run of the same command, from FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
+    cluster: ClusterOptions = field(default_factory=ClusterOptions)
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
     json: bool = False
@@ -76,7 +88,7 @@ class Tiles(Command):
         start = time.perf_counter()
         source = self.reading.stream(self.input)
         try:
-            with _progress() as show:
+            with self.cluster.workers(self.threads) as workers, _progress() as show:
                 found = build_tiles(
                     source,
                     self.output,
@@ -84,9 +96,10 @@ class Tiles(Command):
                     resume=self.resume,
                     replace_old=self.force,
                     threads=self.threads,
+                    workers=workers,
                     on_progress=show,
                 )
-        except (KeyboardInterrupt, Terminated, OSError):
+        except (KeyboardInterrupt, Terminated, OSError, ClusterError):
             if (partial_folder(self.output) / JOURNAL).is_file():
                 say("what is done stays: the same command with --resume continues")
             raise

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -43,6 +44,7 @@ from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
 from meshsplats.finetuning.config import LENGTHS
+from meshsplats.finetuning.ranks import Ranks, joined_ranks
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -79,9 +81,10 @@ else:
 
 @dataclass(frozen=True)
 class RunFiles:
-    """The files of a run. ``mesh`` is the result."""
+    """The files of a run. ``mesh`` is the result; with ``in_cells``, of a run in cells."""
 
     mesh: Path
+    in_cells: bool = False
 
     @property
     def config(self) -> Path:
@@ -108,15 +111,17 @@ class RunFiles:
 
     def check(self, inputs: Sequence[Path], *, resume: bool, force: bool) -> None:
         """OSError if something would be overwritten, cannot be written, or is missing for --resume."""
+        from meshsplats.finetuning.cells import RECORD
         from meshsplats.finetuning.journal import CHECKPOINT
 
-        checkpoint = self.folder / CHECKPOINT
+        checkpoint = self.folder / (RECORD if self.in_cells else CHECKPOINT)
         if resume and not checkpoint.is_file():
             raise FileNotFoundError(f"no checkpoint at {checkpoint}: leave out --resume to start again")
-        if checkpoint.exists() and not (resume or force):
-            raise FileExistsError(
-                f"{checkpoint} is left from an earlier run: --resume continues it, --force starts again"
-            )
+        for left in (self.folder / CHECKPOINT, self.folder / RECORD):
+            if left.exists() and not (resume or force):
+                raise FileExistsError(
+                    f"{left} is left from an earlier run: --resume continues it, --force starts again"
+                )
         if resume and self.mesh.exists() and not force:
             raise FileExistsError(
                 f"{self.mesh} exists: the run has ended, or there was one before;"
@@ -164,7 +169,8 @@ class Trained:
 class Plan:
     """An optimisation that is ready to run."""
 
-    mesh: SplatMesh
+    mesh: SplatMesh | None
+    """Before the first step; None if it is made in cells."""
     dataset: Dataset
     summary: str
     background: Background | None
@@ -178,6 +184,8 @@ class TrainingCommand(Command):
 
     CONFIGURABLE = True
     EXCLUSIVE: ClassVar[tuple[tuple[str, ...], ...]] = (("epochs", "steps", "minutes"), ("data", "cameras"))
+    RANKS: ClassVar[bool] = False
+    """Whether torchrun may start several processes of it, which share the views."""
 
     input: tyro.conf.Positional[Path]
     """Input."""
@@ -214,6 +222,10 @@ class TrainingCommand(Command):
         """The preset with the explicit settings."""
         raise NotImplementedError
 
+    def files(self) -> RunFiles:
+        """The files of the run."""
+        return RunFiles(self.output)
+
     def check(self) -> None:
         """UsageError for options that contradict each other or have no effect."""
         self.target.check()
@@ -230,17 +242,27 @@ class TrainingCommand(Command):
         return self.configured().to_dict()
 
     def execute(self) -> int:
+        with joined_ranks(self.threads) as (ranks, threads):
+            if ranks.count == 1:
+                return self._execute(self.configured(), ranks)
+            if not self.RANKS:
+                raise UsageError("torchrun is for meshsplats finetune")
+            command, config = replace(self, threads=threads), self.configured()
+            if config.batch == 1:
+                config = replace(config, batch=ranks.count)
+            return command._assist(config, ranks) if ranks.index else command._execute(config, ranks)
+
+    def _execute(self, config: FinetuneConfig, ranks: Ranks) -> int:
         from meshsplats.formats.meshes import save_mesh
 
         start = time.perf_counter() - STARTUP_SECONDS
-        config = self.configured()
         self.check()
-        files = RunFiles(self.output)
+        files = self.files()
         files.check(self.inputs, resume=self.resume, force=self.force)
         earlier = self._earlier(files)
         plan = self.plan(config, earlier)
         print_plan(plan, self.target.cache_bytes)
-        options = self._run_options(files, start)
+        options = self._run_options(files, start, ranks)
         try:
             with (
                 files.claimed(self.inputs, resume=self.resume, force=self.force),
@@ -263,6 +285,18 @@ class TrainingCommand(Command):
                 print(line)
         return 0
 
+    def _assist(self, config: FinetuneConfig, ranks: Ranks) -> int:
+        """Takes the part of a rank that is not the first: it writes nothing, and prints errors only."""
+        self.check()
+        files = self.files()
+        with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere), redirect_stdout(nowhere):
+            plan = self.plan(config, self._earlier(files))
+            try:
+                plan.optimise(self._run_options(files, time.perf_counter(), ranks), lambda progress: None)
+            except Interrupted as stop:
+                return 128 + stop.signal
+        return 0
+
     def save_more(self, files: RunFiles, plan: Plan) -> None:
         """Further files of the run."""
 
@@ -281,13 +315,15 @@ class TrainingCommand(Command):
         return type(self).__name__.lower()
 
     def _earlier(self, files: RunFiles) -> Checkpoint | None:
-        """Of a run that is resumed, the checkpoint without its arrays; None for one that starts."""
+        """Of a run that is resumed, the checkpoint without its arrays; None for one that starts, and for one
+        in cells, which have their own."""
         from meshsplats.finetuning.checkpoint import load_checkpoint
         from meshsplats.finetuning.journal import CHECKPOINT
 
-        return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if self.resume else None
+        whole = self.resume and not files.in_cells
+        return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if whole else None
 
-    def _run_options(self, files: RunFiles, start: float) -> RunOptions:
+    def _run_options(self, files: RunFiles, start: float, ranks: Ranks) -> RunOptions:
         """Of a run whose command started at ``start`` by the performance counter."""
         return RunOptions(
             folder=files.folder,
@@ -297,6 +333,7 @@ class TrainingCommand(Command):
             threads=self.threads,
             spent=time.perf_counter() - start,
             cache_bytes=self.target.cache_bytes,
+            ranks=ranks,
         )
 
     def _record_start(self, files: RunFiles) -> None:
@@ -330,6 +367,9 @@ class TrainingCommand(Command):
         steps = lines[-1]["step"] if lines else 0
         total = seconds + (0 if earlier is None else earlier.seconds)
         resumed = "" if earlier is None else f", {seconds:.1f} s of it since it was resumed"
+        held_out = {"before": scores[0], "after": scores[-1]} if scores else None
+        if files.in_cells and held_out is not None:
+            held_out["before"] = None
         if self.json:
             result = {
                 "mesh": str(files.mesh),
@@ -337,13 +377,15 @@ class TrainingCommand(Command):
                 "seconds": round(total, 2),
                 "seconds_since_resumed": None if earlier is None else round(seconds, 2),
                 **trained.counts,
-                "held_out_psnr": {"before": scores[0], "after": scores[-1]} if scores else None,
+                "held_out_psnr": held_out,
                 "run": str(files.folder),
             }
             print(json.dumps(result, indent=1))
             return
         made = f"{files.mesh} ({size_of(files.mesh)}, {trained.summary})"
         quality = f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else ""
+        if len(scores) == 1:
+            quality = f"; held out: {scores[0]:.2f} dB"
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
         print(f"preview: {files.preview}; metrics: {files.folder}/metrics.jsonl")
 
@@ -381,10 +423,13 @@ def print_plan(plan: Plan, cache_bytes: int) -> None:
     from meshsplats.finetuning.memory import available_memory, check_memory, readable
 
     dataset = plan.dataset
-    needed, free = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes), available_memory()
     camera = dataset.train[0].camera
     views = f"{plural(len(dataset.train), 'training view')}, {len(dataset.test)} held out"
     views += f", of {camera.width} x {camera.height} pixels"
+    if plan.mesh is None:
+        say(f"{plan.summary}; {views}")
+        return
+    needed, free = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes), available_memory()
     memory = f"memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else "")
     say(f"{plan.summary}; {views}; {memory}")
 

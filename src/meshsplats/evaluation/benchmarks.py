@@ -5,11 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats.cluster import Workers
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import DataWarning
@@ -156,6 +158,7 @@ def run_benchmark(
     background: Sequence[float] | None = None,
     downscale: int | None = None,
     threads: int | None = None,
+    workers: Workers | None = None,
 ) -> BenchmarkResult:
     """Scores all scenes of ``benchmark`` that are in both ``models`` and ``data``.
 
@@ -169,6 +172,9 @@ def run_benchmark(
         background: display RGB in [0, 1] behind all scenes; ``find_background`` for each by default.
         downscale: downscaling of the images; that of the benchmark by default.
         threads: maximum number of threads; all processors by default.
+        workers: score the scenes, each in a task, with ``workers.threads`` in place of ``threads``; this
+            process by default. They have the folders at the same paths, and ``load``, ``prepare`` and
+            ``score`` are sent to them.
 
     Raises:
         FileNotFoundError: no scene is there. A DataWarning names each single one that is missing.
@@ -189,25 +195,44 @@ def run_benchmark(
             f" in {data}"
         )
 
+    workers = workers or Workers(threads)
+
     def default_score(name: str, dataset: Dataset, background: Background, candidates: Candidates) -> Report:
         mesh, splats, before = candidates
-        report = evaluate(mesh, dataset, splats=splats, before=before, threads=threads)
+        report = evaluate(mesh, dataset, splats=splats, before=before, threads=workers.threads)
         return replace(report, about={**report.about, **background.to_dict()})
 
     score = score or default_score
-    reports, factors = [], {}
-    for name, source in found:
-        factors[name] = downscale or benchmark.scenes[name]
-        dataset = load_dataset(data / name, downscale=factors[name], test_every=benchmark.test_every)
-        scene = load(source)
-        judge = "splats" if isinstance(scene, GaussianCloud) else "mesh"
-        chosen = find_background(
-            dataset, {judge: scene}, given=background, named=model_background(source), threads=threads
-        )
-        warn_of_other_worlds(chosen)
-        dataset = dataset.over(chosen.color)
-        reports.append(score(name, dataset, chosen, prepare(scene, dataset)))
-    return BenchmarkResult(benchmark, factors, tuple(reports))
+    factors = {name: downscale or benchmark.scenes[name] for name, _ in found}
+    scene_report = partial(
+        _scene_report, data, factors, benchmark.test_every, load, prepare, score, background, workers.threads
+    )
+    reports = dict(workers.run(scene_report, found))
+    return BenchmarkResult(benchmark, factors, tuple(reports[i] for i in range(len(found))))
+
+
+def _scene_report(
+    data: Path,
+    factors: Mapping[str, int],
+    test_every: int,
+    load: Callable[[Path], Scene],
+    prepare: Callable[[Scene, Dataset], Candidates],
+    score: Callable[[str, Dataset, Background, Candidates], Report],
+    background: Sequence[float] | None,
+    threads: int | None,
+    found: tuple[str, Path],
+) -> Report:
+    """Scores one scene: its name, and its mesh, splats or model folder."""
+    name, source = found
+    dataset = load_dataset(data / name, downscale=factors[name], test_every=test_every)
+    scene = load(source)
+    judge = "splats" if isinstance(scene, GaussianCloud) else "mesh"
+    chosen = find_background(
+        dataset, {judge: scene}, given=background, named=model_background(source), threads=threads
+    )
+    warn_of_other_worlds(chosen)
+    dataset = dataset.over(chosen.color)
+    return score(name, dataset, chosen, prepare(scene, dataset))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -20,6 +20,7 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
 from meshsplats.formats.safetensors import load_safetensors, save_safetensors
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 VERSION = 1
@@ -139,14 +140,17 @@ def stored_mesh(arrays: dict[str, np.ndarray], blending: str) -> SplatMesh:
         raise FileFormatError(f"the checkpoint's mesh is broken: {error}") from None
 
 
-def mesh_fingerprint(mesh: SplatMesh) -> str:
-    """Hash of the positions, triangles, colours, binding, blending and filter of ``mesh``."""
+def mesh_fingerprint(mesh: SplatMesh, frozen: np.ndarray | None = None) -> str:
+    """Hash of the positions, triangles, colours, binding, blending and filter of ``mesh``, and of the mask of
+    its ``frozen`` vertices."""
     digest = hashlib.sha256(mesh.blending.encode())
     if mesh.filter_px2:
         digest.update(repr(mesh.filter_px2).encode())
     arrays = [mesh.vertices, mesh.faces, mesh.colors]
     if mesh.binding is not None:
         arrays += [getattr(mesh.binding, field.name) for field in mesh.binding.FIELDS]
+    if frozen is not None:
+        arrays.append(frozen)
     for array in arrays:
         digest.update(repr(array.shape).encode())
         digest.update(array.data)
@@ -167,7 +171,18 @@ def dataset_fingerprint(dataset: Dataset) -> str:
         degree = source.cloud.sh_degree if source.sh_degree is None else source.sh_degree
         digest.update(repr((source.look, degree, source.samples, source.cloud.kernel)).encode())
     for splats in {id(source.cloud): source.cloud for source in rendered}.values():
-        for array in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.sh):
-            digest.update(repr(array.shape).encode())
-            digest.update(array.data)
+        _add_splats(digest, splats)
     return digest.hexdigest()
+
+
+def cloud_digest(cloud: GaussianCloud) -> str:
+    """Hash of all splats of ``cloud``."""
+    digest = hashlib.sha256(cloud.kernel.encode())
+    _add_splats(digest, cloud)
+    return digest.hexdigest()
+
+
+def _add_splats(digest: hashlib._Hash, splats: GaussianCloud) -> None:
+    for array in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.sh):
+        digest.update(repr(array.shape).encode())
+        digest.update(array.data)

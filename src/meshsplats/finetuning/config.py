@@ -126,6 +126,10 @@ class FinetuneConfig:
     """For rendered images that are means over each pixel's area: for this initial fraction of the run, train
     on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
     pixel without averaging. 0: train on means only."""
+    batch: int = 1
+    """Views whose gradients are summed for a step, which then counts as that many steps: a run of the same
+    length sees as many views. Learning rates are multiplied by its square root. For runs on several ranks,
+    which share the views of a batch; not with exposures and opacity 'cutoff'."""
     seed: int = 0
     """Seed of the order of the views and of random backgrounds. The same seed gives the same bits, with any
     number of threads, unless the length is given in minutes."""
@@ -140,6 +144,8 @@ class FinetuneConfig:
             for f in fields(self):
                 if f.name in _OF_CUTOFF and getattr(self, f.name) != f.default:
                     raise ValueError(f"{f.name} has no effect without opacity 'cutoff'")
+        if self.batch > 1 and (self.exposure or self.opacity == "cutoff"):
+            raise ValueError("a batch of several views is not for exposure and opacity 'cutoff'")
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
@@ -228,6 +234,7 @@ _RANGES: list[Range] = [
     ("soft_share", 0, 1, False),
     ("soft_phase", 0.01, 0.99, False),
     ("point_share", 0, 1, False),
+    ("batch", 1, 4096, True),
     ("seed", 0, 2**63 - 1, True),
 ]
 
@@ -303,6 +310,7 @@ class FinetuneChanges(TypedDict, total=False):
     soft_share: float
     soft_phase: float
     point_share: float
+    batch: int
     seed: int
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from meshsplats._arrays import subsample
+from meshsplats._arrays import checked_array, subsample
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import masked_ssim
@@ -19,6 +21,7 @@ from meshsplats.finetuning.checkpoint import (
     OtherRunError,
     check_same_run,
     dataset_fingerprint,
+    load_checkpoint,
     mesh_fingerprint,
 )
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
@@ -27,6 +30,7 @@ from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.opaque import visible_faces
+from meshsplats.finetuning.ranks import ALONE, Ranks
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
 from meshsplats.formats.cutting import cut_mesh
@@ -72,6 +76,9 @@ class RunOptions:
     """Seconds already used, which count if the length is given in minutes."""
     cache_bytes: int = CACHE_BYTES
     """Limit of the data set's image cache, for the memory estimate."""
+    ranks: Ranks = ALONE
+    """Processes that share the views of each batch (``ranks.joined_ranks``). The first one writes; the folder
+    of a run that is resumed is at the same path on all."""
 
     def __post_init__(self) -> None:
         for name in ("report_every", "preview_every"):
@@ -113,6 +120,7 @@ def finetune(
     config: FinetuneConfig | None = None,
     *,
     run: RunOptions | None = None,
+    frozen: np.ndarray | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     **changes: Unpack[FinetuneChanges],
 ) -> SplatMesh:
@@ -126,13 +134,16 @@ def finetune(
     Args:
         config: the configuration; the preset 'default' by default.
         run: output folder, resumption from a checkpoint, logging and resources.
+        frozen: (v,) bool, True for vertices of ``mesh`` that keep their positions and colours; none by
+            default. Not with relocation or opacity 'cutoff'.
         on_progress: called after every step.
         changes: fields of ``FinetuneConfig`` in place of those of ``config``: ``finetune(mesh, data,
             minutes=2)``.
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: no training view, an empty mesh.
+        ValueError: no training view, an empty mesh, ``frozen`` of another shape; a batch that the ranks
+            cannot share, or that has more views than there are.
         OtherRunError: the checkpoint is of another run.
         MemoryError: the estimated memory is not available; nothing was written.
         DivergenceError: the loss or a gradient is not finite; the message names the view.
@@ -143,12 +154,29 @@ def finetune(
         raise ValueError("the data set has no training views")
     if not len(mesh.faces):
         raise ValueError("the mesh has no triangles: there is nothing to fine-tune")
+    _check_batch(config, len(dataset.train), run.ranks)
+    if frozen is not None:
+        frozen = checked_array("frozen", frozen, bool, (len(mesh.vertices),))
+        if config.relocate_share or config.opacity == "cutoff":
+            raise ValueError("frozen vertices are not for relocate_share and opacity 'cutoff'")
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
-    loop = TrainingLoop(
-        _run_start(mesh, dataset, config, run, journal), dataset, config, run, journal, on_progress
-    )
+    start = _run_start(mesh, dataset, config, run, journal, frozen)
+    run.ranks.wait()  # before the first one writes what the others have read
+    loop = TrainingLoop(start, dataset, config, run, None if run.ranks.index else journal, on_progress)
+    del start
     return loop.run()
+
+
+def _check_batch(config: FinetuneConfig, views: int, ranks: Ranks) -> None:
+    if config.batch % ranks.count:
+        raise ValueError(
+            f"a batch of {config.batch} cannot be shared by {ranks.count} ranks: give a multiple"
+        )
+    if config.batch > views:
+        raise ValueError(f"a batch of {config.batch} needs as many training views, there are {views}")
+    if ranks.count > 1 and config.minutes is not None:
+        raise ValueError("a length in minutes is not for several ranks, whose clocks differ")
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,16 +197,22 @@ class RunStart:
 
 
 def _run_start(
-    mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, options: RunOptions, journal: Journal | None
+    mesh: SplatMesh,
+    dataset: Dataset,
+    config: FinetuneConfig,
+    options: RunOptions,
+    journal: Journal | None,
+    frozen: np.ndarray | None,
 ) -> RunStart:
     """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
     if journal is None:
-        return RunStart(State.begin(mesh, views, config, options.threads), ("", ""), mesh)
-    fingerprints = mesh_fingerprint(mesh), dataset_fingerprint(dataset)
+        return RunStart(State.begin(mesh, views, config, options.threads, frozen), ("", ""), mesh)
+    fingerprints = mesh_fingerprint(mesh, frozen), dataset_fingerprint(dataset)
     if not options.resume:
-        state = State.begin(mesh, views, config, options.threads)
-        journal.begin(config.to_dict())
+        state = State.begin(mesh, views, config, options.threads, frozen)
+        if not options.ranks.index:
+            journal.begin(config.to_dict())
         return RunStart(state, fingerprints, mesh)
     total = config.total_steps(views)
 
@@ -187,7 +221,10 @@ def _run_start(
         if total is not None and found.step > total:
             raise OtherRunError(f"the run has taken {found.step:,} steps already, {total:,} were requested")
 
-    found = journal.resume(config.to_dict(), check)
+    if options.ranks.index:
+        check(found := load_checkpoint(journal.checkpoint_path))
+    else:
+        found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
     state = State.resume(found.arrays, blending, views, config, options.threads)
     return RunStart(state, fingerprints, mesh, found.step, found.seconds, found.losses)
@@ -251,19 +288,26 @@ class TrainingLoop:
         views = self.dataset.train
         prune_interval = self.config.prune_interval(len(views))
         relocate_interval = self.config.relocate_interval(len(views))
+        ranks = self.options.ranks
+
+        def due(interval: int) -> bool:
+            """Whether the steps just taken have come to a multiple of ``interval``."""
+            return bool(interval) and self.step // interval > before // interval
+
         with StopSignals() as signals:
             if self.step == 0:
                 self._report()
                 self._save_preview()
                 self._save_checkpoint()
             while not self._done():
-                if signals.received is not None:
+                if ranks.any(signals.received is not None):
                     self._save_checkpoint()
-                    raise Interrupted(self.step, signals.received)
-                start = time.perf_counter()
-                loss = make_step(self.state, views, self.step, self.fraction)
+                    raise Interrupted(self.step, signals.received or signal.SIGTERM)
+                start, before = time.perf_counter(), self.step
+                batch = min(self.config.batch, (self.steps or sys.maxsize) - before)
+                loss = make_step(self.state, views, before, self.fraction, batch=batch, ranks=ranks)
                 self.step_cost = time.perf_counter() - start
-                self.step += 1
+                self.step += batch
                 if loss is not None:
                     self.losses.append(loss)
                     self.last_loss = loss
@@ -271,15 +315,13 @@ class TrainingLoop:
                     self._remove_hidden()
                 if self._becomes_hybrid():
                     self._cut()
-                if prune_interval and self.step % prune_interval == 0 and not self._done():
+                if due(prune_interval) and not self._done():
                     self.state = self.state.prune(kept_faces(self.state, views))
-                due = relocate_interval and self.step % relocate_interval == 0
-                if due and self.fraction <= RELOCATION_END:
+                if due(relocate_interval) and self.fraction <= RELOCATION_END:
                     relocate(self.state, views)
-                report_interval = self.options.report_every
-                if report_interval and self.step % report_interval == 0 and not self._done():
+                if due(self.options.report_every) and not self._done():
                     self._report()
-                if self._preview_is_due():
+                if self._passed_quarter() or due(self.options.preview_every):
                     self._save_preview()
                 if time.perf_counter() - self.save_time >= self.options.checkpoint_seconds:
                     self._save_checkpoint()
@@ -339,17 +381,16 @@ class TrainingLoop:
 
     def _report(self) -> None:
         """Scores the held-out views and writes a line of the metrics."""
+        if self.options.ranks.index:
+            self.losses.clear()
+            return
         start = time.perf_counter()
         loss = float(np.mean(self.losses)) if self.losses else None
         mean_ssim = None
         if self.scored_views:
-            mesh = self.result()
-            scores = []
-            for view in self.scored_views:
-                image, target = np.clip(self._render(mesh, view), 0, 1), np.clip(view.image, 0, 1)
-                decibels = min(psnr(image, target, mask=view.mask), 200.0)
-                scores.append((decibels, masked_ssim(image, target, view.mask, self.options.threads)))
-            self.held_out, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))
+            self.held_out, mean_ssim = held_out_scores(
+                self.result(), self.scored_views, self.config, self.options.threads
+            )
         if self.journal is not None:
             self.journal.log_metrics(
                 self.step,
@@ -362,10 +403,10 @@ class TrainingLoop:
         self.losses.clear()
         self.report_cost = time.perf_counter() - start
 
-    def _preview_is_due(self) -> bool:
-        quarter, interval = int(MIN_PREVIEWS * self.fraction), self.options.preview_every
+    def _passed_quarter(self) -> bool:
+        quarter = int(MIN_PREVIEWS * self.fraction)
         passed, self.quarter = quarter > self.quarter, quarter
-        return bool(interval) and (passed or self.step % interval == 0)
+        return passed
 
     def _save_preview(self) -> None:
         if self.journal is None or not self.options.preview_every:
@@ -375,8 +416,7 @@ class TrainingLoop:
         self.journal.save_preview(self.step, np.clip(view.image, 0, 1), image)
 
     def _render(self, mesh: SplatMesh, view: View) -> np.ndarray:
-        samples, threads = samples_of(view, self.config), self.options.threads
-        return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
+        return _image_for(mesh, view, self.config, self.options.threads)
 
     def _save_checkpoint(self) -> None:
         self.save_time = time.perf_counter()
@@ -417,3 +457,21 @@ class TrainingLoop:
                 len(self.state.mesh.faces),
             )
         )
+
+
+def held_out_scores(
+    mesh: SplatMesh, views: Sequence[View], config: FinetuneConfig, threads: int | None
+) -> tuple[float, float]:
+    """Means of PSNR, in dB and at most 200, and SSIM of ``mesh`` in ``views``, at least one."""
+    scores = []
+    for view in views:
+        image, target = np.clip(_image_for(mesh, view, config, threads), 0, 1), np.clip(view.image, 0, 1)
+        decibels = min(psnr(image, target, mask=view.mask), 200.0)
+        scores.append((decibels, masked_ssim(image, target, view.mask, threads)))
+    mean_psnr, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))
+    return mean_psnr, mean_ssim
+
+
+def _image_for(mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None) -> np.ndarray:
+    samples = samples_of(view, config)
+    return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]

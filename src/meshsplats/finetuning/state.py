@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import checked_array
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.adam import RowAdam
@@ -53,6 +54,7 @@ class State:
             they are not fitted.
         solid: for a mesh of opaque and blended triangles, (v,) bool: the vertices of opaque ones, whose
             positions and opacities stay; otherwise None.
+        frozen: (v,) bool: vertices whose positions and colours stay; None if there are none.
     """
 
     def __init__(
@@ -80,10 +82,18 @@ class State:
         relocates = config.relocate_share and self.bound is None
         self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
         self.solid: np.ndarray | None = None
+        self.frozen: np.ndarray | None = None
 
     @classmethod
-    def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
-        """The state before the first step, for ``views`` training views."""
+    def begin(
+        cls,
+        mesh: SplatMesh,
+        views: int,
+        config: FinetuneConfig,
+        threads: int | None,
+        frozen: np.ndarray | None = None,
+    ) -> State:
+        """The state before the first step, for ``views`` training views and vertices that are ``frozen``."""
         if config.opacity == "cutoff":
             _check_for_cutoff(mesh, config)
         mesh = replace(mesh, normals=None)  # positions change, normals would not
@@ -104,7 +114,9 @@ class State:
             sizes = weight_units(mesh, config.position_unit == "scene")
         else:
             sizes = vertex_sizes(mesh)
-        return cls(mesh, sizes, exposures, config, threads)
+        state = cls(mesh, sizes, exposures, config, threads)
+        state.frozen = frozen
+        return state
 
     @classmethod
     def begin_hybrid(cls, mesh: SplatMesh, config: FinetuneConfig, threads: int | None) -> State:
@@ -133,6 +145,8 @@ class State:
                 adam.load_state(part)
             if arrays.get("solid", np.zeros(())):
                 state.solid = _solid_vertices(mesh)
+            if "frozen" in arrays:
+                state.frozen = checked_array("frozen", arrays["frozen"], bool, (len(mesh.vertices),))
             if state._sums is not None:
                 shape = (len(mesh.vertices),)
                 parts = (_checked_shape(arrays[name], shape) for name in state._sums.arrays())
@@ -154,6 +168,8 @@ class State:
             arrays |= self._sums.arrays()
         if self.solid is not None:
             arrays["solid"] = np.ones((), np.int32)
+        if self.frozen is not None:
+            arrays["frozen"] = self.frozen
         return arrays
 
     def result(self) -> SplatMesh:
@@ -172,6 +188,8 @@ class State:
         reached = gradients.colors[:, 3] != 0
         if self.config.opacity == "cutoff":  # but where opaque, only its colour
             reached |= (gradients.colors[:, :3] != 0).any(axis=1)
+        if self.frozen is not None:
+            reached &= ~self.frozen
         if self.solid is not None:
             gradients.colors[self.solid, 3] = 0
         opacity = self.colors[:, 3]
@@ -247,6 +265,8 @@ class State:
             smaller._sums = GradientSums(self._sums.color[used], self._sums.position[used])
         if self.solid is not None:
             smaller.solid = self.solid[used]
+        if self.frozen is not None:
+            smaller.frozen = self.frozen[used]
         return smaller
 
     def _optimisers(self) -> dict[str, RowAdam]:

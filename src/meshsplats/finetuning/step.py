@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
 from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction
 from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of
+from meshsplats.finetuning.ranks import ALONE, Part, Ranks
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering, visible_pixels
@@ -51,6 +53,20 @@ def view_of_step(config: FinetuneConfig, step: int, views: int) -> int:
     """Index of the training view of step ``step``, of ``views``: a new permutation in each epoch."""
     epoch, position = divmod(step, views)
     return int(np.random.default_rng([config.seed, epoch, 0]).permutation(views)[position])
+
+
+def view_of_place(config: FinetuneConfig, number: int, place: int, views: int) -> int:
+    """Index of the training view at ``place`` of the batch with that ``number``, of ``views``.
+
+    A place goes through views of its own, every ``config.batch``-th of all, in a new permutation each time:
+    so a rank needs the images of its share of the views only.
+    """
+    if config.batch == 1:
+        return view_of_step(config, number, views)
+    own = len(range(place, views, config.batch))
+    epoch, position = divmod(number, own)
+    order = np.random.default_rng([config.seed, epoch, 0, place]).permutation(own)
+    return place + config.batch * int(order[position])
 
 
 def uses_point_targets(view: View, config: FinetuneConfig, fraction: float) -> bool:
@@ -169,21 +185,99 @@ def loss_of(
     return loss, gradient
 
 
-def make_step(state: State, views: Sequence[View], step: int, fraction: float) -> float | None:
-    """Takes step ``step`` (from 0), after ``fraction`` (0 to 1) of the run; returns its loss.
+class ViewGradients(NamedTuple):
+    """What a view says about the state."""
 
-    Returns None if no pixel of the view counts; the state has not changed then. Raises DivergenceError,
-    before anything has changed, if the loss or a gradient is not finite.
+    loss: float
+    gradients: Gradients | None
+    """None if the loss is not finite."""
+    finite: bool
+
+
+def make_step(
+    state: State,
+    views: Sequence[View],
+    step: int,
+    fraction: float,
+    *,
+    batch: int = 1,
+    ranks: Ranks = ALONE,
+) -> float | None:
+    """Takes step ``step`` (from 0), after ``fraction`` (0 to 1) of the run, with a ``batch`` of views, at
+    most that of the configuration; returns the mean of their losses.
+
+    Returns None if no pixel of the views counts; the state has not changed then. Raises DivergenceError,
+    before anything has changed, if a loss or a gradient is not finite.
     """
     config = state.config
-    index = view_of_step(config, step, len(views))
-    view = views[index]
     hybrid, steps_before = state.solid is not None, 0.0
+    number = step // config.batch
+    indices = [view_of_place(config, number, place, len(views)) for place in range(batch)]
+    if batch == config.batch == ranks.count == 1:
+        found = view_gradients(state, views, indices[0], step, fraction)
+        if found is None:
+            return None
+        loss, gradients = found.loss, found.gradients
+        failed = 0 if found.finite else 1
+    else:
+        total = ranks.total(_part(state, views, indices, step, fraction, ranks.share(batch)))
+        if not total.views and not total.failed:
+            return None
+        loss, failed = total.loss / max(total.views, 1), total.failed
+        gradients = Gradients(total.vertices, total.colors)
+    if failed or gradients is None:
+        culprit = "the loss" if gradients is None else "a gradient"
+        if batch > 1:
+            culprit = "the loss or a gradient"
+        raise DivergenceError(
+            f"step {step + 1}, view {views[indices[failed - 1]].name!r}: {culprit} is not finite. Check this"
+            " view's image and camera first; if they are sound, lower the learning rates. The last checkpoint"
+            " is from before this step"
+        )
     if hybrid:
         steps_before = step * (1 - config.soft_phase) / fraction
         fraction = soft_fraction(config, fraction)
     else:
         fraction = opaque_fraction(config, fraction)
+    color_rate, position_rate = learning_rates(config, step - steps_before, fraction)
+    if batch > 1:
+        color_rate, position_rate = color_rate * math.sqrt(batch), position_rate * math.sqrt(batch)
+    state.step(gradients, color_rate, position_rate, indices[0])
+    return loss
+
+
+def _part(
+    state: State, views: Sequence[View], indices: Sequence[int], step: int, fraction: float, share: range
+) -> Part:
+    """The sum over the places of a batch in ``share``."""
+    total = Part(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), 0.0, 0, 0)
+    for place in share:
+        found = view_gradients(state, views, indices[place], step + place, fraction)
+        if found is None:
+            continue
+        if found.gradients is None or not found.finite:
+            total = total._replace(failed=place + 1)
+            break
+        if total.views:
+            np.add(total.vertices, found.gradients.vertices, out=total.vertices)
+            np.add(total.colors, found.gradients.colors, out=total.colors)
+        else:
+            total = total._replace(vertices=found.gradients.vertices, colors=found.gradients.colors)
+        total = total._replace(loss=total.loss + found.loss, views=total.views + 1)
+    if total.views:
+        return total
+    count = len(state.vertices)
+    return total._replace(vertices=np.zeros((count, 3), np.float32), colors=np.zeros((count, 4), np.float32))
+
+
+def view_gradients(
+    state: State, views: Sequence[View], index: int, step: int, fraction: float
+) -> ViewGradients | None:
+    """Loss and gradients of the training view of that ``index`` in step ``step``, after ``fraction`` of the
+    run; None if none of its pixels counts."""
+    config, view = state.config, views[index]
+    hybrid = state.solid is not None
+    fraction = soft_fraction(config, fraction) if hybrid else opaque_fraction(config, fraction)
     points = not hybrid and uses_point_targets(view, config, fraction)
     target = target_of(view, config, step, points)
     if target.mask is not None and not target.mask.any():
@@ -198,26 +292,18 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
         exposure = state.exposures[index]
         image = image * exposure[GAIN] + exposure[OFFSET]
     loss, grad_image = loss_of(image, target, config, state.threads)
-    culprit, gradients = "the loss", None
-    if np.isfinite(loss):
-        grad_exposure = None
-        if state.exposures is not None:
-            grad_exposure = exposure_gradient(rendered.color, grad_image)
-            grad_image = grad_image * exposure[GAIN]
-        expected, share = None, 0.0 if hybrid else expected_share(config, fraction)
-        if share:
-            expected = expected_error(target.color, target.mask, config, share)
-            grad_image = grad_image * np.float32(1 - share)
-        culprit, gradients = "a gradient", rendered.backward(grad_image, expected)
-        gradients = gradients._replace(exposure=grad_exposure)
-    if gradients is None or not gradients.finite():
-        raise DivergenceError(
-            f"step {step + 1}, view {view.name!r}: {culprit} is not finite. Check this view's image and"
-            " camera first; if they are sound, lower the learning rates. The last checkpoint is from before"
-            " this step"
-        )
-    state.step(gradients, *learning_rates(config, step - steps_before, fraction), index)
-    return loss
+    if not np.isfinite(loss):
+        return ViewGradients(loss, None, False)
+    grad_exposure = None
+    if state.exposures is not None:
+        grad_exposure = exposure_gradient(rendered.color, grad_image)
+        grad_image = grad_image * exposure[GAIN]
+    expected, share = None, 0.0 if hybrid else expected_share(config, fraction)
+    if share:
+        expected = expected_error(target.color, target.mask, config, share)
+        grad_image = grad_image * np.float32(1 - share)
+    gradients = rendered.backward(grad_image, expected)._replace(exposure=grad_exposure)
+    return ViewGradients(loss, gradients, gradients.finite())
 
 
 def exposure_gradient(image: np.ndarray, grad_image: np.ndarray) -> np.ndarray:

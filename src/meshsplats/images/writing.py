@@ -64,6 +64,11 @@ def save_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
     Raises:
         ValueError: the suffix or the shape is another, or a value is not finite.
     """
+    write_bytes(path, encode_image(path, image))
+
+
+def encode_image(path: str | os.PathLike[str], image: np.ndarray) -> bytes:
+    """The content of the file that ``save_image`` writes to ``path``; its errors."""
     from PIL import Image
 
     encoder = _ENCODERS.get(Path(path).suffix.lower())
@@ -73,7 +78,7 @@ def save_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
     if np.ndim(image) != 3 or np.shape(image)[2] not in channels:
         wanted = " or ".join(f"(h, w, {c})" for c in channels)
         raise ValueError(f"{encoder['format']} images must have shape {wanted}, got {np.shape(image)}")
-    _save(path, Image.fromarray(to_bytes(image)), **encoder)
+    return _encoded(Image.fromarray(to_bytes(image)), **encoder)
 
 
 def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float) -> None:
@@ -81,6 +86,11 @@ def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float)
 
     ``unit`` is the depth of one step in scene units, > 0; a reader needs it to get depths back.
     """
+    write_bytes(path, encode_depth_png(depth, unit))
+
+
+def encode_depth_png(depth: np.ndarray, unit: float) -> bytes:
+    """The content of the file that ``save_depth_png`` writes."""
     from PIL import Image
 
     if not (np.isfinite(unit) and unit > 0):
@@ -88,14 +98,19 @@ def save_depth_png(path: str | os.PathLike[str], depth: np.ndarray, unit: float)
     steps = np.clip(np.rint(np.asarray(depth, np.float64) / unit), 0, 65535).astype(np.uint16)
     # A positive depth must not become 0, which means empty.
     steps[(depth > 0) & (steps == 0)] = 1
-    _save(path, Image.fromarray(steps), format="PNG")
+    return _encoded(Image.fromarray(steps), format="PNG")
 
 
 def save_array(path: str | os.PathLike[str], array: np.ndarray) -> None:
     """Writes ``array`` as .npy; replaces an older file."""
-    encoded = io.BytesIO()  # as in _save: to a file, NumPy reports only how many numbers did not fit
+    write_bytes(path, encode_array(array))
+
+
+def encode_array(array: np.ndarray) -> bytes:
+    """The content of the file that ``save_array`` writes."""
+    encoded = io.BytesIO()  # as in _encoded: to a file, NumPy reports only how many numbers did not fit
     np.save(encoded, array, allow_pickle=False)
-    write_bytes(path, encoded.getbuffer())
+    return encoded.getvalue()
 
 
 def save_animation(
@@ -126,8 +141,7 @@ def save_animation(
     }
     if suffix == ".gif":
         images = [_paletted(image) for image in images]
-    _save(
-        path,
+    encoded = _encoded(
         images[0],
         format={".webp": "WEBP", ".gif": "GIF", ".png": "PNG"}[suffix],
         save_all=True,
@@ -136,13 +150,14 @@ def save_animation(
         loop=0,
         **options[suffix],
     )
+    write_bytes(path, encoded)
 
 
-def _save(path: str | os.PathLike[str], image: Image.Image, **options: Any) -> None:
-    """Encodes in memory first: Pillow's encoders lose the reason why a write to disk fails."""
+def _encoded(image: Image.Image, **options: Any) -> bytes:
+    """Encodes in memory: Pillow's encoders lose the reason why a write to disk fails."""
     encoded = io.BytesIO()
     image.save(encoded, **options)
-    write_bytes(path, encoded.getbuffer())
+    return encoded.getvalue()
 
 
 def strip(images: Sequence[np.ndarray], captions: Sequence[str] = ()) -> np.ndarray:

@@ -67,6 +67,12 @@ def cloud_of(records: np.ndarray, kernel: Kernel) -> GaussianCloud:
     return GaussianCloud(**arrays, sh=records["sh"][:, None], kernel=kernel)
 
 
+def read_records(paths: Iterable[Path]) -> np.ndarray:
+    """All records of the files at ``paths``, in the order of their rows."""
+    records = np.concatenate([np.fromfile(path, RECORD) for path in paths])
+    return records[np.argsort(records["row"], kind="stable")]
+
+
 class Buckets:
     """Files of records in a folder, each the splats of a cell, in the order of their rows."""
 
@@ -110,10 +116,9 @@ class Buckets:
             found.setdefault(cell, []).append(key)
         return found
 
-    def read(self, files: Iterable[str]) -> np.ndarray:
-        """All records of ``files``, in the order of their rows."""
-        records = np.concatenate([np.fromfile(self._path(key), RECORD) for key in files])
-        return records[np.argsort(records["row"], kind="stable")]
+    def paths(self, files: Iterable[str]) -> list[Path]:
+        """The places of ``files`` on the disk, for ``read_records``."""
+        return [self._path(key) for key in files]
 
     def remove(self, files: Iterable[str]) -> None:
         for key in files:

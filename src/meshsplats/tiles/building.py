@@ -12,6 +12,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ import numpy as np
 from meshsplats._files.atomic import atomic_path, write_text
 from meshsplats._files.locks import locked
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
+from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import Fans
 from meshsplats.conversion.budget import triangles_each
 from meshsplats.conversion.merging import FILTER_PX2, merge
@@ -28,7 +30,7 @@ from meshsplats.formats.gaussians import SplatStream
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
-from meshsplats.tiles.buckets import BUCKET, DEPTH, RECORD, Buckets, Cube, cloud_of, records_of
+from meshsplats.tiles.buckets import BUCKET, DEPTH, RECORD, Buckets, Cube, cloud_of, read_records, records_of
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.tileset import Node, tile_frame, tile_path, write_tilesets
 
@@ -40,6 +42,8 @@ ERROR_SHARE = 0.99
 """Share of the mass of an inner tile that its geometric error speaks for."""
 JOURNAL = Path("work", "journal.jsonl")
 """Inside the folder of an unfinished tileset."""
+SURVEY = "survey.npz"
+"""Beside the journal."""
 _MERGED = np.dtype([*RECORD.descr, ("spread", "<f8")])
 """A splat of a tile; the variance of the centres of the file's splats around it, square scene units."""
 
@@ -98,13 +102,15 @@ def build_tiles(
     resume: bool = False,
     replace_old: bool = False,
     threads: int | None = None,
+    workers: Workers | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> TilesetSummary:
     """Writes the splats of ``source`` as the tileset ``folder``, whole or not at all.
 
     Until it is complete it lies in ``FOLDER.partial`` with a journal, so that a run that was ended at any
-    moment can be resumed. The result has the same bits with any number of threads, and after any number of
-    interruptions. Memory does not grow with the scene; the disk holds 60 bytes a splat besides the tiles.
+    moment can be resumed. The result has the same bits with any number of threads and workers, and after any
+    number of interruptions. Memory does not grow with the scene; the disk holds 60 bytes a splat besides the
+    tiles.
 
     Args:
         source: the splats.
@@ -113,6 +119,8 @@ def build_tiles(
         resume: go on with an interrupted run of the same splats and options.
         replace_old: replace a tileset, and begin again where an earlier run left a partial one.
         threads: at most this many; all processors by default.
+        workers: build the cells of the octree, each in a task; this process by default. All of them have the
+            folder at the same path.
         on_progress: called with the count of finished splats and that of all.
 
     Returns:
@@ -123,26 +131,27 @@ def build_tiles(
         FileNotFoundError: there is nothing to resume.
         ValueError: options out of range, or other ones than the interrupted run had; no splat to convert.
         OSError: a full disk; what is done stays, for ``resume``.
+        ClusterError: the workers are lost; what is done stays.
     """
     chosen = options or TileOptions()
     conversion = chosen.resolved()
     target = Path(folder)
-    partial = partial_folder(target)
+    unfinished = partial_folder(target)
     with locked(target.with_name(f".{target.name}.lock")) as ours:
         if not ours:
-            raise FileExistsError(f"{partial}: another process is at work on this tileset")
-        _check_folders(target, partial, resume, replace_old)
-        build = _Build(source, partial, chosen, conversion, threads, on_progress)
+            raise FileExistsError(f"{unfinished}: another process is at work on this tileset")
+        _check_folders(target, unfinished, resume, replace_old)
+        build = _Build(source, unfinished, chosen, conversion, threads, workers, on_progress)
         summary = build.run()
         if target.exists():
             old = target.with_name(f".{target.name}.old")
             shutil.rmtree(old, ignore_errors=True)
             os.rename(target, old)
-            os.rename(partial / "tileset", target)
+            os.rename(unfinished / "tileset", target)
             shutil.rmtree(old)
         else:
-            os.rename(partial / "tileset", target)
-        shutil.rmtree(partial)
+            os.rename(unfinished / "tileset", target)
+        shutil.rmtree(unfinished)
     return summary
 
 
@@ -151,7 +160,7 @@ def partial_folder(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.partial")
 
 
-def _check_folders(target: Path, partial: Path, resume: bool, replace_old: bool) -> None:
+def _check_folders(target: Path, unfinished: Path, resume: bool, replace_old: bool) -> None:
     """Refuses folders that must not be written, and removes what an earlier run has left."""
     if target.exists():
         if not (target / "tileset.json").is_file():
@@ -159,14 +168,14 @@ def _check_folders(target: Path, partial: Path, resume: bool, replace_old: bool)
         if not (replace_old or resume):
             raise FileExistsError(f"{target} exists: give another folder, or have it replaced")
     if resume:
-        if not (partial / JOURNAL).is_file():
-            raise FileNotFoundError(f"nothing to resume in {partial}")
-    elif partial.exists():
+        if not (unfinished / JOURNAL).is_file():
+            raise FileNotFoundError(f"nothing to resume in {unfinished}")
+    elif unfinished.exists():
         if not replace_old:
-            raise FileExistsError(f"{partial} is left from an earlier run: resume it, or remove it")
-        if not (partial / JOURNAL).is_file():
-            raise FileExistsError(f"{partial} exists and is not of this command: remove it")
-        shutil.rmtree(partial)
+            raise FileExistsError(f"{unfinished} is left from an earlier run: resume it, or remove it")
+        if not (unfinished / JOURNAL).is_file():
+            raise FileExistsError(f"{unfinished} exists and is not of this command: remove it")
+        shutil.rmtree(unfinished)
 
 
 class _Build:
@@ -175,56 +184,64 @@ class _Build:
     def __init__(
         self,
         source: SplatStream,
-        partial: Path,
+        folder: Path,
         options: TileOptions,
         conversion: ConversionOptions,
         threads: int | None,
+        workers: Workers | None,
         on_progress: Callable[[int, int], None] | None,
     ) -> None:
         self._source, self._options, self._conversion = source, options, conversion
-        self._threads, self._on_progress = threads, on_progress
-        self._work, self._out = partial / "work", partial / "tileset"
+        self._workers, self._on_progress = workers or Workers(threads), on_progress
+        self._folder, self._threads = folder, threads
+        self._work, self._out = folder / "work", folder / "tileset"
         for part in (self._work / "done", self._work / "splats", self._out):
             part.mkdir(parents=True, exist_ok=True)
-        self.journal = Journal(partial / JOURNAL)
-        self._most = options.max_triangles // triangles_each(conversion)
-        self._up = unit_up(options.up)
-        self._frame = tile_frame(self._up)
+        self.journal = Journal(folder / JOURNAL)
 
     def run(self) -> TilesetSummary:
         self._check_start()
         scene = self._survey()
-        self._kernel = scene.kernel
-        self._pixels = ScenePixels(scene, self._conversion, None, self._up)
-        self._cube = Cube(scene.low, scene.high)
-        buckets = Buckets(self._work / "splats", self._cube, self.journal, BUCKET)
+        buckets = Buckets(self._work / "splats", Cube(scene.low, scene.high), self.journal, BUCKET)
         buckets.fill(self._records(), scene.kept)
         cells = buckets.cells()
         done = {line["key"]: line["splats"] for line in self.journal.steps if line["step"] == "cell"}
         finished = 0
-        for cell, files in cells.items():
-            if cell not in done:
-                records = buckets.read(files)
-                own, merged = self._subtree(cell, records)
-                self._keep(cell, own, merged)
-                done[cell] = len(records)
-                self.journal.add("cell", key=cell, splats=done[cell])
-            buckets.remove(files)
+
+        def ended(cell: str) -> None:
+            nonlocal finished
+            buckets.remove(cells[cell])
             finished += done[cell]
             if self._on_progress:
                 self._on_progress(finished, scene.kept)
-        root = self._root_of(self._upper(sorted(cells))).key
+
+        for cell in done:
+            ended(cell)
+        todo = [(cell, buckets.paths(files)) for cell, files in cells.items() if cell not in done]
+        build = partial(_build_cell, self._tiles(self._workers.threads))
+        for i, count in self._workers.run(build, todo):
+            cell = todo[i][0]
+            done[cell] = count
+            self.journal.add("cell", key=cell, splats=count)
+            ended(cell)
+        for leftover in self._out.rglob(".*"):  # temporary files of workers that were killed
+            leftover.unlink()
+        tiles = self._tiles(self._threads).get()
+        root = tiles.root_of(tiles.upper(sorted(cells), self.journal)).key
         nodes: dict[str, Node] = {}
         for path in sorted((self._work / "done").glob("*.json")):
             for fields in json.loads(path.read_text(encoding="utf-8")):
                 nodes[fields["key"]] = Node(**fields)
         leaves = [node for node in nodes.values() if not node.children]
         splats = sum(node.splats for node in leaves)
-        write_tilesets(self._out, nodes, root, self._up, splats)
+        write_tilesets(self._out, nodes, root, unit_up(self._options.up), splats)
         triangles = sum(node.triangles for node in leaves)
         size = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())
         levels = _height(nodes, root)
         return TilesetSummary(splats, triangles, len(nodes), levels, size, nodes[root].error)
+
+    def _tiles(self, threads: int | None) -> Shared[_Tiles]:
+        return Shared(partial(_Tiles, self._folder, self._options, threads))
 
     def _check_start(self) -> None:
         """Notes what the run is about, or refuses to resume another one."""
@@ -244,7 +261,7 @@ class _Build:
 
     def _survey(self) -> Survey:
         """The survey of the scene; that of the interrupted run if there is one."""
-        path = self._work / "survey.npz"
+        path = self._work / SURVEY
         if self.journal.find("survey") is None:
             found = survey(self._source, self._conversion)
             with atomic_path(path) as temporary:
@@ -256,11 +273,7 @@ class _Build:
                 }
                 np.savez(temporary, **arrays)  # type: ignore[arg-type]
             self.journal.add("survey", kept=found.kept)
-        with np.load(path) as stored:
-            kept, step = (int(n) for n in stored["counts"])
-            low, high, origin = stored["bounds"]
-            kernel: Kernel = str(stored["kernel"])  # type: ignore[assignment]
-            return Survey(kept, kernel, low, high, cloud_of(stored["sample"], kernel), step, origin)
+        return _stored_survey(path)
 
     def _records(self) -> Iterator[np.ndarray]:
         passed = 0
@@ -271,9 +284,42 @@ class _Build:
             if passed > np.iinfo(np.int32).max:
                 raise ValueError(f"{passed:,} splats are more than tiles can number")
 
+
+def _stored_survey(path: Path) -> Survey:
+    """The survey that a run has written."""
+    with np.load(path) as stored:
+        kept, step = (int(n) for n in stored["counts"])
+        low, high, origin = stored["bounds"]
+        kernel: Kernel = str(stored["kernel"])  # type: ignore[assignment]
+        return Survey(kept, kernel, low, high, cloud_of(stored["sample"], kernel), step, origin)
+
+
+def _build_cell(tiles: Shared[_Tiles], cell: tuple[str, list[Path]]) -> int:
+    """Writes the tiles of a cell of that key, with the splats of these files; their count."""
+    key, files = cell
+    records = read_records(files)
+    tiles.get().keep(key, *tiles.get().subtree(key, records))
+    return len(records)
+
+
+class _Tiles:
+    """Writes tiles into the folder of a run whose survey is done. Keeps nothing of them."""
+
+    def __init__(self, folder: Path, options: TileOptions, threads: int | None) -> None:
+        self._options, self._threads = options, threads
+        self._conversion = options.resolved()
+        self._work, self._out = folder / "work", folder / "tileset"
+        self._most = options.max_triangles // triangles_each(self._conversion)
+        self._up = unit_up(options.up)
+        self._frame = tile_frame(self._up)
+        scene = _stored_survey(self._work / SURVEY)
+        self._kernel = scene.kernel
+        self._pixels = ScenePixels(scene, self._conversion, None, self._up)
+        self._cube = Cube(scene.low, scene.high)
+
     # -- cells in memory
 
-    def _subtree(self, key: str, records: np.ndarray) -> tuple[list[Node], np.ndarray]:
+    def subtree(self, key: str, records: np.ndarray) -> tuple[list[Node], np.ndarray]:
         """Writes the tiles of a cell; their nodes, its own last, and the splats that stand for it."""
         codes = self._cube.codes(records["means"])
         order = np.lexsort((records["row"], codes))
@@ -380,7 +426,7 @@ class _Build:
 
     # -- cells above those in memory
 
-    def _keep(self, cell: str, nodes: list[Node], merged: np.ndarray) -> None:
+    def keep(self, cell: str, nodes: list[Node], merged: np.ndarray) -> None:
         """Files what is done of a cell, for the ones above it and for a resumed run."""
         with atomic_path(self._merged(cell)) as temporary:
             merged.tofile(temporary)
@@ -391,23 +437,23 @@ class _Build:
     def _merged(self, cell: str) -> Path:
         return self._work / "done" / f"cell-{cell}.merged"
 
-    def _upper(self, cells: Sequence[str]) -> str:
+    def upper(self, cells: Sequence[str], journal: Journal) -> str:
         """Writes the tiles above ``cells``, ascending; the cell that holds all of them."""
         top = os.path.commonprefix(list(cells))  # noqa: RUF071 - a character is a level
         if len(cells) == 1:
             return top
         parts = [
-            self._upper([cell for cell in cells if cell.startswith(top + octant)])
+            self.upper([cell for cell in cells if cell.startswith(top + octant)], journal)
             for octant in sorted({cell[len(top)] for cell in cells})
         ]
-        if top not in self.journal.keys("above"):
+        if top not in journal.keys("above"):
             merged = [np.fromfile(self._merged(place), _MERGED) for place in parts]
-            node, own = self._inner(top, [self._root_of(place) for place in parts], merged)
-            self._keep(top, [node], own)
-            self.journal.add("above", key=top)
+            node, own = self._inner(top, [self.root_of(place) for place in parts], merged)
+            self.keep(top, [node], own)
+            journal.add("above", key=top)
         return top
 
-    def _root_of(self, cell: str) -> Node:
+    def root_of(self, cell: str) -> Node:
         """The uppermost tile of a cell that is done."""
         nodes = json.loads((self._work / "done" / f"cell-{cell}.json").read_text(encoding="utf-8"))
         return Node(**nodes[-1])
