@@ -27,7 +27,7 @@ from meshsplats.camera import Camera
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.merging import simplify
-from meshsplats.conversion.streaming import flattened, joined
+from meshsplats.conversion.streaming import flattened
 from meshsplats.datasets.views import Dataset, ImageCache, View
 from meshsplats.datasets.windows import window_of
 from meshsplats.finetuning.checkpoint import OtherRunError, cloud_digest, dataset_fingerprint
@@ -37,6 +37,7 @@ from meshsplats.finetuning.journal import CHECKPOINT, Journal
 from meshsplats.finetuning.run import Progress, RunOptions, finetune
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
+from meshsplats.formats.splats._cloud_builder import joined
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import visible_pixels
