@@ -31,7 +31,9 @@ from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
 from meshsplats.formats.cutting import cut_mesh
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.api import Device, check_device
 from meshsplats.rendering.looks import image_of
+from meshsplats.webgpu.device import open_device
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -54,7 +56,8 @@ SCORED_VIEWS = 8
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options that do not change the result: output folder, intervals of logging, resources."""
+    """Options that do not change the result, but for rounding: output folder, intervals of logging,
+    resources."""
 
     folder: Path | None = None
     """Folder for checkpoint, metrics, previews and configuration. None: nothing is written."""
@@ -68,6 +71,8 @@ class RunOptions:
     """Seconds between two checkpoints."""
     threads: int | None = None
     """Maximum number of threads. None: all processors."""
+    device: Device = "cpu"
+    """Where images are rendered, and gradients computed: 'cpu' or 'gpu'. Opacity 'cutoff' needs 'cpu'."""
     spent: float = 0.0
     """Seconds already used, which count if the length is given in minutes."""
     cache_bytes: int = CACHE_BYTES
@@ -81,6 +86,7 @@ class RunOptions:
             raise ValueError(f"checkpoint_seconds must be positive, got {self.checkpoint_seconds}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
+        check_device(self.device)
         if self.resume and self.folder is None:
             raise ValueError("resume needs the folder of the run")
 
@@ -136,6 +142,8 @@ def finetune(
         OtherRunError: the checkpoint is of another run.
         MemoryError: the estimated memory is not available; nothing was written.
         DivergenceError: the loss or a gradient is not finite; the message names the view.
+        MissingDependencyError: device 'gpu' without a GPU, or no library for it; nothing was written.
+        DeviceError: the GPU failed, or did not finish an image.
         Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
     """
     config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()
@@ -143,6 +151,10 @@ def finetune(
         raise ValueError("the data set has no training views")
     if not len(mesh.faces):
         raise ValueError("the mesh has no triangles: there is nothing to fine-tune")
+    if run.device == "gpu":
+        if config.opacity == "cutoff":
+            raise ValueError("opacity 'cutoff' needs device 'cpu': the GPU has no gradients for a cutoff")
+        open_device()
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     loop = TrainingLoop(
@@ -174,10 +186,11 @@ def _run_start(
     """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
     if journal is None:
-        return RunStart(State.begin(mesh, views, config, options.threads), ("", ""), mesh)
+        state = State.begin(mesh, views, config, options.threads, options.device)
+        return RunStart(state, ("", ""), mesh)
     fingerprints = mesh_fingerprint(mesh), dataset_fingerprint(dataset)
     if not options.resume:
-        state = State.begin(mesh, views, config, options.threads)
+        state = State.begin(mesh, views, config, options.threads, options.device)
         journal.begin(config.to_dict())
         return RunStart(state, fingerprints, mesh)
     total = config.total_steps(views)
@@ -189,7 +202,7 @@ def _run_start(
 
     found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
-    state = State.resume(found.arrays, blending, views, config, options.threads)
+    state = State.resume(found.arrays, blending, views, config, options.threads, options.device)
     return RunStart(state, fingerprints, mesh, found.step, found.seconds, found.losses)
 
 
@@ -375,8 +388,14 @@ class TrainingLoop:
         self.journal.save_preview(self.step, np.clip(view.image, 0, 1), image)
 
     def _render(self, mesh: SplatMesh, view: View) -> np.ndarray:
-        samples, threads = samples_of(view, self.config), self.options.threads
-        return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
+        return image_of(
+            mesh,
+            view.camera,
+            view.background,
+            samples=samples_of(view, self.config),
+            threads=self.options.threads,
+            device=self.options.device,
+        )[0]
 
     def _save_checkpoint(self) -> None:
         self.save_time = time.perf_counter()

@@ -18,6 +18,7 @@ from meshsplats.finetuning.hybrid import MAX_OPACITY
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh, solid_faces
+from meshsplats.rendering.api import Device
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)
 
@@ -62,8 +63,10 @@ class State:
         exposures: np.ndarray | None,
         config: FinetuneConfig,
         threads: int | None,
+        device: Device = "cpu",
     ) -> None:
         self.mesh, self.sizes, self.config, self.threads = mesh, sizes, config, threads
+        self.device: Device = device
         self.vertices, self.colors = mesh.vertices.copy(), mesh.colors.copy()
         self.exposures = None if exposures is None else exposures.copy()
         adam = partial(RowAdam, betas=(config.beta1, config.beta2), eps=config.epsilon, threads=threads)
@@ -82,7 +85,14 @@ class State:
         self.solid: np.ndarray | None = None
 
     @classmethod
-    def begin(cls, mesh: SplatMesh, views: int, config: FinetuneConfig, threads: int | None) -> State:
+    def begin(
+        cls,
+        mesh: SplatMesh,
+        views: int,
+        config: FinetuneConfig,
+        threads: int | None,
+        device: Device = "cpu",
+    ) -> State:
         """The state before the first step, for ``views`` training views."""
         if config.opacity == "cutoff":
             _check_for_cutoff(mesh, config)
@@ -104,7 +114,7 @@ class State:
             sizes = weight_units(mesh, config.position_unit == "scene")
         else:
             sizes = vertex_sizes(mesh)
-        return cls(mesh, sizes, exposures, config, threads)
+        return cls(mesh, sizes, exposures, config, threads, device)
 
     @classmethod
     def begin_hybrid(cls, mesh: SplatMesh, config: FinetuneConfig, threads: int | None) -> State:
@@ -121,13 +131,14 @@ class State:
         views: int,
         config: FinetuneConfig,
         threads: int | None,
+        device: Device = "cpu",
     ) -> State:
         """The state in a checkpoint's arrays. FileFormatError if they do not fit each other."""
         mesh = stored_mesh(arrays, blending)
         try:
             sizes = _checked_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
             exposures = _checked_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
-            state = cls(mesh, sizes, exposures, config, threads)
+            state = cls(mesh, sizes, exposures, config, threads, device)
             for name, adam in state._optimisers().items():
                 part = {key: arrays[f"{name}.{key}"] for key in ("mean", "square", "steps")}
                 adam.load_state(part)
@@ -235,7 +246,7 @@ class State:
         used = np.zeros(len(self.mesh.vertices), bool)
         used[self.mesh.faces[keep].ravel()] = True
         mesh = self.result().keep_faces(keep)
-        smaller = State(mesh, self.sizes[used], self.exposures, self.config, self.threads)
+        smaller = State(mesh, self.sizes[used], self.exposures, self.config, self.threads, self.device)
         rows = np.flatnonzero(used)
         positions = smaller.vertices if smaller.bound is None else smaller.bound.weights
         smaller._positions = self._positions.select(positions, rows)

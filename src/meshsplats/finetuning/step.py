@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,8 @@ from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction
 from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
-from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering, visible_pixels
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
+from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
 
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""
@@ -79,7 +81,7 @@ class RenderedView:
         color: (h, w, 3) float32 display RGB.
     """
 
-    def __init__(self, rendering: TapedRendering, linear: bool) -> None:
+    def __init__(self, rendering: AnyRendering, linear: bool) -> None:
         self._rendering, self._linear = rendering, linear
         self.color = linear_to_srgb(rendering.color) if linear else rendering.color
 
@@ -122,7 +124,8 @@ def render_view(
     """The current mesh from the camera of ``view``, over ``background``, display RGB."""
     linear = state.mesh.blending == "linear"
     display = np.asarray(background, np.float32)
-    rendering = TapedRendering(
+    rendering = taped_rendering(
+        state.device,
         state.vertices,
         state.mesh.faces,
         state.colors,
@@ -275,8 +278,9 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
     vertices, colors = state.vertices, state.colors
     pixels = np.zeros(len(vertices), np.float32)
     in_view = np.zeros(len(pixels), bool)
+    count = partial(visible_pixels, threads=state.threads) if state.device == "cpu" else gpu_visible_pixels
     for view in views:
-        pixels += visible_pixels(
+        pixels += count(
             vertices,
             state.mesh.faces,
             colors,
@@ -286,7 +290,6 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
             face_splat=state.mesh.face_splat,
             depth_group=state.mesh.depth_group,
             filter_px2=state.mesh.filter_px2,
-            threads=state.threads,
         )
         in_view |= view.camera.sees(vertices)
     return pixels, in_view

@@ -150,3 +150,22 @@ def taped_rendering(
     if ramp is not None:
         raise ValueError("opacity ramps need device='cpu'")
     return GpuRendering(vertices, faces, colors, attributes, camera, **options)
+
+
+def gpu_visible_pixels(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    camera: Camera,
+    *,
+    mask: np.ndarray | None = None,
+    **options: Any,
+) -> np.ndarray:
+    """``backward.visible_pixels`` on the GPU; arguments are those of it and of ``GpuRendering``."""
+    rendering = GpuRendering(vertices, faces, colors, None, camera, **options)
+    # The derivative of a pixel's red with respect to the vertex's is the weight of the vertex.
+    red = np.zeros((*rendering.alpha.shape, 3), np.float32)
+    red[..., 0] = 1 if mask is None else mask
+    weights = np.zeros_like(colors)
+    rendering.backward(red, None, None, vertices=np.zeros_like(vertices), colors=weights)
+    return np.ascontiguousarray(weights[:, 0])
