@@ -21,6 +21,7 @@ from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
 from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
+from meshsplats.webgpu.renderer import DrawSettings
 
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""
@@ -200,6 +201,8 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
     # Viewers shade a pixel once, with MSAA too: values at pixel centres must be right as well as means.
     centers = points or (hybrid and config.samples is None and step % 2 == 1)
     samples = 1 if centers else samples_of(view, config)
+    if state.trains_on_gpu(view.camera):
+        return _step_on_gpu(state, view, target, samples, step, learning_rates(config, step, fraction))
     ramp = None if hybrid else ramp_of(config, fraction)
     rendered = render_view(state, view, target.background, samples, ramp)
     image = rendered.color
@@ -220,13 +223,37 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
         culprit, gradients = "a gradient", rendered.backward(grad_image, expected)
         gradients = gradients._replace(exposure=grad_exposure)
     if gradients is None or not gradients.finite():
-        raise DivergenceError(
-            f"step {step + 1}, view {view.name!r}: {culprit} is not finite. Check this view's image and"
-            " camera first; if they are sound, lower the learning rates. The last checkpoint is from before"
-            " this step"
-        )
+        raise _divergence(step, view, culprit)
     state.step(gradients, *learning_rates(config, step - steps_before, fraction), index)
     return loss
+
+
+def _step_on_gpu(
+    state: State, view: View, target: Target, samples: int, step: int, rates: tuple[float, float]
+) -> float:
+    """``make_step`` where the loss and Adam are on the GPU, too."""
+    config, mask = state.config, target.mask
+    count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
+    share = config.ssim_weight
+    settings = DrawSettings(
+        samples=samples,
+        min_transmittance=MIN_TRANSMITTANCE["display"],
+        filter_px2=state.mesh.filter_px2,
+    )
+    derivatives = ((1 - share) / count, -share / count, config.l2_weight / count)
+    sums = state.step_on_gpu(view.camera, settings, target.color, mask, target.background, derivatives, rates)
+    loss = share + float(np.dot(derivatives, sums[:3]))
+    if not (np.isfinite(loss) and sums.finite):
+        raise _divergence(step, view, "a gradient" if np.isfinite(loss) else "the loss")
+    return loss
+
+
+def _divergence(step: int, view: View, culprit: str) -> DivergenceError:
+    return DivergenceError(
+        f"step {step + 1}, view {view.name!r}: {culprit} is not finite. Check this view's image and"
+        " camera first; if they are sound, lower the learning rates. The last checkpoint is from before"
+        " this step"
+    )
 
 
 def exposure_gradient(image: np.ndarray, grad_image: np.ndarray) -> np.ndarray:

@@ -233,12 +233,7 @@ class GradientRenderer(MeshRenderer):
             waiting = [(0, 0, w, h)]
             while waiting:
                 area = waiting.pop()
-                samples = area[2] * area[3] * settings.samples**2
-                window = None
-                if samples <= self._window_samples or area[2:] == (1, 1):
-                    window = self._mark(result, area)
-                    if window is None:
-                        self._window_samples = samples - 1
+                window = self._mark_window(result, area)
                 if window is None:
                     waiting += halves(area)
                     continue
@@ -284,6 +279,16 @@ class GradientRenderer(MeshRenderer):
         x, y, w, h = area
         camera = forward.camera
         return replace(camera, cx=camera.cx - x, cy=camera.cy - y, width=w, height=h)
+
+    def _mark_window(self, forward: Forward, area: tuple[int, int, int, int]) -> _Window | None:
+        """``_mark``, which is left out for windows as large as one that had too many fragments."""
+        samples = area[2] * area[3] * forward.settings.samples**2
+        if samples > self._window_samples and area[2:] != (1, 1):
+            return None
+        window = self._mark(forward, area)
+        if window is None:
+            self._window_samples = samples - 1
+        return window
 
     def _mark(self, forward: Forward, area: tuple[int, int, int, int]) -> _Window | None:
         """Renders a window and marks its fragments; None if it has too many."""
@@ -387,9 +392,7 @@ class GradientRenderer(MeshRenderer):
 
     def _add_windows(self, forward: Forward, gradient: np.ndarray) -> np.ndarray:
         """(v, 8) float32 gradients of what is blended now."""
-        encoder = self.device.device.create_command_encoder()
-        encoder.clear_buffer(self._buffers["gradients"])
-        self.device.device.queue.submit([encoder.finish()])
+        self._clear("gradients")
         for window in forward.windows:
             if self._marked is not forward and not self._try_mark(forward, window.area, window.settings):
                 raise DeviceError(f"the GPU did not repeat its own image ({self.device.name})")
@@ -406,9 +409,7 @@ class GradientRenderer(MeshRenderer):
         """Adds the gradients of a window whose fragments are marked."""
         x, y, w, h = window.area
         s = window.settings.samples
-        counts = self._begin(self._part(forward, window.area), window.settings, forward.pose)
-        self._allocate("tape", FRAGMENT_BYTES * window.fragments)
-        self._allocate("tile_sums", SUM_BYTES * window.sums)
+        counts = self._make_room(forward, window)
         of_samples = np.ascontiguousarray(gradient[y : y + h, x : x + w]) * np.float32(1 / s**2)
         self.device.device.queue.write_buffer(self._buffers["samples"], 32 * w * h * s**2, of_samples)
         self._run(kernels.gradient_steps(window.rounds), "color", counts, window.settings)
@@ -417,6 +418,18 @@ class GradientRenderer(MeshRenderer):
             raise self._unfinished(counts, counters)
         if counters[15]:
             raise DeviceError("a sample has too many fragments for gradients on the GPU: use device='cpu'")
+
+    def _make_room(self, forward: Forward, window: _Window) -> dict[str, int]:
+        """Room for the tape of a window, its frame and counts."""
+        counts = self._begin(self._part(forward, window.area), window.settings, forward.pose)
+        self._allocate("tape", FRAGMENT_BYTES * window.fragments)
+        self._allocate("tile_sums", SUM_BYTES * window.sums)
+        return counts
+
+    def _clear(self, name: str) -> None:
+        encoder = self.device.device.create_command_encoder()
+        encoder.clear_buffer(self._buffers[name])
+        self.device.device.queue.submit([encoder.finish()])
 
     def _unfinished(self, counts: dict[str, int], counters: np.ndarray) -> DeviceError:
         return DeviceError(

@@ -63,6 +63,11 @@ def filter_source() -> str:
     return lists_source() + _text("filter.wgsl")
 
 
+def training_source() -> str:
+    """WGSL of the loss and of Adam."""
+    return _text("common.wgsl") + _text("training.wgsl")
+
+
 def _raster_source(queue: int, output: Output, groups: bool) -> str:
     if queue < 2:
         raise ValueError(f"queue must be at least 2, got {queue}")
@@ -165,6 +170,13 @@ GRADIENT_KERNELS = ("count_marks", "place_marks", "find_behind", "add_samples", 
 """Kernels of ``gradients_source``, besides ``raster``."""
 
 
+TRAINING_KERNELS = (
+    *("store_window", "load_window", "judge", "rate", "add_losses", "find_image_gradient"),
+    *("check_gradients", "adam"),
+)
+"""Kernels of ``training_source``."""
+
+
 def mark_steps() -> list[dict[str, Any]]:
     """``raster_steps`` with marks, which find the fragments' places on the tape."""
     return [
@@ -235,6 +247,49 @@ def filter_steps() -> list[dict[str, Any]]:
     names |= {22: "gradients", 23: "vertex_corners"}
     bind = {str(i): name for i, name in names.items()}
     return [{"kernel": "widen_backward", "bind": bind, "count": ["fans", 64], "if": "fans"}]
+
+
+def store_steps() -> list[dict[str, Any]]:
+    """From the samples of a window to the image."""
+    return [_training("store_window", {2: "samples", 3: "image"}, count=["columns", 8], rows=["rows", 8])]
+
+
+def loss_steps() -> list[dict[str, Any]]:
+    """From the image to its loss and gradient."""
+    size: dict[str, Any] = {"count": ["image_columns", 16], "rows": ["image_rows", 16]}
+    compared = {3: "image", 4: "target", 5: "derivatives"}
+    return [
+        {"clear": "results", "from": 0},
+        _training("rate", compared | {7: "losses"}, **size),
+        _training("add_losses", {7: "losses", 8: "results"}, count=["one", 1]),
+        _training("find_image_gradient", compared | {6: "image_gradient"}, **size),
+    ]
+
+
+def window_steps(rounds: int) -> list[dict[str, Any]]:
+    """From the gradient of the image to those of vertices, for one window, with ``gradient_steps``."""
+    loaded = {2: "samples", 6: "image_gradient"}
+    return [
+        _training("load_window", loaded, count=["columns", 8], rows=["rows", 8]),
+        *gradient_steps(rounds),
+        _training("judge", {8: "results", 9: "counters"}, count=["one", 1]),
+    ]
+
+
+def adam_steps() -> list[dict[str, Any]]:
+    """From the gradients of vertices to their new positions and colours."""
+    checked = {"0": "frame", "8": "results", "10": "gradients"}
+    own = {"1": "step", "11": "vertices", "12": "values"}
+    own |= {"13": "position_moments", "14": "color_moments", "15": "traits"}
+    return [
+        {"kernel": "check_gradients", "bind": checked, "count": ["vertices", 256]},
+        {"kernel": "adam", "bind": checked | own, "count": ["vertices", 256]},
+    ]
+
+
+def _training(kernel: str, bind: dict[int, str], **size: Any) -> dict[str, Any]:
+    named = {"1": "step"} | {str(i): name for i, name in bind.items()}
+    return {"kernel": kernel, "bind": named, **size}
 
 
 def _walk_steps(mode: str) -> list[dict[str, Any]]:
