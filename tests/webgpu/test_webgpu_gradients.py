@@ -198,7 +198,7 @@ def test_in_windows_where_a_tape_does_not_fit(monkeypatch):
     monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 16 * 4000)  # as if there were more fragments
     monkeypatch.setattr(renderer_of(mesh).device, "binding_limit", 64 << 20)
     parts = of_mesh(GpuRendering, mesh, view)
-    assert len(parts._forward.windows) >= 4
+    assert len(parts.forward.windows) >= 4
     # The corner of each window is another origin for rounding.
     assert np.abs(parts.color - whole.color).max() < 1e-4
     found = descend(parts, gradient)

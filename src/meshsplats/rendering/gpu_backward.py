@@ -26,6 +26,7 @@ class GpuRendering:
         alpha: (h, w) float32.
         attributes: (h, w, k) float32.
         fragments: count of blended fragments.
+        forward: what the backward pass starts from.
     """
 
     def __init__(
@@ -63,10 +64,10 @@ class GpuRendering:
         )
         with gpu_errors():
             self._renderer = gradient_renderer(faces, len(vertices), face_splat, depth_group)
-            self._forward = self._renderer.forward(
+            self.forward = self._renderer.forward(
                 vertices, colors, camera, settings, pose=world_to_camera, values=values
             )
-        images = self._forward.images
+        images = self.forward.images
         self.color = images.color + images.transmittance[:, :, None] * self._background
         self.alpha = 1 - images.transmittance
         self.fragments = images.work.fragments
@@ -75,7 +76,7 @@ class GpuRendering:
 
     @property
     def vertex_count(self) -> int:
-        return len(self._forward.vertices)
+        return len(self.forward.vertices)
 
     def backward(
         self,
@@ -104,7 +105,7 @@ class GpuRendering:
         gradient = np.concatenate([color, behind[:, :, None]], axis=2, dtype=np.float32)
         with gpu_errors():
             found, more = self._renderer.backward(
-                self._forward, gradient, attributes if self.attributes.shape[2] else None
+                self.forward, gradient, attributes if self.attributes.shape[2] else None
             )
         vertices += found[:, :3] @ self._matrix[:3, :3].astype(np.float32)
         colors += found[:, 4:]

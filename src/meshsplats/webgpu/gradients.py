@@ -244,7 +244,7 @@ class GradientRenderer(MeshRenderer):
                 images.color[part], images.transmittance[part] = pixels[..., :3], pixels[..., 3]
                 if images.values is not None:
                     self._render_values(result, window, images.values[part])
-            images.work.bytes = sum(buffer.size for buffer in self._buffers.values())
+            images.work.bytes = self.bytes
         return result
 
     def _render_values(self, forward: Forward, window: _Window, out: np.ndarray) -> None:

@@ -280,8 +280,13 @@ class MeshRenderer:
                             raise
                 if not drawn:
                     waiting += halves(window)
-            images.work.bytes = sum(buffer.size for buffer in self._buffers.values())
+            images.work.bytes = self.bytes
         return images
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all buffers."""
+        return sum(buffer.size for buffer in self._buffers.values())
 
     def _prepare_filter(self, settings: DrawSettings) -> None:
         if not settings.filter_px2 or "fans" in self._buffers:
