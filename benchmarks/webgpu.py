@@ -1,11 +1,16 @@
 """Work and time of the GPU on the random fans of rendering.py, beside the core.
 
-    python benchmarks/webgpu.py [--scenes 160k 1M 4M] [--mesh FILE --side 400] [--repeat 3]
+    python benchmarks/webgpu.py [--scenes 160k 1M 4M] [--mesh FILE --side 400] [--repeat 3] [--gradients]
 
 Prints a Markdown table: difference from the core (PSNR, pixels off by more than 1e-3), tests of a triangle at
 a sample per blended fragment, walks through a tile list per tile, samples whose first queue was too short,
 dispatches of a frame, megabytes of buffers, and medians of wall time and processor time in milliseconds.
 Times on a software adapter (named in the first line) say nothing about a GPU.
+
+With --gradients, the backward pass of a random gradient: ||g - g_core|| / ||g_core|| of positions, RGB and
+opacities, windows of the image, fragments on the tape and triangles in tiles, dispatches of a window,
+megabytes of buffers, and processor time in milliseconds of the image, of its backward pass, and of both on
+the core.
 """
 
 from __future__ import annotations
@@ -22,7 +27,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from rendering import SCENES, random_fans
 
 from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
+from meshsplats.rendering.backward import TapedRendering
+from meshsplats.rendering.gpu_backward import GpuRendering
+from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import open_device
+from meshsplats.webgpu.gradients import gradient_renderer
 from meshsplats.webgpu.renderer import DrawSettings, draw
 
 
@@ -59,6 +68,54 @@ def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> str:
     return "| " + " | ".join(values) + " |"
 
 
+def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> str:
+    rng = np.random.default_rng(0)
+    gradient = rng.normal(size=(view.height, view.width, 3)).astype(np.float32)
+    found, times = [], []
+    for kind in (GpuRendering, GpuRendering, TapedRendering):  # the first compiles
+        vertices, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
+        start = time.process_time()
+        rendering = kind(
+            mesh.vertices,
+            mesh.faces,
+            mesh.colors,
+            None,
+            view,
+            face_splat=mesh.face_splat,
+            depth_group=mesh.depth_group,
+            filter_px2=mesh.filter_px2,
+            min_transmittance=1e-3,
+        )
+        middle = time.process_time()
+        rendering.backward(gradient, None, None, vertices=vertices, colors=colors)
+        times += [middle - start, time.process_time() - middle]
+        if isinstance(rendering, GpuRendering):
+            forward = rendering.forward
+        found.append((vertices, colors[:, :3], colors[:, 3]))
+    errors = [
+        np.linalg.norm(gpu.astype(float) - core) / np.linalg.norm(core.astype(float))
+        for gpu, core in zip(found[1], found[2], strict=True)
+    ]
+    renderer = gradient_renderer(mesh.faces, len(mesh.vertices), mesh.face_splat, mesh.depth_group)
+    steps = [*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps(), *kernels.gradient_steps(0)]
+    skipped = ("fans",) * (not mesh.filter_px2) + ("groups",) * (mesh.depth_group is None)
+    same = all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))
+    values = (
+        name,
+        f"{len(mesh.faces):,}",
+        f"{view.width} x {view.height}",
+        *(f"{error:.1e}" for error in errors),
+        "yes" if same else "NO",
+        f"{len(forward.windows)}",
+        f"{sum(window.fragments for window in forward.windows):,}",
+        f"{sum(window.sums for window in forward.windows):,}",
+        f"{sum('kernel' in step and step.get('if') not in skipped for step in steps)}",
+        f"{renderer.bytes / 1e6:.0f}",
+        *(f"{1000 * seconds:.0f}" for seconds in (times[2], times[3], times[4] + times[5])),
+    )
+    return "| " + " | ".join(values) + " |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -67,19 +124,30 @@ def main() -> None:
     parser.add_argument("--mesh", type=Path, nargs="*", default=[])
     parser.add_argument("--side", type=int, default=400)
     parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--gradients", action="store_true")
     options = parser.parse_args()
     print(f"{open_device().name}\n", flush=True)
-    columns = (
+    columns: tuple[str, ...] = (
         *("scene", "triangles", "image", "dB", "> 1e-3", "tests a fragment", "walks a tile", "overflowed"),
         *("dispatches", "MB", "ms", "processor ms", "core ms"),
     )
+    if options.gradients:
+        columns = (
+            *("scene", "triangles", "image", "positions", "RGB", "opacities", "same bits", "windows"),
+            *("fragments", "triangles in tiles", "dispatches", "MB", "image ms", "backward ms", "core ms"),
+        )
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns), flush=True)
+
+    def show(name: str, mesh: SplatMesh, view: Camera) -> None:
+        gradients = options.gradients
+        line = measure_gradients(name, mesh, view) if gradients else measure(name, mesh, view, options.repeat)
+        print(line, flush=True)
+
     for name in options.scenes:
-        print(measure(name, *random_fans(*SCENES[name]), options.repeat), flush=True)
+        show(name, *random_fans(*SCENES[name]))
     for path in options.mesh:
         mesh = load_mesh(path)
-        view = orbit(mesh, 4, width=options.side, height=options.side)[1]
-        print(measure(path.stem, mesh, view, options.repeat), flush=True)
+        show(path.stem, mesh, orbit(mesh, 4, width=options.side, height=options.side)[1])
 
 
 if __name__ == "__main__":

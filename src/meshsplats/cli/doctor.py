@@ -8,12 +8,17 @@ import re
 import sys
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.messages import quoted
+
+if TYPE_CHECKING:
+    from meshsplats.camera import Camera
+    from meshsplats.mesh import SplatMesh
+    from meshsplats.rendering.api import Device
 
 
 @dataclass(frozen=True)
@@ -74,29 +79,50 @@ def _core() -> dict[str, Any]:
 
 
 def _gpu() -> dict[str, Any]:
-    """The adapter that ``device="gpu"`` uses, and whether it draws a triangle."""
+    """The adapter that ``device="gpu"`` uses, and whether it draws a triangle and has its gradient."""
     from meshsplats.errors import DeviceError, MissingDependencyError
     from meshsplats.webgpu.device import open_device
 
     result: dict[str, Any] = {"works": False, "adapter": None, "problem": None}
     try:
         result["adapter"] = open_device().name
-        result["works"] = _draws("gpu")
-        if not result["works"]:
+        if not _draws("gpu"):
             result["problem"] = "the image of one triangle is wrong"
+        elif not _has_gradient():
+            result["problem"] = "the gradient of one triangle is wrong"
+        result["works"] = result["problem"] is None
     except (MissingDependencyError, DeviceError) as error:
         result["problem"] = " ".join(str(error).split())
     return result
 
 
-def _draws(device: Literal["cpu", "gpu"] = "cpu") -> bool:
+def _triangle() -> tuple[SplatMesh, Camera]:
     from meshsplats.cameras.trajectories import look_at
     from meshsplats.mesh import SplatMesh
-    from meshsplats.rendering import render
 
     corners = np.array([[-9, -9, 0], [9, -9, 0], [0, 9, 0]])
     mesh = SplatMesh(corners, np.array([[0, 1, 2]]), np.array([[1, 0.5, 0, 0.5]] * 3))
-    camera = look_at((0, 0, -5), (0, 0, 0), width=3, height=3)
+    return mesh, look_at((0, 0, -5), (0, 0, 0), width=3, height=3)
+
+
+def _has_gradient() -> bool:
+    """Whether the GPU has the gradients of the core, of the mean over the image."""
+    from meshsplats.rendering.gpu_backward import taped_rendering
+
+    mesh, camera = _triangle()
+    ones, found = np.ones((3, 3, 3), np.float32), []
+    devices: tuple[Device, ...] = ("cpu", "gpu")
+    for device in devices:
+        rendering = taped_rendering(device, mesh.vertices, mesh.faces, mesh.colors, None, camera)
+        found.append((np.zeros((3, 3), np.float32), np.zeros((3, 4), np.float32)))
+        rendering.backward(ones, None, None, vertices=found[-1][0], colors=found[-1][1])
+    return all(bool(np.allclose(a, b, rtol=1e-4, atol=1e-4)) for a, b in zip(*found, strict=True))
+
+
+def _draws(device: Literal["cpu", "gpu"] = "cpu") -> bool:
+    from meshsplats.rendering import render
+
+    mesh, camera = _triangle()
     middle = render(mesh, camera, background=(0, 0, 1), device=device).color[1, 1]
     return bool(abs(middle - [0.5, 0.25, 0.5]).max() < 1e-5)
 
@@ -140,7 +166,7 @@ def _text(findings: dict[str, Any]) -> str:
     else:
         lines.append(f"core: DOES NOT WORK: {core['problem']}")
     gpu = findings["gpu"]
-    state = "renders correctly" if gpu["works"] else gpu["problem"]
+    state = "renders and differentiates correctly" if gpu["works"] else gpu["problem"]
     lines.append("gpu: " + "; ".join(filter(None, (gpu["adapter"], state))))
     lines.append("libraries: " + _listed(findings["required"]))
     for extra, libraries in findings["extras"].items():

@@ -62,7 +62,7 @@ class Finetune(TrainingCommand):
 
     COMMON = (
         *("input", "output", "preset", "opacity", "minutes", "steps", "data", "downscale", "cameras"),
-        *("width", "max_triangles", "threads", "resume", "force"),
+        *("width", "max_triangles", "threads", "device", "resume", "force"),
     )
 
     RANKS = True

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -47,6 +47,7 @@ from meshsplats.finetuning.config import LENGTHS
 from meshsplats.finetuning.ranks import Ranks, joined_ranks
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.webgpu.device import open_device
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 STARTUP_SECONDS = 1.0
 """Time that Python and the libraries take before the command's own clock starts."""
 _CHANGEABLE = {
-    *("resume", "force", "json", "threads", "report_every", "preview_every", "cache", "output"),
+    *("resume", "force", "json", "threads", "device", "report_every", "preview_every", "cache", "output"),
     *LENGTHS,
 }
 """Options that may change when a run is resumed."""
@@ -208,6 +209,8 @@ class TrainingCommand(Command):
     """Steps between two previews; after each quarter of a short run. 0: none."""
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
+    device: Annotated[Literal["cpu", "gpu"], tyro.conf.arg(metavar="NAME")] = "cpu"
+    """cpu, or gpu: a graphics card (extra gpu)."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -229,6 +232,10 @@ class TrainingCommand(Command):
     def check(self) -> None:
         """UsageError for options that contradict each other or have no effect."""
         self.target.check()
+        if self.device == "gpu":
+            if self.configured().opacity == "cutoff":
+                raise UsageError("--device gpu has no gradients for --opacity cutoff")
+            open_device()
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
         """Reads the input and prepares the optimisation. ``earlier``: checkpoint of a resumed run."""
@@ -331,6 +338,7 @@ class TrainingCommand(Command):
             report_every=self.report_every,
             preview_every=self.preview_every,
             threads=self.threads,
+            device=self.device,
             spent=time.perf_counter() - start,
             cache_bytes=self.target.cache_bytes,
             ranks=ranks,

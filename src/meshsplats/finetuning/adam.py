@@ -107,8 +107,7 @@ class RowAdam:
         selected = None if rows is None else _mask_or_indices(rows, len(self._array))
         if selected is not None and selected.dtype not in (bool, np.int32):
             raise TypeError(f"rows must be a bool mask or int32 indices, got {selected.dtype}")
-        steps = self.steps + 1
-        step = self.lr * math.sqrt(1 - self.betas[1] ** steps) / (1 - self.betas[0] ** steps)
+        step = self.next_rate(self.lr)
         adam_rows(
             self._array,
             self.mean,
@@ -122,8 +121,13 @@ class RowAdam:
             bounds=self.bounds,
             threads=self.threads,
         )
-        self.steps = steps
+        self.steps += 1
         _bump_version(self._values)
+
+    def next_rate(self, lr: float) -> float:
+        """The learning rate ``lr`` with the bias corrections of the next step."""
+        steps = self.steps + 1
+        return lr * math.sqrt(1 - self.betas[1] ** steps) / (1 - self.betas[0] ** steps)
 
     def state(self) -> dict[str, np.ndarray]:
         """Copies of ``mean``, ``square`` and ``steps``, for a checkpoint."""

@@ -35,7 +35,9 @@ from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
 from meshsplats.formats.cutting import cut_mesh
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.api import Device, check_device
 from meshsplats.rendering.looks import image_of
+from meshsplats.webgpu.device import open_device
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -58,7 +60,8 @@ SCORED_VIEWS = 8
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options that do not change the result: output folder, intervals of logging, resources."""
+    """Options that do not change the result, but for rounding: output folder, intervals of logging,
+    resources."""
 
     folder: Path | None = None
     """Folder for checkpoint, metrics, previews and configuration. None: nothing is written."""
@@ -72,6 +75,8 @@ class RunOptions:
     """Seconds between two checkpoints."""
     threads: int | None = None
     """Maximum number of threads. None: all processors."""
+    device: Device = "cpu"
+    """Where images are rendered, and gradients computed: 'cpu' or 'gpu'. Opacity 'cutoff' needs 'cpu'."""
     spent: float = 0.0
     """Seconds already used, which count if the length is given in minutes."""
     cache_bytes: int = CACHE_BYTES
@@ -88,6 +93,7 @@ class RunOptions:
             raise ValueError(f"checkpoint_seconds must be positive, got {self.checkpoint_seconds}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
+        check_device(self.device)
         if self.resume and self.folder is None:
             raise ValueError("resume needs the folder of the run")
 
@@ -147,6 +153,8 @@ def finetune(
         OtherRunError: the checkpoint is of another run.
         MemoryError: the estimated memory is not available; nothing was written.
         DivergenceError: the loss or a gradient is not finite; the message names the view.
+        MissingDependencyError: device 'gpu' without a GPU, or no library for it; nothing was written.
+        DeviceError: the GPU failed, or did not finish an image.
         Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
     """
     config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()
@@ -159,6 +167,10 @@ def finetune(
         frozen = checked_array("frozen", frozen, bool, (len(mesh.vertices),))
         if config.relocate_share or config.opacity == "cutoff":
             raise ValueError("frozen vertices are not for relocate_share and opacity 'cutoff'")
+    if run.device == "gpu":
+        if config.opacity == "cutoff":
+            raise ValueError("opacity 'cutoff' needs device 'cpu': the GPU has no gradients for a cutoff")
+        open_device()
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     start = _run_start(mesh, dataset, config, run, journal, frozen)
@@ -207,10 +219,11 @@ def _run_start(
     """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
     if journal is None:
-        return RunStart(State.begin(mesh, views, config, options.threads, frozen), ("", ""), mesh)
+        state = State.begin(mesh, views, config, options.threads, frozen, options.device)
+        return RunStart(state, ("", ""), mesh)
     fingerprints = mesh_fingerprint(mesh, frozen), dataset_fingerprint(dataset)
     if not options.resume:
-        state = State.begin(mesh, views, config, options.threads, frozen)
+        state = State.begin(mesh, views, config, options.threads, frozen, options.device)
         if not options.ranks.index:
             journal.begin(config.to_dict())
         return RunStart(state, fingerprints, mesh)
@@ -226,7 +239,7 @@ def _run_start(
     else:
         found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
-    state = State.resume(found.arrays, blending, views, config, options.threads)
+    state = State.resume(found.arrays, blending, views, config, options.threads, options.device)
     return RunStart(state, fingerprints, mesh, found.step, found.seconds, found.losses)
 
 
@@ -389,7 +402,7 @@ class TrainingLoop:
         mean_ssim = None
         if self.scored_views:
             self.held_out, mean_ssim = held_out_scores(
-                self.result(), self.scored_views, self.config, self.options.threads
+                self.result(), self.scored_views, self.config, self.options.threads, self.options.device
             )
         if self.journal is not None:
             self.journal.log_metrics(
@@ -416,7 +429,7 @@ class TrainingLoop:
         self.journal.save_preview(self.step, np.clip(view.image, 0, 1), image)
 
     def _render(self, mesh: SplatMesh, view: View) -> np.ndarray:
-        return _image_for(mesh, view, self.config, self.options.threads)
+        return _image_for(mesh, view, self.config, self.options.threads, self.options.device)
 
     def _save_checkpoint(self) -> None:
         self.save_time = time.perf_counter()
@@ -460,18 +473,25 @@ class TrainingLoop:
 
 
 def held_out_scores(
-    mesh: SplatMesh, views: Sequence[View], config: FinetuneConfig, threads: int | None
+    mesh: SplatMesh,
+    views: Sequence[View],
+    config: FinetuneConfig,
+    threads: int | None,
+    device: Device = "cpu",
 ) -> tuple[float, float]:
     """Means of PSNR, in dB and at most 200, and SSIM of ``mesh`` in ``views``, at least one."""
     scores = []
     for view in views:
-        image, target = np.clip(_image_for(mesh, view, config, threads), 0, 1), np.clip(view.image, 0, 1)
+        image = np.clip(_image_for(mesh, view, config, threads, device), 0, 1)
+        target = np.clip(view.image, 0, 1)
         decibels = min(psnr(image, target, mask=view.mask), 200.0)
         scores.append((decibels, masked_ssim(image, target, view.mask, threads)))
     mean_psnr, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))
     return mean_psnr, mean_ssim
 
 
-def _image_for(mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None) -> np.ndarray:
+def _image_for(
+    mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None, device: Device
+) -> np.ndarray:
     samples = samples_of(view, config)
-    return image_of(mesh, view.camera, view.background, samples=samples, threads=threads)[0]
+    return image_of(mesh, view.camera, view.background, samples=samples, threads=threads, device=device)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -9,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.adam import RowAdam
@@ -19,6 +21,10 @@ from meshsplats.finetuning.hybrid import MAX_OPACITY
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh, solid_faces
+from meshsplats.rendering.api import Device
+from meshsplats.webgpu.device import open_device
+from meshsplats.webgpu.renderer import DrawSettings, gpu_errors
+from meshsplats.webgpu.training import MAX_PIXELS, Moments, Rates, Sums, Trainer
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)
 
@@ -44,8 +50,9 @@ class State:
     """The optimisation state.
 
     Attributes:
-        vertices: (v, 3) float32, scene units, changed in place.
-        colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, changed in place.
+        vertices: (v, 3) float32, scene units, changed in place. After steps on the GPU, reading them waits
+            for the GPU.
+        colors: (v, 4) float32 straight RGBA in [0, 1], in the space of ``blending``, likewise.
         mesh: the initial mesh without pruned triangles: triangles, their splats, attributes.
         sizes: (v,) float32, the unit of each vertex' position or, on a base mesh, of its weights.
         bound: for a mesh that is bound to a base, the barycentric weights that are optimised in place of
@@ -64,9 +71,13 @@ class State:
         exposures: np.ndarray | None,
         config: FinetuneConfig,
         threads: int | None,
+        device: Device = "cpu",
     ) -> None:
         self.mesh, self.sizes, self.config, self.threads = mesh, sizes, config, threads
-        self.vertices, self.colors = mesh.vertices.copy(), mesh.colors.copy()
+        self.device: Device = device
+        self._vertices, self._rgba = mesh.vertices.copy(), mesh.colors.copy()
+        self._trainer: Trainer | None = None
+        self._ahead = False  # whether the trainer has taken steps that the arrays here do not have
         self.exposures = None if exposures is None else exposures.copy()
         adam = partial(RowAdam, betas=(config.beta1, config.beta2), eps=config.epsilon, threads=threads)
         self.bound = None if mesh.binding is None else BoundPositions(mesh.binding)
@@ -74,8 +85,8 @@ class State:
             self._positions = adam(self.bound.weights, lr=1.0, scale=sizes)
         else:
             unit = sizes if config.position_unit == "splat" else None
-            self._positions = adam(self.vertices, lr=1.0, scale=unit)
-        self._colors = adam(self.colors, lr=1.0, bounds=(0, 1))
+            self._positions = adam(self._vertices, lr=1.0, scale=unit)
+        self._colors = adam(self._rgba, lr=1.0, bounds=(0, 1))
         # Depends on the triangles alone, so that a resumed run finds the same boundary.
         self._boundary = boundary_vertices(mesh.faces, len(mesh.vertices)) if config.soft_edges else None
         self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
@@ -83,6 +94,16 @@ class State:
         self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
         self.solid: np.ndarray | None = None
         self.frozen: np.ndarray | None = None
+
+    @property
+    def vertices(self) -> np.ndarray:
+        self._download()
+        return self._vertices
+
+    @property
+    def colors(self) -> np.ndarray:
+        self._download()
+        return self._rgba
 
     @classmethod
     def begin(
@@ -92,6 +113,7 @@ class State:
         config: FinetuneConfig,
         threads: int | None,
         frozen: np.ndarray | None = None,
+        device: Device = "cpu",
     ) -> State:
         """The state before the first step, for ``views`` training views and vertices that are ``frozen``."""
         if config.opacity == "cutoff":
@@ -114,7 +136,7 @@ class State:
             sizes = weight_units(mesh, config.position_unit == "scene")
         else:
             sizes = vertex_sizes(mesh)
-        state = cls(mesh, sizes, exposures, config, threads)
+        state = cls(mesh, sizes, exposures, config, threads, device)
         state.frozen = frozen
         return state
 
@@ -133,13 +155,14 @@ class State:
         views: int,
         config: FinetuneConfig,
         threads: int | None,
+        device: Device = "cpu",
     ) -> State:
         """The state in a checkpoint's arrays. FileFormatError if they do not fit each other."""
         mesh = stored_mesh(arrays, blending)
         try:
             sizes = _checked_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
             exposures = _checked_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
-            state = cls(mesh, sizes, exposures, config, threads)
+            state = cls(mesh, sizes, exposures, config, threads, device)
             for name, adam in state._optimisers().items():
                 part = {key: arrays[f"{name}.{key}"] for key in ("mean", "square", "steps")}
                 adam.load_state(part)
@@ -159,6 +182,7 @@ class State:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays that ``resume`` needs, by their names in a checkpoint."""
+        self._download()
         arrays = mesh_arrays(self.result()) | {"sizes": self.sizes}
         if self.exposures is not None:
             arrays["exposure.values"] = self.exposures
@@ -184,6 +208,8 @@ class State:
     def step(self, gradients: Gradients, color_rate: float, position_rate: float, view: int) -> None:
         """One step of Adam along ``gradients`` for the vertices that the training view of index ``view``
         reached."""
+        self._download()
+        self._trainer = None
         # A vertex has a gradient only if its opacity has one, and a single column is quick to scan.
         reached = gradients.colors[:, 3] != 0
         if self.config.opacity == "cutoff":  # but where opaque, only its colour
@@ -224,6 +250,89 @@ class State:
             mean = self.exposures.mean(axis=0, dtype=np.float64) - [1, 1, 1, 0, 0, 0]
             self.exposures -= mean.astype(np.float32)
 
+    def trains_on_gpu(self, camera: Camera) -> bool:
+        """Whether ``step_on_gpu`` takes steps with images of that size.
+
+        Others render on the GPU, and compare images and take their step here: those of base meshes,
+        exposures, linear light, relocation, frozen vertices and depth groups.
+        """
+        return (
+            self.device == "gpu"
+            and self.bound is None
+            and self.exposures is None
+            and self._sums is None
+            and self.solid is None
+            and self.frozen is None
+            and self.mesh.blending == "display"
+            and self.mesh.depth_group is None
+            and camera.width * camera.height <= MAX_PIXELS
+        )
+
+    def step_on_gpu(
+        self,
+        camera: Camera,
+        settings: DrawSettings,
+        target: np.ndarray,
+        mask: np.ndarray | None,
+        background: Sequence[float],
+        loss: tuple[float, float, float],
+        rates: tuple[float, float],
+    ) -> Sums:
+        """Renders, compares and takes a step on the GPU, where all arrays stay.
+
+        Args:
+            camera, settings, target, mask, background: as in ``Trainer.step``.
+            loss: derivatives of the loss with respect to the sums of |x - y|, SSIM, and (x - y)^2.
+            rates: learning rates of colours and of positions.
+
+        Returns:
+            The sums. If they or the gradients are not finite, nothing has changed.
+        """
+        optimisers = [self._colors, *([self._positions] if rates[1] > 0 else [])]
+        steps = [optimiser.next_rate(rate) for optimiser, rate in zip(optimisers, rates, strict=False)]
+        config = self.config
+        with gpu_errors():
+            if self._trainer is None:
+                self._trainer = self._new_trainer()
+            sums = self._trainer.step(
+                camera,
+                settings,
+                target,
+                mask,
+                background,
+                Rates(*loss, steps[0], (*steps, 0.0)[1], (config.beta1, config.beta2), config.epsilon),
+            )
+        if sums.finite:
+            self._ahead = True
+            for optimiser in optimisers:
+                optimiser.steps += 1
+        return sums
+
+    def _new_trainer(self) -> Trainer:
+        count = len(self._vertices)
+        scale = self._positions.scale
+        return Trainer(
+            open_device(),
+            self.mesh,
+            self._vertices,
+            self._rgba,
+            Moments(self._positions.mean, self._positions.square),
+            Moments(self._colors.mean, self._colors.square),
+            np.ones(count, np.float32) if scale is None else scale,
+            np.zeros(count, bool) if self._boundary is None else self._boundary,
+        )
+
+    def _download(self) -> None:
+        """Brings the arrays up to the steps that were taken on the GPU."""
+        if not self._ahead or self._trainer is None:
+            return
+        with gpu_errors():
+            vertices, colors, positions, of_colors = self._trainer.download()
+        self._vertices[:], self._rgba[:] = vertices, colors
+        for optimiser, moments in ((self._positions, positions), (self._colors, of_colors)):
+            optimiser.mean[:], optimiser.square[:] = moments
+        self._ahead = False
+
     def relocate(self, in_view: np.ndarray) -> int:
         """Relocates splats that are almost invisible (see ``relocation``) and restarts the gradient sums.
 
@@ -250,10 +359,11 @@ class State:
         """The state with only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""
         if keep.all():
             return self
+        self._download()
         used = np.zeros(len(self.mesh.vertices), bool)
         used[self.mesh.faces[keep].ravel()] = True
         mesh = self.result().keep_faces(keep)
-        smaller = State(mesh, self.sizes[used], self.exposures, self.config, self.threads)
+        smaller = State(mesh, self.sizes[used], self.exposures, self.config, self.threads, self.device)
         rows = np.flatnonzero(used)
         positions = smaller.vertices if smaller.bound is None else smaller.bound.weights
         smaller._positions = self._positions.select(positions, rows)

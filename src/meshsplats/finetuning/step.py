@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,9 @@ from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of
 from meshsplats.finetuning.ranks import ALONE, Part, Ranks
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
-from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRendering, visible_pixels
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
+from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
+from meshsplats.webgpu.renderer import DrawSettings
 
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""
@@ -95,7 +98,7 @@ class RenderedView:
         color: (h, w, 3) float32 display RGB.
     """
 
-    def __init__(self, rendering: TapedRendering, linear: bool) -> None:
+    def __init__(self, rendering: AnyRendering, linear: bool) -> None:
         self._rendering, self._linear = rendering, linear
         self.color = linear_to_srgb(rendering.color) if linear else rendering.color
 
@@ -138,7 +141,8 @@ def render_view(
     """The current mesh from the camera of ``view``, over ``background``, display RGB."""
     linear = state.mesh.blending == "linear"
     display = np.asarray(background, np.float32)
-    rendering = TapedRendering(
+    rendering = taped_rendering(
+        state.device,
         state.vertices,
         state.mesh.faces,
         state.colors,
@@ -214,6 +218,8 @@ def make_step(
     number = step // config.batch
     indices = [view_of_place(config, number, place, len(views)) for place in range(batch)]
     if batch == config.batch == ranks.count == 1:
+        if state.trains_on_gpu(views[indices[0]].camera):
+            return _step_on_gpu(state, views[indices[0]], step, fraction)
         found = view_gradients(state, views, indices[0], step, fraction)
         if found is None:
             return None
@@ -229,11 +235,7 @@ def make_step(
         culprit = "the loss" if gradients is None else "a gradient"
         if batch > 1:
             culprit = "the loss or a gradient"
-        raise DivergenceError(
-            f"step {step + 1}, view {views[indices[failed - 1]].name!r}: {culprit} is not finite. Check this"
-            " view's image and camera first; if they are sound, lower the learning rates. The last checkpoint"
-            " is from before this step"
-        )
+        raise _divergence(step, views[indices[failed - 1]], culprit)
     if hybrid:
         steps_before = step * (1 - config.soft_phase) / fraction
         fraction = soft_fraction(config, fraction)
@@ -306,6 +308,38 @@ def view_gradients(
     return ViewGradients(loss, gradients, gradients.finite())
 
 
+def _step_on_gpu(state: State, view: View, step: int, fraction: float) -> float | None:
+    """``make_step`` where the loss and Adam are on the GPU, too."""
+    config = state.config
+    points = uses_point_targets(view, config, fraction)
+    target = target_of(view, config, step, points)
+    mask = target.mask
+    if mask is not None and not mask.any():
+        return None
+    samples = 1 if points else samples_of(view, config)
+    rates = learning_rates(config, step, fraction)
+    count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
+    share = config.ssim_weight
+    settings = DrawSettings(
+        samples=samples,
+        min_transmittance=MIN_TRANSMITTANCE["display"],
+        filter_px2=state.mesh.filter_px2,
+    )
+    derivatives = ((1 - share) / count, -share / count, config.l2_weight / count)
+    sums = state.step_on_gpu(view.camera, settings, target.color, mask, target.background, derivatives, rates)
+    loss = share + float(np.dot(derivatives, sums[:3]))
+    if not (np.isfinite(loss) and sums.finite):
+        raise _divergence(step, view, "a gradient" if np.isfinite(loss) else "the loss")
+    return loss
+
+
+def _divergence(step: int, view: View, culprit: str) -> DivergenceError:
+    return DivergenceError(
+        f"step {step + 1}, view {view.name!r}: {culprit} is not finite. Check this view's image and camera"
+        " first; if they are sound, lower the learning rates. The last checkpoint is from before this step"
+    )
+
+
 def exposure_gradient(image: np.ndarray, grad_image: np.ndarray) -> np.ndarray:
     """(6,) float32 gradient of gain and offset, where ``grad_image`` is that of ``image * gain + offset``."""
     gradient = np.empty(6, np.float32)
@@ -355,8 +389,9 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
     vertices, colors = state.vertices, state.colors
     pixels = np.zeros(len(vertices), np.float32)
     in_view = np.zeros(len(pixels), bool)
+    count = partial(visible_pixels, threads=state.threads) if state.device == "cpu" else gpu_visible_pixels
     for view in views:
-        pixels += visible_pixels(
+        pixels += count(
             vertices,
             state.mesh.faces,
             colors,
@@ -366,7 +401,6 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
             face_splat=state.mesh.face_splat,
             depth_group=state.mesh.depth_group,
             filter_px2=state.mesh.filter_px2,
-            threads=state.threads,
         )
         in_view |= view.camera.sees(vertices)
     return pixels, in_view

@@ -9,8 +9,9 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
-from meshsplats.rendering.api import MIN_TRANSMITTANCE
-from meshsplats.rendering.backward import TAPE_BYTES, TapedRendering
+from meshsplats.rendering.api import MIN_TRANSMITTANCE, Device, check_device
+from meshsplats.rendering.backward import TAPE_BYTES
+from meshsplats.rendering.gpu_backward import AnyRendering, taped_rendering
 
 try:
     import torch
@@ -46,6 +47,7 @@ def rasterize(
     min_transmittance: float = MIN_TRANSMITTANCE,
     threads: int | None = None,
     tape_bytes: int = TAPE_BYTES,
+    device: Device = "cpu",
 ) -> Raster:
     """The images that ``render`` gives, differentiable once.
 
@@ -57,6 +59,10 @@ def rasterize(
     The forward pass records a tape of at most ``tape_bytes`` for each image, about two bytes a fragment; the
     backward pass renders tiles that did not fit once more. Every result has the same bits in every run, with
     any number of threads.
+
+    ``device="gpu"`` renders on the best GPU of the machine (extra ``gpu``), with the fragments of
+    ``render(device="gpu")``. Tensors stay on the CPU. The tape of the last image stays on the GPU; the
+    backward pass renders others once more. Results have the same bits in every run on one device.
 
     Args:
         vertices: (v, 3) float32 world positions.
@@ -72,14 +78,18 @@ def rasterize(
         filter_px2: variance in square pixels of the filter for splats, as in ``render``. Gradients go through
             the filter to positions and opacities.
         min_transmittance: early termination of samples with less transmittance than this.
-        threads: at most this many; all processors by default.
-        tape_bytes: limit on the size of the tape of each image.
+        threads: at most this many, of the CPU; all processors by default.
+        tape_bytes: limit on the size of the tape of each image, on the CPU.
+        device: 'cpu' or 'gpu'.
 
     Raises:
         ValueError: tensors of other types, shapes or devices; faces with indices of missing vertices; options
             out of range; a filter without ``face_splat``, or for splats that share vertices.
         RuntimeError: from torch, for a second derivative.
+        MissingDependencyError: no GPU, or no library for it.
+        DeviceError: the GPU failed, or did not finish.
     """
+    check_device(device)
     single = isinstance(cameras, Camera)
     views: list[Camera] = [cameras] if isinstance(cameras, Camera) else list(cameras)
     if not views:
@@ -117,6 +127,7 @@ def rasterize(
         _per_face("depth_group", depth_group, len(faces)),
         dict(filter_px2=filter_px2, samples=samples, min_transmittance=min_transmittance, threads=threads),
         tape_bytes,
+        device,
     )
     inputs = (vertices, attributes, backdrop, poses)
     if torch.is_grad_enabled() and any(part is not None and part.requires_grad for part in inputs):
@@ -133,6 +144,7 @@ class _Constant(NamedTuple):
     depth_group: np.ndarray | None
     options: dict[str, Any]
     tape_bytes: int
+    device: Device
 
 
 def _forward(
@@ -141,7 +153,7 @@ def _forward(
     background: torch.Tensor,
     poses: torch.Tensor | None,
     constant: _Constant,
-    tapes: list[TapedRendering] | None,
+    tapes: list[AnyRendering] | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Colour, alpha and attributes of the images; appends the renderings to ``tapes``, where there is one."""
     points = _array(vertices)
@@ -151,7 +163,8 @@ def _forward(
     backdrop = background.detach().numpy()
     images = []
     for i, camera in enumerate(constant.cameras):
-        rendering = TapedRendering(
+        rendering = taped_rendering(
+            constant.device,
             points,
             constant.faces,
             colors,

@@ -47,6 +47,28 @@ def raster_source(queue: int = QUEUE, *, output: Output = "color", groups: bool 
             face the camera, from those of the vertices or from their positions.
         groups: whether the mesh has depth groups.
     """
+    return _raster_source(queue, output, groups) + _text("image.wgsl")
+
+
+def gradients_source(queue: int = QUEUE, *, groups: bool = False) -> str:
+    """WGSL of ``raster`` with a tape, and of the kernels from the tape to gradients.
+
+    Arguments are those of ``raster_source``.
+    """
+    return _raster_source(queue, "color", groups) + _text("tape.wgsl") + _text("gradients.wgsl")
+
+
+def filter_source() -> str:
+    """WGSL of ``widen_backward``."""
+    return lists_source() + _text("filter.wgsl")
+
+
+def training_source() -> str:
+    """WGSL of the loss and of Adam."""
+    return _text("common.wgsl") + _text("training.wgsl")
+
+
+def _raster_source(queue: int, output: Output, groups: bool) -> str:
     if queue < 2:
         raise ValueError(f"queue must be at least 2, got {queue}")
     text = _text("raster.wgsl").replace("$OUTPUT", str(OUTPUTS.index(output)))
@@ -137,6 +159,152 @@ def resolve_steps() -> list[dict[str, Any]]:
     """From samples to pixels; without effect for one sample in each pixel."""
     bind = {"0": "frame", "20": "samples", "21": "pixels"}
     return [{"kernel": "resolve", "bind": bind, "count": ["columns", 8], "rows": ["rows", 8]}]
+
+
+MARK, WRITE, SCAN = "modes.0", "modes.1", "modes.2"
+"""Uniforms of the kernels with a tape: the two walks, and prefix sums by pair."""
+MODES = ((0, 0, 0, 0), (1, 0, 0, 0), (0, 0, 2, 0))
+
+
+GRADIENT_KERNELS = ("count_marks", "place_marks", "find_behind", "add_samples", "add_tiles", "add_corners")
+"""Kernels of ``gradients_source``, besides ``raster``."""
+
+
+TRAINING_KERNELS = (
+    *("store_window", "load_window", "judge", "rate", "add_losses", "find_image_gradient"),
+    *("check_gradients", "adam"),
+)
+"""Kernels of ``training_source``."""
+
+
+def mark_steps() -> list[dict[str, Any]]:
+    """``raster_steps`` with marks, which find the fragments' places on the tape."""
+    return [
+        *({"clear": "counters", "from": 8}, {"clear": "lists", "from": 0}, {"clear": "again", "from": 0}),
+        *_walk_steps(MARK),
+    ]
+
+
+def mark_again_steps(mode: str = MARK) -> list[dict[str, Any]]:
+    """``again_steps`` with a tape."""
+    return [
+        {"clear": "lists", "from": 0},
+        _taped("tape_again", "again", "lists", mode, indirect=["again", 0]),
+        {"clear": "again", "from": 0},
+        _taped("tape_again", "lists", "again", mode, indirect=["lists", 0]),
+    ]
+
+
+def place_steps() -> list[dict[str, Any]]:
+    """From marks to the places of fragments on the tape, and of the sums of triangles in tiles."""
+    names = {0: "frame", 4: "pairs_b", 8: "counters", 10: "offsets", 11: "boxes", 12: "plan"}
+    names |= {13: "fragment_starts", 14: "sum_starts", 15: "marked"}
+    bind = {str(i): name for i, name in names.items()}
+    steps: list[dict[str, Any]] = [{"clear": name, "from": 0} for name in ("sum_starts", "marked")]
+    steps.append({"kernel": "count_marks", "bind": bind, "indirect": ["plan", 24]})
+    for data in ("fragment_starts", "sum_starts"):
+        common = {"0": "frame", "11": "sums", "13": "plan", "17": SCAN}
+        steps += [
+            {"kernel": "scan_blocks", "bind": common | {"10": data}, "indirect": ["plan", 0]},
+            {"kernel": "scan_sums", "bind": common, "count": ["one", 1]},
+            {"kernel": "scan_add", "bind": common | {"10": data}, "indirect": ["plan", 0]},
+        ]
+    return [*steps, {"kernel": "place_marks", "bind": bind, "indirect": ["plan", 24]}]
+
+
+def gradient_steps(rounds: int) -> list[dict[str, Any]]:
+    """From the gradient of the image to those of vertices, which it adds to ``gradients``.
+
+    Args:
+        rounds: how often ``mark_again_steps`` were needed.
+    """
+
+    def step(kernel: str, bind: dict[int, str], **size: Any) -> dict[str, Any]:
+        return {"kernel": kernel, "bind": {str(i): name for i, name in bind.items()}, **size}
+
+    steps: list[dict[str, Any]] = [
+        {"clear": "counters", "from": 8, "size": 44},
+        *({"clear": "lists", "from": 0}, {"clear": "again", "from": 0}),
+        *_walk_steps(WRITE),
+    ]
+    for _ in range(rounds):
+        steps += mark_again_steps(WRITE)
+    pixels = {0: "frame", 3: "tape", 6: "samples", 8: "counters"}
+    steps.append(step("find_behind", pixels, count=["width", 8], rows=["height", 8]))
+    taped = {0: "frame", 1: "projected", 2: "mesh", 3: "tape", 4: "pairs_b", 6: "samples", 8: "counters"}
+    steps.append(step("add_samples", taped | {12: "plan", 16: "tile_sums"}, indirect=["plan", 24]))
+    sums = {0: "frame", 2: "mesh", 10: "offsets", 12: "plan", 14: "sum_starts", 15: "marked"}
+    by_face = sums | {16: "tile_sums", 17: "face_sums"}
+    steps.append(step("add_tiles", by_face, count=["run_columns", 1], rows=["run_rows", 1]))
+    corners = {0: "frame", 1: "projected", 2: "mesh", 17: "face_sums", 18: "vertex_corners", 19: "gradients"}
+    steps.append(step("add_corners", corners, count=["vertices", 256]))
+    return steps
+
+
+def filter_steps() -> list[dict[str, Any]]:
+    """From the gradients of moved vertices to those of the mesh's own; without effect without a filter."""
+    names = {0: "frame", 1: "vertices", 2: "values", 3: "mesh", 4: "fans", 6: "projected"}
+    names |= {22: "gradients", 23: "vertex_corners"}
+    bind = {str(i): name for i, name in names.items()}
+    return [{"kernel": "widen_backward", "bind": bind, "count": ["fans", 64], "if": "fans"}]
+
+
+def store_steps() -> list[dict[str, Any]]:
+    """From the samples of a window to the image."""
+    return [_training("store_window", {2: "samples", 3: "image"}, count=["columns", 8], rows=["rows", 8])]
+
+
+def loss_steps() -> list[dict[str, Any]]:
+    """From the image to its loss and gradient."""
+    size: dict[str, Any] = {"count": ["image_columns", 16], "rows": ["image_rows", 16]}
+    compared = {3: "image", 4: "target", 5: "derivatives"}
+    return [
+        {"clear": "results", "from": 0},
+        _training("rate", compared | {7: "losses"}, **size),
+        _training("add_losses", {7: "losses", 8: "results"}, count=["one", 1]),
+        _training("find_image_gradient", compared | {6: "image_gradient"}, **size),
+    ]
+
+
+def window_steps(rounds: int) -> list[dict[str, Any]]:
+    """From the gradient of the image to those of vertices, for one window, with ``gradient_steps``."""
+    loaded = {2: "samples", 6: "image_gradient"}
+    return [
+        _training("load_window", loaded, count=["columns", 8], rows=["rows", 8]),
+        *gradient_steps(rounds),
+        _training("judge", {8: "results", 9: "counters"}, count=["one", 1]),
+    ]
+
+
+def adam_steps() -> list[dict[str, Any]]:
+    """From the gradients of vertices to their new positions and colours."""
+    checked = {"0": "frame", "8": "results", "10": "gradients"}
+    own = {"1": "step", "11": "vertices", "12": "values"}
+    own |= {"13": "position_moments", "14": "color_moments", "15": "traits"}
+    return [
+        {"kernel": "check_gradients", "bind": checked, "count": ["vertices", 256]},
+        {"kernel": "adam", "bind": checked | own, "count": ["vertices", 256]},
+    ]
+
+
+def _training(kernel: str, bind: dict[int, str], **size: Any) -> dict[str, Any]:
+    named = {"1": "step"} | {str(i): name for i, name in bind.items()}
+    return {"kernel": kernel, "bind": named, **size}
+
+
+def _walk_steps(mode: str) -> list[dict[str, Any]]:
+    """The first walk through all lists, and two more of those that need them."""
+    found = {"13": "plan", "16": "pairs_b", "18": "lists"}
+    return [
+        {"kernel": "find_lists", "bind": found, "indirect": ["plan", 24]},
+        _taped("tape", "lists", "again", mode, count=["tiles", 1]),
+        *mark_again_steps(mode),
+    ]
+
+
+def _taped(kernel: str, work: str, next_work: str, mode: str, **size: Any) -> dict[str, Any]:
+    step = _raster(kernel, work, next_work, **size)
+    return step | {"bind": step["bind"] | {"3": "tape", "9": mode}}
 
 
 def _raster(kernel: str, work: str, next_work: str, **size: Any) -> dict[str, Any]:

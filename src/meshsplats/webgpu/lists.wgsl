@@ -156,16 +156,22 @@ fn fan_moments(begin: u32, end: u32, first: vec3f, origin: vec3f, shift: vec2f, 
   return m;
 }
 
-@compute @workgroup_size(64)
-fn widen(@builtin(global_invocation_id) id: vec3u) {
-  if (id.x >= frame.fans) { return; }
-  let begin = fans[id.x];
-  let end = fans[id.x + 1u];
-  let first = world(mesh[3u * begin]);
-  let origin = to_camera(first);
-  if (!(origin.z >= frame.near)) { return; }
-  let rough = fan_moments(begin, end, first, origin, vec2f(0.0), vec2f(1.0, 0.0));
-  if (!rough.visible || !(rough.mass > 0.0)) { return; }
+// The transform of a fan. Positions are fan_position(), less `middle`, turned by `axis`, less `mean`.
+struct Fan {
+  first: vec3f, origin: vec3f,  // its first vertex, in world and camera space
+  middle: vec2f, axis: vec2f, mean: vec2f,
+  covariance: vec3f,            // M: xx, xy, yy
+  a: vec3f,                     // A: xx, xy, yy
+  mass: f32,
+  moves: bool,                  // false: the fan stays as it is
+};
+fn fan_of(begin: u32, end: u32) -> Fan {
+  var fan: Fan;
+  fan.first = world(mesh[3u * begin]);
+  fan.origin = to_camera(fan.first);
+  if (!(fan.origin.z >= frame.near)) { return fan; }
+  let rough = fan_moments(begin, end, fan.first, fan.origin, vec2f(0.0), vec2f(1.0, 0.0));
+  if (!rough.visible || !(rough.mass > 0.0)) { return fan; }
   let middle = rough.mean / rough.mass;
   let xx = rough.xx / rough.mass - middle.x * middle.x;
   let xy = rough.xy / rough.mass - middle.x * middle.y;
@@ -173,29 +179,43 @@ fn widen(@builtin(global_invocation_id) id: vec3u) {
   // The longer axis: half the angle of (xx - yy, 2 xy).
   let angle = 0.5 * atan2(2.0 * xy, xx - yy);
   let turned = vec2f(cos(angle), sin(angle));
-  let axis = select(vec2f(1.0, 0.0), turned, abs(xy) + abs(xx - yy) > 0.0);
-  let m = fan_moments(begin, end, first, origin, middle, axis);
-  let mean = m.mean / m.mass;
+  fan.axis = select(vec2f(1.0, 0.0), turned, abs(xy) + abs(xx - yy) > 0.0);
+  fan.middle = middle;
+  let m = fan_moments(begin, end, fan.first, fan.origin, middle, fan.axis);
+  fan.mass = m.mass;
+  fan.mean = m.mean / m.mass;
   let s = frame.filter_variance;
+  let mean = fan.mean;
+  fan.covariance = vec3f(m.xx / m.mass - mean.x * mean.x, m.xy / m.mass - mean.x * mean.y, m.yy / m.mass - mean.y * mean.y);
   let uu = m.xx / m.mass - mean.x * mean.x + MIN_VARIANCE * s;
   let uv = m.xy / m.mass - mean.x * mean.y;
   let vv = m.yy / m.mass - mean.y * mean.y + MIN_VARIANCE * s;
   let determinant = uu * vv - uv * uv;
-  if (!(determinant > 0.0)) { return; }
+  if (!(determinant > 0.0)) { return fan; }
   // B = I + s M^-1; its root is (B + d I) / sqrt(tr B + 2 d) with d^2 = det B.
   let b = vec3f(1.0 + s * vv / determinant, -s * uv / determinant, 1.0 + s * uu / determinant);
   let d = sqrt(1.0 + s * ((uu + vv) / determinant) + s * (s / determinant));
   let scale = 1.0 / sqrt(b.x + b.z + 2.0 * d);
-  let a = vec3f(b.x + d, b.y, b.z + d) * scale;
-  if (!(a.x + abs(a.y) + a.z < MAX_TRANSFORM)) { return; }
-  let start = place_of(precise_point(first));
+  fan.a = vec3f(b.x + d, b.y, b.z + d) * scale;
+  fan.moves = fan.a.x + abs(fan.a.y) + fan.a.z < MAX_TRANSFORM;
+  return fan;
+}
+
+@compute @workgroup_size(64)
+fn widen(@builtin(global_invocation_id) id: vec3u) {
+  if (id.x >= frame.fans) { return; }
+  let begin = fans[id.x];
+  let end = fans[id.x + 1u];
+  let fan = fan_of(begin, end);
+  if (!fan.moves) { return; }
+  let start = place_of(precise_point(fan.first));
   for (var f = begin; f < end; f++) {
     for (var k = 0u; k < 3u; k++) {
       let i = mesh[3u * f + k];
-      let p = fan_position(i, first, origin).xy - middle;
-      let q = vec2f(dot(axis, p), axis.x * p.y - axis.y * p.x) - mean;
-      let r = mean + vec2f(a.x * q.x + a.y * q.y, a.y * q.x + a.z * q.y);
-      let moved = middle + vec2f(axis.x * r.x - axis.y * r.y, axis.y * r.x + axis.x * r.y);
+      let p = fan_position(i, fan.first, fan.origin).xy - fan.middle;
+      let q = vec2f(dot(fan.axis, p), fan.axis.x * p.y - fan.axis.y * p.x) - fan.mean;
+      let r = fan.mean + vec2f(fan.a.x * q.x + fan.a.y * q.y, fan.a.y * q.x + fan.a.z * q.y);
+      let moved = fan.middle + vec2f(fan.axis.x * r.x - fan.axis.y * r.y, fan.axis.y * r.x + fan.axis.x * r.y);
       let x = add_pairs(start.x, vec2f(moved.x, 0.0));
       let y = add_pairs(start.y, vec2f(moved.y, 0.0));
       projected_out[i] = pack_place(Place(x, y, projected_out[i].z));
@@ -311,13 +331,15 @@ fn bound_runs(@builtin(global_invocation_id) id: vec3u) {
 
 // ------------------------------------------------------------------------------------------------ exclusive prefix sums
 //
-// In three dispatches, of the counts by run, or of the table of digits. Sums saturate: too many pairs stay too many.
+// In three dispatches, of the counts by run, of the table of digits (of_table is 1), or of counts by pair (2). Sums
+// saturate: too many pairs stay too many.
 
 const BLOCK = 2048u;  // items of one workgroup
 fn blocks(n: u32) -> u32 { return (n + BLOCK - 1u) / BLOCK; }
 fn add_saturated(a: u32, b: u32) -> u32 { return min(a, 0xffffffffu - b) + b; }
 fn scan_length() -> u32 {
   if (digit.of_table == 1u) { return 256u * blocks(plan[9]); }
+  if (digit.of_table == 2u) { return plan[9]; }
   return frame.runs;
 }
 

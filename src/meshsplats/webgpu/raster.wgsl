@@ -1,6 +1,6 @@
 // Draws tiles: a workgroup a tile, an invocation a sample.
 //
-// The host replaces what begins with $.
+// The host replaces what begins with $, and adds image.wgsl, or tape.wgsl, which records fragments for gradients.
 //
 // The list of a tile comes nearest run first. Each sample keeps the nearest K of its fragments that are not blended
 // yet, sorted. One that is nearer than all runs to come is blended. If there are more than K, the farthest is
@@ -12,7 +12,6 @@ const GROUPS = $GROUPS;        // whether the mesh has depth groups
 
 @group(0) @binding(1) var<storage, read> projected: array<vec4f>;
 @group(0) @binding(2) var<storage, read> mesh: array<u32>;
-@group(0) @binding(3) var<storage, read> values: array<vec4f>;   // by vertex: RGB, normal or world position; opacity
 @group(0) @binding(4) var<storage, read> pairs: array<vec2u>;
 @group(0) @binding(5) var<storage, read> work: array<vec4u>;     // from 1 on: (tile, first pair, end, walks so far)
 @group(0) @binding(6) var<storage, read_write> samples: array<vec4u>;  // RGB and transmittance; then the state
@@ -71,29 +70,12 @@ fn most_effort() -> u32 {
   return max(max(atomicLoad(&efforts[0]), atomicLoad(&efforts[1])), max(atomicLoad(&efforts[2]), atomicLoad(&efforts[3])));
 }
 
-fn is_open() -> bool {
-  return through > 0.0 && through >= frame.min_transmittance && (frame.max_layers == 0u || layers < frame.max_layers);
-}
-
-fn blend_front() {
-  let value = queue_value[head];
-  let weight = through * value.w;
-  rgb = fma(vec3f(weight), value.xyz, rgb);
-  through = fma(-through, value.w, through);
-  if (weight > 0.0) { layers++; blended++; }
-  floor_q = queue_key[head];
-  floor_face = queue_face[head];
-  advanced = true;
-  head = place(1u);
-  count--;
-}
-
 fn is_nearer(q: f32, face: u32, other_q: f32, other_face: u32) -> bool {
   return q > other_q || (q == other_q && face < other_face);
 }
 
 // Puts a fragment into its place. The farthest is dropped if there are too many.
-fn insert(q: f32, face: u32, value: vec4f) {
+fn insert(q: f32, face: u32, value: vec4f, source: u32) {
   var dropped_q = -1.0;
   var dropped_face = 0u;
   if (count == K) {
@@ -114,6 +96,7 @@ fn insert(q: f32, face: u32, value: vec4f) {
     queue_key[after] = queue_key[before];
     queue_face[after] = queue_face[before];
     queue_value[after] = queue_value[before];
+    move_source(after, before);
     i--;
     effort++;
   }
@@ -121,6 +104,7 @@ fn insert(q: f32, face: u32, value: vec4f) {
   queue_key[free] = q;
   queue_face[free] = face;
   queue_value[free] = value;
+  keep_source(free, source);
   count++;
   if (dropped_q >= 0.0) { drop(dropped_q, dropped_face); }
 }
@@ -130,16 +114,6 @@ fn drop(q: f32, face: u32) {
   if (limit_q < 0.0 && hidden()) { return; }  // a limit only comes nearer
   limit_q = q;
   limit_face = face;
-}
-
-// Whether nothing behind the whole queue can be blended. Rounding is why half of the limit is safe.
-fn hidden() -> bool {
-  if (frame.max_layers != 0u && layers + K >= frame.max_layers) { return true; }
-  if (frame.min_transmittance == 0.0) { return false; }
-  var rest = through;
-  for (var i = 0u; i < K; i++) { rest *= 1.0 - queue_value[i].w; }
-  effort += K;
-  return rest < 0.5 * frame.min_transmittance;
 }
 
 // ------------------------------------------------------------------------------------------------ triangle set-up
@@ -214,11 +188,11 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
     let b = vec2i(last);
     box = vec2u(box_bits(a, b), box_bits(a - vec2i(0, 4), b - vec2i(0, 4)));
   }
-  let v = array<vec4f, 3>(values[i.x], values[i.y], values[i.z]);
+  let v = array<vec4f, 3>(value_of(i.x), value_of(i.y), value_of(i.z));
   let opacity = max(max(v[0].w, v[1].w), v[2].w);
   if (frame.cutoff >= 0.0) {
     if (opacity < frame.cutoff) { return false; }
-  } else if (!(opacity > 0.0)) {
+  } else if (!(opacity > 0.0) && !TRANSPARENT) {
     return false;
   }
   var e = array<Edge, 3>(edge(p[1], p[2], o), edge(p[2], p[0], o), edge(p[0], p[1], o));
@@ -287,8 +261,8 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
 // ------------------------------------------------------------------------------------------------ fragments
 
 // The fragment of the triangle in a slot at the sample p, which it covers: adds it to the queue unless it is
-// blended already or lies behind what was dropped. `key` bounds it.
-fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32) {
+// blended already or lies behind what was dropped. `key` bounds it; `source` says where the triangle is from.
+fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32, source: u32) {
   let e = edges_at(slot, p);
   let scale = scales[slot];
   let b = e * scale.xyz;
@@ -323,10 +297,10 @@ fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32) {
     if (value.w < frame.cutoff) { return; }
     value.w = 1.0;
   }
-  if (!(value.w > 0.0)) { return; }
+  if (!(value.w > 0.0) && !TRANSPARENT) { return; }
   if (OUTPUT == 1u) { value = vec4f(1.0 / depth, 0.0, 0.0, value.w); }
   if (OUTPUT >= 2u) { value = vec4f(facing(value.xyz, tile + p), value.w); }
-  insert(q, face, value);
+  insert(q, face, value, source);
 }
 
 // The unit normal that faces the camera at the position p of the image; 0 for one without direction.
@@ -373,15 +347,9 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
   count = 0u;
   effort = 0u;
   var open = in_image;
+  begin_sample(t, x, y);
   if (item.w > 0u && in_image) {
-    let color = bitcast<vec4f>(samples[index]);
-    let state = samples[state_index];
-    rgb = color.xyz;
-    through = color.w;
-    floor_q = bitcast<f32>(state.x);
-    floor_face = state.y;
-    layers = state.z;
-    open = state.w == 1u;
+    open = resume(index, state_index);
   }
   let was_open = open;
   if (t == 0u) { atomicStore(&broken, 0u); }
@@ -456,7 +424,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
         else { slot = 32u + firstTrailingBit(hits.y); hits.y &= hits.y - 1u; }
         let key = keys[slot / RUN];
         if (count == K && queue_key[head] > key) { blend_front(); open = is_open(); }
-        if (open) { add_fragment(slot, p, o, key); }
+        if (open) { add_fragment(slot, p, o, key, RUN * at + slot); }
       }
       atomicAdd(&efforts[t / 16u], effort);
       whole = whole && (rest.x | rest.y | near.x | near.y) == 0u && ((hits.x | hits.y) == 0u || !open);
@@ -484,10 +452,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
   atomicAdd(&totals[1], blended);
   workgroupBarrier();
   let left = atomicLoad(&open_count);
-  if (in_image) {
-    samples[index] = bitcast<vec4u>(vec4f(rgb, through));
-    if (left > 0u) { samples[state_index] = vec4u(bitcast<u32>(floor_q), floor_face, layers, select(0u, 1u, again)); }
-  }
+  if (in_image) { suspend(index, state_index, again, left > 0u); }
   if (t != 0u) { return; }
   atomicAdd(&counters[3], 1u);
   atomicMax(&counters[4], item.w + 1u);

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -70,6 +71,17 @@ class Work:
     overflowed: int = 0
     """Samples whose queue was too short in the first walk."""
 
+    def add(self, tiles: int, counters: np.ndarray) -> None:
+        """Adds a finished window."""
+        self.windows += 1
+        self.tiles += tiles
+        self.pairs += int(counters[0])
+        self.walks += int(counters[3])
+        self.most_walks = max(self.most_walks, int(counters[4]))
+        self.tests += int(counters[5]) + (int(counters[6]) << 32)
+        self.fragments += int(counters[7]) + (int(counters[8]) << 32)
+        self.overflowed += int(counters[11])
+
 
 @dataclass
 class Images:
@@ -105,11 +117,21 @@ def draw(
         MemoryError: the scene does not fit.
         ValueError: two splats share a vertex, and the mesh has a filter.
     """
+    with gpu_errors():
+        return _renderer(mesh).draw(camera, settings, depth=depth, normals=normals, values=values)
+
+
+@contextlib.contextmanager
+def gpu_errors() -> Iterator[None]:
+    """Turns the errors of wgpu into MemoryError and DeviceError, and opens the device anew afterwards.
+
+    Raises MissingDependencyError at once if there is no wgpu or no GPU.
+    """
     open_device()
     import wgpu
 
     try:
-        return _renderer(mesh).draw(camera, settings, depth=depth, normals=normals, values=values)
+        yield
     except wgpu.GPUError as error:
         _forget()  # the device may be lost
         if isinstance(error, MemoryError):
@@ -245,7 +267,7 @@ class MeshRenderer:
             while waiting:
                 window = waiting.pop()
                 if not self._fits(window, settings.samples):
-                    waiting += _halves(window)
+                    waiting += halves(window)
                     continue
                 for budget in budgets:
                     try:
@@ -257,9 +279,14 @@ class MeshRenderer:
                         if budget == budgets[-1]:
                             raise
                 if not drawn:
-                    waiting += _halves(window)
-            images.work.bytes = sum(buffer.size for buffer in self._buffers.values())
+                    waiting += halves(window)
+            images.work.bytes = self.bytes
         return images
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of all buffers."""
+        return sum(buffer.size for buffer in self._buffers.values())
 
     def _prepare_filter(self, settings: DrawSettings) -> None:
         if not settings.filter_px2 or "fans" in self._buffers:
@@ -306,14 +333,7 @@ class MeshRenderer:
                 return False
             self._capacity = min(kernels.MAX_PAIRS, self.device.binding_limit // 8, needed + needed // 4)
             counts = self._begin(part, settings)
-        work.windows += 1
-        work.tiles += counts["tiles"]
-        work.pairs += needed
-        work.walks += int(counters[3])
-        work.most_walks = max(work.most_walks, int(counters[4]))
-        work.tests += int(counters[5]) + (int(counters[6]) << 32)
-        work.fragments += int(counters[7]) + (int(counters[8]) << 32)
-        work.overflowed += int(counters[11])
+        work.add(counts["tiles"], counters)
         rows, columns = slice(y0, y0 + h), slice(x0, x0 + w)
         pixels = self._read(w, h, settings.samples)
         images.color[rows, columns] = pixels[..., :3]
@@ -421,7 +441,7 @@ class MeshRenderer:
                 if compute is not None:
                     compute.end()
                     compute = None
-                encoder.clear_buffer(self._buffers[step["clear"]], step["from"])
+                encoder.clear_buffer(self._buffers[step["clear"]], step["from"], step.get("size"))
                 continue
             if "if" in step and not counts[step["if"]]:
                 continue
@@ -469,16 +489,22 @@ class MeshRenderer:
 
 
 def frame_uniform(
-    camera: Camera, settings: DrawSettings, counts: dict[str, int], capacity: int, offsets: Sequence[int]
+    camera: Camera,
+    settings: DrawSettings,
+    counts: dict[str, int],
+    capacity: int,
+    offsets: Sequence[int],
+    pose: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The bytes of the uniform ``Frame``."""
+    """The bytes of the uniform ``Frame``; ``pose`` (4, 4) float64 overrides that of the camera."""
     s = settings.samples
     w, h = camera.width * s, camera.height * s
     data = np.zeros(64, np.float32)
     words = data.view(np.uint32)
+    matrix = camera.world_to_camera if pose is None else pose
     for i in range(3):
-        data[4 * i : 4 * i + 3] = camera.world_to_camera[i, :3]
-    center = camera.center
+        data[4 * i : 4 * i + 3] = matrix[i, :3]
+    center = camera.center if pose is None else -np.linalg.solve(pose[:3, :3], pose[:3, 3])
     data[12:15] = center
     data[16:19] = center - data[12:15]
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) * s
@@ -491,7 +517,7 @@ def frame_uniform(
     words[40:43] = offsets
     words[43] = s
     for i in range(3):
-        data[44 + 4 * i : 47 + 4 * i] = camera.world_to_camera[i, :3] - data[4 * i : 4 * i + 3]
+        data[44 + 4 * i : 47 + 4 * i] = matrix[i, :3] - data[4 * i : 4 * i + 3]
     data[56:60] = lens - data[20:24]
     return data
 
@@ -540,7 +566,7 @@ def _tiles(samples: int) -> int:
     return -(-samples // kernels.TILE)
 
 
-def _halves(window: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
+def halves(window: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
     x, y, w, h = window
     if max(w, h) == 1:
         raise MemoryError("the GPU cannot hold the triangles of a single pixel: use device='cpu'")

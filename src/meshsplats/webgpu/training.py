@@ -1,0 +1,249 @@
+"""Optimisation steps on the GPU: positions, colours and moments stay there, and only targets travel.
+
+docs/webgpu.md describes the kernels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.errors import DeviceError
+from meshsplats.mesh import SplatMesh
+from meshsplats.webgpu import kernels
+from meshsplats.webgpu.device import CORE_BINDING, Device
+from meshsplats.webgpu.gradients import Forward, GradientRenderer
+from meshsplats.webgpu.renderer import DrawSettings, Images, halves
+
+DERIVATIVE_BYTES = 48
+"""Bytes of the derivatives of SSIM in each pixel, the largest buffer of an image."""
+MAX_PIXELS = CORE_BINDING // DERIVATIVE_BYTES
+"""Most pixels of an image."""
+SIDE = 16
+"""Pixels along each side of a workgroup that compares images."""
+
+
+class Moments(NamedTuple):
+    """The moments of an optimiser, both (v, k) float32."""
+
+    mean: np.ndarray
+    square: np.ndarray
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What one step takes."""
+
+    l1: float
+    ssim: float
+    l2: float
+    """Derivatives of the loss with respect to the sums of |x - y|, SSIM, and (x - y)^2."""
+    colors: float
+    positions: float
+    """Learning rates with Adam's bias corrections; 0: positions are fixed."""
+    betas: tuple[float, float]
+    epsilon: float
+
+
+class Sums(NamedTuple):
+    """Sums over the channels of the pixels that count, and whether the gradients are finite."""
+
+    l1: float
+    ssim: float
+    l2: float
+    finite: bool
+
+
+class Trainer(GradientRenderer):
+    """A mesh whose positions, colours and moments are on a GPU.
+
+    Args:
+        device: the GPU.
+        mesh: the triangles, without depth groups; its positions and colours are not used.
+        vertices, colors: (v, 3) and (v, 4) float32.
+        position_moments, color_moments: of the same shapes.
+        units: (v,) float32 factors of the learning rate of positions.
+        transparent: (v,) bool: vertices whose opacity stays 0 once it is 0.
+
+    Raises:
+        MemoryError: a mesh that does not fit into buffers of 128 MiB.
+        DeviceError: a vertex with too many triangles.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        mesh: SplatMesh,
+        vertices: np.ndarray,
+        colors: np.ndarray,
+        position_moments: Moments,
+        color_moments: Moments,
+        units: np.ndarray,
+        transparent: np.ndarray,
+    ) -> None:
+        super().__init__(device, mesh)
+        assert not self._counts["groups"]
+        count = len(mesh.vertices)
+        self._upload("vertices", vertices)
+        self._upload("values", colors)
+        padded = np.zeros((count, 2, 4), np.float32)
+        padded[:, 0, :3], padded[:, 1, :3] = position_moments
+        self._upload("position_moments", padded)
+        self._upload("color_moments", np.stack(color_moments, axis=1))
+        self._upload("traits", np.stack([units, transparent.astype(np.float32)], axis=1))
+        self._allocate("results", 64)
+        self._allocate("step", 80)
+
+    def _usage(self, name: str) -> int:
+        return super()._usage("frame" if name == "step" else name)
+
+    def _pipeline(self, kernel: str, output: Any, settings: DrawSettings) -> Any:
+        if kernel in kernels.TRAINING_KERNELS:
+            return self.device.pipeline(kernel, ("training",), kernels.training_source)
+        return super()._pipeline(kernel, output, settings)
+
+    def step(
+        self,
+        camera: Camera,
+        settings: DrawSettings,
+        target: np.ndarray,
+        mask: np.ndarray | None,
+        background: Sequence[float],
+        rates: Rates,
+    ) -> Sums:
+        """Renders the mesh, compares the image with a target, and takes a step of Adam.
+
+        Args:
+            camera: of at most ``MAX_PIXELS`` pixels.
+            settings: as in ``GradientRenderer.forward``.
+            target: (h, w, 3) float32 RGB.
+            mask: (h, w) bool, True where pixels count; None: all do.
+            background: RGB behind the mesh.
+            rates: of the loss and of Adam.
+
+        Returns:
+            The sums. If they or the gradients are not finite, nothing has changed.
+
+        Raises:
+            DeviceError: the GPU did not finish; nothing has changed.
+            MemoryError: a single pixel does not fit.
+        """
+        with self._lock:
+            self._prepare(camera, settings, target, mask)
+            forward = Forward(
+                np.zeros((0, 3), np.float32),
+                np.zeros((0, 4), np.float32),
+                None,
+                camera,
+                None,
+                settings,
+                Images(np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.float32)),
+                [],
+            )
+            waiting = [(0, 0, camera.width, camera.height)]
+            while waiting:
+                area = waiting.pop()
+                window = self._mark_window(forward, area)
+                if window is None:
+                    waiting += halves(area)
+                    continue
+                forward.windows.append(window)
+                self._write_step(forward, window.area, 0, background, rates)
+                self._run_for(kernels.store_steps(), forward, window.area)
+            self._run_for(kernels.loss_steps(), forward, forward.windows[-1].area)
+            self._clear("gradients")
+            for window in forward.windows:
+                if self._marked is not forward and not self._try_mark(forward, window.area, window.settings):
+                    raise DeviceError(f"the GPU did not repeat its own image ({self.device.name})")
+                counts = self._make_room(forward, window)
+                self._write_step(forward, window.area, counts["tiles"], background, rates)
+                steps = kernels.window_steps(window.rounds)
+                self._run(steps, "color", counts | self._image_counts(camera), window.settings)
+            last = forward.windows[-1]
+            counts = self._begin(self._part(forward, last.area), last.settings)
+            steps = [*kernels.filter_steps(), *kernels.adam_steps()]
+            self._run(steps, "color", counts, last.settings)
+            data = self.device.device.queue.read_buffer(self._buffers["results"], 0, 32)
+        words = np.frombuffer(data, np.uint32)
+        if words[4]:
+            raise DeviceError(
+                f"the GPU did not finish a backward pass ({self.device.name}): use device='cpu'"
+            )
+        l1, l2, ssim = (float(value) for value in words[:3].view(np.float32))
+        return Sums(l1, ssim, l2, not words[5])
+
+    def download(self) -> tuple[np.ndarray, np.ndarray, Moments, Moments]:
+        """(v, 3) positions, (v, 4) colours, and the moments of both."""
+        count = len(self.mesh.vertices)
+        vertices = self._download("vertices", 12 * count).reshape(count, 3)
+        colors = self._download("values", 16 * count).reshape(count, 4)
+        positions = self._download("position_moments", 32 * count).reshape(count, 2, 4)[..., :3]
+        of_colors = self._download("color_moments", 32 * count).reshape(count, 2, 4)
+        return (
+            vertices,
+            colors,
+            Moments(positions[:, 0], positions[:, 1]),
+            Moments(of_colors[:, 0], of_colors[:, 1]),
+        )
+
+    def _download(self, name: str, size: int) -> np.ndarray:
+        return np.frombuffer(self.device.device.queue.read_buffer(self._buffers[name], 0, size), np.float32)
+
+    def _prepare(
+        self, camera: Camera, settings: DrawSettings, target: np.ndarray, mask: np.ndarray | None
+    ) -> None:
+        """Makes room for an image, and uploads its target."""
+        pixels = camera.width * camera.height
+        assert pixels <= MAX_PIXELS
+        self._prepare_filter(settings)
+        self._allocate("image", 16 * pixels)
+        self._allocate("image_gradient", 16 * pixels)
+        self._allocate("derivatives", DERIVATIVE_BYTES * pixels)
+        counts = self._image_counts(camera)
+        self._allocate("losses", 16 * -(-counts["image_columns"] // SIDE) * -(-counts["image_rows"] // SIDE))
+        padded = np.ones((camera.height, camera.width, 4), np.float32)
+        padded[..., :3] = target
+        if mask is not None:
+            padded[..., 3] = mask
+        self._upload("target", padded)
+        encoder = self.device.device.create_command_encoder()
+        encoder.copy_buffer_to_buffer(
+            self._buffers["values"],
+            0,
+            self._buffers["projected"],
+            self._values_at,
+            16 * len(self.mesh.vertices),
+        )
+        self.device.device.queue.submit([encoder.finish()])
+
+    @staticmethod
+    def _image_counts(camera: Camera) -> dict[str, int]:
+        return {"image_columns": camera.width, "image_rows": camera.height}
+
+    def _run_for(
+        self, steps: list[dict[str, Any]], forward: Forward, area: tuple[int, int, int, int]
+    ) -> None:
+        counts = self._counts | self._image_counts(forward.camera) | {"columns": area[2], "rows": area[3]}
+        self._run(steps, "color", counts, forward.settings)
+
+    def _write_step(
+        self,
+        forward: Forward,
+        area: tuple[int, int, int, int],
+        tiles: int,
+        background: Sequence[float],
+        rates: Rates,
+    ) -> None:
+        """Writes the uniform ``Step`` of a window."""
+        data = np.zeros(20, np.float32)
+        words = data.view(np.uint32)
+        camera = forward.camera
+        words[:8] = camera.width, camera.height, *area, forward.settings.samples, tiles
+        data[8:11] = background
+        data[12:16] = rates.l1, rates.ssim, rates.l2, rates.epsilon
+        data[16:20] = rates.colors, rates.positions, 1 - rates.betas[0], 1 - rates.betas[1]
+        self.device.device.queue.write_buffer(self._buffers["step"], 0, data)

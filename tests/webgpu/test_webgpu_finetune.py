@@ -1,0 +1,250 @@
+"""Fine-tuning on the GPU: the steps of the CPU, but for rounding."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _gpu import need_gpu
+
+from meshsplats.conversion import convert
+from meshsplats.datasets.splat_targets import splat_dataset
+from meshsplats.demo_scene import make_scene
+from meshsplats.errors import DivergenceError, MissingDependencyError
+from meshsplats.finetuning import RunOptions, finetune, make_config
+from meshsplats.finetuning.state import State
+from meshsplats.finetuning.step import importance, make_step
+from meshsplats.webgpu import gradients
+from meshsplats.webgpu.renderer import DrawSettings
+
+GPU = RunOptions(device="gpu")
+TOLERANCE = 1e-4
+"""Of losses, and of the changes of colours and positions after a few steps, relative."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A data set of images of splats, and their mesh."""
+    cloud = make_scene(200)
+    dataset = splat_dataset(cloud, train=6, test=2, width=40, sh_degree=0)
+    return dataset, convert(cloud, cameras=[view.camera for view in dataset.train])
+
+
+def steps(scene, device, count: int = 5, **options) -> tuple[list[float], State]:
+    """The losses of the first steps, and the state after them."""
+    dataset, mesh = scene
+    config = make_config(steps=count, **options)
+    state = State.begin(mesh, len(dataset.train), config, None, device)
+    losses = [make_step(state, dataset.train, i, i / count) for i in range(count)]
+    assert None not in losses
+    return [loss for loss in losses if loss is not None], state
+
+
+OPTIONS = [
+    {},
+    {"background": "random"},
+    {"samples": 1, "l2_weight": 0.0},
+    {"ssim_weight": 0.0},
+    {"soft_edges": False, "position_unit": "scene", "position_rate": 1e-3},
+    {"position_rate": 0.0},
+    {"blending": "linear"},
+    {"relocate_share": 0.1},
+]
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=lambda options: ", ".join(options) or "default")
+def test_steps_are_those_of_the_cpu(scene, options):
+    need_gpu()
+    losses, state = steps(scene, "gpu", **options)
+    expected, known = steps(scene, "cpu", **options)
+    assert np.allclose(losses, expected, rtol=TOLERANCE)
+    for name in ("vertices", "colors"):
+        before, after = getattr(known.mesh, name), getattr(known, name)
+        change = np.linalg.norm(after - before)
+        assert change > 0 or (name == "vertices" and options.get("position_rate") == 0)
+        assert np.linalg.norm(getattr(state, name) - after) <= TOLERANCE * change
+
+
+def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene):
+    need_gpu()
+    dataset, _ = scene
+    camera = dataset.train[0].camera
+    assert steps(scene, "gpu")[1].trains_on_gpu(camera)
+    assert not steps(scene, "cpu", 0)[1].trains_on_gpu(camera)
+    for options in ({"blending": "linear"}, {"relocate_share": 0.1}, {"exposure": True}):
+        assert not steps(scene, "gpu", 0, **options)[1].trains_on_gpu(camera)
+    assert not steps(scene, "gpu", 0)[1].trains_on_gpu(replace(camera, width=2000, height=2000))
+
+
+def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
+    need_gpu()
+    from meshsplats.finetuning import state as module
+
+    dataset, mesh = scene
+    expected, known = steps(scene, "gpu")
+    config = make_config(steps=5)
+    state = State.begin(mesh, len(dataset.train), config, None, "gpu")
+    losses = []
+    for i in range(5):
+        monkeypatch.setattr(module, "MAX_PIXELS", 0 if i in (1, 3) else 1 << 20)
+        losses.append(make_step(state, dataset.train, i, i / 5))
+    assert np.allclose(losses, expected, rtol=TOLERANCE)
+    change = np.linalg.norm(known.vertices - mesh.vertices)
+    assert np.linalg.norm(state.vertices - known.vertices) <= TOLERANCE * change
+
+
+def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
+    need_gpu()
+    expected, known = steps(scene, "gpu")
+    monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 10_000)  # as if there were more fragments
+    losses, state = steps(scene, "gpu")
+    assert state._trainer is not None
+    assert state._trainer._window_samples < 1 << 22
+    assert np.allclose(losses, expected, rtol=TOLERANCE)
+    change = np.linalg.norm(known.vertices - known.mesh.vertices)
+    assert np.linalg.norm(state.vertices - known.vertices) <= TOLERANCE * change
+
+
+def test_nothing_changes_if_the_loss_or_a_gradient_is_not_finite(scene):
+    need_gpu()
+    dataset, mesh = scene
+    state = State.begin(mesh, len(dataset.train), make_config(steps=5), None, "gpu")
+    make_step(state, dataset.train, 0, 0.0)
+    before = {name: array.copy() for name, array in state.arrays().items()}
+    image = dataset.train[0].load()
+    color = image.color.astype(np.float32)
+    color[3, 4, 1] = np.nan
+    alpha = None if image.alpha is None else image.alpha.astype(np.float32)
+    broken = replace(image, color=color, alpha=alpha)
+    views = [replace(view, source=broken) for view in dataset.train]
+    with pytest.raises(DivergenceError, match="the loss is not finite"):
+        make_step(state, views, 1, 0.2)
+    target, camera = dataset.train[0].image, dataset.train[0].camera
+    loss = (0.0, 0.0, 3e38)  # the sums are finite, the gradients are not
+    sums = state.step_on_gpu(camera, DrawSettings(), target, None, (0, 0, 0), loss, (0.02, 0.02))
+    assert np.isfinite(sums[:3]).all()
+    assert not sums.finite
+    after = state.arrays()
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_masked_pixels_do_not_count(scene):
+    need_gpu()
+    dataset, mesh = scene
+    rng = np.random.default_rng(0)
+    views = []
+    for view in dataset.train:
+        image = view.load()
+        mask = rng.random(image.color.shape[:2]) < 0.7
+        views.append(replace(view, source=replace(image, mask=mask)))
+    masked = replace(dataset, train=tuple(views))
+    losses, _ = steps((masked, mesh), "gpu")
+    expected, _ = steps((masked, mesh), "cpu")
+    assert np.allclose(losses, expected, rtol=TOLERANCE)
+    assert not np.allclose(losses, steps(scene, "cpu")[0], rtol=0.01)
+
+
+def test_the_same_bits_every_time(scene):
+    need_gpu()
+    one, two = (steps(scene, "gpu")[1] for _ in range(2))
+    assert one.vertices.tobytes() == two.vertices.tobytes()
+    assert one.colors.tobytes() == two.colors.tobytes()
+
+
+def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
+    need_gpu()
+    dataset, mesh = scene
+    config = make_config(steps=8)
+    whole = finetune(mesh, dataset, config, run=replace(GPU, report_every=0))
+    folder = tmp_path / "run"
+
+    class Stop(Exception):
+        pass
+
+    def after(progress) -> None:
+        if progress.step == 3:
+            raise Stop
+
+    run = RunOptions(folder, device="gpu", report_every=0, preview_every=0, checkpoint_seconds=1e-9)
+    with pytest.raises(Stop):
+        finetune(mesh, dataset, config, run=run, on_progress=after)
+    tuned = finetune(mesh, dataset, config, run=replace(run, resume=True))
+    assert tuned.vertices.tobytes() == whole.vertices.tobytes()
+    assert tuned.colors.tobytes() == whole.colors.tobytes()
+    assert np.array_equal(tuned.faces, whole.faces)
+
+
+def test_a_run_gets_better_and_is_scored_and_pruned(scene, tmp_path):
+    need_gpu()
+    dataset, mesh = scene
+    losses = []
+    tuned = finetune(
+        mesh,
+        dataset,
+        make_config(epochs=6, prune_epochs=2, prune_importance=0.5),
+        run=RunOptions(tmp_path / "run", device="gpu", report_every=10),
+        on_progress=lambda progress: losses.append(progress.loss),
+    )
+    assert np.mean(losses[-6:]) < 0.7 * np.mean(losses[:6])
+    assert 0 < len(tuned.faces) < len(mesh.faces)
+
+
+def test_visible_pixels_are_those_of_the_core(scene):
+    need_gpu()
+    dataset, _ = scene
+    found = [importance(steps(scene, device, 0)[1], dataset.train) for device in ("gpu", "cpu")]
+    assert np.allclose(found[0][0], found[1][0], rtol=1e-4, atol=1e-4)
+    assert np.array_equal(found[0][1], found[1][1])
+
+
+def test_what_needs_the_cpu_is_an_error_before_anything_is_written(scene, tmp_path):
+    dataset, mesh = scene
+    run = RunOptions(tmp_path / "run", device="gpu")
+    with pytest.raises(ValueError, match="opacity 'cutoff' needs device 'cpu'"):
+        finetune(mesh, dataset, make_config(steps=1, opacity="cutoff"), run=run)
+    with pytest.raises(ValueError, match="device must be 'cpu' or 'gpu', got 'cuda'"):
+        RunOptions(device="cuda")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_wgpu_there_is_an_error_and_nothing_is_written(scene, tmp_path, monkeypatch, capsys):
+    from meshsplats import save_mesh
+    from meshsplats.cli import main
+    from meshsplats.webgpu.device import open_device
+
+    dataset, mesh = scene
+    save_mesh(mesh, tmp_path / "mesh.npz")
+    open_device.cache_clear()
+    monkeypatch.setitem(sys.modules, "wgpu", None)
+    try:
+        with pytest.raises(MissingDependencyError, match="the GPU needs wgpu"):
+            finetune(mesh, dataset, make_config(steps=1), run=RunOptions(tmp_path / "run", device="gpu"))
+        words = [
+            "finetune",
+            str(tmp_path / "missing.ply"),
+            "-o",
+            str(tmp_path / "tuned.npz"),
+            "--device",
+            "gpu",
+        ]
+        assert main(words) == 5
+        assert "pip install 'meshsplats[gpu]'" in capsys.readouterr().err
+        assert main([*words, "--tuning.opacity", "cutoff"]) == 2
+    finally:
+        open_device.cache_clear()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.npz"]
+
+
+def test_the_command(tmp_path):
+    need_gpu()
+    from meshsplats import load_mesh, save_gaussians
+    from meshsplats.cli import main
+
+    save_gaussians(make_scene(200), tmp_path / "scene.ply")
+    out = tmp_path / "tuned.npz"
+    words = [str(tmp_path / "scene.ply"), "-o", str(out), "--device", "gpu", "--width", "32", "--steps", "3"]
+    assert main(["finetune", *words]) == 0
+    assert len(load_mesh(out).faces)
+    assert main(["finetune", *words, "--steps", "5", "--resume", "--force"]) == 0
