@@ -36,7 +36,7 @@ def steps(scene, device, count: int = 5, **options) -> tuple[list[float], State]
     """The losses of the first steps, and the state after them."""
     dataset, mesh = scene
     config = make_config(steps=count, **options)
-    state = State.begin(mesh, len(dataset.train), config, None, device)
+    state = State.begin(mesh, len(dataset.train), config, None, device=device)
     losses = [make_step(state, dataset.train, i, i / count) for i in range(count)]
     assert None not in losses
     return [loss for loss in losses if loss is not None], state
@@ -85,7 +85,7 @@ def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
     dataset, mesh = scene
     expected, known = steps(scene, "gpu")
     config = make_config(steps=5)
-    state = State.begin(mesh, len(dataset.train), config, None, "gpu")
+    state = State.begin(mesh, len(dataset.train), config, None, device="gpu")
     losses = []
     for i in range(5):
         monkeypatch.setattr(module, "MAX_PIXELS", 0 if i in (1, 3) else 1 << 20)
@@ -110,7 +110,7 @@ def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
 def test_nothing_changes_if_the_loss_or_a_gradient_is_not_finite(scene):
     need_gpu()
     dataset, mesh = scene
-    state = State.begin(mesh, len(dataset.train), make_config(steps=5), None, "gpu")
+    state = State.begin(mesh, len(dataset.train), make_config(steps=5), None, device="gpu")
     make_step(state, dataset.train, 0, 0.0)
     before = {name: array.copy() for name, array in state.arrays().items()}
     image = dataset.train[0].load()

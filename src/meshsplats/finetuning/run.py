@@ -219,11 +219,11 @@ def _run_start(
     """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
     if journal is None:
-        state = State.begin(mesh, views, config, options.threads, frozen, options.device)
+        state = State.begin(mesh, views, config, options.threads, frozen=frozen, device=options.device)
         return RunStart(state, ("", ""), mesh)
     fingerprints = mesh_fingerprint(mesh, frozen), dataset_fingerprint(dataset)
     if not options.resume:
-        state = State.begin(mesh, views, config, options.threads, frozen, options.device)
+        state = State.begin(mesh, views, config, options.threads, frozen=frozen, device=options.device)
         if not options.ranks.index:
             journal.begin(config.to_dict())
         return RunStart(state, fingerprints, mesh)

@@ -112,6 +112,7 @@ class State:
         views: int,
         config: FinetuneConfig,
         threads: int | None,
+        *,
         frozen: np.ndarray | None = None,
         device: Device = "cpu",
     ) -> State:
