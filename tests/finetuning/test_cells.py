@@ -8,15 +8,17 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from meshsplats import finetune, load_mesh, make_config, save_gaussian_blocks, splat_dataset
 from meshsplats.cli import main
-from meshsplats.cluster import Shared, open_workers
+from meshsplats.cluster import Shared, Workers, open_workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.streaming import joined
 from meshsplats.datasets.views import Dataset, ImageCache, View, ViewImage
@@ -152,7 +154,7 @@ def test_frozen_vertices_stay(held, tmp_path):
 
     def stop(progress):
         if progress.step == 17:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     run = RunOptions(folder=tmp_path / "run", threads=1, report_every=0, preview_every=0)
     with pytest.raises(Interrupted):
@@ -201,6 +203,40 @@ def test_a_cluster_gives_the_same_bits(held, whole_run, tmp_path):
     assert digests(run) == digests(whole_run)
 
 
+class Deadly(Workers):
+    """Ends a worker once, when the checkpoint of a cell is there."""
+
+    def __init__(self, workers, folder):
+        super().__init__(workers.threads)
+        self.workers, self.folder = workers, folder
+
+    def run(self, function, tasks):
+        return self.workers.run(partial(end_once, self.folder, function), tasks)
+
+
+def end_once(folder, function, task):
+    def watch():
+        while not list(folder.glob("run/cells/*/checkpoint.safetensors")):
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    try:
+        os.close(os.open(folder / "ended", os.O_CREAT | os.O_EXCL))
+        threading.Thread(target=watch, daemon=True).start()
+    except FileExistsError:
+        pass
+    return function(task)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_cells_outlive_a_killed_worker(held, whole_run, tmp_path):
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    with open_workers("local") as workers:
+        run = tuned(tmp_path / "run", held, workers=Deadly(workers, tmp_path))
+    assert (tmp_path / "ended").exists()
+    assert digests(run) == digests(whole_run)
+
+
 def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeypatch):
     """Finished cells are not repeated, and a cell goes on from its checkpoint."""
     real = in_cells.finetune
@@ -213,7 +249,7 @@ def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeyp
         def stop(progress):
             steps.append(progress.step)
             if len(steps) == cut:
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
 
         return real(mesh, dataset, config, run=run, frozen=frozen, on_progress=stop)
 
