@@ -15,8 +15,17 @@ from functools import partial
 
 import numpy as np
 import pytest
+from _photographs import write_photographs
 
-from meshsplats import finetune, load_mesh, make_config, save_gaussian_blocks, splat_dataset
+from meshsplats import (
+    finetune,
+    load_mesh,
+    make_config,
+    orbit,
+    render_splats,
+    save_gaussian_blocks,
+    splat_dataset,
+)
 from meshsplats.cli import main
 from meshsplats.cluster import Shared, Workers, open_workers
 from meshsplats.conversion import ConversionOptions
@@ -350,3 +359,24 @@ def test_the_command_tunes_in_cells(tmp_path, capsys):
     assert main([*words, "--resume", "--force"]) == 0
     np.testing.assert_array_equal(load_mesh(out).vertices, mesh.vertices)
     assert main([*words, "--force", "--preset", "paper", "--steps", "4"]) == 0
+
+
+@pytest.mark.parametrize("kind", ["splats", "photographs"])
+def test_the_command_has_the_same_bits_on_a_cluster(kind, tmp_path):
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    splats = tmp_path / "city.ply"
+    save_gaussian_blocks(city_blocks(1000, degree=0), splats, 1000)
+    words = ["finetune", str(splats), "--steps", "12", "--cell-splats", "500", "--threads", "1"]
+    if kind == "photographs":
+        cloud = joined(list(city_blocks(1000, degree=0)))
+        cameras = orbit(cloud, 6, width=40, height=40, elevation=30)
+        images = [render_splats(cloud, camera, background=(1, 1, 1)).color for camera in cameras]
+        write_photographs(tmp_path / "data", cameras, images)
+        words += ["--data", str(tmp_path / "data")]
+    else:
+        words += ["--views", "6", "--width", "40", "--held-out", "0"]
+    assert main([*words, "-o", str(tmp_path / "here.npz")]) == 0
+    assert main([*words, "-o", str(tmp_path / "there.npz"), "--cluster", "local"]) == 0
+    here, there = (load_mesh(tmp_path / f"{name}.npz") for name in ("here", "there"))
+    for name in ("vertices", "colors", "faces", "face_splat"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))

@@ -23,7 +23,7 @@ _STARTED = "TORCHELASTIC_RUN_ID"
 
 
 class Part(NamedTuple):
-    """What a rank has found in a step."""
+    """The findings of a rank in a step."""
 
     vertices: np.ndarray
     """(v, 3) float32 sum of the gradients of its views."""
