@@ -287,7 +287,37 @@ def test_a_configuration_file_names_no_cluster(splats, tmp_path, capsys):
     assert "cluster" in capsys.readouterr().err
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_a_killed_command_with_workers_is_resumed(splats, tmp_path):
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
+    words = [sys.executable, "-c", TILES, str(splats), str(tmp_path / "there")]
+    process = subprocess.Popen([*words, "new"])
+    made = tmp_path / "there.partial" / "tileset"
+    while len(list(made.rglob("*.glb"))) < 4 and process.poll() is None:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "there").exists()
+    subprocess.run([*words, "resume"], check=True)
+    assert digest(tmp_path / "there") == digest(tmp_path / "here")
+
+
 # ---- Full disks, lost schedulers
+
+
+TILES = """
+import sys
+from meshsplats import open_workers, stream_gaussians
+from meshsplats.tiles import building
+if __name__ == "__main__":
+    building.BUCKET = 3000
+    with open_workers("local") as workers:
+        building.build_tiles(
+            stream_gaussians(sys.argv[1]), sys.argv[2], building.TileOptions(max_triangles=4096),
+            resume=sys.argv[3] == "resume", workers=workers,
+        )
+"""
 
 
 LIMITED = """

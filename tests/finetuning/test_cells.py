@@ -8,15 +8,26 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from _photographs import write_photographs
 
-from meshsplats import finetune, load_mesh, make_config, save_gaussian_blocks, splat_dataset
+from meshsplats import (
+    finetune,
+    load_mesh,
+    make_config,
+    orbit,
+    render_splats,
+    save_gaussian_blocks,
+    splat_dataset,
+)
 from meshsplats.cli import main
-from meshsplats.cluster import Shared, open_workers
+from meshsplats.cluster import Shared, Workers, open_workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.streaming import joined
 from meshsplats.datasets.views import Dataset, ImageCache, View, ViewImage
@@ -152,7 +163,7 @@ def test_frozen_vertices_stay(held, tmp_path):
 
     def stop(progress):
         if progress.step == 17:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
 
     run = RunOptions(folder=tmp_path / "run", threads=1, report_every=0, preview_every=0)
     with pytest.raises(Interrupted):
@@ -201,6 +212,40 @@ def test_a_cluster_gives_the_same_bits(held, whole_run, tmp_path):
     assert digests(run) == digests(whole_run)
 
 
+class Deadly(Workers):
+    """Ends a worker once, when the checkpoint of a cell is there."""
+
+    def __init__(self, workers, folder):
+        super().__init__(workers.threads)
+        self.workers, self.folder = workers, folder
+
+    def run(self, function, tasks):
+        return self.workers.run(partial(end_once, self.folder, function), tasks)
+
+
+def end_once(folder, function, task):
+    def watch():
+        while not list(folder.glob("run/cells/*/checkpoint.safetensors")):
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    try:
+        os.close(os.open(folder / "ended", os.O_CREAT | os.O_EXCL))
+        threading.Thread(target=watch, daemon=True).start()
+    except FileExistsError:
+        pass
+    return function(task)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_cells_outlive_a_killed_worker(held, whole_run, tmp_path):
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    with open_workers("local") as workers:
+        run = tuned(tmp_path / "run", held, workers=Deadly(workers, tmp_path))
+    assert (tmp_path / "ended").exists()
+    assert digests(run) == digests(whole_run)
+
+
 def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeypatch):
     """Finished cells are not repeated, and a cell goes on from its checkpoint."""
     real = in_cells.finetune
@@ -213,7 +258,7 @@ def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeyp
         def stop(progress):
             steps.append(progress.step)
             if len(steps) == cut:
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
 
         return real(mesh, dataset, config, run=run, frozen=frozen, on_progress=stop)
 
@@ -314,3 +359,24 @@ def test_the_command_tunes_in_cells(tmp_path, capsys):
     assert main([*words, "--resume", "--force"]) == 0
     np.testing.assert_array_equal(load_mesh(out).vertices, mesh.vertices)
     assert main([*words, "--force", "--preset", "paper", "--steps", "4"]) == 0
+
+
+@pytest.mark.parametrize("kind", ["splats", "photographs"])
+def test_the_command_has_the_same_bits_on_a_cluster(kind, tmp_path):
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    splats = tmp_path / "city.ply"
+    save_gaussian_blocks(city_blocks(1000, degree=0), splats, 1000)
+    words = ["finetune", str(splats), "--steps", "12", "--cell-splats", "500", "--threads", "1"]
+    if kind == "photographs":
+        cloud = joined(list(city_blocks(1000, degree=0)))
+        cameras = orbit(cloud, 6, width=40, height=40, elevation=30)
+        images = [render_splats(cloud, camera, background=(1, 1, 1)).color for camera in cameras]
+        write_photographs(tmp_path / "data", cameras, images)
+        words += ["--data", str(tmp_path / "data")]
+    else:
+        words += ["--views", "6", "--width", "40", "--held-out", "0"]
+    assert main([*words, "-o", str(tmp_path / "here.npz")]) == 0
+    assert main([*words, "-o", str(tmp_path / "there.npz"), "--cluster", "local"]) == 0
+    here, there = (load_mesh(tmp_path / f"{name}.npz") for name in ("here", "there"))
+    for name in ("vertices", "colors", "faces", "face_splat"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))

@@ -240,7 +240,7 @@ class Render(Command):
         return convert(scene)
 
     def load(self) -> GaussianCloud | SplatMesh | Tileset:
-        """What the images show, from the input."""
+        """The scene of the images, from the input."""
         return self._tileset() or self._drawable(self.part.of(load_scene(self.input, self.reading)))
 
     def _draw(

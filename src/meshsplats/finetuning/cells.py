@@ -15,7 +15,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -143,10 +143,17 @@ def waves(cells: Cells, means: np.ndarray) -> list[list[int]]:
 
 @dataclass(frozen=True, eq=False)
 class CellScene:
-    """What the tasks of a run need in each process."""
+    """Splats and views, which every process of a run needs."""
 
     cloud: GaussianCloud
     dataset: Dataset
+    _divided: dict[int, Cells] = field(default_factory=dict, init=False, repr=False)
+
+    def cells(self, most: int) -> Cells:
+        """The splats in cells of at most ``most``; divided once."""
+        if most not in self._divided:
+            self._divided[most] = divide(self.cloud.means, most)
+        return self._divided[most]
 
 
 class TunedCells:
@@ -215,7 +222,7 @@ def finetune_cells(
         raise ValueError("the data set has no training views")
     if not len(here.cloud):
         raise ValueError("there is no splat to fine-tune")
-    cells = divide(here.cloud.means, options.splats)
+    cells = here.cells(options.splats)
     count = len(cells.low)
     folder = run.folder / "cells"
     _begin(run, folder, config, options, here, count)
@@ -238,7 +245,7 @@ def finetune_cells(
                 seconds = time.perf_counter() - start
                 left = seconds / fresh * (count - len(done))
                 share = len(done) / count
-                on_progress(Progress(len(done), count, share, None, None, seconds, left, 0))
+                on_progress(Progress(steps, None, share, None, None, seconds, left, 0))
         before += tuple(wave)
     return TunedCells([task.file(cell) for cell in range(count)])
 
@@ -313,9 +320,9 @@ class _Tuning:
 
     def coarsen(self, cell: int) -> None:
         """Writes the splats that stand for ``cell``."""
-        cloud = self.scene.get().cloud
-        own = divide(cloud.means, self.options.splats).own(cell)
-        save_gaussians(self._few(cloud.select(own), len(cloud)), self.coarse_file(cell))
+        scene = self.scene.get()
+        own = scene.cells(self.options.splats).own(cell)
+        save_gaussians(self._few(scene.cloud.select(own), len(scene.cloud)), self.coarse_file(cell))
 
     def _few(self, part: GaussianCloud, every: int) -> GaussianCloud:
         """``part`` of ``every`` splats, merged."""
@@ -327,7 +334,7 @@ class _Tuning:
         """Writes the tuned mesh of a cell after those ``before``; the count of its steps."""
         cell, before = task
         scene = self.scene.get()
-        cells = divide(scene.cloud.means, self.options.splats)
+        cells = scene.cells(self.options.splats)
         own, margin = cells.own(cell), cells.margin(cell, scene.cloud.means)
         done = np.isin(cells.owner[margin], before)
         views = _views_that_see(scene.cloud.means[own], scene.dataset.train)

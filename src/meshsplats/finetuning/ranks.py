@@ -23,7 +23,7 @@ _STARTED = "TORCHELASTIC_RUN_ID"
 
 
 class Part(NamedTuple):
-    """What a rank has found in a step."""
+    """The findings of a rank in a step."""
 
     vertices: np.ndarray
     """(v, 3) float32 sum of the gradients of its views."""
@@ -121,9 +121,9 @@ class _TorchRanks(Ranks):
             if i == self.index and i < 2:
                 continue
             count = int(head[0])
+            where = all_rows[i][:count].astype(np.intp)
             for array, added in ((vertices, all_vertices[i]), (colors, all_colors[i])):
-                where = all_rows[i][:count]
-                array[where] = _rows_of(array, where, count) + added[:count]
+                _add_rows(array, where, added[:count])
         loss, views = (float(sum(head[i] for head in heads)) for i in (1, 2))
         failed = next((int(head[3]) for head in heads if head[3]), 0)
         return Part(vertices, colors, loss, int(views), failed)
@@ -158,3 +158,11 @@ def _rows_of(array: np.ndarray, rows: np.ndarray, length: int) -> np.ndarray:
     np.take(array, rows, axis=0, out=result[: len(rows)], mode="clip")
     result[len(rows) :] = 0
     return result
+
+
+def _add_rows(array: np.ndarray, rows: np.ndarray, added: np.ndarray) -> None:
+    """Adds ``added`` to the ``rows`` of ``array``, which differ."""
+    total = _rows_of(array, rows, len(rows))
+    total += added
+    whole = np.dtype((np.void, array.itemsize * array.shape[1]))  # a row at a time: twice as fast
+    array.view(whole).reshape(-1)[rows] = total.view(whole).reshape(-1)

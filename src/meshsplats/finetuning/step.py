@@ -190,7 +190,7 @@ def loss_of(
 
 
 class ViewGradients(NamedTuple):
-    """What a view says about the state."""
+    """Loss and gradients of a view."""
 
     loss: float
     gradients: Gradients | None
