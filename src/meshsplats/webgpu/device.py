@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from meshsplats.errors import DeviceError, MissingDependencyError
@@ -38,7 +40,6 @@ class Device:
     """A device with WebGPU's core limits: no features, 8 storage buffers a stage, 128 MiB a binding."""
 
     def __init__(self, adapter: Any) -> None:
-        self.adapter = adapter
         self.info: dict[str, str] = {key: str(value) for key, value in dict(adapter.info).items()}
         self.device: Any = adapter.request_device_sync(required_limits=CORE_LIMITS)
         self.binding_limit = CORE_BINDING
@@ -67,6 +68,20 @@ class Device:
         return f"{info['device']} ({kind.get(info['adapter_type'], 'unknown kind')}, {info['backend_type']})"
 
 
+@contextlib.contextmanager
+def _without_display() -> Iterator[None]:
+    """Without a session, Mesa's choice of the display's GPU only writes an error line to stderr: left out."""
+    name = "NODEVICE_SELECT"
+    if os.environ.get("XDG_RUNTIME_DIR") or name in os.environ:
+        yield
+        return
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[name]
+
+
 def find_adapters() -> list[Any]:
     """The adapters of this machine, the best first.
 
@@ -78,7 +93,8 @@ def find_adapters() -> list[Any]:
     except ImportError as error:
         raise MissingDependencyError(f"the GPU needs wgpu ({error}): {GET_WGPU}") from None
     try:
-        adapters = list(wgpu.gpu.enumerate_adapters_sync())
+        with _without_display():
+            adapters = list(wgpu.gpu.enumerate_adapters_sync())
     except (RuntimeError, OSError) as error:
         raise MissingDependencyError(f"wgpu finds no graphics driver: {error}") from None
 

@@ -27,7 +27,6 @@ MAX_PAIRS = 16_000_000
 """Pairs of a run and a tile in one frame."""
 
 MAX_RUNS = 1 << 24
-MAX_FACES = 1 << 29
 
 Output = Literal["color", "depth", "vertex_normals", "face_normals"]
 OUTPUTS: tuple[Output, ...] = ("color", "depth", "vertex_normals", "face_normals")

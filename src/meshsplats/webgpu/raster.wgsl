@@ -18,7 +18,6 @@ const GROUPS = $GROUPS;        // whether the mesh has depth groups
 @group(0) @binding(7) var<storage, read_write> next_work: array<atomic<u32>>;  // tiles to walk again, as `work`
 @group(0) @binding(8) var<storage, read_write> counters: array<atomic<u32>>;
 
-const SLOTS = 64u;             // triangles that are set up together
 const OWNER = 0x20000000u;     // with the face: bit i says that edge i owns the samples on it
 const FACE = 0x1fffffffu;
 
