@@ -11,7 +11,7 @@ import tyro
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import Output, check_mesh_suffix, load_scene
+from meshsplats.cli.common import Output, SplatOptions, check_mesh_suffix, load_scene
 from meshsplats.cli.messages import command_line
 from meshsplats.cli.training import (
     Plan,
@@ -67,6 +67,7 @@ class Finetune(TrainingCommand):
     """Conversion of splats; same: that of --preset. default: one ellipse of 8 triangles per splat. paper: the
     paper's conversion, also for published."""
     conversion: StartOptions = field(default_factory=StartOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
 
     def configured(self) -> FinetuneConfig:
         return make_config(self.preset, **self.explicit_settings())

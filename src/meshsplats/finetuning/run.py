@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -146,7 +146,7 @@ def finetune(
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     loop = TrainingLoop(
-        _run_start(mesh, dataset, config, run, journal), dataset, config, run, journal, on_progress
+        run_start(mesh, dataset, config, run, journal), dataset, config, run, journal, on_progress
     )
     return loop.run()
 
@@ -168,7 +168,7 @@ class RunStart:
     """Losses of the steps since the last line of the metrics."""
 
 
-def _run_start(
+def run_start(
     mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig, options: RunOptions, journal: Journal | None
 ) -> RunStart:
     """Begins or resumes the run in the folder of ``journal``."""
@@ -248,9 +248,6 @@ class TrainingLoop:
 
     def run(self) -> SplatMesh:
         """Takes all steps. Interrupted, after a checkpoint, if a signal arrived."""
-        views = self.dataset.train
-        prune_interval = self.config.prune_interval(len(views))
-        relocate_interval = self.config.relocate_interval(len(views))
         with StopSignals() as signals:
             if self.step == 0:
                 self._report()
@@ -261,21 +258,13 @@ class TrainingLoop:
                     self._save_checkpoint()
                     raise Interrupted(self.step, signals.received)
                 start = time.perf_counter()
-                loss = make_step(self.state, views, self.step, self.fraction)
+                loss = make_step(self.state, self._views(), self.step, self.fraction)
                 self.step_cost = time.perf_counter() - start
                 self.step += 1
                 if loss is not None:
                     self.losses.append(loss)
                     self.last_loss = loss
-                if self._settles():
-                    self._remove_hidden()
-                if self._becomes_hybrid():
-                    self._cut()
-                if prune_interval and self.step % prune_interval == 0 and not self._done():
-                    self.state = self.state.prune(kept_faces(self.state, views))
-                due = relocate_interval and self.step % relocate_interval == 0
-                if due and self.fraction <= RELOCATION_END:
-                    relocate(self.state, views)
+                self._adapt()
                 report_interval = self.options.report_every
                 if report_interval and self.step % report_interval == 0 and not self._done():
                     self._report()
@@ -297,6 +286,25 @@ class TrainingLoop:
         mesh = self.state.result()
         uncut = self.config.opacity == "cutoff" and self.state.solid is None
         return cut_mesh(mesh, self.config.cutoff) if uncut else mesh
+
+    def _views(self) -> Sequence[View]:
+        """The training views of the next step."""
+        return self.dataset.train
+
+    def _adapt(self) -> None:
+        """Removes and relocates triangles after a step, where that is due."""
+        views = self.dataset.train
+        if self._settles():
+            self._remove_hidden()
+        if self._becomes_hybrid():
+            self._cut()
+        prune_interval = self.config.prune_interval(len(views))
+        if prune_interval and self.step % prune_interval == 0 and not self._done():
+            self.state = self.state.prune(kept_faces(self.state, views))
+        relocate_interval = self.config.relocate_interval(len(views))
+        due = relocate_interval and self.step % relocate_interval == 0
+        if due and self.fraction <= RELOCATION_END:
+            relocate(self.state, views)
 
     def _settles(self) -> bool:
         """Whether it is time to remove the triangles that no training view shows: once."""
