@@ -23,7 +23,7 @@ FLOORS = (
     ("conversion", "datasets", "viewer"),
     ("evaluation",),
     ("finetuning",),
-    ("levels", "prior", "tiles"),
+    ("levels", "prior", "tiles", "training"),
     ("blender",),
     ("cli",),
     ("__main__",),

@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.conversion import ConversionOptions, bake_filter, convert, simplify
     from meshsplats.conversion.streaming import convert_blocks
     from meshsplats.datasets.folder import load_dataset
+    from meshsplats.datasets.points import load_points
     from meshsplats.datasets.splat_targets import splat_dataset
     from meshsplats.datasets.views import Dataset, View, ViewImage
     from meshsplats.errors import DataWarning, DivergenceError, FileFormatError, MissingDependencyError
@@ -58,6 +59,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.tiles.building import TileOptions, build_tiles
     from meshsplats.tiles.drawing import render_tiles
     from meshsplats.tiles.tileset import Tileset
+    from meshsplats.training import TrainConfig, train, train_config
     from meshsplats.viewer.page import PageOptions, make_page
 
 try:
@@ -74,6 +76,7 @@ _HOME = {
     "meshsplats.conversion": ("ConversionOptions", "bake_filter", "convert", "simplify"),
     "meshsplats.conversion.streaming": ("convert_blocks",),
     "meshsplats.datasets.folder": ("load_dataset",),
+    "meshsplats.datasets.points": ("load_points",),
     "meshsplats.datasets.splat_targets": ("splat_dataset",),
     "meshsplats.datasets.views": ("Dataset", "View", "ViewImage"),
     "meshsplats.errors": ("DataWarning", "DivergenceError", "FileFormatError", "MissingDependencyError"),
@@ -103,6 +106,7 @@ _HOME = {
     "meshsplats.tiles.building": ("TileOptions", "build_tiles"),
     "meshsplats.tiles.drawing": ("render_tiles",),
     "meshsplats.tiles.tileset": ("Tileset",),
+    "meshsplats.training": ("TrainConfig", "train", "train_config"),
     "meshsplats.viewer.page": ("PageOptions", "make_page"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
@@ -131,6 +135,7 @@ __all__ = [
     "SplatStream",
     "TileOptions",
     "Tileset",
+    "TrainConfig",
     "View",
     "ViewImage",
     "Workers",
@@ -152,6 +157,7 @@ __all__ = [
     "load_dataset",
     "load_gaussians",
     "load_mesh",
+    "load_points",
     "load_prior",
     "look_around",
     "look_at",
@@ -175,6 +181,8 @@ __all__ = [
     "ssim",
     "starting_mesh",
     "stream_gaussians",
+    "train",
+    "train_config",
     "train_prior",
 ]
 

@@ -39,6 +39,7 @@ COMMANDS = {
     "render": ("meshsplats.cli.render:Render", "images of splats or a mesh, and a turntable"),
     "compare": ("meshsplats.cli.compare:Compare", "mesh against splats: PSNR, SSIM, images side by side"),
     "finetune": ("meshsplats.cli.finetune:Finetune", "a mesh optimised to look like splats or photographs"),
+    "train": ("meshsplats.cli.train:Train", "photographs to a mesh, without splats"),
     "simplify": ("meshsplats.cli.simplify:Simplify", "fewer splats that look the same"),
     "levels": ("meshsplats.cli.levels:Levels", "levels of detail: meshes for smaller and smaller sizes"),
     "tiles": ("meshsplats.cli.tiles:Tiles", "a 3D Tiles tileset of splats of any number"),

@@ -13,7 +13,15 @@ import tyro
 from meshsplats._arrays import subsample
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import ClusterOptions, Count, Output, check_mesh_suffix, load_scene, plural
+from meshsplats.cli.common import (
+    ClusterOptions,
+    Count,
+    Output,
+    SplatOptions,
+    check_mesh_suffix,
+    load_scene,
+    plural,
+)
 from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
     Plan,
@@ -80,6 +88,7 @@ class Finetune(TrainingCommand):
     cell_splats: Count = None
     """Tune splats in cells of at most N, in the memory of a cell, one after the other or by --cluster."""
     cluster: ClusterOptions = field(default_factory=ClusterOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
 
     def files(self) -> RunFiles:
         return RunFiles(self.output, self.cell_splats is not None)

@@ -11,7 +11,7 @@ import tyro
 
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.cameras.framing import guess_up
-from meshsplats.cli.common import File, Number, Output
+from meshsplats.cli.common import File, Number, Output, SplatOptions
 from meshsplats.cli.messages import UsageError, quoted
 from meshsplats.cli.training import (
     Plan,
@@ -82,6 +82,7 @@ class Prior(TrainingCommand):
     """Splats whose images are the targets, in place of --data: a file or a model folder."""
     laying: LayOptions = field(default_factory=LayOptions)
     tuning: PriorTuningOptions = field(default_factory=PriorTuningOptions)
+    reading: SplatOptions = field(default_factory=SplatOptions)
 
     @property
     def inputs(self) -> list[Path]:

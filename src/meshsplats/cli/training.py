@@ -22,7 +22,6 @@ from meshsplats.cli.common import (
     Count,
     Number,
     Output,
-    SplatOptions,
     check_outputs,
     chosen_background,
     draw_preview,
@@ -171,12 +170,14 @@ class Plan:
     """An optimisation that is ready to run."""
 
     mesh: SplatMesh | None
-    """Before the first step; None if it is made in cells."""
+    """What is optimised; None if it is made on the way."""
     dataset: Dataset
     summary: str
     background: Background | None
     """That of photographs; None without them."""
     optimise: Callable[[RunOptions, ShowProgress], Trained]
+    needed: int | None = None
+    """Estimated memory in bytes, which is there; None: that of fine-tuning ``mesh``, if there is one."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,6 @@ class TrainingCommand(Command):
     """Continue an interrupted run of the same command; with --force also one that has ended, for longer."""
     target: TargetOptions = field(default_factory=TargetOptions)
     tuning: TuningOptions = field(default_factory=TuningOptions)
-    reading: SplatOptions = field(default_factory=SplatOptions)
     report_every: int = 100
     """Steps between two scores on held-out views."""
     preview_every: int = 500
@@ -220,6 +220,11 @@ class TrainingCommand(Command):
     def inputs(self) -> list[Path]:
         """Files that must not be overwritten."""
         return [self.input]
+
+    @property
+    def has_photographs(self) -> bool:
+        """Whether the targets are photographs."""
+        return self.target.data is not None
 
     def configured(self) -> FinetuneConfig:
         """The preset with the explicit settings."""
@@ -278,7 +283,7 @@ class TrainingCommand(Command):
                 self._record_start(files)
                 trained = plan.optimise(options, show)
         except Interrupted as stop:
-            return report_interrupt(stop, files)
+            return self.report_interrupt(stop, files)
         except OtherRunError as error:
             raise self._naming_options(error, files) from None
         save_mesh(trained.saved, files.mesh, alpha=trained.alpha)
@@ -304,13 +309,19 @@ class TrainingCommand(Command):
                 return 128 + stop.signal
         return 0
 
+    def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
+        """Says how to resume; returns the exit code."""
+        say(f"stopped after step {stop.step:,}; the checkpoint is in {files.folder}: the same command with")
+        say("  --resume continues from there")
+        return 128 + (stop.signal or signal.SIGINT)
+
     def save_more(self, files: RunFiles, plan: Plan) -> None:
         """Further files of the run."""
 
     def explicit_settings(self) -> dict[str, Any]:
         """The settings on the command line, with the length of the run."""
         tuning = {name: value for name, value in asdict(self.tuning).items() if value is not None}
-        if tuning.get("exposure") and self.target.data is None:
+        if tuning.get("exposure") and not self.has_photographs:
             raise UsageError("--exposure has no effect without --data: rendered images have one exposure")
         lengths = {name: getattr(self, name) for name in LENGTHS if getattr(self, name) is not None}
         if len(lengths) > 1:
@@ -431,22 +442,16 @@ def print_plan(plan: Plan, cache_bytes: int) -> None:
     from meshsplats.finetuning.memory import available_memory, check_memory, readable
 
     dataset = plan.dataset
+    needed = plan.needed
+    if needed is None and plan.mesh is not None:
+        needed = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes)
     camera = dataset.train[0].camera
-    views = f"{plural(len(dataset.train), 'training view')}, {len(dataset.test)} held out"
-    views += f", of {camera.width} x {camera.height} pixels"
-    if plan.mesh is None:
-        say(f"{plan.summary}; {views}")
-        return
-    needed, free = check_memory(plan.mesh, dataset, cache_bytes=cache_bytes), available_memory()
-    memory = f"memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else "")
-    say(f"{plan.summary}; {views}; {memory}")
-
-
-def report_interrupt(stop: Interrupted, files: RunFiles) -> int:
-    """Says how to resume; returns the exit code."""
-    say(f"stopped after step {stop.step:,}; the checkpoint is in {files.folder}: the same command with")
-    say("  --resume continues from there")
-    return 128 + (stop.signal or signal.SIGINT)
+    text = f"{plan.summary}; {plural(len(dataset.train), 'training view')}, {len(dataset.test)} held out"
+    text += f", of {camera.width} x {camera.height} pixels"
+    if needed is not None:
+        free = available_memory()
+        text += f"; memory: about {readable(needed)}" + (f" of {readable(free)} free" if free else "")
+    say(text)
 
 
 def _in_words(value: Any) -> str:

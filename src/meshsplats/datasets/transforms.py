@@ -62,6 +62,14 @@ def read_transforms(path: Path) -> Transforms:
     return Transforms([_frame(path, common, f, i) for i, f in enumerate(frames)], splits)
 
 
+def points_file(path: Path) -> str | None:
+    """The point cloud that ``path`` names, relative to its folder; None if it names none."""
+    named = _read_json(path).get("ply_file_path")
+    if named is not None and not isinstance(named, str):
+        raise FileFormatError(f"{path}: 'ply_file_path' must be a file name")
+    return named or None
+
+
 def _read_json(path: Path) -> dict[str, Any]:
     content = read_json(path)
     if not isinstance(content, dict):

@@ -30,18 +30,24 @@ def estimate_memory(mesh: SplatMesh, dataset: Dataset, cache_bytes: int = CACHE_
 
     It is estimated from array sizes; ``cache_bytes`` is the limit of the data set's image cache.
     """
-    views = dataset.views
-    vertex = VERTEX_BYTES + (BOUND_BYTES if mesh.binding is not None else 0)
+    vertex = BOUND_BYTES if mesh.binding is not None else 0
     vertex += FILTER_BYTES if mesh.filter_px2 else 0
+    count = len(mesh.vertices)
+    return estimate_bytes(count, len(mesh.faces), dataset, cache_bytes) + count * vertex
+
+
+def estimate_bytes(vertices: int, faces: int, dataset: Dataset, cache_bytes: int) -> int:
+    """The same for a mesh with numbers of ``vertices`` and ``faces``, without a filter and not on a base."""
+    views = dataset.views
     pixels = max((view.camera.width * view.camera.height for view in views), default=0)
     clouds = {id(v.source.cloud): v.source.cloud for v in views if isinstance(v.source, RenderedSplats)}
     arrays = (a for c in clouds.values() for a in (c.means, c.quaternions, c.scales, c.opacities, c.sh))
     return (
         BASE_BYTES
         + sum(array.nbytes for array in arrays)
-        + min(len(mesh.faces) * FACE_POOL_BYTES, POOL_LIMIT)
-        + len(mesh.vertices) * vertex
-        + len(mesh.faces) * FACE_BYTES
+        + min(faces * FACE_POOL_BYTES, POOL_LIMIT)
+        + vertices * VERTEX_BYTES
+        + faces * FACE_BYTES
         + pixels * PIXEL_BYTES
         + min(dataset.memory, cache_bytes)
     )
@@ -72,14 +78,20 @@ def available_memory() -> int | None:
 def check_memory(mesh: SplatMesh, dataset: Dataset, *, cache_bytes: int = CACHE_BYTES) -> int:
     """Returns ``estimate_memory``; raises MemoryError with advice if it exceeds ``available_memory``."""
     needed = estimate_memory(mesh, dataset, cache_bytes)
+    what = f"fine-tuning {len(mesh.vertices):,} vertices on {len(dataset.views):,} images"
+    check_bytes(needed, what, "convert fewer splats (--max-splats)")
+    return needed
+
+
+def check_bytes(needed: int, what: str, advice: str) -> None:
+    """Raises MemoryError if ``needed`` exceeds ``available_memory``. ``what``: the work; ``advice``: a way to
+    make it smaller."""
     available = available_memory()
     if available is not None and needed > available:
         raise MemoryError(
-            f"fine-tuning {len(mesh.vertices):,} vertices on {len(dataset.views):,} images needs about"
-            f" {readable(needed)}, {readable(available)} are free: convert fewer splats (--max-splats), use"
-            " smaller images (--downscale, --width), or keep fewer of them in memory (--cache)"
+            f"{what} needs about {readable(needed)}, {readable(available)} are free: {advice}, use smaller"
+            " images (--downscale, --width), or keep fewer of them in memory (--cache)"
         )
-    return needed
 
 
 def readable(size: float) -> str:

@@ -173,7 +173,7 @@ def finetune(
         open_device()
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
-    start = _run_start(mesh, dataset, config, run, journal, frozen)
+    start = run_start(mesh, dataset, config, run, journal, frozen)
     run.ranks.wait()  # before the first one writes what the others have read
     loop = TrainingLoop(start, dataset, config, run, None if run.ranks.index else journal, on_progress)
     del start
@@ -208,13 +208,13 @@ class RunStart:
     """Losses of the steps since the last line of the metrics."""
 
 
-def _run_start(
+def run_start(
     mesh: SplatMesh,
     dataset: Dataset,
     config: FinetuneConfig,
     options: RunOptions,
     journal: Journal | None,
-    frozen: np.ndarray | None,
+    frozen: np.ndarray | None = None,
 ) -> RunStart:
     """Begins or resumes the run in the folder of ``journal``."""
     views = len(dataset.train)
@@ -298,15 +298,7 @@ class TrainingLoop:
 
     def run(self) -> SplatMesh:
         """Takes all steps. Interrupted, after a checkpoint, if a signal arrived."""
-        views = self.dataset.train
-        prune_interval = self.config.prune_interval(len(views))
-        relocate_interval = self.config.relocate_interval(len(views))
         ranks = self.options.ranks
-
-        def due(interval: int) -> bool:
-            """Whether the steps just taken have come to a multiple of ``interval``."""
-            return bool(interval) and self.step // interval > before // interval
-
         with StopSignals() as signals:
             if self.step == 0:
                 self._report()
@@ -318,23 +310,16 @@ class TrainingLoop:
                     raise Interrupted(self.step, signals.received or signal.SIGTERM)
                 start, before = time.perf_counter(), self.step
                 batch = min(self.config.batch, (self.steps or sys.maxsize) - before)
-                loss = make_step(self.state, views, before, self.fraction, batch=batch, ranks=ranks)
+                loss = make_step(self.state, self._views(), before, self.fraction, batch=batch, ranks=ranks)
                 self.step_cost = time.perf_counter() - start
                 self.step += batch
                 if loss is not None:
                     self.losses.append(loss)
                     self.last_loss = loss
-                if self._settles():
-                    self._remove_hidden()
-                if self._becomes_hybrid():
-                    self._cut()
-                if due(prune_interval) and not self._done():
-                    self.state = self.state.prune(kept_faces(self.state, views))
-                if due(relocate_interval) and self.fraction <= RELOCATION_END:
-                    relocate(self.state, views)
-                if due(self.options.report_every) and not self._done():
+                self._adapt(before)
+                if self._due(self.options.report_every, before) and not self._done():
                     self._report()
-                if self._passed_quarter() or due(self.options.preview_every):
+                if self._passed_quarter() or self._due(self.options.preview_every, before):
                     self._save_preview()
                 if time.perf_counter() - self.save_time >= self.options.checkpoint_seconds:
                     self._save_checkpoint()
@@ -352,6 +337,27 @@ class TrainingLoop:
         mesh = self.state.result()
         uncut = self.config.opacity == "cutoff" and self.state.solid is None
         return cut_mesh(mesh, self.config.cutoff) if uncut else mesh
+
+    def _views(self) -> Sequence[View]:
+        """The training views of the next step."""
+        return self.dataset.train
+
+    def _adapt(self, before: int) -> None:
+        """Removes and relocates triangles where the steps since ``before`` make that due."""
+        views = self.dataset.train
+        if self._settles():
+            self._remove_hidden()
+        if self._becomes_hybrid():
+            self._cut()
+        if self._due(self.config.prune_interval(len(views)), before) and not self._done():
+            self.state = self.state.prune(kept_faces(self.state, views))
+        due = self._due(self.config.relocate_interval(len(views)), before)
+        if due and self.fraction <= RELOCATION_END:
+            relocate(self.state, views)
+
+    def _due(self, interval: int, before: int) -> bool:
+        """Whether the steps since ``before`` have come to a multiple of ``interval``; 0: never."""
+        return bool(interval) and self.step // interval > before // interval
 
     def _settles(self) -> bool:
         """Whether it is time to remove the triangles that no training view shows: once."""

@@ -363,22 +363,39 @@ class State:
         self._download()
         used = np.zeros(len(self.mesh.vertices), bool)
         used[self.mesh.faces[keep].ravel()] = True
-        mesh = self.result().keep_faces(keep)
-        smaller = State(mesh, self.sizes[used], self.exposures, self.config, self.threads, self.device)
-        rows = np.flatnonzero(used)
-        positions = smaller.vertices if smaller.bound is None else smaller.bound.weights
-        smaller._positions = self._positions.select(positions, rows)
-        smaller._colors = self._colors.select(smaller.colors, rows)
+        return self.rebuild(self.result().keep_faces(keep), np.flatnonzero(used))
+
+    def rebuild(self, mesh: SplatMesh, rows: np.ndarray, sizes: np.ndarray | None = None) -> State:
+        """The state of ``mesh``, whose vertex i takes over what the optimisers know of vertex ``rows[i]``.
+
+        Args:
+            mesh: the new mesh, with its positions and colours.
+            rows: (v,) indices of vertices of this state, in any order.
+            sizes: (v,) float32 units of the new positions; by default those of ``rows``.
+        """
+        self._download()
+        units = self.sizes[rows] if sizes is None else sizes
+        result = State(mesh, units, self.exposures, self.config, self.threads, self.device)
+        positions = result.vertices if result.bound is None else result.bound.weights
+        result._positions = self._positions.select(positions, rows)
+        result._colors = self._colors.select(result.colors, rows)
+        if sizes is not None and result._positions.scale is not None:
+            result._positions.scale = sizes.copy()
         if self._exposures is not None:
             every = np.arange(len(self._exposures.mean))
-            smaller._exposures = self._exposures.select(smaller.exposures, every)
+            result._exposures = self._exposures.select(result.exposures, every)
         if self._sums is not None:
-            smaller._sums = GradientSums(self._sums.color[used], self._sums.position[used])
+            result._sums = GradientSums(self._sums.color[rows], self._sums.position[rows])
         if self.solid is not None:
-            smaller.solid = self.solid[used]
+            result.solid = self.solid[rows]
         if self.frozen is not None:
-            smaller.frozen = self.frozen[used]
-        return smaller
+            result.frozen = self.frozen[rows]
+        return result
+
+    def restart(self, rows: np.ndarray) -> None:
+        """Zeroes the first moments of the vertices ``rows``, after their values were replaced."""
+        self._positions.restart(rows, rows)
+        self._colors.restart(rows, rows)
 
     def _optimisers(self) -> dict[str, RowAdam]:
         found = {"positions": self._positions, "colors": self._colors}

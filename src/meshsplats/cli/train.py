@@ -1,0 +1,165 @@
+"""``meshsplats train``: photographs to a mesh, without splats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from meshsplats.cli.arguments import as_cli_options
+from meshsplats.cli.common import File, Output, check_mesh_suffix, check_outputs
+from meshsplats.cli.messages import UsageError, command_line, say
+from meshsplats.cli.training import (
+    Plan,
+    RunFiles,
+    ShowProgress,
+    Trained,
+    TrainingCommand,
+)
+from meshsplats.datasets.views import Dataset
+from meshsplats.evaluation.backgrounds import BLACK, Background
+from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
+from meshsplats.finetuning.checkpoint import Checkpoint
+from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS
+from meshsplats.finetuning.step import samples_of
+from meshsplats.training.config import FIXED, TrainConfig, train_config
+from meshsplats.training.run import SO_FAR, check_training_memory, train
+
+if TYPE_CHECKING:
+    GrowingOptions = TrainConfig
+else:
+    GrowingOptions = as_cli_options(
+        TrainConfig,
+        "Default: see docs/training.md.",
+        without=("preset", *LENGTHS, *FIXED),
+        defaults=lambda name: f"(default: {getattr(TrainConfig, name)})",
+        checked=False,
+    )
+
+
+@dataclass(frozen=True)
+class PhotographOptions:
+    """The photographs."""
+
+    downscale: int = 1
+    """Factor by which images are smaller than the photographs."""
+    test_every: int = 8
+    """Every n-th view is held out for scores, if the data set has no split; 0: none."""
+    cache: float = 2.0
+    """Gigabytes of images kept in memory; others are read again when they are needed."""
+
+    def check(self) -> None:
+        """ValueError for values out of range."""
+        if not self.cache >= 0:
+            raise ValueError(f"--cache must be a number of gigabytes, >= 0, got {self.cache}")
+
+    @property
+    def cache_bytes(self) -> int:
+        return int(self.cache * 1e9)
+
+
+@dataclass(frozen=True)
+class Train(TrainingCommand):
+    """Makes a mesh from photographs with cameras: COLMAP, NeRF-synthetic or nerfstudio folders.
+
+    Without cameras, they are found first (extra photos) and saved beside the photographs. Beside the result
+    NAME: its configuration, a preview, and a folder NAME.run with metrics, previews and a checkpoint, from
+    which --resume continues after Ctrl-C.
+    """
+
+    COMMON = (
+        *("input", "output", "minutes", "steps", "max_splats", "downscale", "test_every", "exposure"),
+        *("as_splats", "threads", "resume", "force"),
+    )
+    EXCLUSIVE = (LENGTHS,)
+
+    input: tyro.conf.Positional[Path]
+    """The folder of the photographs, or its transforms.json."""
+    output: Output
+    """The mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
+    as_splats: File = None
+    """Also write the fans as splats to this .ply file, for splat viewers."""
+    target: PhotographOptions = field(default_factory=PhotographOptions)  # type: ignore[assignment]
+    tuning: GrowingOptions = field(default_factory=GrowingOptions)
+
+    @property
+    def has_photographs(self) -> bool:
+        return True
+
+    def configured(self) -> TrainConfig:
+        return train_config(**self.explicit_settings())
+
+    def check(self) -> None:
+        check_mesh_suffix(self.output)
+        if self.as_splats is not None:
+            if self.as_splats.suffix.lower() != ".ply":
+                raise UsageError(f"--as-splats must end in .ply, got {self.as_splats.name!r}")
+            if self.as_splats == self.output:
+                raise UsageError("--as-splats must not be the mesh itself: give another name")
+            check_outputs([self.as_splats], self.force, inputs=self.inputs)
+        super().check()
+
+    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
+        from meshsplats.datasets.points import load_points
+        from meshsplats.formats.gaussians import save_gaussians
+        from meshsplats.training.as_splats import splats_of_fans
+        from meshsplats.training.reconstruction import bare_photographs, find_cameras
+
+        assert isinstance(config, TrainConfig)
+        if bare_photographs(self.input):
+            find_cameras(self.input, say)
+        dataset, background = self._dataset(config)
+        points = load_points(self.input)
+        known = "no known points" if points is None else f"{len(points.positions):,} known points"
+
+        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
+            mesh = train(dataset, config, points=points, run=run, on_progress=show)
+            if self.as_splats is not None:
+                save_gaussians(splats_of_fans(mesh), self.as_splats)
+            counts: dict[str, int] = {"fans": mesh.splat_count or 0, "triangles": len(mesh.faces)}
+            return Trained(
+                mesh, mesh, counts, f"{counts['triangles']:,} triangles of {counts['fans']:,} fans"
+            )
+
+        needed = check_training_memory(dataset, config, cache_bytes=self.target.cache_bytes)
+        summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
+        return Plan(None, dataset, summary, background, optimise, needed)
+
+    def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
+        code = super().report_interrupt(stop, files)
+        say(f"the mesh so far: {files.folder / SO_FAR}")
+        return code
+
+    def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
+        """The command that scores the result on held-out views, or one that renders it if there are none."""
+        target, folder = self.target, self.output.with_suffix("")
+        if not plan.dataset.test:
+            words: list[str | Path | int] = ["meshsplats", "render", self.output, "-o", f"{folder}-images"]
+            return [f"next: {command_line(words)}"]
+        words = ["meshsplats", "evaluate", self.output, "--data", self.input]
+        words += ["--downscale", target.downscale] if target.downscale != 1 else []
+        words += ["--test-every", target.test_every] if target.test_every != 8 else []
+        if plan.background is not None:
+            words += ["--background", plan.background.name]
+        words += ["--samples", samples_of(plan.dataset.train[0], config), "-o", f"{folder}-evaluation"]
+        return [f"next: {command_line(words)}"]
+
+    def _dataset(self, config: TrainConfig) -> tuple[Dataset, Background]:
+        from meshsplats.datasets.folder import load_dataset
+
+        options: dict[str, Any] = {"downscale": self.target.downscale, "test_every": self.target.test_every}
+        dataset = load_dataset(self.input, cache_bytes=self.target.cache_bytes, **options)
+        if len(dataset.train) < 2:
+            raise ValueError(
+                f"{self.input}: {len(dataset.train)} training views, {len(dataset.test)} held out; at least 2"
+                " are needed to train on (--test-every 0 holds none out)"
+            )
+        if config.background in BACKGROUNDS:
+            found = Background(BACKGROUNDS[config.background], "given")
+        elif dataset.train[0].load().alpha is None:
+            found = Background(BLACK, "given")  # covered by the fans themselves
+        else:
+            found = Background((1.0, 1.0, 1.0), "usual")
+        return dataset.over(found.color), found

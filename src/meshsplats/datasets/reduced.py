@@ -1,0 +1,78 @@
+"""Views at a fraction of their size: each pixel is the mean of those that it covers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from meshsplats.datasets.views import ImageCache, View, ViewImage
+
+_WHOLE = 1 - 1e-6
+"""Share of a pixel that must count for the pixel to count."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedImage:
+    """The image of ``view`` at the size ``width`` x ``height``, made when it is first used."""
+
+    view: View
+    width: int
+    height: int
+    store: ImageCache = field(repr=False)
+
+    def load(self) -> ViewImage:
+        image = self.store.find(self)
+        if image is None:
+            image = reduced_image(self.view.load(), self.width, self.height)
+            self.store.keep(self, image)
+        return image
+
+    @property
+    def nbytes(self) -> int:
+        share = self.width * self.height / (self.view.camera.width * self.view.camera.height)
+        return int(self.view.source.nbytes * share)
+
+
+def reduced_views(views: Sequence[View], factor: float, store: ImageCache) -> tuple[View, ...]:
+    """``views`` with sides ``factor`` (0 to 1) times as long. The images are kept in ``store``.
+
+    The views themselves are returned for a factor of 1.
+    """
+    if factor == 1:
+        return tuple(views)
+    result = []
+    for view in views:
+        camera = view.camera.scaled(factor)
+        result.append(
+            replace(view, camera=camera, source=ReducedImage(view, camera.width, camera.height, store))
+        )
+    return tuple(result)
+
+
+def reduced_image(image: ViewImage, width: int, height: int) -> ViewImage:
+    """``image`` at a smaller size. Pixels that do not count are left out of the means; a new pixel counts if
+    all pixels that it covers do."""
+    rows = _mixing(image.color.shape[0], height)
+    columns = _mixing(image.color.shape[1], width)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        mixed = np.einsum("yh,hw...,xw->yx...", rows, values.astype(np.float32), columns, optimize=True)
+        return np.ascontiguousarray(mixed)
+
+    unit = np.float32(255 if image.color.dtype == np.uint8 else 1)
+    known = image.color if image.mask is None else np.where(image.mask[..., None], image.color, 0)
+    color = (mean(known) / unit).astype(np.float16)
+    alpha = None if image.alpha is None else (mean(image.alpha) / unit).astype(np.float16)
+    mask = None if image.mask is None else mean(image.mask) >= _WHOLE
+    return ViewImage(color, alpha, mask)
+
+
+def _mixing(before: int, after: int) -> np.ndarray:
+    """(after, before) float32 shares of the old pixels in each new one along an axis; rows add up to 1."""
+    edges = np.linspace(0, before, after + 1)
+    starts = np.arange(before)
+    overlap = np.minimum(edges[1:, None], starts + 1) - np.maximum(edges[:-1, None], starts)
+    shares = np.maximum(overlap, 0)
+    return (shares / shares.sum(axis=1, keepdims=True)).astype(np.float32)

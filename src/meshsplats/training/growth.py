@@ -1,0 +1,181 @@
+"""Growth: fans that no view shows are dropped, and those that several views find wrong are halved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.datasets.views import View
+from meshsplats.finetuning.relocation import HALF, split_in_halves
+from meshsplats.finetuning.state import GAIN, OFFSET, State
+from meshsplats.finetuning.step import MIN_TRANSMITTANCE, samples_of
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.backward import TapedRendering
+
+SCORED_VIEWS = 20
+"""Maximum number of training views, evenly spread, in which fans are judged."""
+MIN_PIXELS = 0.02
+"""A fan that contributes fewer pixels than this to each view is dropped, if a view has it in its image."""
+CLEAR = 0.5
+"""A fan with a greater share of its pixels where photographs are transparent is dropped."""
+MIN_OPACITY = 0.02
+"""A fan of less opacity is dropped."""
+NEAR = 0.3
+"""Depth of a near field, as a share of the depth where the scene begins."""
+SMALLEST = 0.7
+"""Pixels that a fan must contribute to a view to be halved."""
+
+
+class Scores(NamedTuple):
+    """What views say of n fans."""
+
+    error: np.ndarray
+    """(n,) sum of the error in the pixels of each fan, by its share in them, without the view that has most:
+    an error that one view sees is that view's."""
+    most_pixels: np.ndarray
+    """(n,) largest contribution to any view, in pixels."""
+    clear_share: np.ndarray
+    """(n,) share of its pixels that are transparent in the photographs."""
+    in_view: np.ndarray
+    """(n,) bool: whether the centre lies in the image of any view."""
+
+
+def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
+    """Judges the fans of ``state`` in up to ``SCORED_VIEWS`` of ``views``, others in each ``turn``."""
+    mesh = state.mesh
+    corners = corners_of(mesh)
+    n = fan_count(mesh)
+    total, most, pixels = np.zeros(n), np.zeros(n), np.zeros(n)
+    all_pixels, clear_pixels = np.zeros(n), np.zeros(n)
+    in_view = np.zeros(n, bool)
+    step = -(-len(views) // SCORED_VIEWS)
+    for index in range(turn % step, len(views), step):
+        view = views[index]
+        rendering = TapedRendering(
+            state.vertices,
+            mesh.faces,
+            state.colors,
+            np.zeros((len(mesh.vertices), 3), np.float32),
+            view.camera,
+            background=view.background,
+            samples=samples_of(view, state.config),
+            min_transmittance=MIN_TRANSMITTANCE[mesh.blending],
+            face_splat=mesh.face_splat,
+            threads=state.threads,
+        )
+        image = rendering.color
+        if state.exposures is not None:
+            exposure = state.exposures[index]
+            image = image * exposure[GAIN] + exposure[OFFSET]
+        counts = np.ones(image.shape[:2], np.float32)
+        difference = np.square(image - view.image).sum(axis=2)
+        if view.mask is not None:
+            difference[~view.mask] = 0
+            counts[~view.mask] = 0
+        alpha = view.alpha
+        clear = np.zeros_like(counts) if alpha is None else (1 - alpha) * counts
+        sums = rendering.scatter_to_vertices(np.stack([difference, counts, clear], axis=2))
+        error, count, outside = sums.reshape(n, corners, 3).sum(axis=1, dtype=np.float64).T
+        total += error
+        np.maximum(most, error, out=most)
+        np.maximum(pixels, count, out=pixels)
+        all_pixels += count
+        clear_pixels += outside
+        in_view |= view.camera.sees(state.vertices[::corners])
+    clear_share = clear_pixels / np.maximum(all_pixels, 1e-9)
+    return Scores(total - most, pixels, clear_share, in_view)
+
+
+def corners_of(mesh: SplatMesh) -> int:
+    """Vertices of each fan of a mesh of equal fans, which lie one after the other."""
+    assert mesh.face_splat is not None
+    return int(mesh.faces[mesh.face_splat == mesh.face_splat[0]].max()) + 1
+
+
+def fan_count(mesh: SplatMesh) -> int:
+    """Number of fans of such a mesh."""
+    return len(mesh.vertices) // corners_of(mesh)
+
+
+def grow(state: State, found: Scores, target: int) -> State:
+    """Drops the fans that ``found`` has no use for, and halves those with the largest error until there are
+    ``target``. A halved fan is never dropped: there may be fewer."""
+    corners, n = corners_of(state.mesh), fan_count(state.mesh)
+    opacity = state.colors[:, 3].reshape(n, corners).max(axis=1)
+    useless = (found.most_pixels < MIN_PIXELS) | (opacity < MIN_OPACITY) | (found.clear_share > CLEAR)
+    keep = ~(found.in_view & useless)
+    if not keep.any():
+        keep[:] = True
+    kept = np.flatnonzero(keep)
+    able = kept[(found.most_pixels[kept] >= SMALLEST) & (found.error[kept] > 0)]
+    wanted = min(max(target - len(kept), 0), len(able))
+    halved = np.sort(able[np.argsort(-found.error[able], kind="stable")][:wanted])
+    return select_fans(state, kept, halved)
+
+
+class NearFields(NamedTuple):
+    """The space right in front of the cameras, where nothing may float."""
+
+    cameras: tuple[Camera, ...]
+    depths: np.ndarray
+    """(views,) depth of the near field of each camera, scene units."""
+
+    @classmethod
+    def around(cls, views: Sequence[View], mesh: SplatMesh) -> NearFields:
+        """Those of ``views`` for a scene that ``mesh``, its fans at the start, shows roughly: ``NEAR`` times
+        the depth before which one in fifty of the fans in an image lies."""
+        centers = mesh.vertices[:: corners_of(mesh)]
+        depths = np.zeros(len(views))
+        for i, view in enumerate(views):
+            positions, depth = view.camera.project(centers)
+            depth = depth[view.camera.in_image(positions)]
+            if len(depth):
+                depths[i] = NEAR * float(np.quantile(depth, 0.02))
+        return cls(tuple(view.camera for view in views), depths)
+
+    def contain(self, mesh: SplatMesh) -> np.ndarray:
+        """(n,) bool: the fans whose centre lies in the near field of a camera."""
+        centers = mesh.vertices[:: corners_of(mesh)]
+        inside = np.zeros(len(centers), bool)
+        for camera, limit in zip(self.cameras, self.depths, strict=True):
+            axis = camera.world_to_camera[2].astype(np.float32)
+            depth = centers @ axis[:3] + axis[3]
+            rows = np.flatnonzero((depth > 0) & (depth < limit))
+            if len(rows):
+                # The near plane is as near as it gets here: what it cuts off floats there, too.
+                closest = replace(camera, near=min(camera.near, 1e-3 * float(limit)))
+                inside[rows] |= closest.sees(centers[rows])
+        return inside
+
+
+def select_fans(state: State, kept: np.ndarray, halved: np.ndarray | None = None) -> State:
+    """The state with the fans ``kept``, of which each of ``halved`` becomes two; both ascending indices."""
+    halved = np.zeros(0, np.int64) if halved is None else halved
+    mesh, corners = state.mesh, corners_of(state.mesh)
+    sides = len(mesh.faces) // (len(mesh.vertices) // corners)
+    source = np.concatenate([kept, halved])
+    n = len(source)
+    rows = (source[:, None] * corners + np.arange(corners)).ravel()
+    positions = state.vertices[rows].reshape(n, corners, 3)
+    sizes = state.sizes[rows].reshape(n, corners)
+    place = np.searchsorted(kept, halved)
+    if len(halved):
+        positions[place], positions[len(kept) :] = split_in_halves(positions[place])
+        sizes[place] *= np.sqrt(np.float32(HALF))
+        sizes[len(kept) :] = sizes[place]
+    faces = mesh.faces[:sides] + corners * np.arange(n, dtype=np.int32)[:, None, None]
+    grown = replace(
+        mesh,
+        vertices=positions.reshape(-1, 3),
+        faces=faces.reshape(-1, 3),
+        colors=state.colors[rows],
+        face_splat=np.repeat(np.arange(n, dtype=np.int32), sides),
+    )
+    result = state.rebuild(grown, rows, sizes.ravel())
+    fresh = np.concatenate([place, np.arange(len(kept), n)])
+    result.restart((fresh[:, None] * corners + np.arange(corners)).ravel())
+    return result

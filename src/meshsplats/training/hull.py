@@ -1,0 +1,218 @@
+"""The visual hull of a masked subject: the cells of a grid that no silhouette rules out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.datasets.views import View
+
+FIRST_LEVEL = 32
+"""Cells along each side of the first grid. Each further one has twice as many."""
+LAST_LEVEL = 1024
+"""Cells along each side of the finest grid."""
+TOLERANCE = 0.1
+"""Share of the views that may rule a cell out without effect, while it is not known which are misplaced."""
+MISPLACED = 0.75
+"""A view whose silhouette overlaps that of the first hull by less than this share of the median is misplaced
+and takes no further part."""
+ASTRAY = 0.04
+"""Share of the views that may have a point outside of their silhouettes."""
+OPAQUE = 0.5
+"""Alpha from which a pixel belongs to the silhouette."""
+SEEN_SHARE = 0.5
+"""Share of the views that must have a cell in their image."""
+
+
+class Surface(NamedTuple):
+    """Cells on the surface of a hull."""
+
+    points: np.ndarray
+    """(n, 3) float64 their centres."""
+    normals: np.ndarray
+    """(n, 3) float64 unit normals that point outwards."""
+    side: float
+    """Side of a cell, scene units."""
+
+
+class _Silhouette:
+    """The silhouette of one view, as sums over all rectangles from the image's corner."""
+
+    def __init__(self, view: View) -> None:
+        image = view.load()
+        assert image.alpha is not None
+        unit = 255 if image.alpha.dtype == np.uint8 else 1
+        inside = image.alpha >= OPAQUE * unit
+        if image.mask is not None:
+            inside |= ~image.mask  # pixels that do not count rule nothing out
+        self.camera: Camera = view.camera
+        self.inside = inside
+        self.sums = np.zeros((inside.shape[0] + 1, inside.shape[1] + 1), np.int32)
+        self.sums[1:, 1:] = inside.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
+
+    def test(self, points: np.ndarray, reach: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) bool each: ``points`` (n, 3) that lie in the image; those of them whose square of ``reach``
+        scene units, one number or (n,), to each side holds no pixel of the silhouette."""
+        positions, depth = self.camera.project(points)
+        in_image = self.camera.in_image(positions)
+        rows = np.flatnonzero(in_image)
+        size = max(self.camera.fx, self.camera.fy) * np.broadcast_to(reach, len(points))[rows] / depth[rows]
+        x, y = positions[rows].T
+        left = np.maximum(np.floor(x - size), 0).astype(np.int64)
+        top = np.maximum(np.floor(y - size), 0).astype(np.int64)
+        right = np.minimum(np.floor(x + size) + 1, self.camera.width).astype(np.int64)
+        bottom = np.minimum(np.floor(y + size) + 1, self.camera.height).astype(np.int64)
+        s = self.sums
+        count = s[bottom, right] - s[top, right] - s[bottom, left] + s[top, left]
+        empty = np.zeros(len(points), bool)
+        empty[rows] = count == 0
+        return in_image, empty
+
+
+def has_silhouettes(views: Sequence[View]) -> bool:
+    """Whether the images of ``views`` have alpha that leaves out a part of them, judged by the first."""
+    if not views:
+        return False
+    alpha = views[0].alpha
+    return alpha is not None and bool((alpha < OPAQUE).any()) and bool((alpha >= OPAQUE).any())
+
+
+def in_silhouettes(views: Sequence[View], points: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """(n,) bool: ``points`` (n, 3) that lie within the silhouettes, give or take ``reach`` (n,) scene units,
+    of all views that have them in the image but ``ASTRAY`` of them."""
+    seen, against = np.zeros(len(points)), np.zeros(len(points))
+    for view in views:
+        in_image, empty = _Silhouette(view).test(points, reach)
+        seen += in_image
+        against += empty
+    return against <= ASTRAY * seen
+
+
+def carve(
+    views: Sequence[View], cells: int, solid: Callable[[np.ndarray], np.ndarray] | None = None
+) -> Surface | None:
+    """The surface of the visual hull, of at least ``cells`` cells where the finest grid has as many.
+
+    A cell is empty where views see it outside of their silhouettes. Views with wrong poses are found by their
+    silhouettes and left out. ``solid`` gives (n,) bool for points (n, 3): cells that it rules out are empty,
+    too. None if nothing is left, as for alpha that is not of one subject.
+    """
+    outlines = [_Silhouette(view) for view in views]
+    low, side = _root(outlines)
+    count, tolerance = FIRST_LEVEL, int(TOLERANCE * len(outlines))
+    index = np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = _kept(outlines, index, low, side / count, tolerance)
+    if not len(index):
+        return None
+    # The root cube is a guess: the grid is laid anew around what the first carving left.
+    first, last = index.min(axis=0), index.max(axis=0) + 1
+    low, side = low + (first - 1) * side / count, float((last - first + 2).max()) * side / count
+    index = np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = _kept(outlines, index, low, side / count, tolerance)
+    if tolerance and len(index):
+        outlines = _placed(outlines, low + (index + 0.5) * side / count, side / count)
+        index = _kept(outlines, index, low, side / count, 0)
+    while len(index):
+        surface = _surface(index, count, low, side / count)
+        if len(surface.points) >= cells or count >= LAST_LEVEL:
+            return surface
+        count *= 2
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+        index = (2 * index[:, None] + corners).reshape(-1, 3)
+        index = _kept(outlines, index, low, side / count, 0)
+        if solid is not None and len(index):
+            index = index[solid(low + (index + 0.5) * side / count)]
+    return None
+
+
+def _root(outlines: Sequence[_Silhouette]) -> tuple[np.ndarray, float]:
+    """(3,) least corner and side of a cube around the subject: where the rays through the middles of the
+    silhouettes meet."""
+    rays, centers = [], []
+    for outline in outlines:
+        rows, columns = np.nonzero(outline.inside)
+        camera = outline.camera
+        x, y = (columns.mean(), rows.mean()) if len(rows) else (camera.cx, camera.cy)
+        ray = np.array([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, 1.0])
+        ray = ray @ camera.world_to_camera[:3, :3]
+        rays.append(ray / np.linalg.norm(ray))
+        centers.append(camera.center)
+    directions, origins = np.array(rays), np.array(centers)
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    weights = np.ones(len(directions))
+    middle = origins.mean(axis=0)
+    for _ in range(10):  # reweighted least squares: a few misplaced views do not matter
+        left = np.einsum("n,nij->ij", weights, across) + 1e-9 * np.eye(3)
+        middle = np.linalg.solve(left, np.einsum("n,nij,nj->i", weights, across, origins))
+        error = np.linalg.norm(np.einsum("nij,nj->ni", across, middle - origins), axis=1)
+        weights = 1 / np.maximum(error, 1e-6 * max(error.max(), 1e-12))
+    half = float(np.median(np.linalg.norm(origins - middle, axis=1)))
+    return middle - half, 2 * half
+
+
+def _kept(
+    outlines: Sequence[_Silhouette], index: np.ndarray, low: np.ndarray, side: float, tolerance: int
+) -> np.ndarray:
+    """The cells ``index`` (n, 3) of the given ``side`` that at most ``tolerance`` views rule out."""
+    points = low + (index + 0.5) * side
+    seen, against = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    rows = np.arange(len(points))
+    for outline in outlines:
+        in_image, empty = outline.test(points[rows], side / 2)
+        seen[rows] += in_image
+        against[rows] += empty
+        rows = rows[against[rows] <= tolerance]
+    keep = np.zeros(len(points), bool)
+    keep[rows] = seen[rows] >= max(SEEN_SHARE * len(outlines), 1)
+    return index[keep]
+
+
+def _placed(outlines: Sequence[_Silhouette], points: np.ndarray, side: float) -> list[_Silhouette]:
+    """The views whose silhouettes agree with the cells of ``side`` at ``points`` (n, 3)."""
+    overlap = np.array([_overlap(outline, points, side) for outline in outlines])
+    return [o for o, share in zip(outlines, overlap, strict=True) if share >= MISPLACED * np.median(overlap)]
+
+
+def _overlap(outline: _Silhouette, points: np.ndarray, side: float) -> float:
+    """Pixels in both the silhouette and the image of the cells, as a share of those in either."""
+    camera = outline.camera
+    positions, depth = camera.project(points)
+    rows = camera.in_image(positions)
+    drawn = np.zeros((camera.height + 1, camera.width + 1), np.int32)
+    size = max(camera.fx, camera.fy) * side / 2 / depth[rows]
+    x, y = positions[rows].T
+    left, right = (np.clip(np.floor(v), 0, camera.width).astype(np.int64) for v in (x - size, x + size + 1))
+    top, bottom = (np.clip(np.floor(v), 0, camera.height).astype(np.int64) for v in (y - size, y + size + 1))
+    for row, column, sign in ((top, left, 1), (top, right, -1), (bottom, left, -1), (bottom, right, 1)):
+        np.add.at(drawn, (row, column), sign)
+    covered = drawn.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
+    either = np.count_nonzero(covered | outline.inside)
+    return np.count_nonzero(covered & outline.inside) / either if either else 0.0
+
+
+def _surface(index: np.ndarray, count: int, low: np.ndarray, side: float) -> Surface:
+    """The cells of ``index`` (n, 3), of ``count`` along each side, with an empty one beside them."""
+    first = index.min(axis=0) - 3
+    shape = tuple(index.max(axis=0) - first + 4)
+    filled = np.zeros(shape, bool)
+    x, y, z = (index - first).T
+    filled[x, y, z] = True
+    inner = np.ones(len(index), bool)
+    slope = np.zeros((len(index), 3))
+    for i in (-2, -1, 0, 1, 2):
+        for j in (-2, -1, 0, 1, 2):
+            for k in (-2, -1, 0, 1, 2):
+                there = filled[x + i, y + j, z + k]
+                if abs(i) + abs(j) + abs(k) == 1:
+                    inner &= there
+                length = np.sqrt(i * i + j * j + k * k)
+                if length:
+                    slope -= there[:, None] * (np.array([i, j, k]) / length**2)
+    outer = ~inner
+    slope = slope[outer]
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    normals = np.where(length > 1e-9, slope / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
+    return Surface(low + (index[outer] + 0.5) * side, normals, side)

@@ -1,0 +1,146 @@
+"""Cameras of bare photographs: structure from motion by pycolmap, saved beside the photographs."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from meshsplats._files.atomic import write_bytes, write_text
+from meshsplats.datasets.folder import find_layout
+from meshsplats.datasets.image_files import SUFFIXES
+from meshsplats.errors import DataWarning, MissingDependencyError
+from meshsplats.images.reading import read_header
+
+CAMERAS, POINTS = "transforms.json", "sparse_points.ply"
+"""Files beside the photographs."""
+MAX_SIDE = 1600
+"""Longest side of the images in which features are found, in pixels."""
+MAX_FEATURES = 3000
+"""Features of an image: matching takes the square of that for each pair."""
+FEWEST = 3
+"""Photographs that must find their place."""
+NEEDS = "photographs without cameras need the library pycolmap: pip install 'meshsplats[photos]'"
+
+
+def bare_photographs(folder: Path) -> list[Path]:
+    """The image files in ``folder``/images, else in ``folder`` itself, sorted; none for a data set that has
+    cameras."""
+    if not folder.is_dir() or find_layout(folder) is not None:
+        return []
+    place = folder / "images" if (folder / "images").is_dir() else folder
+    return sorted(path for path in place.iterdir() if path.suffix in SUFFIXES and path.is_file())
+
+
+def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -> None:
+    """Finds the cameras of the photographs in ``folder`` (``bare_photographs``) and writes
+    ``transforms.json`` and ``sparse_points.ply`` there, as nerfstudio has them, whole or not at all.
+
+    ``say`` is called with a line about each stage. Takes minutes: all pairs of photographs are matched.
+
+    Raises:
+        MissingDependencyError: pycolmap is not installed.
+        ValueError: fewer than ``FEWEST`` photographs, or so few that match each other.
+        OSError: the folder cannot be written.
+
+    Warns with a DataWarning about photographs that found no place.
+    """
+    photographs = bare_photographs(folder)
+    if len(photographs) < FEWEST:
+        raise ValueError(
+            f"{folder}: {len(photographs)} photographs without cameras; at least {FEWEST} are needed, some"
+            " thirty for a good result"
+        )
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder}: no permission to write the cameras beside the photographs")
+    try:
+        import pycolmap
+    except ImportError:
+        raise MissingDependencyError(NEEDS) from None
+    place = photographs[0].parent
+    sizes = {(header.width, header.height) for header in map(read_header, photographs)}
+    pycolmap.logging.minloglevel = 3
+    pycolmap.set_random_seed(0)
+    with tempfile.TemporaryDirectory(prefix="meshsplats-") as work:
+        database = os.path.join(work, "database.db")
+        mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.PER_IMAGE
+        say(f"finding the cameras of {len(photographs)} photographs: features")
+        pycolmap.extract_features(
+            database,
+            place,
+            camera_mode=mode,
+            device=pycolmap.Device.cpu,
+            **_feature_options(pycolmap),
+        )
+        say(f"finding the cameras: {len(photographs) * (len(photographs) - 1) // 2:,} pairs")
+        pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+        say("finding the cameras: poses")
+        found = pycolmap.incremental_mapping(database, place, work)
+    best = max(found.values(), key=lambda model: model.num_reg_images(), default=None)
+    count = 0 if best is None else best.num_reg_images()
+    if best is None or count < FEWEST:
+        raise ValueError(
+            f"{folder}: {count} of {len(photographs)} photographs match each other, at least {FEWEST} must."
+            " Photographs must overlap by two thirds, be sharp, and show a subject with texture that does not"
+            " move"
+        )
+    names = {image.name for image in best.images.values() if image.has_pose}
+    lost = [path.name for path in photographs if path.name not in names]
+    if lost:
+        warnings.warn(
+            f"{folder}: {len(lost)} of {len(photographs)} photographs match no others and are left out:"
+            f" {', '.join(lost[:5])}" + (", ..." if len(lost) > 5 else ""),
+            DataWarning,
+            stacklevel=2,
+        )
+    write_bytes(folder / POINTS, _points(best))
+    prefix = "images/" if place != folder else ""
+    write_text(folder / CAMERAS, json.dumps(_transforms(best, prefix), indent=1) + "\n")
+    say(f"cameras of {count} photographs and {len(best.points3D):,} points: {folder / CAMERAS}")
+
+
+def _feature_options(pycolmap: Any) -> dict[str, Any]:
+    """Options of ``extract_features`` in the library's version."""
+    if hasattr(pycolmap, "FeatureExtractionOptions"):
+        options = pycolmap.FeatureExtractionOptions()
+        options.max_image_size = MAX_SIDE
+        options.sift.max_num_features = MAX_FEATURES
+        return {"extraction_options": options}
+    return {"sift_options": {"max_image_size": MAX_SIDE, "max_num_features": MAX_FEATURES}}
+
+
+def _transforms(model: Any, prefix: str) -> dict[str, Any]:
+    """The cameras of ``model`` as in nerfstudio's file: OpenGL axes, one radial term."""
+    frames = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if not image.has_pose:
+            continue
+        pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+        matrix = np.vstack([np.asarray(pose.matrix(), np.float64), [0, 0, 0, 1]])
+        world = np.linalg.inv(matrix)
+        world[:3, 1:3] *= -1
+        world[3] = [0, 0, 0, 1]
+        camera = model.cameras[image.camera_id]
+        focal, cx, cy, k1 = map(float, camera.params)  # SIMPLE_RADIAL
+        lens = {"fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "k1": k1}
+        size = {"w": int(camera.width), "h": int(camera.height)}
+        frames.append({"file_path": prefix + image.name, "transform_matrix": world.tolist(), **lens, **size})
+    return {"camera_model": "OPENCV", "ply_file_path": POINTS, "frames": frames}
+
+
+def _points(model: Any) -> bytes:
+    """The points of ``model`` as a .ply file."""
+    points = list(model.points3D.values())
+    rows = np.empty(len(points), np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)]))
+    for i, point in enumerate(points):
+        rows[i] = (np.asarray(point.xyz), np.asarray(point.color))
+    names = [*(f"float {axis}" for axis in "xyz"), *(f"uchar {name}" for name in ("red", "green", "blue"))]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    lines += [*(f"property {name}" for name in names), "end_header", ""]
+    return "\n".join(lines).encode() + rows.tobytes()

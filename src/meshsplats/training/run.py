@@ -1,0 +1,177 @@
+"""train: photographs with cameras to a tuned mesh, without splats to start from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from meshsplats.datasets.points import ScenePoints
+from meshsplats.datasets.reduced import reduced_views
+from meshsplats.datasets.views import Dataset, ImageCache, View
+from meshsplats.errors import FileFormatError
+from meshsplats.finetuning.interruption import Interrupted
+from meshsplats.finetuning.journal import Journal
+from meshsplats.finetuning.memory import check_bytes, estimate_bytes
+from meshsplats.finetuning.run import Progress, RunOptions, RunStart, TrainingLoop, run_start
+from meshsplats.formats.meshes import load_mesh, save_mesh
+from meshsplats.mesh import SplatMesh
+from meshsplats.training.config import TrainConfig, with_train_changes
+from meshsplats.training.growth import (
+    NearFields,
+    fan_count,
+    grow,
+    score,
+    select_fans,
+)
+from meshsplats.training.initial import colored, fans_of, flat_splats, starting_patches
+from meshsplats.training.patches import Patches
+from meshsplats.training.schedule import budget, events_passed, image_factor
+from meshsplats.training.stereo import MATCHING_BYTES
+
+START, SO_FAR = "start.npz", "mesh.npz"
+"""Files in the folder of a run: the fans that it started from, and those at an interruption."""
+
+
+def train(
+    dataset: Dataset,
+    config: TrainConfig | None = None,
+    *,
+    points: ScenePoints | None = None,
+    run: RunOptions | None = None,
+    on_progress: Callable[[Progress], None] | None = None,
+    **changes: Any,
+) -> SplatMesh:
+    """Makes a mesh from the training views of ``dataset`` alone.
+
+    Fans start on the surfaces that matched photographs, known points and silhouettes show, and on a shell
+    around everything where nothing masks the background. Then they are optimised as by ``finetune``, on
+    images from a quarter of the size to the full one, while their set grows: fans with errors that several
+    views see are halved, those that contribute nothing are dropped.
+
+    Args:
+        dataset: the training views, and held-out views to score. Photographs without alpha are taken over
+            the ``background`` of their views.
+        config: the configuration; ``train_config()`` by default.
+        points: known points of the scene, from ``load_points``.
+        run: output folder, resumption from a checkpoint, logging and resources.
+        on_progress: called after every step.
+        changes: fields of ``TrainConfig`` in place of those of ``config``.
+
+    Returns:
+        Fans of ``config.sides`` triangles, at most ``config.max_splats`` of them, one after the other
+        (``face_splat``).
+
+    Raises:
+        TypeError: a field that does not exist.
+        ValueError: fewer than two training views, or masks that do not fit the cameras.
+        OtherRunError, MemoryError, DivergenceError, Interrupted: as by ``finetune``. Interrupted leaves the
+            mesh so far in the folder, too.
+    """
+    began = time.perf_counter()
+    config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
+    if len(dataset.train) < 2:
+        raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
+    check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
+    journal = None if run.folder is None else Journal(run.folder)
+    if run.resume and journal is not None:
+        mesh = _stored_start(journal)
+    else:
+        mesh = starting_fans(dataset, config, points, run.threads)
+    run = replace(run, spent=run.spent + time.perf_counter() - began)
+    start = run_start(mesh, dataset, config, run, journal)
+    if journal is not None and not run.resume:
+        save_mesh(mesh, journal.folder / START)
+    loop = GrowingLoop(start, dataset, config, run, journal, on_progress)
+    try:
+        return loop.run()
+    except Interrupted:
+        if journal is not None:
+            save_mesh(loop.result(), journal.folder / SO_FAR)
+        raise
+
+
+def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes: int) -> int:
+    """Estimated peak memory in bytes of a process that trains. MemoryError if there is less."""
+    fans = max(config.max_splats, config.start_splats)
+    needed = estimate_bytes(fans * (1 + config.sides), fans * config.sides, dataset, cache_bytes)
+    # Reduced images have 1/4 and 1/16 of the pixels.
+    needed += MATCHING_BYTES + min(dataset.memory, cache_bytes) // 3
+    what = f"training {config.max_splats:,} fans on {len(dataset.views):,} images"
+    check_bytes(needed, what, "allow fewer fans (--max-splats)")
+    return needed
+
+
+def starting_fans(
+    dataset: Dataset, config: TrainConfig, points: ScenePoints | None = None, threads: int | None = None
+) -> SplatMesh:
+    """The fans that a training starts from, coloured from the training views; see ``train``."""
+    views = dataset.train
+    count = min(config.start_splats, config.max_splats)
+    patches, shell = starting_patches(views, count, points)
+    parts = [part for part in (patches, shell) if part is not None]
+    if not parts:
+        raise ValueError("the photographs have nothing in common that a mesh could start from")
+    joined = Patches.joined(*parts)
+    if len(joined.points) > config.max_splats:
+        joined = joined.select(np.linspace(0, len(joined.points) - 1, config.max_splats).astype(int))
+    return colored(fans_of(flat_splats(joined), config.sides), views, threads)
+
+
+def _stored_start(journal: Journal) -> SplatMesh:
+    path = journal.folder / START
+    if not path.is_file():
+        raise FileNotFoundError(f"no {path}: leave out --resume to begin anew")
+    mesh = load_mesh(path)
+    if mesh.face_splat is None or not len(mesh.faces):
+        raise FileFormatError(f"{path}: not the fans that a training started from")
+    return mesh
+
+
+class GrowingLoop(TrainingLoop):
+    """The loop of fine-tuning, on images that become larger, with a set of fans that grows."""
+
+    config: TrainConfig
+
+    def __init__(
+        self,
+        start: RunStart,
+        dataset: Dataset,
+        config: TrainConfig,
+        options: RunOptions,
+        journal: Journal | None,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> None:
+        super().__init__(start, dataset, config, options, journal, on_progress)
+        self._store = ImageCache(options.cache_bytes // 3)
+        self._reduced: dict[float, Sequence[View]] = {}
+        self.first_fans = fan_count(start.mesh)
+        self.near = NearFields.around(dataset.train, start.mesh)
+        self.events = events_passed(config, self.fraction)
+
+    def result(self) -> SplatMesh:
+        """The current fans, but those in the near field of a camera."""
+        mesh = super().result()
+        assert mesh.face_splat is not None
+        stray = self.near.contain(mesh)
+        return mesh.keep_faces(~stray[mesh.face_splat]) if stray.any() and not stray.all() else mesh
+
+    def _views(self) -> Sequence[View]:
+        factor = image_factor(self.config, self.fraction)
+        if factor not in self._reduced:
+            self._reduced[factor] = reduced_views(self.dataset.train, factor, self._store)
+        return self._reduced[factor]
+
+    def _adapt(self, before: int) -> None:
+        before, self.events = self.events, events_passed(self.config, self.fraction)
+        if self.events <= before or self._done():
+            return
+        state = self.state
+        stray = self.near.contain(state.result())
+        if stray.any() and not stray.all():
+            state = select_fans(state, np.flatnonzero(~stray))
+        target = budget(self.config, self.events, self.first_fans)
+        self.state = grow(state, score(state, self._views(), self.events), target)

@@ -1,0 +1,193 @@
+"""Where a training starts: hulls hold their object, patches lie on surfaces, sizes follow the scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _balls import ball_view, cameras_around
+
+from meshsplats.datasets.points import ScenePoints
+from meshsplats.datasets.views import View, ViewImage
+from meshsplats.training.hull import carve, has_silhouettes, in_silhouettes
+from meshsplats.training.initial import (
+    colored,
+    fans_of,
+    flat_splats,
+    ranges_of_cameras,
+    ranges_of_points,
+    starting_patches,
+)
+from meshsplats.training.patches import merged
+from meshsplats.training.stereo import dense_points
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return [ball_view(camera) for camera in cameras_around(24)]
+
+
+@pytest.fixture(scope="module")
+def room():
+    return [ball_view(camera, backdrop=True) for camera in cameras_around(24)]
+
+
+def on_sphere(count: int = 400) -> np.ndarray:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def test_the_hull_holds_the_ball_and_little_more(ball):
+    surface = carve(ball, 1500)
+    assert len(surface.points) >= 1500
+    radius = np.linalg.norm(surface.points, axis=1)
+    # Cells of the surface lie around the sphere; 24 silhouettes leave some room beside it.
+    assert radius.min() > 1 - surface.side
+    assert np.quantile(radius, 0.9) < 1.08 + surface.side
+    for point in on_sphere():  # no part of the ball is carved away
+        assert np.linalg.norm(surface.points - point, axis=1).min() < 0.25
+    outward = np.einsum("ni,ni->n", surface.normals, surface.points / radius[:, None])
+    assert np.median(outward) > 0.9
+
+
+def test_a_misplaced_view_does_not_cut_the_hull(ball):
+    wrong = cameras_around(24, seed=2)[7].world_to_camera.copy()
+    wrong[0, 3] += 1.2
+    views = list(ball)
+    views[7] = replace(views[7], camera=replace(views[7].camera, world_to_camera=wrong))
+    surface = carve(views, 1500)
+    assert np.linalg.norm(surface.points, axis=1).min() > 1 - surface.side
+
+
+def test_silhouettes_of_nothing_in_common_are_refused(ball):
+    views = []
+    for i, view in enumerate(ball):
+        alpha = np.zeros((64, 64), np.float32)
+        alpha[5:9, 5 + 7 * (i % 8) : 9 + 7 * (i % 8)] = 1
+        views.append(View(view.camera, ViewImage(alpha[..., None].repeat(3, axis=2), alpha)))
+    assert carve(views, 500) is None
+    with pytest.raises(ValueError, match="cameras and masks do not fit"):
+        starting_patches(views, 500)
+
+
+def test_silhouettes_need_alpha_that_leaves_something_out(ball, room):
+    assert has_silhouettes(ball)
+    assert not has_silhouettes(room)
+    assert not has_silhouettes([])
+    view = ball[0]
+    full = ViewImage(view.load().color, np.ones((64, 64), np.float32))
+    assert not has_silhouettes([replace(view, source=full)])
+
+
+def test_points_beside_a_silhouette_are_found(ball):
+    points = np.concatenate([0.9 * on_sphere(50), 1.5 * on_sphere(50)])
+    inside = in_silhouettes(ball, points, np.full(100, 0.01))
+    assert inside[:50].all()
+    assert not inside[50:].any()
+
+
+def test_matched_photographs_show_the_sphere(room):
+    """Depths of the ball and of what is far behind it, without any known point."""
+    near, far, targets = ranges_of_cameras(room)
+    found = dense_points(room, near, far, targets)
+    radius = np.linalg.norm(found.points, axis=1)
+    ball = radius < 3
+    assert ball.sum() > 2000
+    assert np.median(np.abs(radius[ball] - 1)) < 0.03
+    assert np.quantile(np.abs(radius[ball] - 1), 0.9) < 0.2
+    assert found.free(3 * on_sphere(100)).max() > 3  # what views see past
+    assert found.free(0.7 * on_sphere(100)).max() <= 3
+
+
+def test_ranges_of_depth_hold_the_points(room):
+    points = np.concatenate([on_sphere(300), 8 * on_sphere(300)])
+    near, far, _targets = ranges_of_points(room, points)
+    for view, low, high in zip(room, near, far, strict=True):
+        positions, depth = view.camera.project(points)
+        seen = depth[view.camera.in_image(positions)]
+        assert low < np.quantile(seen, 0.02)
+        assert high > seen.max()
+    # Views without a point in their image have the range of the others.
+    away = room[0].camera.world_to_camera.copy()
+    away[:3] *= np.array([[-1], [1], [-1]])
+    turned = replace(room[0], camera=replace(room[0].camera, world_to_camera=away))
+    few = on_sphere(300) * 0.5
+    assert np.isfinite(ranges_of_points([turned, *room[1:]], few)[0]).all()
+
+
+def test_patches_of_points_on_a_plane_lie_in_it():
+    rng = np.random.default_rng(1)
+    across = rng.uniform(-1, 1, (4000, 2))
+    points = np.column_stack([across, 0.5 * across[:, 0] + rng.normal(0, 0.002, 4000)])
+    patches = merged(points, np.full((4000, 3), 0.3), np.full(4000, 0.01), np.ones(4000), 300)
+    assert 100 < len(patches.points) <= 300
+    normal = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
+    assert np.median(np.abs(patches.normals @ normal)) > 0.99
+    assert np.abs(patches.points @ normal).max() < 0.02
+    assert patches.colors == pytest.approx(0.3, abs=1e-6)
+
+
+def test_patches_follow_the_size_of_a_pixel():
+    """Far surfaces, whose pixels are larger, have larger patches."""
+    rng = np.random.default_rng(1)
+    near = np.column_stack([rng.uniform(-1, 1, (3000, 2)), np.zeros(3000)])
+    far = np.column_stack([rng.uniform(-8, 8, (3000, 2)), np.full(3000, 8.0)])
+    pixels = np.repeat([0.01, 0.08], 3000)
+    patches = merged(np.concatenate([near, far]), np.zeros((6000, 3)), pixels, np.ones(6000), 500)
+    behind = patches.points[:, 2] > 4
+    assert np.median(patches.sides[behind]) == 8 * np.median(patches.sides[~behind])
+
+
+def test_a_point_that_nothing_confirms_is_left_out():
+    points = np.concatenate([np.random.default_rng(0).uniform(0, 1, (500, 3)), [[9.0, 9, 9]]])
+    patches = merged(points, np.zeros((501, 3)), np.full(501, 0.1), np.ones(501), 50)
+    assert patches.points.max() < 2
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_the_start_has_the_scale_of_the_scene(masked):
+    starts = []
+    for scale in (1.0, 50.0):
+        cameras = cameras_around(16, scale=scale)
+        views = [ball_view(camera, scale, backdrop=not masked) for camera in cameras]
+        patches, shell = starting_patches(views, 1200)
+        assert (shell is None) == masked
+        starts.append(patches)
+    small, large = starts
+    assert len(large.points) == pytest.approx(len(small.points), rel=0.1)
+    assert np.median(large.sides) == pytest.approx(50 * np.median(small.sides), rel=0.1)
+    extent = [np.quantile(np.linalg.norm(p.points, axis=1), 0.5) for p in starts]
+    assert extent[1] == pytest.approx(50 * extent[0], rel=0.1)
+
+
+def test_the_shell_lies_behind_everything(room):
+    patches, shell = starting_patches(room, 1500)
+    assert 0 < len(shell.points) <= 1500
+    inner = np.linalg.norm(patches.points, axis=1).max()
+    assert np.linalg.norm(shell.points, axis=1).min() > min(inner, 8)
+
+
+def test_known_points_are_part_of_the_start(room):
+    """Also where no photographs match: there are none of these colours."""
+    spot = np.random.default_rng(0).normal([0, 0, 1.4], 0.03, (200, 3))
+    points = ScenePoints(
+        np.concatenate([spot, on_sphere(200)]),
+        np.repeat([[255, 0, 255], [128, 128, 128]], 200, axis=0).astype(np.uint8),
+        np.full(400, 3),
+    )
+    patches, _ = starting_patches(room, 1500, points)
+    assert (np.abs(patches.colors - [1, 0, 1]).max(axis=1) < 0.1).sum() >= 2
+
+
+def test_colours_are_those_of_the_photographs(ball):
+    patches, _ = starting_patches(ball, 1500)
+    mesh = fans_of(flat_splats(patches), 6)
+    grey = replace(mesh, colors=np.column_stack([np.full((len(mesh.colors), 3), 0.5), mesh.colors[:, 3]]))
+    tinted = colored(grey, ball, None)
+    from meshsplats.rendering import render
+
+    view = ball[3]
+    error = [np.abs(render(m, view.camera).color - view.image).mean() for m in (grey, tinted)]
+    assert error[1] < 0.6 * error[0]
+    assert np.array_equal(tinted.colors[:, 3], grey.colors[:, 3])

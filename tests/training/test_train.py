@@ -1,0 +1,319 @@
+"""Training on tiny scenes of known truth: quality, budget, near fields, bits, interruption, errors."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from _balls import ball_view, cameras_around
+from _photographs import write_photographs
+
+from meshsplats.cli import main
+from meshsplats.datasets.views import Dataset
+from meshsplats.evaluation.report import evaluate
+from meshsplats.finetuning import Interrupted, RunOptions
+from meshsplats.finetuning.checkpoint import OtherRunError
+from meshsplats.finetuning.state import State
+from meshsplats.formats.gaussians import load_gaussians
+from meshsplats.formats.meshes import load_mesh
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering import render_splats
+from meshsplats.training import starting_fans, train, train_config
+from meshsplats.training.as_splats import splats_of_fans
+from meshsplats.training.growth import NearFields, Scores, fan_count, grow, score, select_fans
+from meshsplats.training.initial import fans_of
+from meshsplats.training.run import SO_FAR
+from meshsplats.training.schedule import budget, events_passed, image_factor
+
+SMALL = {"start_splats": 600, "max_splats": 1500, "growth_events": 4}
+
+
+def views_of(count: int, seed: int, backdrop: bool) -> tuple:
+    return tuple(ball_view(camera, backdrop=backdrop) for camera in cameras_around(count, seed=seed))
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return Dataset(views_of(20, 0, False), views_of(3, 1, False))
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Dataset(views_of(20, 0, True), views_of(3, 1, True)).over((0, 0, 0))
+
+
+@pytest.fixture(scope="module")
+def trained(ball):
+    return train(ball, train_config(steps=120, **SMALL))
+
+
+def same(a: SplatMesh, b: SplatMesh) -> bool:
+    return all(
+        np.array_equal(getattr(a, n), getattr(b, n)) for n in ("vertices", "faces", "colors", "face_splat")
+    )
+
+
+def psnr_of(mesh: SplatMesh, dataset: Dataset) -> float:
+    return evaluate(mesh, dataset).method("mesh").mean("psnr")
+
+
+# ---- What it is for
+
+
+def test_a_ball_is_recovered_from_its_photographs(ball, trained):
+    """On held-out views; the start alone has less than 20 dB."""
+    start = starting_fans(ball, train_config(steps=120, **SMALL))
+    before, after = psnr_of(start, ball), psnr_of(trained, ball)
+    assert after > 24
+    assert after > before + 4
+
+
+def test_a_scene_without_masks_is_recovered_too(room):
+    mesh = train(room, train_config(steps=150, start_splats=1500, max_splats=3000, growth_events=4))
+    assert psnr_of(mesh, room) > 20
+
+
+def test_growth_is_worth_its_fans(ball, trained):
+    still = train(ball, train_config(steps=120, **SMALL | {"growth_events": 0}))
+    assert fan_count(still) < fan_count(trained)
+    assert psnr_of(trained, ball) > psnr_of(still, ball) + 0.5
+
+
+def test_the_budget_holds(ball, trained):
+    assert fan_count(trained) == trained.splat_count <= 1500
+    tight = train(ball, train_config(steps=20, start_splats=600, max_splats=200))
+    assert fan_count(tight) <= 200
+
+
+# ---- Growth
+
+
+def begun(dataset: Dataset) -> State:
+    config = train_config(steps=10, **SMALL)
+    return State.begin(starting_fans(dataset, config), len(dataset.train), config, None)
+
+
+def test_growth_halves_where_several_views_see_errors(ball):
+    state = begun(ball)
+    n = fan_count(state.mesh)
+    found = score(state, ball.train)
+    grown = grow(state, found, n + 50)
+    kept = fan_count(grown.mesh) - 50
+    assert kept <= n
+    again = found._replace(error=np.zeros(n))  # without an error nothing is halved
+    assert fan_count(grow(state, again, n + 50).mesh) == kept
+
+
+def test_an_error_in_one_view_alone_halves_nothing(ball):
+    state = begun(ball)
+    bright = ball.train[4].load()
+    views = list(ball.train)
+    clean = score(state, views).error
+    broken = replace(bright, color=np.clip(bright.color + 0.7, 0, 1), alpha=np.ones((64, 64), np.float32))
+    views[4] = replace(views[4], source=broken)
+    # All of it is in the largest term, which does not count: only what this view hides of others changes.
+    assert score(state, views).error.sum() < 1.3 * clean.sum()
+
+
+def test_fans_that_contribute_nothing_are_dropped(ball):
+    state = begun(ball)
+    n = fan_count(state.mesh)
+    useful = Scores(np.ones(n), np.full(n, 5.0), np.zeros(n), np.ones(n, bool))
+    faint = np.arange(n) < 10
+    for worse in (
+        useful._replace(most_pixels=np.where(faint, 0.001, 5.0)),
+        useful._replace(clear_share=np.where(faint, 0.9, 0.0)),
+    ):
+        assert fan_count(grow(state, worse, 0).mesh) == n - 10
+    unseen = useful._replace(most_pixels=np.zeros(n), in_view=np.zeros(n, bool))
+    assert fan_count(grow(state, unseen, 0).mesh) == n
+    state.colors[:7, 3] = 0  # all of the first fan
+    assert fan_count(grow(state, useful, 0).mesh) == n - 1
+
+
+def test_halves_have_the_place_and_colours_of_their_fan(ball):
+    state = begun(ball)
+    n = fan_count(state.mesh)
+    halved = select_fans(state, np.arange(n), np.array([3, 8]))
+    k = 7
+    before = state.vertices.reshape(n, k, 3)
+    after = halved.vertices.reshape(n + 2, k, 3)
+    rest = np.setdiff1d(np.arange(n), [3, 8])
+    assert np.array_equal(after[rest], before[rest])
+    for fan, other in ((3, n), (8, n + 1)):
+        pair = after[[fan, other]]
+        assert np.allclose(pair.reshape(-1, 3).mean(axis=0), before[fan].mean(axis=0), atol=1e-6)
+        assert np.linalg.norm(pair[0, 0] - pair[1, 0]) > 0
+        assert np.array_equal(halved.colors.reshape(n + 2, k, 4)[other], state.colors.reshape(n, k, 4)[fan])
+    assert (halved.sizes.reshape(n + 2, k)[[3, n]] < state.sizes.reshape(n, k)[3]).all()
+
+
+def test_no_fan_is_in_a_near_field(ball, trained):
+    start = starting_fans(ball, train_config(steps=1, **SMALL))
+    near = NearFields.around(ball.train, start)
+    assert (near.depths > 0.3).all()
+    assert (near.depths < 2).all()
+    assert not near.contain(trained).any()
+    # One that is put there is found, even right in front of the lens.
+    camera = ball.train[2].camera
+    for share in (0.9, 0.01):
+        stray = start.vertices.copy()
+        place = camera.center + share * near.depths[2] * camera.world_to_camera[2, :3]
+        stray[:7] += (place - stray[0]).astype(np.float32)
+        assert near.contain(replace(start, vertices=stray)).nonzero()[0].tolist() == [0]
+
+
+def test_a_stray_in_a_near_field_does_not_survive(ball, monkeypatch):
+    """Wherever it starts: it is gone from the result."""
+    from meshsplats.training import run
+
+    start = starting_fans(ball, train_config(steps=1, **SMALL))
+    camera = ball.train[2].camera
+    stray = start.vertices.copy()
+    place = camera.center + 0.3 * camera.world_to_camera[2, :3]
+    stray[:7] += (place - stray[0]).astype(np.float32)
+    monkeypatch.setattr(run, "starting_fans", lambda *_: replace(start, vertices=stray))
+    mesh = train(ball, train_config(steps=3, **SMALL | {"growth_events": 0}))
+    assert fan_count(mesh) == fan_count(start) - 1
+
+
+# ---- Schedule
+
+
+def test_the_schedule_grows_images_and_budget():
+    config = train_config(steps=100, max_splats=1000, growth_events=5, growth_end=0.5)
+    assert [image_factor(config, f) for f in (0, 0.0999, 0.1, 0.2999, 0.3, 1)] == [
+        *(0.25, 0.25, 0.5),
+        *(0.5, 1.0, 1.0),
+    ]
+    passed = [events_passed(config, step / 100) for step in range(101)]
+    assert [passed.index(i) for i in range(1, 6)] == [10, 20, 30, 40, 50]
+    assert max(passed) == 5
+    budgets = [budget(config, event, 100) for event in range(1, 6)]
+    assert budgets == sorted(budgets)
+    assert budgets[-1] == 1000
+    assert max(budget(config, event, 3000) for event in range(1, 6)) <= 1000
+
+
+# ---- Runs
+
+
+def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads(ball):
+    config = train_config(steps=12, **SMALL)
+    meshes = [train(ball, config, run=RunOptions(threads=n)) for n in (1, 2)]
+    assert same(*meshes)
+    assert not same(meshes[0], train(ball, replace(config, seed=1)))
+
+
+def test_a_resumed_run_ends_with_the_same_bits(ball, tmp_path):
+    """Stopped before, between and after growth, with exposures; each time the mesh so far is there."""
+    config = train_config(steps=24, exposure=True, **SMALL)
+    whole = train(ball, config, run=RunOptions(tmp_path / "whole"))
+    folder = tmp_path / "run"
+    for stop in (2, 7, 20):
+
+        def after(progress, stop=stop):
+            if progress.step == stop:
+                signal.raise_signal(signal.SIGINT)
+
+        resume = folder.exists()
+        with pytest.raises(Interrupted):
+            train(ball, config, run=RunOptions(folder, resume), on_progress=after)
+        so_far = load_mesh(folder / SO_FAR)
+        assert 0 < fan_count(so_far) <= 1500
+    assert same(train(ball, config, run=RunOptions(folder, resume=True)), whole)
+    with pytest.raises(OtherRunError, match="max_splats was 1500 and is 1600"):
+        train(ball, replace(config, max_splats=1600), run=RunOptions(folder, resume=True))
+
+
+def test_bad_input_is_refused_before_the_work(ball, tmp_path):
+    with pytest.raises(ValueError, match="at least 2 training views"):
+        train(Dataset(ball.train[:1]), train_config(steps=1))
+    with pytest.raises(ValueError, match="sides must be a whole number from 3 to 16"):
+        train_config(sides=2)
+    with pytest.raises(ValueError, match="opacity must be 'blended'"):
+        train_config(opacity="cutoff")
+    with pytest.raises(TypeError, match="did you mean 'max_splats'"):
+        train_config(max_splat=3)
+    with pytest.raises(FileNotFoundError, match=r"no .*start\.npz: leave out --resume"):
+        train(ball, train_config(steps=1), run=RunOptions(tmp_path / "none", resume=True))
+
+
+def test_memory_is_estimated_up_front(ball, monkeypatch):
+    from meshsplats.finetuning import memory
+
+    monkeypatch.setattr(memory, "available_memory", lambda: 10**8)
+    with pytest.raises(MemoryError, match=r"training 100,000 fans on 23 images needs about .*--max-splats"):
+        train(ball, train_config(steps=1))
+
+
+# ---- As splats
+
+
+def test_fans_become_the_splats_that_they_were_made_of(trained):
+    rng = np.random.default_rng(0)
+    cloud = splats_of_fans(trained)
+    assert len(cloud) == fan_count(trained)
+    flat = replace(
+        cloud,
+        scales=np.sort(rng.uniform(0.05, 0.3, cloud.scales.shape), axis=1) * [0, 1, 1],
+        opacities=rng.uniform(0.1, 0.7, len(cloud)),
+        kernel="2dgs",
+    ).select(np.arange(100))
+    # Fans drop the smallest axis, whichever it is.
+    flat = replace(flat, kernel="3dgs")
+    again = splats_of_fans(fans_of(flat, 8))
+    assert np.allclose(again.means, flat.means, atol=1e-5)
+    assert np.allclose(again.colors, flat.colors, atol=1e-5)
+    assert np.allclose(again.scales[:, 1:], flat.scales[:, 1:], rtol=1e-3)
+
+    def spread(c):
+        return np.einsum("nij,nj,nkj->nik", c.rotations, np.square(c.scales * [0, 1, 1]), c.rotations)
+
+    assert np.allclose(spread(again), spread(flat), atol=1e-5)
+
+
+def test_splats_of_a_training_look_like_it(ball, trained):
+    view = ball.test[0]
+    image = render_splats(splats_of_fans(trained), view.camera, dilation=0.02, samples=2).color
+    assert -10 * np.log10(np.square(image - view.image).mean()) > 18
+
+
+def test_other_meshes_do_not_become_splats(trained):
+    for mesh in (
+        replace(trained, face_splat=None),
+        trained.keep_faces(np.arange(len(trained.faces)) != 5),
+    ):
+        with pytest.raises(ValueError, match="not a mesh of equal fans"):
+            splats_of_fans(mesh)
+
+
+# ---- The command
+
+
+def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
+    views = ball.train[:12]
+    images = [straight(view) for view in views]
+    folder = write_photographs(tmp_path / "photos", [view.camera for view in views], images)
+    out, splats = tmp_path / "mesh.npz", tmp_path / "splats.ply"
+    words = ["train", str(folder), "-o", str(out), "--steps", "12", "--start-splats", "300"]
+    words += ["--max-splats", "500", "--as-splats", str(splats), "--json"]
+    assert main(words) == 0
+    mesh = load_mesh(out)
+    assert fan_count(mesh) <= 500
+    assert len(load_gaussians(splats)) == fan_count(mesh)
+    for name in ("config.toml", "preview.png"):
+        assert (tmp_path / f"mesh.npz.{name}").is_file()
+    assert main(words) == 3  # what is there is not overwritten
+    assert main(["train", str(folder), "-o", str(tmp_path / "b.npz"), "--as-splats", "b.spz"]) == 2
+    capsys.readouterr()
+
+
+def straight(view) -> np.ndarray:
+    """(h, w, 4) image with straight colours, as .png files have them."""
+    image = view.load()
+    alpha = image.alpha[..., None]
+    color = np.divide(image.color, alpha, out=np.zeros_like(image.color), where=alpha > 0)
+    return np.concatenate([color, alpha], axis=2)
