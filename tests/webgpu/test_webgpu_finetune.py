@@ -21,7 +21,10 @@ from meshsplats.webgpu.renderer import DrawSettings
 
 GPU = RunOptions(device="gpu")
 TOLERANCE = 1e-4
-"""Of losses, and of the changes of colours and positions after a few steps, relative."""
+"""Of losses, relative."""
+CHANGES = 1e-3
+"""Of the changes of colours and positions after a few steps, relative. Adam divides by the size of a gradient:
+where that is next to nothing, rounding decides on a step."""
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +54,7 @@ OPTIONS = [
     {"position_rate": 0.0},
     {"blending": "linear"},
     {"relocate_share": 0.1},
+    {"exposure": True},
 ]
 
 
@@ -64,7 +68,7 @@ def test_steps_are_those_of_the_cpu(scene, options):
         before, after = getattr(known.mesh, name), getattr(known, name)
         change = np.linalg.norm(after - before)
         assert change > 0 or (name == "vertices" and options.get("position_rate") == 0)
-        assert np.linalg.norm(getattr(state, name) - after) <= TOLERANCE * change
+        assert np.linalg.norm(getattr(state, name) - after) <= CHANGES * change
 
 
 def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene):
@@ -92,7 +96,7 @@ def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
         losses.append(make_step(state, dataset.train, i, i / 5))
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - mesh.vertices)
-    assert np.linalg.norm(state.vertices - known.vertices) <= TOLERANCE * change
+    assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
 
 
 def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
@@ -104,7 +108,7 @@ def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
     assert state._trainer._window_samples < 1 << 22
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - known.mesh.vertices)
-    assert np.linalg.norm(state.vertices - known.vertices) <= TOLERANCE * change
+    assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
 
 
 def test_nothing_changes_if_the_loss_or_a_gradient_is_not_finite(scene):

@@ -34,6 +34,8 @@ PAIR_BYTES = 100
 FRAGMENT_BYTES = 16
 SUM_BYTES = 64
 """Bytes of the sums of a triangle, over one tile or all."""
+MAX_FAN = 4096
+"""Most triangles of a splat with a low-pass filter: one invocation goes through all of them nine times."""
 MAX_VALENCE = 16_384
 """Most triangles at a vertex: one invocation adds them."""
 ROWS = 32_768
@@ -131,6 +133,8 @@ class GradientRenderer(MeshRenderer):
         MemoryError: a mesh that does not fit into buffers of 128 MiB.
         DeviceError: a vertex with too many triangles.
     """
+
+    max_fan = MAX_FAN
 
     def __init__(self, device: Device, mesh: SplatMesh) -> None:
         self._check_corners(device, mesh)

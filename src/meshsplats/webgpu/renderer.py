@@ -178,6 +178,8 @@ def _forget() -> None:
 class MeshRenderer:
     """A mesh on a GPU."""
 
+    max_fan = MAX_FAN
+
     def __init__(self, device: Device, mesh: SplatMesh) -> None:
         self.device = device
         self.mesh = mesh
@@ -311,9 +313,9 @@ class MeshRenderer:
         splat = self.mesh.face_splat
         assert splat is not None
         starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
-        if np.diff(starts).max() > MAX_FAN:
+        if np.diff(starts).max() > self.max_fan:
             raise DeviceError(
-                f"the filter of the GPU takes splats of up to {MAX_FAN:,} triangles; one has"
+                f"the filter of the GPU takes splats of up to {self.max_fan:,} triangles; one has"
                 f" {np.diff(starts).max():,}. Use device='cpu'"
             )
         owner = np.full(len(self.mesh.vertices), -1, np.int32)
