@@ -8,14 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _gpu import need_gpu
+from _priors import bumpy
 
+from meshsplats import Dataset, orbit, render
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset
+from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import importance, make_step
+from meshsplats.prior import bind
 from meshsplats.webgpu import gradients
 from meshsplats.webgpu.renderer import DrawSettings
 
@@ -23,8 +27,8 @@ GPU = RunOptions(device="gpu")
 TOLERANCE = 1e-4
 """Of losses, relative."""
 CHANGES = 1e-3
-"""Of the changes of colours and positions after a few steps, relative. Adam divides by the size of a gradient:
-where that is next to nothing, rounding decides on a step."""
+"""Of the changes of colours and positions after a few steps, relative. Adam divides by the size of a
+gradient: where that is next to nothing, rounding decides on a step."""
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +73,25 @@ def test_steps_are_those_of_the_cpu(scene, options):
         change = np.linalg.norm(after - before)
         assert change > 0 or (name == "vertices" and options.get("position_rate") == 0)
         assert np.linalg.norm(getattr(state, name) - after) <= CHANGES * change
+
+
+def test_a_mesh_on_a_base_with_depth_groups():
+    need_gpu()
+    base = bumpy(4)
+    mesh = bind(base, triangles=4).mesh
+    assert mesh.binding is not None
+    assert mesh.depth_group is not None
+    views = []
+    for camera in orbit(mesh, 3, width=32, height=32):
+        image = render(replace(mesh, colors=mesh.colors[::-1]), camera)
+        views.append(View(camera, ViewImage(image.color)))
+    scene = Dataset(tuple(views), ()), mesh
+    losses, state = steps(scene, "gpu", 3)
+    expected, known = steps(scene, "cpu", 3)
+    assert np.allclose(losses, expected, rtol=TOLERANCE)
+    change = np.linalg.norm(known.vertices - mesh.vertices)
+    assert change > 0
+    assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
 
 
 def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene):
