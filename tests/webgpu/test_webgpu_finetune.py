@@ -8,20 +8,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _gpu import need_gpu
+from _priors import bumpy
 
+from meshsplats import Dataset, orbit, render
 from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset
+from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import importance, make_step
+from meshsplats.prior import bind
 from meshsplats.webgpu import gradients
 from meshsplats.webgpu.renderer import DrawSettings
 
 GPU = RunOptions(device="gpu")
 TOLERANCE = 1e-4
-"""Of losses, and of the changes of colours and positions after a few steps, relative."""
+"""Of losses, relative."""
+CHANGES = 1e-3
+"""Of the changes of colours and positions after a few steps, relative. Adam divides by the size of a
+gradient: where that is next to nothing, rounding decides on a step."""
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +58,7 @@ OPTIONS = [
     {"position_rate": 0.0},
     {"blending": "linear"},
     {"relocate_share": 0.1},
+    {"exposure": True},
 ]
 
 
@@ -64,7 +72,26 @@ def test_steps_are_those_of_the_cpu(scene, options):
         before, after = getattr(known.mesh, name), getattr(known, name)
         change = np.linalg.norm(after - before)
         assert change > 0 or (name == "vertices" and options.get("position_rate") == 0)
-        assert np.linalg.norm(getattr(state, name) - after) <= TOLERANCE * change
+        assert np.linalg.norm(getattr(state, name) - after) <= CHANGES * change
+
+
+def test_a_mesh_on_a_base_with_depth_groups():
+    need_gpu()
+    base = bumpy(4)
+    mesh = bind(base, triangles=4).mesh
+    assert mesh.binding is not None
+    assert mesh.depth_group is not None
+    views = []
+    for camera in orbit(mesh, 3, width=32, height=32):
+        image = render(replace(mesh, colors=mesh.colors[::-1]), camera)
+        views.append(View(camera, ViewImage(image.color)))
+    scene = Dataset(tuple(views), ()), mesh
+    losses, state = steps(scene, "gpu", 3)
+    expected, known = steps(scene, "cpu", 3)
+    assert np.allclose(losses, expected, rtol=TOLERANCE)
+    change = np.linalg.norm(known.vertices - mesh.vertices)
+    assert change > 0
+    assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
 
 
 def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene):
@@ -92,7 +119,7 @@ def test_steps_here_and_on_the_gpu_take_turns(scene, monkeypatch):
         losses.append(make_step(state, dataset.train, i, i / 5))
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - mesh.vertices)
-    assert np.linalg.norm(state.vertices - known.vertices) <= TOLERANCE * change
+    assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
 
 
 def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
@@ -104,7 +131,7 @@ def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
     assert state._trainer._window_samples < 1 << 22
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - known.mesh.vertices)
-    assert np.linalg.norm(state.vertices - known.vertices) <= TOLERANCE * change
+    assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
 
 
 def test_nothing_changes_if_the_loss_or_a_gradient_is_not_finite(scene):

@@ -148,6 +148,25 @@ def test_through_the_filter_of_needles_and_of_fans_seen_edge_on():
     assert_same_gradients(replace(mesh, vertices=points.reshape(-1, 3)), camera(60, 50), filter_px2=0.3)
 
 
+def large_fan(triangles: int) -> SplatMesh:
+    angles = np.arange(triangles) * 2 * np.pi / triangles
+    rim = np.stack([np.cos(angles), np.sin(angles), 2 + 0.3 * np.cos(angles)], axis=1)
+    faces = [(0, 1 + i, 1 + (i + 1) % triangles) for i in range(triangles)]
+    colors = np.random.default_rng(0).random((triangles + 1, 4))
+    splat = np.zeros(triangles, int)
+    return SplatMesh(np.concatenate([[[0, 0, 2.0]], rim]), faces, colors, face_splat=splat)
+
+
+def test_through_the_filter_of_the_largest_fan():
+    mesh, view = large_fan(gradients.MAX_FAN), camera(60, 50)
+    gradient = random_gradient(view)
+    found = descend(of_mesh(GpuRendering, mesh, view, filter_px2=0.3), gradient)
+    expected = descend(of_mesh(TapedRendering, mesh, view, filter_px2=0.3), gradient)
+    assert all(error(a, b) < 1e-3 for a, b in zip(found, expected, strict=True))  # slivers, by rounding
+    with pytest.raises(DeviceError, match="up to 4,096 triangles; one has 4,097"):
+        of_mesh(GpuRendering, large_fan(gradients.MAX_FAN + 1), view, filter_px2=0.3)
+
+
 def test_the_image_is_that_of_render():
     mesh, view, _ = scene("terminated early")
     taped = of_mesh(GpuRendering, mesh, view, min_transmittance=1e-3)

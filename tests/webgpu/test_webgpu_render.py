@@ -275,7 +275,8 @@ def test_the_kernels_need_core_limits_only():
     assert limits["max-compute-workgroup-storage-size"] == 16384
     assert limits["max-storage-buffer-binding-size"] == 128 << 20
     assert not open_device().device.features
-    for text in (kernels.lists_source(), kernels.raster_source(groups=True)):
+    gradients = (kernels.gradients_source(), kernels.filter_source(), kernels.training_source())
+    for text in (kernels.lists_source(), kernels.raster_source(groups=True), *gradients):
         assert not re.search(r"^\s*(enable|requires)\b", text, re.M)
 
 

@@ -5,6 +5,7 @@ docs/webgpu.md describes the kernels.
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -33,10 +34,17 @@ PAIR_BYTES = 100
 FRAGMENT_BYTES = 16
 SUM_BYTES = 64
 """Bytes of the sums of a triangle, over one tile or all."""
+MAX_FAN = 4096
+"""Most triangles of a splat with a low-pass filter: one invocation goes through all of them nine times."""
 MAX_VALENCE = 16_384
 """Most triangles at a vertex: one invocation adds them."""
 ROWS = 32_768
 """Workgroups in each row of a dispatch that is larger than one dimension."""
+
+_MARK_STEPS = (*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps())
+_MARK_AGAIN_STEPS = (*kernels.mark_again_steps(), *kernels.place_steps())
+_FILTER_STEPS = tuple(kernels.filter_steps())
+_gradient_steps = functools.lru_cache(maxsize=64)(kernels.gradient_steps)
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,8 @@ class GradientRenderer(MeshRenderer):
         MemoryError: a mesh that does not fit into buffers of 128 MiB.
         DeviceError: a vertex with too many triangles.
     """
+
+    max_fan = MAX_FAN
 
     def __init__(self, device: Device, mesh: SplatMesh) -> None:
         self._check_corners(device, mesh)
@@ -336,7 +346,7 @@ class GradientRenderer(MeshRenderer):
 
     def _walk(self, counts: dict[str, int], settings: DrawSettings, work: Work) -> tuple[int, np.ndarray]:
         """Renders and marks until all tiles are finished; the repetitions, and the counters."""
-        steps = [*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps()]
+        steps = _MARK_STEPS
         work.frames += 1
         work.dispatches = 0
         previous = None
@@ -348,7 +358,7 @@ class GradientRenderer(MeshRenderer):
             if counters[9] or counters[12] or (previous is not None and previous == counters[3]):
                 break
             previous = counters[3]
-            steps = [*kernels.mark_again_steps(), *kernels.place_steps()]
+            steps = _MARK_AGAIN_STEPS
         raise self._unfinished(counts, counters)
 
     # ------------------------------------------------------------------------------------------ backward pass
@@ -400,7 +410,7 @@ class GradientRenderer(MeshRenderer):
         if forward.settings.filter_px2:
             last = forward.windows[-1]
             counts = self._begin(self._part(forward, last.area), last.settings, forward.pose)
-            self._run(kernels.filter_steps(), "color", counts, last.settings)
+            self._run(_FILTER_STEPS, "color", counts, last.settings)
         size = 32 * len(forward.vertices)
         data = self.device.device.queue.read_buffer(self._buffers["gradients"], 0, size)
         return np.frombuffer(data, np.float32).reshape(-1, 8).copy()
@@ -412,7 +422,7 @@ class GradientRenderer(MeshRenderer):
         counts = self._make_room(forward, window)
         of_samples = np.ascontiguousarray(gradient[y : y + h, x : x + w]) * np.float32(1 / s**2)
         self.device.device.queue.write_buffer(self._buffers["samples"], 32 * w * h * s**2, of_samples)
-        self._run(kernels.gradient_steps(window.rounds), "color", counts, window.settings)
+        self._run(_gradient_steps(window.rounds), "color", counts, window.settings)
         counters = self._counters()
         if counters[2] != counts["tiles"]:
             raise self._unfinished(counts, counters)

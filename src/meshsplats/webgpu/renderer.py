@@ -28,6 +28,9 @@ MAX_FAN = 8192
 _Output = Literal[kernels.Output, "values"]
 """What a frame blends: the outputs of ``raster``, and other values than the colours."""
 
+_LIST_STEPS, _RASTER_STEPS = tuple(kernels.list_steps()), tuple(kernels.raster_steps())
+_AGAIN_STEPS, _RESOLVE_STEPS = tuple(kernels.again_steps()), tuple(kernels.resolve_steps())
+
 MAX_ROUNDS = 10_000
 """Most repetitions of a frame's last steps."""
 
@@ -97,6 +100,17 @@ class Images:
     work: Work = field(default_factory=Work)
 
 
+@dataclass(frozen=True)
+class _Pass:
+    """A walk through the lists of an image for another output than colour."""
+
+    output: _Output
+    vertex_values: np.ndarray | None
+    """(v, 4) float32: what is blended, and opacities; None: the depth."""
+    image: np.ndarray
+    """(h, w, c) float32, where it goes."""
+
+
 def draw(
     mesh: SplatMesh,
     camera: Camera,
@@ -164,11 +178,14 @@ def _forget() -> None:
 class MeshRenderer:
     """A mesh on a GPU."""
 
+    max_fan = MAX_FAN
+
     def __init__(self, device: Device, mesh: SplatMesh) -> None:
         self.device = device
         self.mesh = mesh
         self._lock = threading.Lock()
         self._buffers: dict[str, Any] = {}
+        self._bind_groups: dict[tuple[Any, ...], Any] = {}
         self._capacity = FIRST_PAIRS
         self._fans = 0
         runs = find_runs(mesh.faces, mesh.face_splat)
@@ -233,6 +250,7 @@ class MeshRenderer:
             raise MemoryError(f"the GPU cannot hold {name}: {size / 2**20:.0f} MiB")
         if old is not None:
             del self._buffers[name]
+            self._bind_groups.clear()
             old.destroy()
         self._buffers[name] = self.device.device.create_buffer(size=size, usage=self._usage(name))
 
@@ -263,6 +281,7 @@ class MeshRenderer:
         budgets = self.device.budgets if settings.budget is None else (settings.budget,)
         with self._lock:
             self._prepare_filter(settings)
+            passes = list(self._passes(images, values))
             waiting = [(0, 0, w, h)]
             while waiting:
                 window = waiting.pop()
@@ -272,7 +291,7 @@ class MeshRenderer:
                 for budget in budgets:
                     try:
                         drawn = self._draw_window(
-                            camera, window, replace(settings, budget=budget), images, values
+                            camera, window, replace(settings, budget=budget), images, passes
                         )
                         break
                     except DeviceError:
@@ -294,9 +313,9 @@ class MeshRenderer:
         splat = self.mesh.face_splat
         assert splat is not None
         starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
-        if np.diff(starts).max() > MAX_FAN:
+        if np.diff(starts).max() > self.max_fan:
             raise DeviceError(
-                f"the filter of the GPU takes splats of up to {MAX_FAN:,} triangles; one has"
+                f"the filter of the GPU takes splats of up to {self.max_fan:,} triangles; one has"
                 f" {np.diff(starts).max():,}. Use device='cpu'"
             )
         owner = np.full(len(self.mesh.vertices), -1, np.int32)
@@ -317,7 +336,7 @@ class MeshRenderer:
         window: tuple[int, int, int, int],
         settings: DrawSettings,
         images: Images,
-        values: np.ndarray | None,
+        passes: Sequence[_Pass],
     ) -> bool:
         """Draws a window; False if it has too many pairs."""
         x0, y0, w, h = window
@@ -338,27 +357,30 @@ class MeshRenderer:
         pixels = self._read(w, h, settings.samples)
         images.color[rows, columns] = pixels[..., :3]
         images.transmittance[rows, columns] = pixels[..., 3]
+        for one in passes:
+            if one.vertex_values is not None:
+                self._upload("other_values", one.vertex_values)
+            self._frame(one.output, counts, settings, None)
+            channels = one.image.shape[2]
+            one.image[rows, columns] = self._read(w, h, settings.samples)[..., :channels]
+        return True
+
+    def _passes(self, images: Images, values: np.ndarray | None) -> Iterator[_Pass]:
+        """The passes for the outputs besides colour."""
         if images.depth is not None:
-            self._frame("depth", counts, settings, None)
-            images.depth[rows, columns] = self._read(w, h, settings.samples)[..., 0]
+            yield _Pass("depth", None, images.depth[:, :, None])
         alpha = self.mesh.colors[:, 3:]
         if images.normals is not None:
             known = self.mesh.normals
             of_vertex = self.mesh.vertices if known is None else known
-            self._upload("other_values", np.concatenate([of_vertex, alpha], axis=1, dtype=np.float32))
-            self._frame("face_normals" if known is None else "vertex_normals", counts, settings, None)
-            images.normals[rows, columns] = self._read(w, h, settings.samples)[..., :3]
+            together = np.concatenate([of_vertex, alpha], axis=1, dtype=np.float32)
+            yield _Pass("face_normals" if known is None else "vertex_normals", together, images.normals)
         if values is not None and images.values is not None:
             for first in range(0, values.shape[1], 3):
                 some = values[:, first : first + 3]
                 padding = np.zeros((len(some), 3 - some.shape[1]), np.float32)
-                self._upload("other_values", np.concatenate([some, padding, alpha], axis=1, dtype=np.float32))
-                self._frame("values", counts, settings, None)
-                count = some.shape[1]
-                images.values[rows, columns, first : first + count] = self._read(w, h, settings.samples)[
-                    ..., :count
-                ]
-        return True
+                together = np.concatenate([some, padding, alpha], axis=1, dtype=np.float32)
+                yield _Pass("values", together, images.values[:, :, first : first + some.shape[1]])
 
     def _begin(self, camera: Camera, settings: DrawSettings) -> dict[str, int]:
         """Sizes the buffers of a frame and writes its uniforms; returns the counts of its steps."""
@@ -389,8 +411,7 @@ class MeshRenderer:
         self, output: _Output, counts: dict[str, int], settings: DrawSettings, work: Work | None
     ) -> np.ndarray:
         """Renders one frame to the samples, until all tiles are finished; returns the counters."""
-        steps = kernels.list_steps() if output == "color" else []
-        steps += kernels.raster_steps()
+        steps = (*_LIST_STEPS, *_RASTER_STEPS) if output == "color" else _RASTER_STEPS
         if work is not None:
             work.frames += 1
             work.dispatches = 0
@@ -405,7 +426,7 @@ class MeshRenderer:
             if counters[9] or counters[12] or (previous is not None and previous == counters[3]):
                 break
             previous = counters[3]
-            steps = kernels.again_steps()
+            steps = _AGAIN_STEPS
         raise DeviceError(
             f"the GPU did not finish {counts['tiles'] - int(counters[2]):,} of {counts['tiles']:,} tiles"
             f" ({self.device.name}): use device='cpu'"
@@ -420,7 +441,7 @@ class MeshRenderer:
         name = "samples"
         if samples > 1:
             counts = {"columns": width, "rows": height}
-            self._run(kernels.resolve_steps(), "color", counts, DrawSettings())
+            self._run(_RESOLVE_STEPS, "color", counts, DrawSettings())
             name = "pixels"
         data = self.device.device.queue.read_buffer(self._buffers[name], 0, 16 * width * height)
         return np.frombuffer(data, np.float32).reshape(height, width, 4)
@@ -463,10 +484,17 @@ class MeshRenderer:
         gpu.queue.submit([encoder.finish()])
 
     def _bind_group(self, pipeline: Any, bind: dict[str, str], output: _Output) -> Any:
+        other = output in ("values", "vertex_normals", "face_normals")
+        key = (pipeline, other, *bind.items())
+        if key not in self._bind_groups:
+            self._bind_groups[key] = self._new_bind_group(pipeline, bind, other)
+        return self._bind_groups[key]
+
+    def _new_bind_group(self, pipeline: Any, bind: dict[str, str], other: bool) -> Any:
         entries = []
         for binding, name in bind.items():
             base, _, index = name.partition(".")
-            if base == "values" and output in ("values", "vertex_normals", "face_normals"):
+            if base == "values" and other:
                 base = "other_values"
             buffer = self._buffers[base]
             offset, size = (256 * int(index), 16) if index else (0, buffer.size)

@@ -5,6 +5,7 @@ docs/webgpu.md describes the kernels.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -25,6 +26,10 @@ MAX_PIXELS = CORE_BINDING // DERIVATIVE_BYTES
 """Most pixels of an image."""
 SIDE = 16
 """Pixels along each side of a workgroup that compares images."""
+
+_STORE_STEPS, _LOSS_STEPS = tuple(kernels.store_steps()), tuple(kernels.loss_steps())
+_ADAM_STEPS = (*kernels.filter_steps(), *kernels.adam_steps())
+_window_steps = functools.lru_cache(maxsize=64)(kernels.window_steps)
 
 
 class Moments(NamedTuple):
@@ -153,20 +158,19 @@ class Trainer(GradientRenderer):
                     continue
                 forward.windows.append(window)
                 self._write_step(forward, window.area, 0, background, rates)
-                self._run_for(kernels.store_steps(), forward, window.area)
-            self._run_for(kernels.loss_steps(), forward, forward.windows[-1].area)
+                self._run_for(_STORE_STEPS, forward, window.area)
+            self._run_for(_LOSS_STEPS, forward, forward.windows[-1].area)
             self._clear("gradients")
             for window in forward.windows:
                 if self._marked is not forward and not self._try_mark(forward, window.area, window.settings):
                     raise DeviceError(f"the GPU did not repeat its own image ({self.device.name})")
                 counts = self._make_room(forward, window)
                 self._write_step(forward, window.area, counts["tiles"], background, rates)
-                steps = kernels.window_steps(window.rounds)
+                steps = _window_steps(window.rounds)
                 self._run(steps, "color", counts | self._image_counts(camera), window.settings)
             last = forward.windows[-1]
             counts = self._begin(self._part(forward, last.area), last.settings)
-            steps = [*kernels.filter_steps(), *kernels.adam_steps()]
-            self._run(steps, "color", counts, last.settings)
+            self._run(_ADAM_STEPS, "color", counts, last.settings)
             data = self.device.device.queue.read_buffer(self._buffers["results"], 0, 32)
         words = np.frombuffer(data, np.uint32)
         if words[4]:
@@ -225,7 +229,7 @@ class Trainer(GradientRenderer):
         return {"image_columns": camera.width, "image_rows": camera.height}
 
     def _run_for(
-        self, steps: list[dict[str, Any]], forward: Forward, area: tuple[int, int, int, int]
+        self, steps: Sequence[dict[str, Any]], forward: Forward, area: tuple[int, int, int, int]
     ) -> None:
         counts = self._counts | self._image_counts(forward.camera) | {"columns": area[2], "rows": area[3]}
         self._run(steps, "color", counts, forward.settings)
