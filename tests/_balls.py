@@ -34,7 +34,7 @@ def cameras_around(
 def texture(points: np.ndarray) -> np.ndarray:
     """(..., 3) RGB of points (..., 3) of the unit sphere: waves in all directions."""
     rng = np.random.default_rng(3)
-    waves = rng.normal(0, 7, (3, 24))
+    waves = rng.normal(0, 4, (3, 24))
     mix = rng.normal(0, 0.11, (24, 3))
     return np.clip(0.5 + np.sin(points @ waves) @ mix, 0, 1)
 

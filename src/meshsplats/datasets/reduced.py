@@ -35,6 +35,29 @@ class ReducedImage:
         return int(self.view.source.nbytes * share)
 
 
+@dataclass(frozen=True, eq=False)
+class OpaqueImage:
+    """The image of ``view``, a photograph without alpha, with an alpha of 1: it hides any background."""
+
+    view: View
+
+    def load(self) -> ViewImage:
+        image = self.view.load()
+        if image.alpha is not None:
+            return image
+        one = 255 if image.color.dtype == np.uint8 else 1
+        return replace(image, alpha=np.full(image.color.shape[:2], one, image.color.dtype))
+
+    @property
+    def nbytes(self) -> int:
+        return self.view.source.nbytes
+
+
+def opaque_views(views: Sequence[View]) -> tuple[View, ...]:
+    """``views`` with an alpha of 1 where their images have none."""
+    return tuple(replace(view, source=OpaqueImage(view)) for view in views)
+
+
 def reduced_views(views: Sequence[View], factor: float, store: ImageCache) -> tuple[View, ...]:
     """``views`` with sides ``factor`` (0 to 1) times as long. The images are kept in ``store``.
 

@@ -25,9 +25,9 @@ class TrainConfig(FinetuneConfig):
     """About the number of fans at the start, at most max_splats."""
     sides: int = 6
     """Triangles of a fan, 3 to 16."""
-    growth_events: int = 12
+    growth_events: int = 6
     """Number of times that fans are halved and dropped. 0: their set stays as it is."""
-    growth_end: float = 0.6
+    growth_end: float = 0.5
     """Share of the run at the last of these times."""
     quarter_share: float = 0.1
     """First share of the run, in which images have a quarter of the photographs' sides."""

@@ -18,6 +18,8 @@ from meshsplats.rendering.backward import TapedRendering
 
 SCORED_VIEWS = 20
 """Maximum number of training views, evenly spread, in which fans are judged."""
+SHELL = "shell"
+"""Attribute of a mesh in training: 1 for the fans of the shell, which are never dropped, else 0."""
 MIN_PIXELS = 0.02
 """A fan that contributes fewer pixels than this to each view is dropped, if a view has it in its image."""
 CLEAR = 0.5
@@ -108,6 +110,8 @@ def grow(state: State, found: Scores, target: int) -> State:
     opacity = state.colors[:, 3].reshape(n, corners).max(axis=1)
     useless = (found.most_pixels < MIN_PIXELS) | (opacity < MIN_OPACITY) | (found.clear_share > CLEAR)
     keep = ~(found.in_view & useless)
+    if SHELL in state.mesh.attributes:  # others see what is behind everything
+        keep |= state.mesh.attributes[SHELL][::corners] > 0
     if not keep.any():
         keep[:] = True
     kept = np.flatnonzero(keep)
@@ -162,9 +166,14 @@ def select_fans(state: State, kept: np.ndarray, halved: np.ndarray | None = None
     rows = (source[:, None] * corners + np.arange(corners)).ravel()
     positions = state.vertices[rows].reshape(n, corners, 3)
     sizes = state.sizes[rows].reshape(n, corners)
+    colors = state.colors[rows].reshape(n, corners, 4)
     place = np.searchsorted(kept, halved)
     if len(halved):
-        positions[place], positions[len(kept) :] = split_in_halves(positions[place])
+        whole, tints = positions[place], colors[place, :, :3]
+        halves = split_in_halves(whole)
+        for where, half in zip((place, slice(len(kept), None)), halves, strict=True):
+            positions[where] = half
+            colors[where, :, :3] = colors_at(whole, tints, half)
         sizes[place] *= np.sqrt(np.float32(HALF))
         sizes[len(kept) :] = sizes[place]
     faces = mesh.faces[:sides] + corners * np.arange(n, dtype=np.int32)[:, None, None]
@@ -172,10 +181,37 @@ def select_fans(state: State, kept: np.ndarray, halved: np.ndarray | None = None
         mesh,
         vertices=positions.reshape(-1, 3),
         faces=faces.reshape(-1, 3),
-        colors=state.colors[rows],
+        colors=colors.reshape(-1, 4),
+        attributes={name: values[rows] for name, values in mesh.attributes.items()},
         face_splat=np.repeat(np.arange(n, dtype=np.int32), sides),
     )
     result = state.rebuild(grown, rows, sizes.ravel())
     fresh = np.concatenate([place, np.arange(len(kept), n)])
     result.restart((fresh[:, None] * corners + np.arange(corners)).ravel())
     return result
+
+
+def colors_at(fans: np.ndarray, colors: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(n, m, c) float32 values that fans with vertices (n, k, 3), centre first, and ``colors`` (n, k, c) have
+    at ``points`` (n, m, 3), by barycentric weights in the triangle nearest to each."""
+    center = fans[:, :1].astype(np.float64)
+    first = fans[:, 1:] - center
+    second = np.roll(first, -1, axis=1)
+    offset = points - center
+    a, b, c = (
+        np.einsum("nsi,nsi->ns", *pair)[:, None]
+        for pair in ((first, first), (first, second), (second, second))
+    )
+    along = np.einsum("nmi,nsi->nms", offset, first), np.einsum("nmi,nsi->nms", offset, second)
+    area = np.maximum(a * c - b * b, 1e-30)
+    u, v = (c * along[0] - b * along[1]) / area, (a * along[1] - b * along[0]) / area
+    weights = np.stack([1 - u - v, u, v], axis=-1)
+    sector = weights.min(axis=-1).argmax(axis=-1)
+    weights = np.take_along_axis(weights, sector[..., None, None], axis=2)[:, :, 0]
+    weights = np.clip(weights, 0, 1)
+    weights /= weights.sum(axis=-1, keepdims=True)
+    rim = np.stack([sector + 1, (sector + 1) % first.shape[1] + 1], axis=-1)
+    corners = np.concatenate([np.zeros_like(rim[..., :1]), rim], axis=-1)
+    found = np.take_along_axis(colors[:, None], corners.reshape(len(fans), 1, -1, 1), axis=2)
+    found = found.reshape(*corners.shape, colors.shape[2])
+    return np.einsum("nmk,nmkc->nmc", weights, found).astype(np.float32)

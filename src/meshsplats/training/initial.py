@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from meshsplats.training.stereo import SIDE, WITNESSES, dense_points
 
 COLOR_VIEWS = 40
 """Maximum number of training views, evenly spread, that give the first colours."""
+NEAREST_POINTS = 2000
+"""Points, at most, among which the nearest is looked for."""
 OPACITY = 0.8
 """Opacity of fans at the start."""
 SIGMA = 0.6
@@ -36,10 +39,16 @@ NEARER, FARTHER = 0.6, 3.0
 """Depths are tried from this multiple of the least depth of the points to that of the greatest."""
 SHELL_SHARE = 0.25
 """Share of the fans at the start for the shell around everything..."""
+SHELL_DISTANCE = 1.3
+"""Radius of the shell, as a multiple of the distance of the farthest points but one in fifty..."""
 SHELL_VIEWS, SHELL_SIDE = 48, 100
 """... found in this many views, of images of at most this side..."""
-COVERED = 0.9
+SHELL_MARGIN = 0.25
+"""... widened to each side by this share..."""
+COVERED = 0.98
 """... where the other fans have less alpha than this."""
+FILL_WEIGHT = 2
+"""Weight of a point that was not matched itself against one that was: it stands for more pixels."""
 FREE_VIEWS = 3
 """Views that must see past a cell of the hull to make it empty."""
 
@@ -59,8 +68,10 @@ def starting_patches(
         known = None
     near, far, targets = ranges_of_points(views, known) if known is not None else ranges_of_cameras(views)
     depths = dense_points(views, near, far, targets)
-    places, colors = depths.points, depths.colors
-    weights = np.ones(len(places))
+    between, tints_between = depths.between()
+    places = np.concatenate([depths.points, between])
+    colors = np.concatenate([depths.colors, tints_between])
+    weights = np.concatenate([np.full(len(depths.points), 1.0), np.full(len(between), float(FILL_WEIGHT))])
     if known is not None and points is not None:
         tracked = points.views >= MIN_TRACK
         tints = points.colors[tracked].astype(np.float32) / np.float32(255)
@@ -70,7 +81,7 @@ def starting_patches(
     dense = None
     if len(places):
         dense = merged(places, colors, pixel_sizes(views, places), weights, count - shell)
-    return dense, shell_patches(views, dense, far, shell)
+    return dense, shell_patches(views, dense, shell_radius(views, places, far), shell)
 
 
 def _masked_patches(views: Sequence[View], count: int) -> Patches:
@@ -147,13 +158,24 @@ def pixel_sizes(views: Sequence[View], points: np.ndarray) -> np.ndarray:
     return least
 
 
-def shell_patches(
-    views: Sequence[View], patches: Patches | None, far: np.ndarray, count: int
-) -> Patches | None:
-    """About ``count`` pieces of a sphere around everything, where views see it past ``patches``."""
+def shell_radius(views: Sequence[View], points: np.ndarray, far: np.ndarray) -> float:
+    """Radius of the shell around the cameras: behind nearly all ``points`` (n, 3), or at the greatest depths
+    ``far`` (views,) where there are few."""
     centers = np.array([view.camera.center for view in views])
     middle = np.median(centers, axis=0)
-    radius = float(np.median(far)) + float(np.linalg.norm(centers - middle, axis=1).max())
+    outermost = float(np.linalg.norm(centers - middle, axis=1).max())
+    if len(points) < FEWEST_POINTS:
+        return float(np.median(far)) + outermost
+    distance = float(np.quantile(np.linalg.norm(points - middle, axis=1), 0.98))
+    return max(SHELL_DISTANCE * distance, 1.5 * outermost)
+
+
+def shell_patches(
+    views: Sequence[View], patches: Patches | None, radius: float, count: int
+) -> Patches | None:
+    """About ``count`` pieces of a sphere of ``radius`` around the cameras, where views see it past
+    ``patches``."""
+    middle = np.median(np.array([view.camera.center for view in views]), axis=0)
     mesh = None if patches is None else fans_of(flat_splats(patches), 4)
     looks = []
     for view in subsample(views, SHELL_VIEWS):
@@ -161,7 +183,11 @@ def shell_patches(
         covered = np.zeros((camera.height, camera.width), np.float32)
         if mesh is not None:
             covered = render(mesh, camera).alpha
-        looks.append((camera, covered))
+        # Views between these see a little more than they do.
+        x, y = (round(SHELL_MARGIN * side) for side in (camera.width, camera.height))
+        covered = np.pad(covered, ((y, y), (x, x)))
+        wider = {"width": camera.width + 2 * x, "height": camera.height + 2 * y}
+        looks.append((replace(camera, cx=camera.cx + x, cy=camera.cy + y, **wider), covered))
     total = 4 * count
     for _ in range(4):
         directions = _sphere(total)
@@ -234,11 +260,15 @@ def fans_of(cloud: GaussianCloud, sides: int) -> SplatMesh:
     )
 
 
-def colored(mesh: SplatMesh, views: Sequence[View], threads: int | None) -> SplatMesh:
+def colored(
+    mesh: SplatMesh, views: Sequence[View], threads: int | None, unseen_from: int | None = None
+) -> SplatMesh:
     """``mesh`` with colours from the images of ``views``: for each vertex the mean over the pixels that it is
-    blended into, with the weights of the blending."""
-    from dataclasses import replace
+    blended into, with the weights of the blending.
 
+    Vertices from index ``unseen_from`` on that no view shows take the colour of the nearest one among them
+    that is seen.
+    """
     sums = np.zeros((len(mesh.vertices), 4))
     for view in subsample(views, COLOR_VIEWS):
         image = view.load()
@@ -262,4 +292,21 @@ def colored(mesh: SplatMesh, views: Sequence[View], threads: int | None) -> Spla
     colors = mesh.colors.copy()
     seen = sums[:, 3] > 1e-6
     colors[seen, :3] = np.clip(sums[seen, :3] / sums[seen, 3:], 0, 1)
+    if unseen_from is not None:
+        rows = np.flatnonzero(~seen[unseen_from:]) + unseen_from
+        known = np.flatnonzero(seen[unseen_from:]) + unseen_from
+        if len(rows) and len(known):
+            colors[rows, :3] = colors[_nearest(mesh.vertices[known], mesh.vertices[rows], known), :3]
     return replace(mesh, colors=colors)
+
+
+def _nearest(points: np.ndarray, places: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """For each of ``places`` (m, 3) the entry of ``indices`` (n,) of the nearest of ``points`` (n, 3)."""
+    some = points[:: max(1, len(points) // NEAREST_POINTS)]
+    taken = indices[:: max(1, len(points) // NEAREST_POINTS)]
+    found = np.empty(len(places), np.int64)
+    squares = np.square(some).sum(axis=1)
+    for start in range(0, len(places), 4096):
+        part = places[start : start + 4096]
+        found[start : start + 4096] = (squares - 2 * part @ some.T).argmin(axis=1)
+    return taken[found]

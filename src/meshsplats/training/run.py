@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.datasets.points import ScenePoints
-from meshsplats.datasets.reduced import reduced_views
+from meshsplats.datasets.reduced import opaque_views, reduced_views
 from meshsplats.datasets.views import Dataset, ImageCache, View
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
@@ -21,6 +21,7 @@ from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.growth import (
+    SHELL,
     NearFields,
     fan_count,
     grow,
@@ -116,9 +117,14 @@ def starting_fans(
     if not parts:
         raise ValueError("the photographs have nothing in common that a mesh could start from")
     joined = Patches.joined(*parts)
-    if len(joined.points) > config.max_splats:
-        joined = joined.select(np.linspace(0, len(joined.points) - 1, config.max_splats).astype(int))
-    return colored(fans_of(flat_splats(joined), config.sides), views, threads)
+    count = len(joined.points)
+    chosen = np.linspace(0, count - 1, min(count, config.max_splats)).astype(int)
+    mesh = fans_of(flat_splats(joined.select(chosen)), config.sides)
+    if shell is None:
+        return colored(mesh, views, threads)
+    in_shell = np.repeat(chosen >= count - len(shell.points), 1 + config.sides)
+    mesh = colored(mesh, views, threads, int(np.count_nonzero(~in_shell)))
+    return replace(mesh, attributes={SHELL: in_shell.astype(np.float32)})
 
 
 def _stored_start(journal: Journal) -> SplatMesh:
@@ -154,7 +160,7 @@ class GrowingLoop(TrainingLoop):
 
     def result(self) -> SplatMesh:
         """The current fans, but those in the near field of a camera."""
-        mesh = super().result()
+        mesh = replace(super().result(), attributes={})
         assert mesh.face_splat is not None
         stray = self.near.contain(mesh)
         return mesh.keep_faces(~stray[mesh.face_splat]) if stray.any() and not stray.all() else mesh
@@ -162,7 +168,9 @@ class GrowingLoop(TrainingLoop):
     def _views(self) -> Sequence[View]:
         factor = image_factor(self.config, self.fraction)
         if factor not in self._reduced:
-            self._reduced[factor] = reduced_views(self.dataset.train, factor, self._store)
+            # With alpha, some steps have a random background: what is opaque must be covered.
+            views = opaque_views(self.dataset.train)
+            self._reduced[factor] = reduced_views(views, factor, self._store)
         return self._reduced[factor]
 
     def _adapt(self, before: int) -> None:

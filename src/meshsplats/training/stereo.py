@@ -40,6 +40,18 @@ WITNESSES = 2
 """Views that must confirm a depth."""
 
 
+FILL_STRIDE = 2
+"""Of the rows and columns without a depth one in this many is filled."""
+FILL_AGREEMENT = 4.0
+"""Planes by which filled depths of two views of a point may differ."""
+FILL_WITNESSES = 4
+"""Other views that must agree with a filled depth."""
+FILL_FREE = 2
+"""Views that must see past a filled point to refute it."""
+FARNESS = 4
+"""Power of the depth in the weights of the depths that others are filled from."""
+
+
 class DepthView(NamedTuple):
     """Depths of a view."""
 
@@ -76,6 +88,25 @@ class Depths(NamedTuple):
             known = view.inverse[v, u]
             count[rows] += (known > 0) & (1 / z[rows] > known + margin * view.step)
         return count
+
+    def between(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points (m, 3) and colours (m, 3) where nothing could be matched: on walls without texture, say.
+
+        Each view fills its unknown pixels from the depths around them, the farther ones above all. A point
+        stays if the filled depths of ``FILL_WITNESSES`` other views agree, and hardly a view sees past it.
+        """
+        full = [view._replace(inverse=_filled(view.inverse)) for view in self.views]
+        points, colors = [], []
+        for view, whole in zip(self.views, full, strict=True):
+            rows, columns = np.nonzero((view.inverse == 0) & (whole.inverse > 0))
+            chosen = (rows % FILL_STRIDE == 0) & (columns % FILL_STRIDE == 0)
+            rows, columns = rows[chosen], columns[chosen]
+            there = _places(whole, rows, columns)
+            agree = _witnesses(there, [other for other in full if other is not whole], FILL_AGREEMENT)
+            keep = (agree >= FILL_WITNESSES) & (self.free(there) < FILL_FREE)
+            points.append(there[keep])
+            colors.append(view.color[rows[keep], columns[keep]])
+        return np.concatenate(points), np.concatenate(colors)
 
 
 class _Photo:
@@ -211,16 +242,7 @@ def _confirmed(depths: Sequence[DepthView]) -> Depths:
     for view in depths:
         rows, columns = np.nonzero(view.inverse)
         there = _places(view, rows, columns)
-        witnesses = np.zeros(len(there), int)
-        for other in depths:
-            if other is view:
-                continue
-            positions, z = other.camera.project(there)
-            seen = np.flatnonzero(other.camera.in_image(positions))
-            u, v = positions[seen].astype(int).T
-            known = other.inverse[v, u]
-            agree = (known > 0) & (np.abs(1 / z[seen] - known) < AGREEMENT * other.step)
-            witnesses[seen[agree]] += 1
+        witnesses = _witnesses(there, [other for other in depths if other is not view], AGREEMENT)
         keep = witnesses >= WITNESSES
         rows, columns = rows[keep], columns[keep]
         inverse = np.zeros_like(view.inverse)
@@ -230,6 +252,41 @@ def _confirmed(depths: Sequence[DepthView]) -> Depths:
         colors.append(view.color[rows, columns])
         pixels.append(1 / (inverse[rows, columns].astype(np.float64) * view.camera.fx))
     return Depths(np.concatenate(points), np.concatenate(colors), np.concatenate(pixels), tuple(views))
+
+
+def _witnesses(points: np.ndarray, views: Sequence[DepthView], planes: float) -> np.ndarray:
+    """(n,) int: how many of ``views`` have ``points`` (n, 3) at their depth, give or take ``planes``."""
+    count = np.zeros(len(points), int)
+    for view in views:
+        positions, z = view.camera.project(points)
+        rows = np.flatnonzero(view.camera.in_image(positions))
+        u, v = positions[rows].astype(int).T
+        known = view.inverse[v, u]
+        count[rows[(known > 0) & (np.abs(1 / z[rows] - known) < planes * view.step)]] += 1
+    return count
+
+
+def _filled(inverse: np.ndarray) -> np.ndarray:
+    """``inverse`` depths (h, w) with values for all pixels, from a pyramid of means of the known ones; all 0
+    if none is known."""
+    if min(inverse.shape) < 2 or (inverse > 0).all():
+        return inverse
+    height, width = inverse.shape
+    even = np.pad(inverse, ((0, height % 2), (0, width % 2)))
+    # Relative to the nearest, and bounded: powers of far ones overflow.
+    relative = np.maximum(even / max(float(even.max()), 1e-30), 1e-4)
+    weights = np.where(even > 0, relative.astype(np.float64) ** -FARNESS, 0)
+
+    def halved(values: np.ndarray) -> np.ndarray:
+        return values.reshape(len(values) // 2, 2, -1, 2).sum(axis=(1, 3))
+
+    total = halved(weights)
+    coarse = np.divide(halved(weights * even), total, out=np.zeros_like(total), where=total > 0)
+    coarse = _filled(coarse.astype(np.float32))
+    fine = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)[:height, :width]
+    edge = np.pad(fine, 1, mode="edge")
+    smooth = sum(edge[i : i + height, j : j + width] for i in range(3) for j in range(3)) / np.float32(9)
+    return np.where(inverse > 0, inverse, smooth)
 
 
 def _places(view: DepthView, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
