@@ -96,7 +96,7 @@ def test_matched_photographs_show_the_sphere(room):
     assert ball.sum() > 2000
     assert np.median(np.abs(radius[ball] - 1)) < 0.03
     assert np.quantile(np.abs(radius[ball] - 1), 0.9) < 0.2
-    assert np.median(found.free(1.5 * on_sphere(100))) >= 2  # what views see past
+    assert found.free(1.5 * on_sphere(100)).mean() > 0.9  # what views see past
     assert found.free(0.7 * on_sphere(100)).max() <= 3
 
 
