@@ -14,12 +14,16 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from _photographs import write_photographs
 
 import meshsplats
 from meshsplats import cli, demo_scene
 from meshsplats._core import library
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import toml
 from meshsplats.errors import MissingDependencyError
+from meshsplats.formats.gaussians import load_gaussians
+from meshsplats.rendering import render_splats
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(
@@ -175,12 +179,18 @@ def test_commands_of_the_readme_work(scene_file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for name in ("scene.ply", "city.ply"):
         (tmp_path / name).write_bytes(scene_file.read_bytes())
+    cameras = orbit(load_gaussians(scene_file), 9, width=32, height=32)
+    images = [render_splats(load_gaussians(scene_file), camera).color for camera in cameras]
+    write_photographs(tmp_path / "photos", cameras, images)
     for command in commands:
         small = ["--width", "48"] if command[1] in ("render", "compare") and "--width" not in command else []
         if command[1] == "finetune":
             at = command.index("--minutes")
             command[at : at + 2] = []
             small = ["--width", "48", "--views", "3", "--held-out", "1", "--steps", "2"]
+        if command[1] == "train":
+            at = command.index("--minutes")
+            command[at : at + 2] = ["--steps", "2"]
         if command[1] == "levels":
             small = ["--no-tune", "--width", "48", "--levels", "2"]
         if command[1] == "base":

@@ -186,8 +186,9 @@ def shell_patches(
         # Views between these see a little more than they do.
         x, y = (round(SHELL_MARGIN * side) for side in (camera.width, camera.height))
         covered = np.pad(covered, ((y, y), (x, x)))
-        wider = {"width": camera.width + 2 * x, "height": camera.height + 2 * y}
-        looks.append((replace(camera, cx=camera.cx + x, cy=camera.cy + y, **wider), covered))
+        height, width = covered.shape
+        wider = replace(camera, width=width, height=height, cx=camera.cx + x, cy=camera.cy + y)
+        looks.append((wider, covered))
     total = 4 * count
     for _ in range(4):
         directions = _sphere(total)
