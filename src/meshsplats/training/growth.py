@@ -170,8 +170,8 @@ def select_fans(state: State, kept: np.ndarray, halved: np.ndarray | None = None
     place = np.searchsorted(kept, halved)
     if len(halved):
         whole, tints = positions[place], colors[place, :, :3]
-        halves = split_in_halves(whole)
-        for where, half in zip((place, slice(len(kept), None)), halves, strict=True):
+        added = np.arange(len(kept), n)
+        for where, half in zip((place, added), split_in_halves(whole), strict=True):
             positions[where] = half
             colors[where, :, :3] = colors_at(whole, tints, half)
         sizes[place] *= np.sqrt(np.float32(HALF))
