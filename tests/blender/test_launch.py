@@ -185,7 +185,7 @@ def test_the_pipe_ends_the_worker(monkeypatch):
         with subprocess.Popen(
             [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         ) as process:
-            assert process.stdout.readline() == b"ready\n"
+            assert process.stdout.readline().strip() == b"ready"
             process.stdin.write(greeting)
             process.stdin.close()
             if greeting:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -59,7 +60,8 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
     )
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"40 splats -> {len(mesh.faces)} triangles, {len(mesh.vertices)} vertices"
-    assert lines[-1].startswith("next: meshsplats compare '")  # the space in the name is quoted
+    quote = '"' if sys.platform == "win32" else "'"
+    assert lines[-1].startswith(f"next: meshsplats compare {quote}")  # the space in the name is quoted
 
 
 def test_options_reach_the_conversion(splats, tmp_path):

@@ -292,7 +292,7 @@ def test_doctor(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "_draws", lambda *_: False)
     assert main(["doctor"]) == 1
     out = capsys.readouterr().out
-    assert "pip install 'no-such-thing>=1'" in out
+    assert f"pip install {messages.quoted('no-such-thing>=1')}" in out
     assert "DOES NOT WORK" in out
 
 

@@ -311,7 +311,7 @@ def test_missing_images_are_counted_and_left_out(tmp_path):
 def test_no_images_at_all_says_where_they_were_expected(tmp_path):
     folder = simple_colmap(tmp_path, 2)
     (folder / "images").rename(folder / "images_2")
-    refused(folder, r"none of its images is there.*images/p00\.png.*give a downscale of 2")
+    refused(folder, r"none of its images is there.*images.p00\.png.*give a downscale of 2")
     assert len(load_dataset(folder, downscale=2).views) == 2
 
 

@@ -150,7 +150,7 @@ def test_files_are_recognised_by_content(tmp_path):
     mesh = random_mesh(np.random.default_rng(4))
     for suffix in SUFFIXES:
         save_mesh(mesh, tmp_path / f"m{suffix}")
-        (tmp_path / f"m{suffix}").rename(tmp_path / "mesh.dat")
+        (tmp_path / f"m{suffix}").replace(tmp_path / "mesh.dat")
         assert_same(load_mesh(tmp_path / "mesh.dat"), mesh, 1e-4)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -160,7 +161,8 @@ class Buckets:
             raise
         finally:
             for file in files.values():
-                file.close()
+                with suppress(OSError):  # a full disk, which is reported already
+                    file.close()
         if passed != size:
             raise ValueError(f"the splats changed while they were read: {size:,} before, {passed:,} now")
         return dict(sorted(counts.items()))
