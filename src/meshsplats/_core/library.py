@@ -214,13 +214,14 @@ def run(name: str, argument: ctypes.Structure) -> None:
     """Runs a function of the core that takes one structure. Raises MemoryError, or ValueError with the core's
     message; ImportError if the core does not have it."""
     message = ctypes.create_string_buffer(256)
-    try:
-        function = getattr(load_core(), name)
-    except AttributeError:
+    core = load_core()
+    if not hasattr(core, name) and "baseline" in available_variants():
+        core = load_core("baseline")  # has what gains nothing from wide vectors
+    if not hasattr(core, name):
         raise ImportError(
             f"the compiled core has no {name}: it is older than the Python code, install the package again"
-        ) from None
-    status = function(ctypes.byref(argument), message, len(message))
+        )
+    status = getattr(core, name)(ctypes.byref(argument), message, len(message))
     text = message.value.decode()
     if status == 1:
         raise MemoryError(f"{name}: {text}")

@@ -8,7 +8,9 @@
 #include "cpu.h"
 #include "gradient.h"
 #include "hidden_new.h"
+#ifndef MS_NO_MERGING
 #include "merging.h"
+#endif
 #include "mesh_tile.h"
 #include "splats.h"
 #include "ssim.h"
@@ -281,6 +283,7 @@ MS_EXPORT int ms_adam_rows(const MsAdam *adam, char *message, int message_size) 
     return guarded(message, message_size, [&] { ms::adam_rows(*adam); });
 }
 
+#ifndef MS_NO_MERGING
 MS_EXPORT int ms_nearest(const MsNearest *points, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::find_nearest(*points); });
 }
@@ -288,5 +291,6 @@ MS_EXPORT int ms_nearest(const MsNearest *points, char *message, int message_siz
 MS_EXPORT int ms_merge_pairs(MsMerging *merging, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::merge_pairs(*merging); });
 }
+#endif
 
 }  // extern "C"
