@@ -254,7 +254,7 @@ def test_windows_are_halved_while_they_have_too_many_pairs(monkeypatch):
 
 def test_what_does_not_fit_is_an_error_before_any_work(monkeypatch):
     mesh = many_triangles()[0]
-    monkeypatch.setattr(renderer, "MAX_FAN", 3)
+    monkeypatch.setattr(MeshRenderer, "max_fan", 3)
     with pytest.raises(DeviceError, match="splats of up to 3 triangles"):
         render(random_fans(5), camera(), filter_px2=0.3, device="gpu")
     from meshsplats.webgpu.device import Device, find_adapters
