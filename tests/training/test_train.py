@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from _balls import ball_view, cameras_around
 from _photographs import write_photographs
+from PIL import Image
 
 from meshsplats.cli import main
 from meshsplats.datasets.views import Dataset
@@ -332,6 +333,9 @@ def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
     assert len(load_gaussians(splats)) == fan_count(mesh)
     for name in ("config.toml", "preview.png"):
         assert (tmp_path / f"mesh.npz.{name}").is_file()
+    with Image.open(tmp_path / "mesh.npz.preview.png") as preview:  # from the first held-out photograph
+        assert preview.size == (views[0].camera.width, views[0].camera.height)
+    np.testing.assert_allclose(mesh.up, [0, 0, 1], atol=0.1)  # as the cameras are held
     assert main(words) == 3  # what is there is not overwritten
     assert main(["train", str(folder), "-o", str(tmp_path / "b.npz"), "--as-splats", "b.spz"]) == 2
     capsys.readouterr()

@@ -432,14 +432,15 @@ def plural(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
-def draw_preview(scene: SplatMesh | GaussianCloud, path: Path) -> None:
-    """Saves an image of ``scene``."""
+def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None) -> None:
+    """Saves an image of ``scene`` from ``camera``; by default from the front and a little to the side."""
     from meshsplats.images.writing import save_image
     from meshsplats.rendering import render_splats
     from meshsplats.rendering.looks import image_of
     from meshsplats.rendering.samples import needed_samples
 
-    camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]  # more of the shape than from the front
+    if camera is None:  # more of the shape than from the front
+        camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]
     if isinstance(scene, SplatMesh):
         save_image(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
     else:

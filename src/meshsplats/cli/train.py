@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from meshsplats.camera import Camera
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import File, Output, check_mesh_suffix, check_outputs
 from meshsplats.cli.messages import UsageError, command_line, say
@@ -126,6 +127,10 @@ class Train(TrainingCommand):
         needed = check_training_memory(dataset, config, cache_bytes=self.target.cache_bytes)
         summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
         return Plan(None, dataset, summary, background, optimise, needed)
+
+    def preview_camera(self, plan: Plan) -> Camera:
+        # From elsewhere, it would show what no photograph shows.
+        return (plan.dataset.test or plan.dataset.train)[0].camera
 
     def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
         code = super().report_interrupt(stop, files)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import tyro
 
 from meshsplats._files.locks import locked
+from meshsplats.camera import Camera
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
     Count,
@@ -290,7 +291,7 @@ class TrainingCommand(Command):
         result = None if plan.background is None else plan.background.to_dict()
         write_configuration(files.config, self._name, self, result)
         self.save_more(files, plan)
-        draw_preview(trained.shown, files.preview)
+        draw_preview(trained.shown, files.preview, self.preview_camera(plan))
         self._print_result(files, time.perf_counter() - start, earlier, trained)
         if not self.json:
             for line in self.next_steps(files, config, plan):
@@ -308,6 +309,10 @@ class TrainingCommand(Command):
             except Interrupted as stop:
                 return 128 + stop.signal
         return 0
+
+    def preview_camera(self, plan: Plan) -> Camera | None:
+        """The camera of the preview; None: one in front of the mesh."""
+        return None
 
     def report_interrupt(self, stop: Interrupted, files: RunFiles) -> int:
         """Says how to resume; returns the exit code."""

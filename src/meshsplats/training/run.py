@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import opaque_views, reduced_views
 from meshsplats.datasets.views import Dataset, ImageCache, View
@@ -120,6 +121,7 @@ def starting_fans(
     count = len(joined.points)
     chosen = np.linspace(0, count - 1, min(count, config.max_splats)).astype(int)
     mesh = fans_of(flat_splats(joined.select(chosen)), config.sides)
+    mesh = replace(mesh, up=guess_up(cameras=[view.camera for view in views]))
     if shell is None:
         return colored(mesh, views, threads)
     in_shell = np.repeat(chosen >= count - len(shell.points), 1 + config.sides)
