@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 else:
     StartOptions = as_cli_options(
         ConversionOptions,
-        "The mesh that the optimisation starts from. Default: the value of the preset.",
+        "The mesh at the start. Default: the value of the preset.",
         without=("look",),  # that of the targets
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
@@ -64,8 +64,8 @@ else:
 class Finetune(TrainingCommand):
     """Optimises a mesh until its images match those of the splats, or photographs.
 
-    Splats are converted first. Beside the result NAME: its configuration, a preview, and a folder NAME.run
-    with metrics, previews and a checkpoint, from which --resume continues after Ctrl-C.
+    Splats are converted first. Beside the result NAME: its configuration, a preview, and a folder NAME.run,
+    from which --resume continues after Ctrl-C.
     """
 
     COMMON = (
