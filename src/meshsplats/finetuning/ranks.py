@@ -106,24 +106,29 @@ class _TorchRanks(Ranks):
     def __init__(self, distributed: Any) -> None:
         self._distributed = distributed
         self.index, self.count = distributed.get_rank(), distributed.get_world_size()
+        self._sent, self._received = _Rows(), _Rows()
 
     def total(self, part: Part) -> Part:
         # A vertex has a gradient only if its opacity has one.
-        rows = np.flatnonzero(part.colors[:, 3]).astype(np.int32)
+        rows = np.flatnonzero(part.colors[:, 3])
         heads = self._gather(np.array([len(rows), part.loss, part.views, part.failed], np.float64))
-        most = int(max(head[0] for head in heads))
+        own = self._sent.take(len(rows))
+        own[0][:] = rows
         vertices, colors = part.vertices, part.colors
-        all_rows = self._gather(_padded(rows, most))
-        all_vertices, all_colors = (self._gather(_rows_of(array, rows, most)) for array in (vertices, colors))
+        for array, copied in zip((vertices, colors), own[1:], strict=True):
+            # Ten times as fast as indexing, without the check of each row.
+            np.take(array, rows, axis=0, out=copied, mode="clip")
         if self.index > 1:  # to add to those of the first two, in whatever order, is to add in their order
             vertices, colors = np.zeros_like(vertices), np.zeros_like(colors)
-        for i, head in enumerate(heads):
-            if i == self.index and i < 2:
+        for sender, head in enumerate(heads):
+            found = own if sender == self.index else self._received.take(int(head[0]))
+            # Several times as fast as gathering, and each sends as many rows as it has.
+            for array in found:
+                self._distributed.broadcast(_tensor(array), sender)
+            if sender == self.index < 2:
                 continue
-            count = int(head[0])
-            where = all_rows[i][:count].astype(np.intp)
-            for array, added in ((vertices, all_vertices[i]), (colors, all_colors[i])):
-                _add_rows(array, where, added[:count])
+            for array, added in zip((vertices, colors), found[1:], strict=True):
+                _add_rows(array, found[0], added)
         loss, views = (float(sum(head[i] for head in heads)) for i in (1, 2))
         failed = next((int(head[3]) for head in heads if head[3]), 0)
         return Part(vertices, colors, loss, int(views), failed)
@@ -136,33 +141,35 @@ class _TorchRanks(Ranks):
 
     def _gather(self, array: np.ndarray) -> Sequence[np.ndarray]:
         """The arrays of all ranks, of one shape, in their order."""
-        import torch
-
-        own = torch.from_numpy(array)
-        found = [torch.empty_like(own) for _ in range(self.count)]
-        self._distributed.all_gather(found, own)
-        return [tensor.numpy() for tensor in found]
+        found = [np.empty_like(array) for _ in range(self.count)]
+        self._distributed.all_gather([_tensor(each) for each in found], _tensor(array))
+        return found
 
 
-def _padded(array: np.ndarray, length: int) -> np.ndarray:
-    """``array`` (n,) with 0 behind it, ``length`` in all."""
-    result = np.zeros(length, array.dtype)
-    result[: len(array)] = array
-    return result
+class _Rows:
+    """Memory for rows of gradients, used again in each step."""
+
+    def __init__(self) -> None:
+        self._indices, self._values = np.empty(0, np.int32), np.empty(0, np.float32)
+
+    def take(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(count,) int32 indices of vertices, (count, 3) and (count, 4) float32 their gradients."""
+        if count > len(self._indices):
+            self._indices, self._values = np.empty(count, np.int32), np.empty(7 * count, np.float32)
+        vertices, colors = self._values[: 3 * count], self._values[3 * count : 7 * count]
+        return self._indices[:count], vertices.reshape(count, 3), colors.reshape(count, 4)
 
 
-def _rows_of(array: np.ndarray, rows: np.ndarray, length: int) -> np.ndarray:
-    """The ``rows`` of ``array`` with rows of 0 behind them, ``length`` in all."""
-    result = np.empty((length, *array.shape[1:]), array.dtype)
-    # Ten times as fast as indexing, without the check of each row.
-    np.take(array, rows, axis=0, out=result[: len(rows)], mode="clip")
-    result[len(rows) :] = 0
-    return result
+def _tensor(array: np.ndarray) -> Any:
+    """``array`` for torch, in the same memory."""
+    import torch
+
+    return torch.from_numpy(array)
 
 
 def _add_rows(array: np.ndarray, rows: np.ndarray, added: np.ndarray) -> None:
     """Adds ``added`` to the ``rows`` of ``array``, which differ."""
-    total = _rows_of(array, rows, len(rows))
+    total = np.take(array, rows, axis=0, mode="clip")
     total += added
     whole = np.dtype((np.void, array.itemsize * array.shape[1]))  # a row at a time: twice as fast
     array.view(whole).reshape(-1)[rows] = total.view(whole).reshape(-1)
