@@ -29,7 +29,7 @@ from meshsplats.tiles.drawing import choose_tiles, render_tiles
 from meshsplats.tiles.tileset import Tileset
 tileset = Tileset({tileset!r})
 camera = orbit(tileset.root.load(), 1, elevation=25, width=800, height=600, distance={distance})[0]
-tiles, error = choose_tiles(tileset, camera)
+tiles, error = choose_tiles(tileset, [camera])
 print(f"{{len(tiles)}} tiles, {{sum(tile.triangles for tile in tiles):,}} triangles, {{error:.2f}} pixels")
 save_image({image!r}, render_tiles(tileset, camera, samples=2).color)
 """

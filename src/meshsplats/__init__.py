@@ -57,7 +57,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
     from meshsplats.tiles.building import TileOptions, build_tiles
-    from meshsplats.tiles.drawing import render_tiles
+    from meshsplats.tiles.drawing import render_tiles, tiles_mesh
     from meshsplats.tiles.tileset import Tileset
     from meshsplats.training import TrainConfig, train, train_config
     from meshsplats.viewer.page import PageOptions, make_page
@@ -104,7 +104,7 @@ _HOME = {
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
     "meshsplats.tiles.building": ("TileOptions", "build_tiles"),
-    "meshsplats.tiles.drawing": ("render_tiles",),
+    "meshsplats.tiles.drawing": ("render_tiles", "tiles_mesh"),
     "meshsplats.tiles.tileset": ("Tileset",),
     "meshsplats.training": ("TrainConfig", "train", "train_config"),
     "meshsplats.viewer.page": ("PageOptions", "make_page"),
@@ -181,6 +181,7 @@ __all__ = [
     "ssim",
     "starting_mesh",
     "stream_gaussians",
+    "tiles_mesh",
     "train",
     "train_config",
     "train_prior",

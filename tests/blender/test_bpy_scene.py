@@ -14,10 +14,21 @@ bpy = pytest.importorskip("bpy", reason="Blender's module is not here: make test
 
 from _blender_scenes import ball_splats, cameras, random_mesh
 
-from meshsplats import convert, save_cameras, save_gaussians, save_mesh
+from meshsplats import (
+    TileOptions,
+    build_tiles,
+    convert,
+    psnr,
+    save_cameras,
+    save_gaussians,
+    save_mesh,
+    stream_gaussians,
+)
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import meshes, rendering
 from meshsplats.cli import main
+from meshsplats.conversion.streaming import joined
+from meshsplats.demo_scene.city import city_blocks
 from meshsplats.images.reading import load_image
 
 
@@ -101,6 +112,31 @@ def test_scene_stands_upright():
         rotation = frame.to_blender(np.array(up, float))
         assert np.allclose(rotation @ up, [0, 0, 1])
         assert np.isclose(np.linalg.det(rotation), 1)
+
+
+def test_command_line_draws_the_tiles_of_a_tileset_that_the_camera_needs(tmp_path, capsys, monkeypatch):
+    source = tmp_path / "city.ply"
+    save_gaussians(joined(list(city_blocks(4000, degree=0))), source)
+    build_tiles(stream_gaussians(source), tmp_path / "tiles", TileOptions(max_triangles=4000))
+    view = ["--width", "60", "--azimuth", "30", "--elevation", "20", "--json"]
+    images = {}
+    for distance in ("0.4", "3"):
+        given = [str(tmp_path / "tiles"), "--distance", distance, *view]
+        assert main(["blender", *given, "-o", str(tmp_path / f"b{distance}.png")]) == 0
+        images[distance] = json.loads(capsys.readouterr().out)["triangles"]
+        assert main(["render", *given, "-o", str(tmp_path / f"r{distance}.png"), "--samples", "2"]) == 0
+        capsys.readouterr()
+        ours, theirs = (load_image(tmp_path / f"{kind}{distance}.png") / 255.0 for kind in "rb")
+        assert psnr(ours, theirs) > 45
+    assert images["3"] < 0.5 * images["0.4"]
+    monkeypatch.setattr("meshsplats.cli.blender._TILE_TRIANGLES", 6000)
+    given = [str(tmp_path / "tiles"), "--distance", "0.4", *view]
+    assert main(["blender", *given, "-o", str(tmp_path / "limited.png")]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["triangles"] <= 6000
+    assert "need more than 6,000 triangles" in told.err
+    assert main(["blender", str(source), "-o", str(tmp_path / "x.png"), "--max-error", "2"]) == 2
+    assert "--max-error is for tilesets" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".glb", ".ply"])

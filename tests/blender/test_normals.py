@@ -13,6 +13,8 @@ from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.subject import lit_arrays
 from meshsplats.colors import srgb_to_linear
+from meshsplats.conversion.streaming import joined
+from meshsplats.demo_scene.city import city_blocks
 
 
 def angles(mesh, normals, true):
@@ -76,3 +78,18 @@ def test_lit_faces_wind_towards_their_normals_and_colours_are_linear():
     assert (arrays["colors"] != plain).any()
     assert 0 < distance < 1
     assert (lit_arrays(replace(mesh, blending="linear"))[0]["colors"] == mesh.colors).all()
+
+
+def test_a_street_faces_up_though_it_is_seen_better_from_below():
+    """Houses hide it from most cameras above the scene, and nothing from those below it."""
+    mesh = convert(joined(list(city_blocks(6000, degree=0))), mode="flat")
+    up = mesh.up.astype(np.float64)
+    heights = mesh.vertices @ up
+    flat = np.delete(mesh.vertices, int(np.abs(up).argmax()), axis=1)
+    cell = np.floor((flat - flat.min(axis=0)) / 0.5).astype(int) + 1
+    tops = np.full(cell.max(axis=0) + 2, -np.inf)
+    np.maximum.at(tops, tuple(cell.T), heights)
+    around = np.max([np.roll(tops, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
+    street = around[tuple(cell.T)] < np.quantile(heights, 0.05) + 0.3  # nothing above it or beside it
+    assert street.sum() > 1000
+    assert (shading_normals(mesh)[street] @ up > 0.9).mean() > 0.99

@@ -9,11 +9,14 @@ import pytest
 from _blender_scenes import ball_splats
 
 from meshsplats import GaussianCloud, convert, orbit, render
+from meshsplats._geometry import vertex_normals
 from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.normals import shading_normals
-from meshsplats.blender.stand_in import stand_in, surface_net
+from meshsplats.blender.stand_in import _Feet, stand_in, surface_net
+from meshsplats.blender.subject import ground_height
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.evaluation.metrics import psnr
+from meshsplats.prior.surface import Grid
 
 
 def ball_field(count: int = 24, radius: float = 8.0) -> np.ndarray:
@@ -96,6 +99,36 @@ def test_thin_parts_cast_their_own_shadow_and_floaters_none(ball):
     assert np.isin(hair, fine).all()
     assert (np.linalg.norm(centers[fine], axis=1) > 1.02).all(), "not those of the ball"
     assert centers[fine][:, 1].min() > -2, "not the floater"
+
+
+@pytest.mark.parametrize(("low", "high"), [(10.4, 11.2), (10.4, 12.1)])
+def test_splats_at_the_underside_of_a_slab_that_face_up_are_lit_from_above(low, high):
+    """A street that the images show a little too thick is no thicker than two voxels."""
+    steps = np.arange(24.0)
+    square = np.maximum.reduce(
+        np.broadcast_arrays(*np.meshgrid(*2 * [np.abs(steps - 11.5) - 8], indexing="ij"))
+    )
+    height = np.maximum(low - steps, steps - high)
+    field = np.maximum(square[:, :, None], height)
+    vertices, faces, cells = surface_net(field)
+    grid = Grid(np.zeros(3), 1.0, field.shape)
+    feet = _Feet(grid, field, vertices, vertex_normals(vertices, faces), cells)
+    place = np.random.default_rng(0).uniform([6, 6, low], [17, 17, low + 0.1], (100, 3))
+    up = np.tile([0.0, 0, 1], (100, 1))
+    index, found = feet.of(place, up)
+    assert found.all()
+    assert (feet.facing(index, up)[:, 2] > 0.9).all()
+    assert (feet.projected(place, index)[:, 2] > high - 0.9).all()
+
+
+def test_a_ground_below_a_scene_with_a_street_leaves_the_street_in_the_light():
+    """The highest that the ground may be is below all but stray points that face up."""
+    rng = np.random.default_rng(0)
+    heights = np.concatenate([rng.uniform(0.0, 0.1, 500), rng.uniform(0, 5, 500)])
+    facing = np.concatenate([np.ones(500), np.full(500, 0.1)])
+    assert -0.31 < ground_height(0.05, heights, facing, 0.3) < -0.2
+    assert ground_height(-1.0, heights, facing, 0.3) == -1.0, "an object that stands on feet"
+    assert ground_height(0.05, heights, -facing, 0.3) == 0.05, "undersides do not count"
 
 
 def test_nothing_solid_has_no_stand_in():

@@ -34,7 +34,7 @@ from meshsplats.demo_scene.city import city_blocks
 from meshsplats.tiles import buckets, building
 from meshsplats.tiles import tileset as tilesets
 from meshsplats.tiles.building import TileOptions, build_tiles
-from meshsplats.tiles.drawing import choose_tiles, reaches, render_tiles, screen_error
+from meshsplats.tiles.drawing import choose_tiles, reaches, render_tiles, screen_error, tiles_mesh
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.tileset import Tileset
 
@@ -383,7 +383,7 @@ def test_the_image_is_that_of_the_whole_mesh(splats, tileset):
         np.testing.assert_allclose(fine.mean_depth(empty=0), whole.mean_depth(empty=0), rtol=0.02)
         assert psnr(render_tiles(found, camera, samples=2).color, whole.color) > 40
     far = orbit(mesh, 1, elevation=20, width=120, height=90, distance=4)[0]
-    tiles, worst = choose_tiles(found, far)
+    tiles, worst = choose_tiles(found, [far])
     assert worst <= 1
     assert sum(tile.triangles for tile in tiles) < 0.3 * len(mesh.faces)
     assert psnr(render_tiles(found, far, samples=4).color, render(mesh, far, samples=4).color) > 40
@@ -396,7 +396,7 @@ def test_an_image_in_parts_is_the_same(tileset):
     background = np.random.default_rng(0).random((130, 200, 3)).astype(np.float32)
     options = {"max_error": 0, "background": background, "depth": True}
     whole = render_tiles(found, camera, **options)
-    most = sum(tile.triangles for tile in choose_tiles(found, camera, max_error=0)[0]) - 1
+    most = sum(tile.triangles for tile in choose_tiles(found, [camera], max_error=0)[0]) - 1
     loaded = []
     with pytest.MonkeyPatch.context() as patch:
         import meshsplats.tiles.drawing as drawing
@@ -415,20 +415,42 @@ def test_the_tiles_that_a_camera_needs(tileset):
     camera = orbit(found.root.load(), 1, elevation=15, width=200, height=130)[0]
     everything = [tile for tile, _ in found.tiles()]
     for most_error in (0.5, 2.0, 8.0):
-        tiles, worst = choose_tiles(found, camera, max_error=most_error)
+        tiles, worst = choose_tiles(found, [camera], max_error=most_error)
         assert worst <= most_error
         assert all(screen_error(camera, tile) <= most_error or not tile.children for tile in tiles)
     for tile in everything:  # a box with a corner in the image is never left out
         if camera.sees(tile.corners()).any():
             assert reaches(camera, tile)
     away = orbit(found.root.load(), 1, elevation=15, width=200, height=130, target=(500, 0, 0))[0]
-    assert choose_tiles(found, away)[0] == []
+    assert choose_tiles(found, [away])[0] == []
     assert render_tiles(found, away, samples=1).alpha.max() == 0
-    tiles, worst = choose_tiles(found, camera, max_error=0, most=20_000)
+    tiles, worst = choose_tiles(found, [camera], max_error=0, most=20_000)
     assert sum(tile.triangles for tile in tiles) <= 20_000
     assert worst > 0
     with pytest.raises(ValueError, match="max_error must be"):
-        choose_tiles(found, camera, max_error=-1)
+        choose_tiles(found, [camera], max_error=-1)
+
+
+def test_one_mesh_has_the_tiles_that_several_cameras_need(splats, tileset):
+    """Each image is as good as with the tiles of its camera alone; a limit makes it coarser, not larger."""
+    found = Tileset(tileset)
+    whole = convert(load_gaussians(splats))
+    options = {"elevation": 10, "width": 120, "height": 90}
+    cameras = [orbit(whole, 1, distance=distance, **options)[0] for distance in (0.3, 4)]
+    near, far = (tiles_mesh(found, [camera])[0] for camera in cameras)
+    assert len(far.faces) < 0.3 * len(whole.faces)
+    both, error = tiles_mesh(found, cameras)
+    assert error <= 1
+    assert len(near.faces) <= len(both.faces) < len(whole.faces)
+    for camera in cameras:
+        truth = render(whole, camera, samples=3).color
+        assert psnr(render(both, camera, samples=3).color, truth) > 40
+    limited, error = tiles_mesh(found, cameras, max_triangles=len(both.faces) // 2)
+    assert len(limited.faces) <= len(both.faces) // 2
+    assert error > 1
+    away = orbit(whole, 1, target=(500, 0, 0), **options)
+    with pytest.raises(ValueError, match="none of the cameras sees"):
+        tiles_mesh(found, away)
 
 
 # ---- Files from strangers

@@ -3,7 +3,8 @@
 The layers of a splat mesh are tilted by chance, and crossed ones stand upright on the surface; lit by their
 own normals they look mottled. Here each splat takes the normal of the surface that it and its neighbours
 form: their centres lie in it, and the largest of their discs lie along it. The outer side is the one from
-which cameras around the scene see the splat.
+which cameras around the scene see the splat; of a sheet that is seen from both sides, such as a street, the
+upper one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats._geometry import spacing
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import guess_up
+from meshsplats.cameras.framing import guess_up, scene_bounds
 from meshsplats.cameras.trajectories import dome
 from meshsplats.mesh import SplatMesh, splat_starts
 from meshsplats.rendering import render
@@ -26,6 +27,9 @@ clean and noisy, where 2 to 3 give the least error (see docs/blender.md)."""
 VIEWS = 24
 _SIDE = 160
 """Side in pixels of the images that decide visibility."""
+_BOTH = 0.15
+"""A splat is part of a sheet if its side that is seen less is seen this often, against the other one. Cameras
+below the scene then do not count: they see a street as a whole, those above it between houses only."""
 _SOLID = 0.3
 """Opacity from which a pixel counts as covered."""
 _CHUNK = 1 << 16
@@ -61,8 +65,7 @@ def shading_normals(
         # Both have trace 1: along the normal the discs' tensor is large, the scatter of the centres small.
         both = discs - np.divide(scatter, size, out=np.zeros_like(scatter), where=size > 0)
         normals[part] = np.linalg.eigh(both)[1][:, :, 2]
-    outward = _seen_from(mesh, centers, cell, cameras, threads)
-    side = np.einsum("ij,ij->i", normals, outward)
+    side = _seen_side(mesh, centers, normals, cell, cameras, threads)
     normals *= np.where(side < 0, -1.0, 1.0)[:, None]
     # Splats that no camera sees have no weight here and take the side of their neighbours.
     trust = np.where(side == 0, 1e-3, 1.0) * weights
@@ -175,20 +178,32 @@ def views_around(
     return views + [camera.within(side) for camera in subsample(cameras or (), most)]
 
 
-def _seen_from(
-    mesh: SplatMesh, centers: np.ndarray, tolerance: float, cameras: Sequence[Camera], threads: int | None
+def _seen_side(
+    mesh: SplatMesh,
+    centers: np.ndarray,
+    normals: np.ndarray,
+    tolerance: float,
+    cameras: Sequence[Camera],
+    threads: int | None,
 ) -> np.ndarray:
-    """(n, 3) sum of the unit directions from each centre to the cameras that see it; zero where none does."""
-    seen = np.zeros_like(centers)
-    for camera in views_around(mesh, VIEWS, _SIDE, cameras, 16):
+    """(n,) positive where the cameras that see a centre are on the side of its normal, negative on the other
+    one; 0 where none sees it."""
+    front, back, upper = np.zeros((3, len(centers)))
+    up, middle = guess_up(mesh), scene_bounds(mesh).center
+    for i, camera in enumerate(views_around(mesh, VIEWS, _SIDE, cameras, 16)):
         surface = render(mesh, camera, depth=True, threads=threads).mean_depth(min_alpha=_SOLID)
         positions, z = camera.project(centers)
         rows = np.flatnonzero(camera.in_image(positions))
         column, row = positions[rows].T.astype(np.intp)
         visible = rows[z[rows] < surface[row, column] + tolerance]
         away = camera.center - centers[visible]
-        seen[visible] += away / np.linalg.norm(away, axis=1, keepdims=True)
-    return seen
+        side = np.einsum("ij,ij->i", normals[visible], away) / np.linalg.norm(away, axis=1)
+        front[visible] += np.maximum(side, 0)
+        back[visible] += np.maximum(-side, 0)
+        if i >= VIEWS or (camera.center - middle) @ up > 0:
+            upper[visible] += side
+    sheet = (np.minimum(front, back) > _BOTH * np.maximum(front, back)) & (upper != 0)
+    return np.where(sheet, upper, front - back)
 
 
 def _to_vertices(mesh: SplatMesh, owner: np.ndarray, normals: np.ndarray) -> np.ndarray:

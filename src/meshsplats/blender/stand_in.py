@@ -41,8 +41,9 @@ _BELOW, _HIDDEN = 0.5, 1e-3
 """Splats that lie deeper below the surface than this, in voxels, have this weight in its colours."""
 _FILLS = 4
 """Edges across which colours spread to vertices without splats."""
-_SIDES = 4
-"""Weight of a squared distance to a point of the surface that faces the other way."""
+_SIDES = 1e4
+"""Weight of a squared distance to a point of the surface that faces the other way: such a point counts where
+no other one is near. A street may be a slab of two voxels."""
 _CHUNK = 1 << 16
 
 
@@ -110,7 +111,7 @@ def stand_in(
         except ValueError:  # nothing but floaters
             fine[:] = False
     place = np.where(found[:, None], feet.projected(splats.centers, foot), splats.centers)
-    normal = np.where(found[:, None], outward[foot], splats.normals)
+    normal = np.where(found[:, None], feet.facing(foot, splats.normals), splats.normals)
     place_of, normal_of = place[splats.of_vertex], normal[splats.of_vertex]
     large = np.flatnonzero((splats.reach > _LARGE * grid.voxel)[splats.of_vertex])
     if len(large):
@@ -118,7 +119,7 @@ def stand_in(
         there &= found[splats.of_vertex[large]]
         rows = large[there]
         place_of[rows] = feet.projected(mesh.vertices[rows].astype(np.float64), own[there])
-        normal_of[rows] = outward[own[there]]
+        normal_of[rows] = feet.facing(own[there], normals[rows])
     # A point for each cell of half a voxel, or of the splats' own spacing where they are farther apart.
     size = max(grid.voxel / 2, min(grid.voxel, typical_spacing(mesh, splats.centers)))
     points, ways, point_of = _clustered(place_of, normal_of, size)
@@ -279,6 +280,15 @@ class _Feet:
             nearer = away < best[rows]
             best[rows[nearer]], index[rows[nearer]] = away[nearer], vertex[nearer]
         return index, np.isfinite(best)
+
+    def facing(self, index: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(k, 3) unit normals of the surface at the vertices ``index`` (k,) for splats with ``normals``
+        (k, 3). A sheet thinner than a voxel has both its sides in one vertex: there, those of the splats."""
+        own = self.normals[index]
+        behind = (self.vertices[index] - self.grid.voxel * own - self.grid.low) / self.grid.voxel
+        steps = np.clip(np.rint(behind).astype(np.int64), 0, np.array(self.field.shape) - 1)
+        sheet = self.field[tuple(steps.T)] > 0
+        return np.where(sheet[:, None], unit(normals, own), own)
 
     def projected(self, places: np.ndarray, index: np.ndarray) -> np.ndarray:
         """``places`` (k, 3) moved along the normals of the vertices ``index`` onto their tangent planes, and

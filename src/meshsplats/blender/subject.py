@@ -19,6 +19,10 @@ from meshsplats.mesh import SplatMesh
 _FLOOR = 0.002
 """Share of the opacity that may lie below the ground: strays must not lift the subject off it."""
 
+_UPWARD, _TOPS = 0.5, 0.01
+"""Cosine to the up direction from which a surface faces up, and the share of such points that may lie below
+the ground."""
+
 SELF_SHADOW = 3.0
 """Distance within which layers do not shade each other, in spacings of the splats."""
 
@@ -67,6 +71,9 @@ def prepare(
         arrays["face_splat"] = mesh.face_splat
     if options.light is not None:
         lit, of_light = lit_subject(mesh, cameras, threads=options.threads)
+        if "light_points" in lit:
+            points, normals = lit["light_points"] @ up, lit["light_normals"] @ up
+            facts["floor"] = ground_height(facts["floor"], points, normals, of_light["light_spacing"])
         return arrays | lit, facts | of_light
     return arrays, facts
 
@@ -76,6 +83,20 @@ def lowest(bounds: Bounds, up: np.ndarray) -> float:
     heights = bounds.points @ up
     weights = bounds.weights if bounds.weights.sum() > 0 else np.ones(len(heights))
     return weighted_quantile(heights, weights, _FLOOR)
+
+
+def ground_height(floor: float, heights: np.ndarray, upward: np.ndarray, size: float) -> float:
+    """Height of a ground for a lit subject: ``floor``, its lowest part, or less where the subject is a scene
+    with a ground of its own, such as a street, which a plane at its height would cover.
+
+    Args:
+        floor: height of the lowest part of the subject.
+        heights: (n,) of the points at which light on it is gathered.
+        upward: (n,) cosines between the normals there and the up direction.
+        size: distance of neighbouring points.
+    """
+    tops = heights[upward > _UPWARD]
+    return min(floor, float(np.quantile(tops, _TOPS)) - size) if len(tops) else floor
 
 
 def lit_subject(

@@ -21,12 +21,14 @@ from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
     Count,
     File,
+    Number,
     Output,
     PartOptions,
     SplatOptions,
     ViewOptions,
     check_outputs,
     load_scene,
+    open_tileset,
     parse_color,
     plural,
     size_of,
@@ -39,11 +41,14 @@ from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from meshsplats.blender import Progress
+    from meshsplats.tiles.tileset import Tileset
 
 LIT_SAMPLES = 16
 """Default number of samples per pixel of lit images."""
 _EVERY = 10.0
 """Seconds between lines of progress, if standard error is no terminal."""
+_TILE_TRIANGLES = 2_000_000
+"""Triangles that Blender gets of a tileset: about 700 MB."""
 _FORMATS = (".png", ".exr", ".blend")
 
 
@@ -91,7 +96,8 @@ class Blender(Command):
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
-    """Splats, a model folder, a mesh, or a chain of levels of detail (levels.json; for a .blend)."""
+    """Splats, a model folder, a mesh, the folder of a tileset, or a chain of levels of detail (levels.json,
+    for a .blend)."""
     output: Output
     """A .png or .exr for one view, a folder for several, or a .blend with a camera for each view."""
     lit: bool = False
@@ -121,6 +127,8 @@ class Blender(Command):
     """Maximum number of threads. Default: all processors."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     part: PartOptions = field(default_factory=PartOptions)
+    max_error: Number = None
+    """Tileset: take tiles whose geometric error is at most this many pixels in the images. Default: 1."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -135,8 +143,13 @@ class Blender(Command):
         chain = self._chain(suffix)
         command(self.executable)
         start = time.perf_counter()
+        tileset = open_tileset(self.input, self.part, self.max_error)
         files = [level.path for level in chain.levels] if chain else [self.input]
-        scene, *coarser = (self.part.of(load_scene(file, self.reading)) for file in files)
+        scene: GaussianCloud | SplatMesh
+        if tileset:  # the coarsest tile says where it is
+            scene, coarser = tileset.root.load(), []
+        else:
+            scene, *coarser = (self.part.of(load_scene(file, self.reading)) for file in files)
         cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800)
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
@@ -149,7 +162,7 @@ class Blender(Command):
         check_outputs(
             [*images, *([blend] if blend else []), *records], self.force, None if suffix else self.output
         )
-        mesh = _converted(scene, self.lit)
+        mesh = self._tiles(tileset, cameras) if tileset else _converted(scene, self.lit)
         subject: SplatMesh | LevelMeshes = mesh
         if chain:
             levels = [mesh, *(_converted(level, self.lit) for level in coarser)]
@@ -180,6 +193,19 @@ class Blender(Command):
                 f"{self.input}: a chain of levels of detail makes a .blend; for images, give one mesh of it"
             )
         return read_chain(self.input)
+
+    def _tiles(self, tileset: Tileset, cameras: Sequence[Camera]) -> SplatMesh:
+        """The tiles that the cameras need."""
+        from meshsplats.tiles.drawing import MAX_ERROR, tiles_mesh
+
+        wanted = MAX_ERROR if self.max_error is None else self.max_error
+        mesh, error = tiles_mesh(tileset, cameras, max_error=wanted, max_triangles=_TILE_TRIANGLES)
+        if error > wanted:
+            say(
+                f"the views need more than {_TILE_TRIANGLES:,} triangles: errors are up to {error:.1f}, not"
+                f" {wanted:g} pixels. Render views of parts, or 'meshsplats render', which draws in parts"
+            )
+        return mesh
 
     def _options(self, suffix: str) -> SceneOptions:
         """The scene for Blender; UsageError for options that contradict each other or have no effect."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import sys
 import warnings
@@ -30,6 +31,7 @@ from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from meshsplats.formats.gaussians import SplatStream
+    from meshsplats.tiles.tileset import Tileset
 
 T = TypeVar("T")
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
@@ -251,6 +253,26 @@ class PartOptions:
         from meshsplats.conversion.cleaning import cropped
 
         return cropped(scene, self.crop)
+
+
+def open_tileset(path: Path, part: PartOptions, max_error: float | None) -> Tileset | None:
+    """The tileset at ``path``, None if it is something else, for a command with --crop and --max-error.
+
+    Raises UsageError for options without effect.
+    """
+    from meshsplats.tiles import is_tileset
+
+    if not is_tileset(path):
+        if max_error is not None:
+            raise UsageError("--max-error is for tilesets")
+        return None
+    if max_error is not None and not 0 <= max_error < math.inf:
+        raise UsageError(f"--max-error must be a number of pixels, at least 0, got {max_error}")
+    if part.crop is not None:
+        raise UsageError("--crop has no effect on a tileset: give it to 'meshsplats tiles'")
+    from meshsplats.tiles.tileset import Tileset
+
+    return Tileset(path)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -27,6 +26,7 @@ from meshsplats.cli.common import (
     check_outputs,
     chosen_background,
     load_scene,
+    open_tileset,
     parse_color,
     plural,
     size_of,
@@ -114,7 +114,7 @@ class Render(Command):
         single = self.output.suffix.lower() == ".png"
         self._check(single)
         start = time.perf_counter()
-        tileset = self._tileset()
+        tileset = open_tileset(self.input, self.part, self.max_error)
         # The coarsest tile says where a tileset is.
         scene = tileset.root.load() if tileset else self.part.of(load_scene(self.input, self.reading))
         self._check_scene(scene)
@@ -209,22 +209,6 @@ class Render(Command):
             raise UsageError("--device gpu draws meshes: leave out --as-splats")
         self.draw.check_device()
 
-    def _tileset(self) -> Tileset | None:
-        """The tileset of the input; None if it is something else. UsageError for options without effect."""
-        from meshsplats.tiles import is_tileset
-
-        if not is_tileset(self.input):
-            if self.max_error is not None:
-                raise UsageError("--max-error is for tilesets")
-            return None
-        if self.max_error is not None and not 0 <= self.max_error < math.inf:
-            raise UsageError(f"--max-error must be a number of pixels, at least 0, got {self.max_error}")
-        if self.part.crop is not None:
-            raise UsageError("--crop has no effect on a tileset: give it to 'meshsplats tiles'")
-        from meshsplats.tiles.tileset import Tileset
-
-        return Tileset(self.input)
-
     def _check_scene(self, scene: GaussianCloud | SplatMesh) -> None:
         if isinstance(scene, SplatMesh) and self.as_splats:
             raise ValueError(f"{self.input} is a mesh: --as-splats needs a splat file")
@@ -241,7 +225,8 @@ class Render(Command):
 
     def load(self) -> GaussianCloud | SplatMesh | Tileset:
         """The scene of the images, from the input."""
-        return self._tileset() or self._drawable(self.part.of(load_scene(self.input, self.reading)))
+        tileset = open_tileset(self.input, self.part, self.max_error)
+        return tileset or self._drawable(self.part.of(load_scene(self.input, self.reading)))
 
     def _draw(
         self,

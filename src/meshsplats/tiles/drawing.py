@@ -26,13 +26,13 @@ SMALLEST = 16
 
 
 def choose_tiles(
-    tileset: Tileset, camera: Camera, *, max_error: float = MAX_ERROR, most: int | None = None
+    tileset: Tileset, cameras: Sequence[Camera], *, max_error: float = MAX_ERROR, most: int | None = None
 ) -> tuple[list[Tile], float]:
-    """The tiles that ``camera`` needs, in the order of the octree, and their largest error in pixels.
+    """The tiles that ``cameras`` need together, in octree order, and their largest error in pixels.
 
-    The screen-space error of a tile is its geometric error at the nearest point of its box. A tile of more
-    than ``max_error`` is replaced by its children, those of the largest error first, as long as there are at
-    most ``most`` triangles. Tiles outside the image are left out.
+    The screen-space error of a tile is its geometric error at the nearest point of its box, in the image
+    where it is largest. A tile of more than ``max_error`` is replaced by its children, those of the largest
+    error first, as long as there are at most ``most`` triangles. Tiles outside all images are left out.
     """
     if not max_error >= 0:
         raise ValueError(f"max_error must be a number of pixels, at least 0, got {max_error}")
@@ -43,10 +43,11 @@ def choose_tiles(
 
     def add(tile: Tile, place: tuple[int, ...]) -> None:
         nonlocal triangles, worst
-        if not reaches(camera, tile):
+        seeing = [camera for camera in cameras if reaches(camera, tile)]
+        if not seeing:
             return
         triangles += tile.triangles
-        pixels = screen_error(camera, tile)
+        pixels = max(screen_error(camera, tile) for camera in seeing)
         if pixels > max_error and tile.children:
             heapq.heappush(queue, (-pixels, next(order), place, tile))
         else:
@@ -121,11 +122,11 @@ def render_tiles(
         ValueError: an option out of its range.
         FileFormatError: a tile is broken.
     """
-    tiles, _ = choose_tiles(tileset, camera, max_error=max_error)
+    tiles, _ = choose_tiles(tileset, [camera], max_error=max_error)
     if sum(tile.triangles for tile in tiles) <= max_triangles:
         return render(join_tiles(tileset, tiles), camera, **options)
     if max(camera.width, camera.height) <= SMALLEST:
-        tiles, _ = choose_tiles(tileset, camera, max_error=max_error, most=max_triangles)
+        tiles, _ = choose_tiles(tileset, [camera], max_error=max_error, most=max_triangles)
         return render(join_tiles(tileset, tiles), camera, **options)
     axis = int(camera.width >= camera.height)
     middle = (camera.height, camera.width)[axis] // 2
@@ -147,11 +148,39 @@ def render_tiles(
     return _side_by_side(parts, axis)
 
 
+def tiles_mesh(
+    tileset: Tileset,
+    cameras: Sequence[Camera],
+    *,
+    max_error: float = MAX_ERROR,
+    max_triangles: int = MAX_TRIANGLES,
+) -> tuple[SplatMesh, float]:
+    """One mesh of the tiles that ``cameras`` need together, and its largest error in pixels.
+
+    The error is larger than ``max_error`` where the tiles that the cameras need have more than
+    ``max_triangles`` triangles.
+
+    Args:
+        tileset: the tileset.
+        cameras: viewpoints, lenses and sizes of the images.
+        max_error: screen-space error in pixels up to which a tile is fine enough; 0 takes the leaves.
+        max_triangles: maximum number of triangles.
+
+    Raises:
+        ValueError: an option out of its range; no tile is in any of the images.
+        FileFormatError: a tile is broken.
+    """
+    tiles, worst = choose_tiles(tileset, cameras, max_error=max_error, most=max_triangles)
+    if not tiles:
+        raise ValueError(f"{tileset.path}: none of the cameras sees any of it")
+    return join_tiles(tileset, tiles), worst
+
+
 def samples_for(tileset: Tileset, cameras: Sequence[Camera], max_error: float = MAX_ERROR) -> int:
     """Side of the grid of samples in each pixel that the tiles need; see ``needed_samples``."""
     found = 1
     for camera in subsample(cameras, CAMERAS):
-        tiles, _ = choose_tiles(tileset, camera, max_error=max_error, most=MAX_TRIANGLES // 8)
+        tiles, _ = choose_tiles(tileset, [camera], max_error=max_error, most=MAX_TRIANGLES // 8)
         found = max(found, needed_samples(join_tiles(tileset, tiles), [camera]))
     return found
 

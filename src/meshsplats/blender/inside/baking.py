@@ -57,6 +57,22 @@ def points_of(obj: Any) -> Any:
     return target if target is not None and target.users_collection else None
 
 
+def places_of(obj: Any) -> tuple[np.ndarray, np.ndarray, float]:
+    """(n, 3) the points of the splats ``obj``, (n, 3) unit normals there, and the distance of neighbours, in
+    Blender's world; n is 0 if it has none."""
+    target = points_of(obj)
+    if target is None:
+        return np.zeros((0, 3)), np.zeros((0, 3)), 0.0
+    co = np.empty(3 * len(target.data.vertices), np.float32)
+    target.data.vertices.foreach_get("co", co)
+    world = np.array(obj.matrix_world)
+    corners = co.reshape(-1, 3).astype(np.float64) @ world[:3, :3].T + world[:3, 3]
+    a, b, c = corners.reshape(-1, 3, 3).swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return (a + b + c) / 3, normals, target.data[SIZE] * obj.matrix_world.median_scale
+
+
 def bake(scene: Any, objs: list[Any], *, samples: int = SAMPLES) -> int:
     """Gathers the light of ``scene`` on the splat objects ``objs`` and shows them in it.
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from meshsplats.blender.inside import baking, meshes, objects, scene, stage
 from meshsplats.blender.options import LIGHTS, LightOptions
+from meshsplats.blender.subject import ground_height
 from meshsplats.cameras.framing import scene_bounds, weighted_quantile
 from meshsplats.cameras.trajectories import orbit
 
@@ -32,6 +33,9 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
     light, bounds = LIGHTS[lights], scene_bounds(points)
     low = weighted_quantile(bounds.points[:, 2], bounds.weights, _FLOOR)
+    for obj in objs:
+        places, normals, size = baking.places_of(obj)
+        low = ground_height(low, places[:, 2], normals[:, 2], size)
     stage.clear()
     viewer = None
     if camera:
