@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import shutil
 import signal
@@ -16,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from _cities import SMALL, digest, write_city
 from _photographs import write_photographs
 
 from meshsplats import (
@@ -23,20 +23,15 @@ from meshsplats import (
     load_mesh,
     orbit,
     render_splats,
-    save_gaussian_blocks,
     save_mesh,
     stream_gaussians,
 )
 from meshsplats.cli import main
 from meshsplats.cluster import ANY_PORT, Shared, Workers, open_workers
 from meshsplats.demo_scene import make_scene
-from meshsplats.demo_scene.city import city_blocks
 from meshsplats.errors import ClusterError, DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.tiles import building
-from meshsplats.tiles.building import TileOptions, build_tiles
-
-COUNT = 12_000
-SMALL = TileOptions(max_triangles=4096)
+from meshsplats.tiles.building import build_tiles
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +44,7 @@ def scheduler():
 
 @pytest.fixture(scope="module")
 def splats(tmp_path_factory):
-    path = tmp_path_factory.mktemp("city") / "city.ply"
-    save_gaussian_blocks(city_blocks(COUNT, degree=0), path, COUNT)
-    return path
+    return write_city(tmp_path_factory.mktemp("city"))
 
 
 @pytest.fixture(autouse=True)
@@ -59,10 +52,9 @@ def small_buckets(monkeypatch):
     monkeypatch.setattr(building, "BUCKET", 3000)
 
 
-def digest(folder):
-    """Every file but the records of the command line."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and "config" not in path.name)
-    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+def results(folder):
+    """Hashes of every file but the records of the command line."""
+    return {name: found for name, found in digest(folder).items() if "config" not in Path(name).name}
 
 
 # ---- Functions that workers run
@@ -201,7 +193,7 @@ def test_tiles_of_a_cluster_have_the_same_bits(splats, scheduler, tmp_path, caps
     words = ["tiles", str(splats), "-o", str(tmp_path / "there"), "--max-triangles", "4096"]
     assert main([*words, "--cluster", scheduler]) == 0
     assert "cluster: 2 workers of tcp://" in capsys.readouterr().err
-    assert digest(tmp_path / "there") == digest(tmp_path / "here")
+    assert results(tmp_path / "there") == results(tmp_path / "here")
     assert not (tmp_path / "there.partial").exists()
 
 
@@ -231,21 +223,21 @@ def test_tiles_outlive_a_killed_worker(splats, scheduler, tmp_path, monkeypatch)
     with open_workers(scheduler) as workers:
         build_tiles(stream_gaussians(splats), tmp_path / "there", SMALL, workers=workers)
     assert (tmp_path / "died").exists()
-    assert digest(tmp_path / "there") == digest(tmp_path / "here")
+    assert results(tmp_path / "there") == results(tmp_path / "here")
 
 
 def test_images_of_a_cluster_have_the_same_bits(splats, scheduler, tmp_path):
     words = ["render", str(splats), "--orbit", "3", "--width", "64", "--depth", "png", "--animation", "none"]
     assert main([*words, "-o", str(tmp_path / "here")]) == 0
     assert main([*words, "-o", str(tmp_path / "there"), "--cluster", scheduler]) == 0
-    found = digest(tmp_path / "there")
-    assert found == digest(tmp_path / "here")
+    found = results(tmp_path / "there")
+    assert found == results(tmp_path / "here")
     assert len([name for name in found if name.endswith(".png")]) == 6
     build_tiles(stream_gaussians(splats), tmp_path / "tiles", SMALL)
     words[1] = str(tmp_path / "tiles")
     assert main([*words, "-o", str(tmp_path / "here2")]) == 0
     assert main([*words, "-o", str(tmp_path / "there2"), "--cluster", scheduler]) == 0
-    assert digest(tmp_path / "there2") == digest(tmp_path / "here2")
+    assert results(tmp_path / "there2") == results(tmp_path / "here2")
 
 
 def test_scores_of_a_cluster_are_the_same(scheduler, tmp_path, capsys):
@@ -261,8 +253,8 @@ def test_scores_of_a_cluster_are_the_same(scheduler, tmp_path, capsys):
     words = ["evaluate", str(models), "--data", str(data), "--protocol", "tanks-and-temples", "--strips", "1"]
     assert main([*words, "-o", str(tmp_path / "here")]) == 0
     assert main([*words, "-o", str(tmp_path / "there"), "--cluster", scheduler]) == 0
-    found = digest(tmp_path / "there")
-    assert found == digest(tmp_path / "here")
+    found = results(tmp_path / "there")
+    assert found == results(tmp_path / "here")
     assert {"report.json", "train/report.json", "truck/report.json"} <= set(found)
     capsys.readouterr()
     words = [
@@ -300,7 +292,7 @@ def test_a_killed_command_with_workers_is_resumed(splats, tmp_path):
     process.wait()
     assert not (tmp_path / "there").exists()
     subprocess.run([*words, "resume"], check=True)
-    assert digest(tmp_path / "there") == digest(tmp_path / "here")
+    assert results(tmp_path / "there") == results(tmp_path / "here")
 
 
 # ---- Full disks, lost schedulers
@@ -352,7 +344,7 @@ def test_tiles_go_on_after_files_that_could_not_be_written(splats, tmp_path):
     for path in (tmp_path / "there.partial" / "tileset").rglob("*.glb"):
         load_mesh(path)
     build_tiles(stream_gaussians(splats), tmp_path / "there", SMALL, resume=True)
-    assert digest(tmp_path / "there") == digest(tmp_path / "here")
+    assert results(tmp_path / "there") == results(tmp_path / "here")
 
 
 def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, tmp_path):
@@ -375,7 +367,7 @@ def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, tmp_path):
         with open_workers("local") as workers:
             build_tiles(stream_gaussians(splats), small / "tiles", SMALL, workers=workers, resume=True)
         build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
-        assert digest(small / "tiles") == digest(tmp_path / "here")
+        assert results(small / "tiles") == results(tmp_path / "here")
     finally:
         subprocess.run(["umount", str(small)], check=True)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import shutil
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _cities import COUNT, SMALL, digest, write_city
 
 from meshsplats import (
     FileFormatError,
@@ -38,15 +38,10 @@ from meshsplats.tiles.drawing import choose_tiles, reaches, render_tiles, screen
 from meshsplats.tiles.journal import Journal
 from meshsplats.tiles.tileset import Tileset
 
-COUNT = 12_000
-SMALL = TileOptions(max_triangles=4096)
-
 
 @pytest.fixture(scope="module")
 def splats(tmp_path_factory):
-    path = tmp_path_factory.mktemp("city") / "city.ply"
-    save_gaussian_blocks(city_blocks(COUNT, degree=0), path, COUNT)
-    return path
+    return write_city(tmp_path_factory.mktemp("city"))
 
 
 @pytest.fixture(autouse=True)
@@ -64,11 +59,6 @@ def tileset(splats, tmp_path_factory):
         patch.setattr(tilesets, "LEVELS_PER_FILE", 2)
         build_tiles(stream_gaussians(splats, block=1000), folder, SMALL)
     return folder
-
-
-def digest(folder):
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
 # ---- A reader by the letter of the specifications, without any of ours

@@ -15,7 +15,6 @@ from meshsplats._json import read_json
 from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
 
-"""Larger camera files are refused."""
 MAX_CAMERAS = 20_000
 
 
