@@ -20,9 +20,9 @@ import numpy as np
 
 import meshsplats as ms
 from meshsplats.cluster import Shared
-from meshsplats.conversion.streaming import joined
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.finetuning.cells import CellOptions, Cells, CellScene, divide, finetune_cells
+from meshsplats.gaussians import joined
 from meshsplats.rendering.looks import image_of
 
 NEAR = 1.0

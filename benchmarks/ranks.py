@@ -13,11 +13,11 @@ import argparse
 import time
 
 import meshsplats as ms
-from meshsplats.conversion.streaming import joined
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.finetuning.ranks import joined_ranks
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
+from meshsplats.gaussians import joined
 
 VIEWS = 8
 LENGTH = 10**6

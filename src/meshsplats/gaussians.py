@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -103,3 +104,23 @@ class GaussianCloud:
         rows = np.arange(len(self))[index]
         fields = ("means", "quaternions", "scales", "opacities", "sh")
         return replace(self, **{name: np.take(getattr(self, name), rows, axis=0) for name in fields})
+
+
+def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
+    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one."""
+    if len(clouds) == 1:
+        return clouds[0]
+    sh = np.zeros((sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds), 3), np.float32)
+    start = 0
+    for cloud in clouds:
+        sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
+        start += len(cloud)
+    kernels = {cloud.kernel for cloud in clouds}
+    return GaussianCloud(
+        means=np.concatenate([cloud.means for cloud in clouds]),
+        quaternions=np.concatenate([cloud.quaternions for cloud in clouds]),
+        scales=np.concatenate([cloud.scales for cloud in clouds]),
+        opacities=np.concatenate([cloud.opacities for cloud in clouds]),
+        sh=sh,
+        kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
+    )

@@ -27,8 +27,8 @@ from meshsplats import (
 from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import meshes, rendering
 from meshsplats.cli import main
-from meshsplats.conversion.streaming import joined
 from meshsplats.demo_scene.city import city_blocks
+from meshsplats.gaussians import joined
 from meshsplats.images.reading import load_image
 
 

@@ -13,8 +13,8 @@ from meshsplats.blender.linear import linear_colors
 from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.subject import lit_arrays
 from meshsplats.colors import srgb_to_linear
-from meshsplats.conversion.streaming import joined
 from meshsplats.demo_scene.city import city_blocks
+from meshsplats.gaussians import joined
 
 
 def angles(mesh, normals, true):

@@ -29,7 +29,6 @@ from meshsplats import (
 from meshsplats.cli import main
 from meshsplats.cluster import Shared, Workers, open_workers
 from meshsplats.conversion import ConversionOptions
-from meshsplats.conversion.streaming import joined
 from meshsplats.datasets.views import Dataset, ImageCache, View, ViewImage
 from meshsplats.datasets.windows import window_of
 from meshsplats.demo_scene import make_scene
@@ -39,6 +38,7 @@ from meshsplats.finetuning import cells as in_cells
 from meshsplats.finetuning.cells import CellOptions, CellScene, divide, finetune_cells, waves
 from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.run import held_out_scores
+from meshsplats.gaussians import joined
 
 COUNT, MOST = 3000, 1100
 CONFIG = make_config(steps=60)

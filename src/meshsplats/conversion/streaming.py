@@ -26,8 +26,7 @@ from meshsplats.conversion.footprint import (
 )
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
 from meshsplats.conversion.selection import within
-from meshsplats.formats.splats._cloud_builder import joined
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.gaussians import GaussianCloud, Kernel, joined
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:

@@ -37,8 +37,7 @@ from meshsplats.finetuning.journal import CHECKPOINT, Journal
 from meshsplats.finetuning.run import Progress, RunOptions, finetune
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.formats.splats._cloud_builder import joined
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import GaussianCloud, joined
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import visible_pixels
 

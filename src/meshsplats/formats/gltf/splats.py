@@ -19,7 +19,7 @@ from meshsplats.formats._orientation import HALF_TURN_Z, transformed
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.reader import objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
-from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined
+from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined_within
 from meshsplats.formats.splats.spz import read_spz
 from meshsplats.gaussians import GaussianCloud
 
@@ -48,7 +48,7 @@ def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
         raise document.error(
             f"a glTF file without splats (no primitive has {EXTENSION}); load_mesh reads meshes"
         )
-    return joined(clouds, document.budget)
+    return joined_within(clouds, document.budget)
 
 
 def has_splats(path: Path) -> bool:

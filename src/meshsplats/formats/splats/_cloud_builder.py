@@ -11,7 +11,7 @@ import numpy as np
 
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.gaussians import GaussianCloud, Kernel, joined
 
 
 class SplatRows(NamedTuple):
@@ -162,27 +162,12 @@ class CloudBuilder:
         return dropped
 
 
-def joined(clouds: Sequence[GaussianCloud], budget: Budget | None = None) -> GaussianCloud:
-    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one."""
-    if len(clouds) == 1:
-        return clouds[0]
-    count, width = sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds)
-    if budget is not None:
+def joined_within(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCloud:
+    """``joined``, which takes memory from the ``budget`` of a file."""
+    if len(clouds) > 1:
+        count, width = sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds)
         budget.spend(4 * (11 + 3 * width) * count, f"its {count:,} splats together")
-    sh = np.zeros((count, width, 3), np.float32)
-    start = 0
-    for cloud in clouds:
-        sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
-        start += len(cloud)
-    kernels = {cloud.kernel for cloud in clouds}
-    return GaussianCloud(
-        means=np.concatenate([cloud.means for cloud in clouds]),
-        quaternions=np.concatenate([cloud.quaternions for cloud in clouds]),
-        scales=np.concatenate([cloud.scales for cloud in clouds]),
-        opacities=np.concatenate([cloud.opacities for cloud in clouds]),
-        sh=sh,
-        kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
-    )
+    return joined(clouds)
 
 
 def decode_smallest_three(out: np.ndarray, small: np.ndarray, largest: np.ndarray) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from meshsplats._json import json_object
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.splats._cloud_builder import SplatReader, joined
+from meshsplats.formats.splats._cloud_builder import SplatReader, joined_within
 from meshsplats.formats.splats.sog import read_sog
 from meshsplats.gaussians import GaussianCloud, Kernel
 
@@ -33,7 +33,7 @@ def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
         budget.extend(own.file_bytes)
         budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
         parts.append(cloud)
-    return joined(parts, budget)
+    return joined_within(parts, budget)
 
 
 def streamed_parts(path: Path) -> Iterator[tuple[str, SplatReader, Budget]]:
