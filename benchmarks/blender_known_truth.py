@@ -7,6 +7,10 @@ folder), clean, noisy, and fine-tuned against the texture, and drawn on the grou
 ``meshsplats blender --lit`` draws them and, for comparison, with a plain diffuse material. Prints a Markdown
 table, below Blender's own output, and writes a strip of the images (-o). Shadow overlap is intersection over
 union of those pixels of the ground that are darker than 0.8 of the bare ground.
+
+``--frames 40`` draws that many frames of an orbit instead, a degree apart, denoised, and prints how much a pixel
+of the cow flickers: the RMS of half the difference between a frame and the mean of its neighbours, in 8-bit
+levels, of the textured mesh, of fine-tuned splats lit, and of the same unlit.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from PIL import Image
 
 from meshsplats import Dataset, GaussianCloud, SplatMesh, View, convert, dome, finetune, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import meshes, rendering, scene, versions
+from meshsplats.blender.inside import meshes, rendering, scene, stage, versions
 from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.linear import linear_colors
 from meshsplats.colors import linear_to_srgb
@@ -138,28 +142,72 @@ def add_truth(obj, texture: Path, like) -> None:
     bpy.context.scene.collection.objects.link(target)
 
 
+def shot(made) -> np.ndarray:
+    """The linear image of the scene's camera."""
+    with tempfile.TemporaryDirectory() as scratch:
+        rendering.render_to(made.scene, Path(scratch) / "image.exr")
+        return rendering.read_pixels(Path(scratch) / "image.exr")[..., :3]
+
+
+def display(image: np.ndarray) -> np.ndarray:
+    return linear_to_srgb(np.clip(image, 0, 1))
+
+
+def print_flicker(
+    obj, texture: np.ndarray, folder: Path, asked: argparse.Namespace, options: SceneOptions
+) -> None:
+    mesh = fine_tuned(replace(convert(sample(obj, texture, False), mode="flat"), up=UP), obj, texture)
+    size = {"width": asked.width, "height": asked.width * 3 // 4, "distance": 1.3}
+    views = [orbit(mesh, 1, elevation=25, azimuth=215 + i, **size)[0] for i in range(asked.frames)]
+    layers, limit = subject.count(mesh, views[:1], options)
+    arrays, facts = subject.prepare(mesh, views, options, layers)
+    drawn = {}
+    for name in ("textured mesh", "splats, --lit"):
+        made = scene.build(scene.Subject(**arrays, **facts), views, options, limit, edges=False)
+        if name == "textured mesh":
+            made.obj.hide_render = True
+            for child in made.obj.children:
+                child.hide_render = True
+            add_truth(obj, folder / "spot_texture.png", made.obj)
+        frames = []
+        for i, (view, camera) in enumerate(zip(views, made.cameras, strict=True)):
+            made.scene.frame_set(i)
+            stage.aim(made.scene, view, camera)
+            frames.append(display(shot(made)))
+        drawn[name] = np.stack(frames)
+    drawn["splats, unlit"] = np.stack([render(mesh, view, samples=4).color for view in views])
+    cow = np.stack([render(mesh, view).alpha > 0.98 for view in views])
+    inside = cow[1:-1] & cow[:-2] & cow[2:]
+    print("\n| | flicker of the cow |\n|---|---|")
+    for name, frames in drawn.items():
+        change = (frames[1:-1] - (frames[:-2] + frames[2:]) / 2) / 2
+        print(f"| {name} | {255 * np.sqrt(np.square(change[inside]).mean()):.2f} |")
+    if asked.output is not None:
+        shown = [frames[0] for frames in drawn.values()]
+        save_image(asked.output, strip(shown, list(drawn)))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Lit splats against a known surface.")
     parser.add_argument("--data", type=Path, required=True, help="folder with meshes/spot_textured/spot")
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--samples", type=int, default=48)
     parser.add_argument("-o", "--output", type=Path, help="image of all: a .png")
+    parser.add_argument("--frames", type=int, help="draw an orbit and print flicker")
     asked = parser.parse_args()
     folder = asked.data / "meshes" / "spot_textured" / "spot"
     obj = read_obj(folder / "spot_triangulated.obj")
     texture = np.asarray(Image.open(folder / "spot_texture.png").convert("RGB"))
-    options = SceneOptions(light=LightOptions(sun=(130, 40)), samples=asked.samples)
+    light = LightOptions(sun=(130, 40))
+    if asked.frames:
+        print_flicker(
+            obj, texture, folder, asked, SceneOptions(light=light, samples=asked.samples, denoise=True)
+        )
+        return
+    options = SceneOptions(light=light, samples=asked.samples)
     height = asked.width * 3 // 4
     view = None
     shown, captions = [], []
-
-    def shot(made) -> np.ndarray:
-        with tempfile.TemporaryDirectory() as scratch:
-            rendering.render_to(made.scene, Path(scratch) / "image.exr")
-            return rendering.read_pixels(Path(scratch) / "image.exr")[..., :3]
-
-    def display(image: np.ndarray) -> np.ndarray:
-        return linear_to_srgb(np.clip(image, 0, 1))
 
     rows = [
         "| splats | material | PSNR, image | PSNR, cow alone | shadow overlap | light, of the mesh's |",
