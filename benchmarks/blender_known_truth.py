@@ -3,14 +3,14 @@
     blender-env/bin/python benchmarks/blender_known_truth.py --data ../shared/data
 
 Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the data
-folder), clean, noisy, and fine-tuned against the texture, and drawn on the ground under sun and sky: as
-``meshsplats blender --lit`` draws them and, for comparison, with a plain diffuse material. Prints a Markdown
-table, below Blender's own output, and writes a strip of the images (-o). Shadow overlap is intersection over
-union of those pixels of the ground that are darker than 0.8 of the bare ground.
+folder): clean, noisy, with floaters and holes, and fine-tuned against the texture. They are drawn on the ground
+under sun and sky, as ``meshsplats blender --lit`` draws them and, for comparison, with a plain diffuse material.
+Prints a Markdown table, below Blender's own output, and writes a strip of the images (-o). Shadow overlap is
+intersection over union of those pixels of the ground that are darker than 0.8 of the bare ground.
 
-``--frames 40`` draws that many frames of an orbit instead, a degree apart, denoised, and prints how much a pixel
-of the cow flickers: the RMS of half the difference between a frame and the mean of its neighbours, in 8-bit
-levels, of the textured mesh, of fine-tuned splats lit, and of the same unlit.
+``--frames 40`` draws an orbit of that many frames instead, a degree apart, denoised, and prints how much a
+pixel of the cow flickers: the RMS of half the difference between a frame and the mean of its neighbours, in
+8-bit levels, of the textured mesh, of fine-tuned splats lit, and of the same unlit.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ SPLATS = 20_000
 FINE = 3
 """Times that each triangle of the surface is split in four, for its images."""
 STEPS = 300
+KINDS = ("clean", "noisy", "faulty", "clean, fine-tuned", "noisy, fine-tuned", "faulty, fine-tuned")
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -57,9 +58,11 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
     return np.array(points), np.array(coordinates), indices[:, :, 0], indices[:, :, 1]
 
 
-def sample(obj, texture: np.ndarray, noisy: bool) -> GaussianCloud:
-    """Flat splats in the surface; ``noisy``: tilted by 20 degrees at random, moved by a third of their
-    spacing, and of all opacities from 0.3 on."""
+def sample(obj, texture: np.ndarray, kind: str) -> GaussianCloud:
+    """Flat splats in the surface. In a "noisy" kind they are tilted by 20 degrees at random, moved by a third
+    of their spacing, and of all opacities from 0.3 on. A "faulty" one has holes of two spacings, too, a
+    twentieth of the splats, and as many faint grey floaters around."""
+    noisy = "noisy" in kind or "faulty" in kind
     points, coordinates, faces, texture_faces = obj
     rng = np.random.default_rng(0)
     a, b, c = (points[faces[:, k]] for k in range(3))
@@ -91,6 +94,14 @@ def sample(obj, texture: np.ndarray, noisy: bool) -> GaussianCloud:
     quaternions[normals[:, 2] < -0.999999] = [0, 1, 0, 0]
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     sigma = np.tile(spacing * np.array([0.75, 0.75, 0.03]), (SPLATS, 1))
+    if "faulty" in kind:
+        middles = means[rng.choice(SPLATS, SPLATS // 260, replace=False)]
+        gone = np.zeros(SPLATS, bool)
+        for middle in middles:
+            gone |= np.square(means - middle).sum(axis=1) < (2 * spacing) ** 2
+        means[gone] = rng.uniform(1.3 * points.min(axis=0), 1.3 * points.max(axis=0), (gone.sum(), 3))
+        opacities[gone], colors[gone] = rng.uniform(0.02, 0.3, gone.sum()), 0.5
+        sigma[gone] = spacing
     return GaussianCloud(means, quaternions, sigma, opacities, ((colors - 0.5) / SH_C0)[:, None])
 
 
@@ -156,7 +167,7 @@ def display(image: np.ndarray) -> np.ndarray:
 def print_flicker(
     obj, texture: np.ndarray, folder: Path, asked: argparse.Namespace, options: SceneOptions
 ) -> None:
-    mesh = fine_tuned(replace(convert(sample(obj, texture, False), mode="flat"), up=UP), obj, texture)
+    mesh = fine_tuned(replace(convert(sample(obj, texture, "clean"), mode="flat"), up=UP), obj, texture)
     size = {"width": asked.width, "height": asked.width * 3 // 4, "distance": 1.3}
     views = [orbit(mesh, 1, elevation=25, azimuth=215 + i, **size)[0] for i in range(asked.frames)]
     layers, limit = subject.count(mesh, views[:1], options)
@@ -214,8 +225,8 @@ def main() -> None:
         "|---|---|---|---|---|---|",
     ]
     target = ground = None
-    for kind in ("clean", "noisy", "clean, fine-tuned", "noisy, fine-tuned"):
-        mesh = replace(convert(sample(obj, texture, "noisy" in kind), mode="flat"), up=UP)
+    for kind in KINDS:
+        mesh = replace(convert(sample(obj, texture, kind), mode="flat"), up=UP)
         if "tuned" in kind:
             mesh = fine_tuned(mesh, obj, texture)
         if view is None:
