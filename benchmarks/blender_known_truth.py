@@ -2,11 +2,12 @@
 
     blender-env/bin/python benchmarks/blender_known_truth.py --data ../shared/data
 
-Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the data
-folder): clean, noisy, with floaters and holes, and fine-tuned against the texture. They are drawn on the ground
-under sun and sky, as ``meshsplats blender --lit`` draws them and, for comparison, with a plain diffuse material.
-Prints a Markdown table, below Blender's own output, and writes a strip of the images (-o). Shadow overlap is
-intersection over union of those pixels of the ground that are darker than 0.8 of the bare ground.
+Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the
+data folder): clean, noisy, with floaters and holes, and fine-tuned against the texture. They are drawn on
+the ground under sun and sky, as ``meshsplats blender --lit`` draws them and, for comparison, with a plain
+diffuse material. Prints a Markdown table, below Blender's own output, and writes a strip of the images
+(-o). Shadow overlap is intersection over union of those pixels of the ground that are darker than 0.8 of
+the bare ground.
 
 ``--frames 40`` draws an orbit of that many frames instead, a degree apart, denoised, and prints how much a
 pixel of the cow flickers: the RMS of half the difference between a frame and the mean of its neighbours, in
