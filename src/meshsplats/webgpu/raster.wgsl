@@ -148,7 +148,12 @@ fn at_sample(f: vec3f) -> f32 {
 
 fn between(a: vec2f, b: vec2f) -> vec2f { return add_pairs(b, -a); }
 // a b - c d
-fn cross_of(a: vec2f, b: vec2f, c: vec2f, d: vec2f) -> vec2f { return add_pairs(multiply_pairs(a, b), -multiply_pairs(c, d)); }
+fn cross_of(a: vec2f, b: vec2f, c: vec2f, d: vec2f) -> vec2f {
+  let p = product_of(a.x, b.x);
+  let q = product_of(c.x, d.x);
+  let s = sum_of(p.x, -q.x);
+  return sum_of(s.x, s.y + ((p.y - q.y) + ((a.x * b.y + a.y * b.x) - (c.x * d.y + c.y * d.x))));
+}
 
 // The coefficients of 1 / z for visible corners; (0, 0, c[0].w) if they are too large. `area` is twice the signed area.
 fn depth_plane(c: array<Place, 3>, area: vec2f) -> vec3f {
@@ -168,31 +173,21 @@ fn corner_at(vertex: u32) -> Corner {
   let p = unpack_vertex(v);
   return Corner(p, unpack_rest(v, p));
 }
-// A fixed order of vertices at different places.
-fn precedes(j: Corner, k: Corner) -> bool {
-  if (j.p.x != k.p.x) { return j.p.x < k.p.x; }
-  if (j.p.y != k.p.y) { return j.p.y < k.p.y; }
-  if (j.rest.x != k.rest.x) { return j.rest.x < k.rest.x; }
-  if (j.rest.y != k.rest.y) { return j.rest.y < k.rest.y; }
-  return j.p.w < k.p.w;
-}
 
+// From p to q, from the corner o of the tile.
 struct Edge { a: f32, b: f32, x: f32, y: f32, c: f32 };
-
-// The edge from p to q, from the corner o of the tile. The other direction has the same bits, negated.
 fn edge(p: Corner, q: Corner, o: vec2f) -> Edge {
-  var j = p;
-  var k = q;
-  var s = 1.0;
-  if (precedes(q, p)) { j = q; k = p; s = -1.0; }
-  if (j.p.z > 0.0 && k.p.z > 0.0) {
-    let start = (j.p.xy - o) + j.rest.xy;
-    let x = between(vec2f(j.p.x, j.rest.x), vec2f(k.p.x, k.rest.x));
-    let y = between(vec2f(j.p.y, j.rest.y), vec2f(k.p.y, k.rest.y));
-    return Edge(-s * y.x, s * x.x, start.x, start.y, 0.0);
+  if (p.p.z > 0.0 && q.p.z > 0.0) {
+    let start = (p.p.xy - o) + p.rest.xy;
+    let step = (q.p.xy - p.p.xy) + (q.rest - p.rest).xy;
+    return Edge(-step.y, step.x, start.x, start.y, 0.0);
   }
-  let u = homogeneous(j.p);
-  let v = homogeneous(k.p);
+  // The other direction has the same bits, negated.
+  let swapped = q.p.x < p.p.x || (q.p.x == p.p.x && (q.p.y < p.p.y || (q.p.y == p.p.y && q.p.w < p.p.w)));
+  var u = homogeneous(p.p);
+  var v = homogeneous(q.p);
+  var s = 1.0;
+  if (swapped) { let w = u; u = v; v = w; s = -1.0; }
   let n = cross(vec3f(u.xy - o * u.z, u.z), vec3f(v.xy - o * v.z, v.z));
   return Edge(s * n.x, s * n.y, 0.0, 0.0, s * n.z);
 }
@@ -293,18 +288,20 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
   var bits = face;
   var constant = vec4f(0.0);
   for (var k = 0u; k < 3u; k++) {
-    let line = vec4f(flip * e[k].a, flip * e[k].b, e[k].x, e[k].y);
-    let c = flip * e[k].c;
-    let far = f32(TILE) - 0.5;
-    let best = edge_at(line, vec2f(select(0.5, far, line.x > 0.0), select(0.5, far, line.y > 0.0)), c);
     let j = (k + 1u) % 3u;
     let l = (k + 2u) % 3u;
+    var line = vec4f(flip * e[k].a, flip * e[k].b, e[k].x, e[k].y);
+    let c = flip * e[k].c;
     var room = 0.0;
     constant[k] = NO_CONSTANT;
     if (visible[j] && visible[l]) {
+      line.x = flip * between(places[l].y, places[j].y).x;
+      line.y = flip * between(places[j].x, places[l].x).x;
       constant[k] = flip * cross_of(places[j].x, places[l].y, places[l].x, places[j].y).x;
       room = 2.5e-7 * (abs(line.x) + abs(line.y)) * (32.0 + abs(line.z) + abs(line.w));
     }
+    let far = f32(TILE) - 0.5;
+    let best = edge_at(line, vec2f(select(0.5, far, line.x > 0.0), select(0.5, far, line.y > 0.0)), c);
     if (!(best >= -room)) { return false; }
     constant.w = max(constant.w, room);
     edges[3u * slot + k] = line;
