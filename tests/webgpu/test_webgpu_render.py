@@ -46,7 +46,7 @@ def random_fans(count: int = 400, seed: int = 0, *, radius: float = 0.12, alpha=
 
 
 def nearly_coplanar(count: int = 40, seed: int = 0) -> SplatMesh:
-    """Triangles whose corners lie in one tilted plane, but for rounding: 1 / depth of layers differs by 1e-8."""
+    """Triangles whose corners lie in one tilted plane, but for rounding: 1 / depth differs by about 1e-8."""
     rng = np.random.default_rng(seed)
     rays = np.concatenate([rng.uniform(-1.5, 1.5, (3 * count, 2)), np.ones((3 * count, 1))], axis=1)
     points = rays / (rays @ [0.02, 0.03, 0.12])[:, None]
