@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from _gpu import need_gpu
 from _rendering import camera, fan, layers, seen_by, soup, turned
-from test_webgpu_render import random_fans
+from test_webgpu_render import crossing_planes, nearly_coplanar, random_fans
 
 from meshsplats import Camera, SplatMesh, render
 from meshsplats.errors import DeviceError
@@ -58,13 +58,15 @@ def scene(name: str) -> tuple[SplatMesh, Camera, dict]:
         "opaque": lambda: (with_opacity(soup(0), 1), view, {}),
         "transparent": lambda: (with_opacity(soup(0), 0), view, {}),
         "one pixel": lambda: (soup(8), camera(1, 1), {"samples": 16}),
+        "edges through samples": lambda: (*crossing_planes(), {}),
+        "nearly equal depths": lambda: (varied(nearly_coplanar(), 0.4), view, {}),
     }[name]()
 
 
 SCENES = [
     *("piercing", "turned camera", "samples", "depth groups", "equal depths", "saturated"),
     *("terminated early", "many layers", "across tiles", "a fan", "far smaller than a pixel"),
-    *("near plane", "opaque", "transparent", "one pixel"),
+    *("near plane", "opaque", "transparent", "one pixel", "edges through samples", "nearly equal depths"),
 ]
 
 

@@ -45,6 +45,33 @@ def random_fans(count: int = 400, seed: int = 0, *, radius: float = 0.12, alpha=
     )
 
 
+def nearly_coplanar(count: int = 40, seed: int = 0) -> SplatMesh:
+    """Triangles whose corners lie in one tilted plane, but for rounding: 1 / depth differs by about 1e-8."""
+    rng = np.random.default_rng(seed)
+    rays = np.concatenate([rng.uniform(-1.5, 1.5, (3 * count, 2)), np.ones((3 * count, 1))], axis=1)
+    points = rays / (rays @ [0.02, 0.03, 0.12])[:, None]
+    colors = np.column_stack([rng.random((count, 3)), np.full(count, 0.4)])
+    return SplatMesh(points, np.arange(3 * count).reshape(-1, 3), np.repeat(colors, 3, axis=0))
+
+
+def crossing_planes(seed: int = 0) -> tuple[SplatMesh, Camera]:
+    """Pairs of planes that cross in an edge, each of two triangles; the edges lead, but for rounding, through
+    centres of pixels."""
+    rng = np.random.default_rng(seed)
+    points, faces = [], []
+    for i in range(12):
+        a, b = np.array([2.5 + i, 2.5]), np.array([22.5, 22.5 - i])
+        sides = [(a + b) / 2 + d for d in ((6, -6), (-6, 6), (5, -7), (-7, 5))]
+        image = (np.array([a, b, *sides]) - 16) / 32
+        depth = rng.uniform(2, 3, (6, 1))
+        faces += [(6 * i, 6 * i + 1, 6 * i + k) for k in (2, 3, 4, 5)]
+        points.append(np.hstack([image * depth, depth]))
+    colors = rng.random((72, 4)) * [1, 1, 1, 0.5]
+    return SplatMesh(np.concatenate(points), faces, colors), Camera(
+        np.eye(4), 32.0, 32.0, 16.0, 16.0, 32, 32, 0.1
+    )
+
+
 def draw(mesh: SplatMesh, view: Camera, settings: DrawSettings) -> renderer.Images:
     return renderer.draw(mesh, view, settings)
 
@@ -75,6 +102,30 @@ def test_equal_depths_are_ordered_by_face_index(depths):
     assert_same_image(*both(mesh, camera()), least=130)
     backwards = replace(mesh, colors=mesh.colors[::-1])
     assert np.abs(render(mesh, camera()).color - render(backwards, camera()).color).max() > 0.05
+
+
+@pytest.mark.parametrize("samples", [1, 2, 4])
+def test_layers_within_rounding_of_each_other_have_the_order_of_the_core(samples):
+    mesh, view = nearly_coplanar(), camera(60, 50)
+    gpu, core = both(mesh, view, samples=samples, depth=True)
+    assert_same_image(gpu, core, most=1e-3)
+    backwards = replace(mesh, colors=mesh.colors[::-1])
+    assert np.abs(core.color - render(backwards, view, samples=samples).color).max() > 0.1
+
+
+def test_windows_leave_the_order_of_such_layers(monkeypatch):
+    monkeypatch.setattr(renderer, "WINDOW_SAMPLES", 2500)
+    mesh, view = nearly_coplanar(), camera(140, 30)
+    assert_same_image(*both(mesh, view), most=1e-3)
+    assert draw(mesh, view, DrawSettings()).work.windows == 2
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_samples_within_rounding_of_an_edge_are_on_the_side_that_the_core_sees(seed):
+    mesh, view = crossing_planes(seed)
+    gpu, core = both(mesh, view)
+    assert_same_image(gpu, core)
+    assert core.fragments > 1000
 
 
 def test_depth_groups():

@@ -47,7 +47,7 @@ fn widen_backward(@builtin(global_invocation_id) id: vec3u) {
   for (var corner = 3u * begin; corner < 3u * end; corner++) {
     let i = mesh[corner];
     if (!is_first(corner, i)) { continue; }
-    let w = projected_out[i].z;
+    let w = unpack_vertex(projected_out[i]).z;
     let relative = fan_position(i, fan.first, fan.origin).xy;
     let q = turn(fan.axis, relative - fan.middle) - fan.mean;
     let moved = fan.middle + turn_back(fan.axis, fan.mean + apply(fan.a, q));
@@ -114,7 +114,7 @@ fn widen_backward(@builtin(global_invocation_id) id: vec3u) {
     grad[1] += grad_u;
     grad[2] += grad_v;
     for (var j = 0u; j < 3u; j++) {
-      let w = projected_out[i[j]].z;
+      let w = unpack_vertex(projected_out[i[j]]).z;
       let by_image = to_position(turn_back(fan.axis, grad[j].xy), start + p[j].xy, w);
       gradients[2u * i[j]] += vec4f(by_image - vec3f(0.0, 0.0, k * grad[j].z * w * w), 0.0);
       gradients[2u * i[j] + 1u].w += scale * by_alpha[j];

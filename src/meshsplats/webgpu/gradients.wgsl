@@ -126,16 +126,16 @@ fn add_tile(i: u32, k: u32) {
   let o = vec2f(corner);
   let face = unpack_run(mesh[frame.runs_at + (pair.y & 0xffffffu)]).first + k;
   let ids = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
-  let p = array<vec4f, 3>(projected[ids.x], projected[ids.y], projected[ids.z]);
+  let p = array<Corner, 3>(corner_at(ids.x), corner_at(ids.y), corner_at(ids.z));
   let v0 = value_of(ids.x);
   let v1 = value_of(ids.y) - v0;
   let v2 = value_of(ids.z) - v0;
   let e0 = edge(p[1], p[2], o);
   let e1 = edge(p[2], p[0], o);
   let e2 = edge(p[0], p[1], o);
-  var scale = vec3f(p[0].z, p[1].z, p[2].z);
+  var scale = vec3f(p[0].p.z, p[1].p.z, p[2].p.z);
   if (!all(scale > vec3f(0.0))) {
-    let z = vec3f(depth_of(p[0]), depth_of(p[1]), depth_of(p[2]));
+    let z = vec3f(depth_of(p[0].p), depth_of(p[1].p), depth_of(p[2].p));
     scale = vec3f(
       select(1.0, z.y * z.z, scale.y > 0.0 && scale.z > 0.0), select(1.0, z.z * z.x, scale.z > 0.0 && scale.x > 0.0),
       select(1.0, z.x * z.y, scale.x > 0.0 && scale.y > 0.0));
@@ -201,11 +201,12 @@ fn add_tiles(
 
 // The rows of A for the origin o, in the image.
 struct Inverse { a: array<vec3f, 3>, o: vec2f };
-fn inverse_of(p: array<vec4f, 3>) -> Inverse {
+fn inverse_of(c: array<Corner, 3>) -> Inverse {
   var result: Inverse;
+  let p = array<vec4f, 3>(c[0].p, c[1].p, c[2].p);
   if (p[0].z > 0.0 && p[1].z > 0.0 && p[2].z > 0.0) {
-    let u = (p[1].xy - p[0].xy) + (rest_of(p[1]) - rest_of(p[0]));
-    let w = (p[2].xy - p[0].xy) + (rest_of(p[2]) - rest_of(p[0]));
+    let u = (p[1].xy - p[0].xy) + (c[1].rest - c[0].rest).xy;
+    let w = (p[2].xy - p[0].xy) + (c[2].rest - c[0].rest).xy;
     let d = u.x * w.y - w.x * u.y;
     result.a[0] = vec3f((u.y - w.y) / d, (w.x - u.x) / d, 1.0) * p[0].z;
     result.a[1] = vec3f(w.y / d, -w.x / d, 0.0) * p[1].z;
@@ -218,8 +219,8 @@ fn inverse_of(p: array<vec4f, 3>) -> Inverse {
   }
   var h: array<vec3f, 3>;
   for (var k = 0u; k < 3u; k++) {
-    let c = homogeneous(p[k]);
-    h[k] = vec3f(c.xy - result.o * c.z, c.z);
+    let v = homogeneous(p[k]);
+    h[k] = vec3f(v.xy - result.o * v.z, v.z);
   }
   let det = dot(h[0], cross(h[1], h[2]));
   for (var k = 0u; k < 3u; k++) { result.a[k] = cross(h[(k + 1u) % 3u], h[(k + 2u) % 3u]) / det; }
@@ -244,7 +245,7 @@ fn add_corners(@builtin(global_invocation_id) id: vec3u) {
     let ids = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
     let v0 = value_of(ids.x);
     let m = vec3f(-n, dot(r, value_of(ids.y) - v0) - n, dot(r, value_of(ids.z) - v0) - n);
-    let inverse = inverse_of(array<vec4f, 3>(projected[ids.x], projected[ids.y], projected[ids.z]));
+    let inverse = inverse_of(array<Corner, 3>(corner_at(ids.x), corner_at(ids.y), corner_at(ids.z)));
     let d = -(m.x * inverse.a[0] + m.y * inverse.a[1] + m.z * inverse.a[2]);
     position += vec3f(frame.lens.xy * d.xy, d.z + dot(frame.lens.zw - inverse.o, d.xy));
   }

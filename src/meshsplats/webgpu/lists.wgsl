@@ -4,8 +4,8 @@
 @group(0) @binding(2) var<storage, read> values: array<vec4f>;             // by vertex: RGB and opacity
 @group(0) @binding(3) var<storage, read> mesh: array<u32>;
 @group(0) @binding(4) var<storage, read> fans: array<u32>;                 // (fans + 1) first face of each fan
-@group(0) @binding(5) var<storage, read> projected: array<vec4f>;
-@group(0) @binding(6) var<storage, read_write> projected_out: array<vec4f>;
+@group(0) @binding(5) var<storage, read> projected: array<vec4u>;
+@group(0) @binding(6) var<storage, read_write> projected_out: array<vec4u>;
 @group(0) @binding(7) var<storage, read_write> group_bounds: array<atomic<u32>>;  // by group: largest 1 / z, complement of the least
 @group(0) @binding(8) var<storage, read_write> boxes_out: array<vec2u>;    // by run: x0 | x1 << 16, y0 | y1 << 16, in tiles
 @group(0) @binding(9) var<storage, read> boxes: array<vec2u>;
@@ -31,31 +31,8 @@ fn rotate(d: vec3f) -> vec3f {
 }
 fn world(i: u32) -> vec3f { return vec3f(vertices[3u * i], vertices[3u * i + 1u], vertices[3u * i + 2u]); }
 
-// Positions in the image are computed with twice the precision: a sample of a tiny triangle is easily on the wrong
-// side of an edge. A vec2f stands for the sum of its two numbers (Dekker 1971). Compilers may take a + b - a for b, but
-// not across integers: `kept` has the value of x.
-fn kept(x: f32) -> f32 { return bitcast<f32>(bitcast<u32>(x) ^ bitcast<u32>(frame.right.w)); }
-fn sum_of(a: f32, b: f32) -> vec2f {
-  let s = kept(a + b);
-  let t = kept(s - a);
-  return vec2f(s, (a - kept(s - t)) + (b - t));
-}
-fn product_of(a: f32, b: f32) -> vec2f {
-  let p = kept(a * b);
-  let a1 = bitcast<f32>(bitcast<u32>(a) & 0xfffff000u);  // products of halves are exact
-  let b1 = bitcast<f32>(bitcast<u32>(b) & 0xfffff000u);
-  let a2 = kept(a - a1);
-  let b2 = kept(b - b1);
-  return vec2f(p, ((kept(a1 * b1) - p) + kept(a1 * b2) + kept(a2 * b1)) + a2 * b2);
-}
-fn add_pairs(a: vec2f, b: vec2f) -> vec2f {
-  let s = sum_of(a.x, b.x);
-  return sum_of(s.x, s.y + (a.y + b.y));
-}
-fn multiply_pairs(a: vec2f, b: vec2f) -> vec2f {
-  let p = product_of(a.x, b.x);
-  return sum_of(p.x, p.y + (a.x * b.y + a.y * b.x));
-}
+// Positions in the image are computed with pairs of numbers: a sample of a tiny triangle is easily on the wrong side
+// of an edge, and two layers easily in the wrong order.
 fn along(axis: vec4f, rest: vec4f, x: vec2f, y: vec2f, z: vec2f) -> vec2f {
   let xy = add_pairs(multiply_pairs(vec2f(axis.x, rest.x), x), multiply_pairs(vec2f(axis.y, rest.y), y));
   return add_pairs(xy, multiply_pairs(vec2f(axis.z, rest.z), z));
@@ -75,20 +52,12 @@ fn to_camera(p: vec3f) -> vec3f {
   let c = precise_point(p);
   return vec3f(c.x.x, c.y.x, c.z.x);
 }
-// (x, y) in the image of a point beyond the near plane: x.x + x.y, y.x + y.y.
-struct Place { x: vec2f, y: vec2f, w: f32 };
 fn place_of(c: Point) -> Place {
-  let w = 1.0 / c.z.x;
-  let error = product_of(w, c.z.x);
-  let inverse = sum_of(w, w * (((1.0 - error.x) - error.y) - w * c.z.y));
+  let inverse = invert_pair(c.z);
   return Place(
     add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.x, frame.lens_rest.x), c.x), inverse), vec2f(frame.lens.z, frame.lens_rest.z)),
     add_pairs(multiply_pairs(multiply_pairs(vec2f(frame.lens.y, frame.lens_rest.y), c.y), inverse), vec2f(frame.lens.w, frame.lens_rest.w)),
-    w);
-}
-fn pack_place(p: Place) -> vec4f {
-  let x = vec2f(p.x.x, p.y.x);
-  return vec4f(x, p.w, pack_rest(x, vec2f(p.x.y, p.y.y)));
+    inverse);
 }
 
 @compute @workgroup_size(256)
@@ -99,7 +68,7 @@ fn project(@builtin(global_invocation_id) id: vec3u) {
   if (c.z >= frame.near) {
     projected_out[id.x] = pack_place(place_of(p));
   } else {
-    projected_out[id.x] = vec4f(fma(frame.lens.xy, c.xy, frame.lens.zw * c.z), 0.0, c.z);
+    projected_out[id.x] = bitcast<vec4u>(vec4f(fma(frame.lens.xy, c.xy, frame.lens.zw * c.z), 0.0, c.z));
   }
 }
 
@@ -135,7 +104,7 @@ fn fan_moments(begin: u32, end: u32, first: vec3f, origin: vec3f, shift: vec2f, 
     var a: vec3f;
     for (var k = 0u; k < 3u; k++) {
       let i = mesh[3u * f + k];
-      if (!(projected_out[i].z > 0.0)) { m.visible = false; }
+      if (projected_out[i].z == 0u) { m.visible = false; }
       p[k] = fan_position(i, first, origin);
       let d = p[k].xy - shift;
       q[k] = vec2f(dot(axis, d), axis.x * d.y - axis.y * d.x);
@@ -218,7 +187,9 @@ fn widen(@builtin(global_invocation_id) id: vec3u) {
       let moved = fan.middle + vec2f(fan.axis.x * r.x - fan.axis.y * r.y, fan.axis.y * r.x + fan.axis.x * r.y);
       let x = add_pairs(start.x, vec2f(moved.x, 0.0));
       let y = add_pairs(start.y, vec2f(moved.y, 0.0));
-      projected_out[i] = pack_place(Place(x, y, projected_out[i].z));
+      let unmoved = projected_out[i];
+      let v = unpack_vertex(unmoved);
+      projected_out[i] = pack_place(Place(x, y, vec2f(v.z, unpack_rest(unmoved, v).z)));
     }
   }
 }
@@ -234,7 +205,7 @@ fn bound_groups(@builtin(global_invocation_id) id: vec3u) {
   let g = mesh[frame.face_groups_at + id.x];
   if (g == NO_GROUP) { return; }
   for (var k = 0u; k < 3u; k++) {
-    let p = projected[mesh[3u * id.x + k]];
+    let p = unpack_vertex(projected[mesh[3u * id.x + k]]);
     let bits = bitcast<u32>(select(1.0 / frame.near, p.z, p.z > 0.0));  // floats > 0 are ordered as their bits
     atomicMax(&group_bounds[2u * g], bits);
     atomicMax(&group_bounds[2u * g + 1u], ~bits);
@@ -245,7 +216,9 @@ fn bound_groups(@builtin(global_invocation_id) id: vec3u) {
 fn find_planes(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= frame.groups) { return; }
   let f = 3u * mesh[frame.group_faces_at + id.x];
-  let p = array<vec4f, 3>(projected_out[mesh[f]], projected_out[mesh[f + 1u]], projected_out[mesh[f + 2u]]);
+  let p = array<vec4f, 3>(
+    unpack_vertex(projected_out[mesh[f]]), unpack_vertex(projected_out[mesh[f + 1u]]),
+    unpack_vertex(projected_out[mesh[f + 2u]]));
   let most = bitcast<f32>(atomicLoad(&group_bounds[2u * id.x]));
   let least = bitcast<f32>(~atomicLoad(&group_bounds[2u * id.x + 1u]));
   var anchor = vec3f(0.0, 0.0, most);
@@ -259,8 +232,8 @@ fn find_planes(@builtin(global_invocation_id) id: vec3u) {
     let q = (cross(v[1], v[2]) + cross(v[2], v[0]) + cross(v[0], v[1])) / det;
     if (abs(det) > 1e-30 && all(abs(q) < vec3f(1e30))) { slope = q.xy; anchor = vec3f(0.0, 0.0, q.z); }
   }
-  projected_out[frame.vertices + 2u * id.x] = vec4f(anchor, 0.0);
-  projected_out[frame.vertices + 2u * id.x + 1u] = vec4f(slope, least, most);
+  projected_out[frame.vertices + 2u * id.x] = bitcast<vec4u>(vec4f(anchor, 0.0));
+  projected_out[frame.vertices + 2u * id.x + 1u] = bitcast<vec4u>(vec4f(slope, least, most));
 }
 
 // The slope of 1 / z in the image of a triangle; z is 1, or 0 for a triangle without area.
@@ -288,7 +261,8 @@ fn bound_runs(@builtin(global_invocation_id) id: vec3u) {
   var any_visible = false;
   for (var i = 0u; i < run.count; i++) {
     let f = 3u * (run.first + i);
-    let p = array<vec4f, 3>(projected[mesh[f]], projected[mesh[f + 1u]], projected[mesh[f + 2u]]);
+    let p = array<vec4f, 3>(
+      unpack_vertex(projected[mesh[f]]), unpack_vertex(projected[mesh[f + 1u]]), unpack_vertex(projected[mesh[f + 2u]]));
     var a = vec2f(3e38);
     var b = vec2f(-3e38);
     var visible = 0u;
@@ -429,9 +403,9 @@ fn nearest_in_tile(run: Run, corner: vec2f) -> f32 {
   var key = 0.0;
   for (var i = 0u; i < run.count; i++) {
     let face = run.first + i;
-    let p = projected[mesh[3u * face]];
-    let q = projected[mesh[3u * face + 1u]];
-    let r = projected[mesh[3u * face + 2u]];
+    let p = unpack_vertex(projected[mesh[3u * face]]);
+    let q = unpack_vertex(projected[mesh[3u * face + 1u]]);
+    let r = unpack_vertex(projected[mesh[3u * face + 2u]]);
     let visible = vec3<bool>(p.z > 0.0, q.z > 0.0, r.z > 0.0);
     if (!any(visible)) { continue; }
     var low = corner + 0.5;
@@ -457,8 +431,8 @@ fn nearest_in_tile(run: Run, corner: vec2f) -> f32 {
     if (frame.groups > 0u) {
       let g = mesh[frame.face_groups_at + face];
       if (g != NO_GROUP) {
-        let anchor = projected[frame.vertices + 2u * g];
-        let plane = projected[frame.vertices + 2u * g + 1u];
+        let anchor = bitcast<vec4f>(projected[frame.vertices + 2u * g]);
+        let plane = bitcast<vec4f>(projected[frame.vertices + 2u * g + 1u]);
         let top = anchor.z + dot(plane.xy, 0.5 * (low + high) - anchor.xy) + 1.001 * dot(abs(plane.xy), 0.5 * (high - low));
         nearest = clamp(top, plane.z, plane.w);
       }

@@ -10,7 +10,7 @@ const K = $Ku;                 // fragments of the queue of each sample
 const OUTPUT = $OUTPUTu;       // 0: RGB of the vertices; 1: depth; 2: normals of vertices; 3: of faces
 const GROUPS = $GROUPS;        // whether the mesh has depth groups
 
-@group(0) @binding(1) var<storage, read> projected: array<vec4f>;
+@group(0) @binding(1) var<storage, read> projected: array<vec4u>;
 @group(0) @binding(2) var<storage, read> mesh: array<u32>;
 @group(0) @binding(4) var<storage, read> pairs: array<vec2u>;
 @group(0) @binding(5) var<storage, read> work: array<vec4u>;     // from 1 on: (tile, first pair, end, walks so far)
@@ -28,6 +28,10 @@ var<workgroup> scales: array<vec4f, 64>;   // E_i times these are proportional t
 var<workgroup> least: array<f32, 64>;      // least 1 / z
 var<workgroup> ids: array<u32, 64>;        // face and OWNER bits
 var<workgroup> corners: array<vec4f, 192>; // values
+// From the corner of the core's tile: 1 / z = a x + b y + c; E_i = a x + b y + constants[i]. Where the E_i of the tile
+// is nearer to 0 than the fourth constant, the core's may have another sign.
+var<workgroup> depths: array<vec3f, 64>;
+var<workgroup> constants: array<vec4f, 64>;
 var<workgroup> planes: array<vec4f, 64>;   // of the depth group: slopes, 1 / z at the corner of the tile; 1 if there is one
 var<workgroup> ranges: array<vec2f, 64>;   // of 1 / z of the depth group
 var<workgroup> boxes: array<u32, 128>;     // the samples in its box, one bit each: two words a slot
@@ -43,6 +47,9 @@ var<workgroup> decision: vec4u;
 var<workgroup> efforts: array<atomic<u32>, 4>;
 
 // The sample.
+var<private> core_corner: vec2f;  // of the core's tile
+var<private> block: vec2f;        // corner of its block of 4 x 4 samples, from core_corner
+var<private> in_block: vec2f;     // its centre, from the corner of the block
 var<private> rgb: vec3f;
 var<private> through: f32;        // transmittance
 var<private> layers: u32;         // fragments blended
@@ -117,22 +124,70 @@ fn drop(q: f32, face: u32) {
 
 // ------------------------------------------------------------------------------------------------ triangle set-up
 
-struct Edge { a: f32, b: f32, x: f32, y: f32, c: f32 };
+// The core's bits decide about order and coverage: layers often lie within rounding of each other, and samples
+// within rounding of an edge that two fans of a splat share. So the operations are the core's where it matters:
+// coefficients with more bits than float32, rounded once, from the corner of a tile of the core; then, without
+// contraction, the value at the corner of a block of 4 x 4 samples plus that of the sample from there.
 
-// The edge from p to q, from the corner o of the tile. The other direction has the same bits, negated.
-fn edge(p: vec4f, q: vec4f, o: vec2f) -> Edge {
-  let swapped = q.x < p.x || (q.x == p.x && (q.y < p.y || (q.y == p.y && q.w < p.w)));
-  var j = p;
-  var k = q;
-  var s = 1.0;
-  if (swapped) { j = q; k = p; s = -1.0; }
-  if (p.z > 0.0 && q.z > 0.0) {
-    let start = (j.xy - o) + rest_of(j);
-    let step = (k.xy - j.xy) + (rest_of(k) - rest_of(j));
-    return Edge(-s * step.y, s * step.x, start.x, start.y, 0.0);
+const CORE_TILE = 16u;
+const NO_CONSTANT = 1e38;      // of an edge with an end nearer than the near plane
+
+// For the sample at `sample` in the tile with the corner o. Tiles of the core hold whole pixels.
+fn find_block(o: vec2u, sample: vec2u) {
+  let side = CORE_TILE / frame.samples * frame.samples;
+  let corner = o / side * side;
+  let from_corner = sample - corner;
+  core_corner = vec2f(corner);
+  block = vec2f(from_corner & vec2u(~3u));
+  in_block = vec2f(from_corner & vec2u(3u)) + 0.5;
+}
+fn at_sample(f: vec3f) -> f32 {
+  let at_block = kept(f.x * block.x) + kept(kept(f.y * block.y) + f.z);
+  return kept(kept(f.x * in_block.x) + kept(f.y * in_block.y)) + kept(at_block);
+}
+
+fn between(a: vec2f, b: vec2f) -> vec2f { return add_pairs(b, -a); }
+// a b - c d
+fn cross_of(a: vec2f, b: vec2f, c: vec2f, d: vec2f) -> vec2f {
+  let p = product_of(a.x, b.x);
+  let q = product_of(c.x, d.x);
+  let s = sum_of(p.x, -q.x);
+  return sum_of(s.x, s.y + ((p.y - q.y) + ((a.x * b.y + a.y * b.x) - (c.x * d.y + c.y * d.x))));
+}
+
+// The coefficients of 1 / z for visible corners; (0, 0, c[0].w) if they are too large. `area` is twice the signed area.
+fn depth_plane(c: array<Place, 3>, area: vec2f) -> vec3f {
+  let uw = between(c[0].w, c[1].w);
+  let vw = between(c[0].w, c[2].w);
+  let inverse = invert_pair(area);
+  let x = multiply_pairs(cross_of(uw, between(c[0].y, c[2].y), between(c[0].y, c[1].y), vw), inverse);
+  let y = multiply_pairs(cross_of(between(c[0].x, c[1].x), vw, uw, between(c[0].x, c[2].x)), inverse);
+  let plane = vec3f(
+    x.x, y.x, add_pairs(c[0].w, -add_pairs(multiply_pairs(x, c[0].x), multiply_pairs(y, c[0].y))).x);
+  return select(vec3f(0.0, 0.0, c[0].w.x), plane, all(abs(plane) < vec3f(1e30)));
+}
+
+struct Corner { p: vec4f, rest: vec3f };  // unpack_vertex and unpack_rest
+fn corner_at(vertex: u32) -> Corner {
+  let v = projected[vertex];
+  let p = unpack_vertex(v);
+  return Corner(p, unpack_rest(v, p));
+}
+
+// From p to q, from the corner o of the tile.
+struct Edge { a: f32, b: f32, x: f32, y: f32, c: f32 };
+fn edge(p: Corner, q: Corner, o: vec2f) -> Edge {
+  if (p.p.z > 0.0 && q.p.z > 0.0) {
+    let start = (p.p.xy - o) + p.rest.xy;
+    let step = (q.p.xy - p.p.xy) + (q.rest - p.rest).xy;
+    return Edge(-step.y, step.x, start.x, start.y, 0.0);
   }
-  let u = homogeneous(j);
-  let v = homogeneous(k);
+  // The other direction has the same bits, negated.
+  let swapped = q.p.x < p.p.x || (q.p.x == p.p.x && (q.p.y < p.p.y || (q.p.y == p.p.y && q.p.w < p.p.w)));
+  var u = homogeneous(p.p);
+  var v = homogeneous(q.p);
+  var s = 1.0;
+  if (swapped) { let w = u; u = v; v = w; s = -1.0; }
   let n = cross(vec3f(u.xy - o * u.z, u.z), vec3f(v.xy - o * v.z, v.z));
   return Edge(s * n.x, s * n.y, 0.0, 0.0, s * n.z);
 }
@@ -155,7 +210,14 @@ fn box_bits(low: vec2i, high: vec2i) -> u32 {
 }
 
 fn covers(slot: u32, p: vec2f) -> bool {
-  let e = edges_at(slot, p);
+  var e = edges_at(slot, p);
+  let c = constants[slot];
+  if (any(abs(e) < vec3f(c.w))) {
+    let f = 3u * slot;
+    let core = vec3f(
+      at_sample(vec3f(edges[f].xy, c.x)), at_sample(vec3f(edges[f + 1u].xy, c.y)), at_sample(vec3f(edges[f + 2u].xy, c.z)));
+    e = select(e, core, c.xyz < vec3f(NO_CONSTANT));
+  }
   let id = ids[slot];
   let owned = vec3<bool>((id & OWNER) != 0u, (id & (2u * OWNER)) != 0u, (id & (4u * OWNER)) != 0u);
   return all((e > vec3f(0.0)) | ((e == vec3f(0.0)) & owned));
@@ -163,16 +225,9 @@ fn covers(slot: u32, p: vec2f) -> bool {
 
 // Sets up a face in a slot, for the tile with the corner o; false if it covers no sample of it.
 fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
-  var i = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
-  var p = array<vec4f, 3>(projected[i.x], projected[i.y], projected[i.z]);
-  // The nearest corner first: add_fragment adds to its 1 / z, with the same bits for any first corner.
-  if (p[1].z > p[0].z && p[1].z >= p[2].z) {
-    i = i.yzx;
-    p = array<vec4f, 3>(p[1], p[2], p[0]);
-  } else if (p[2].z > p[0].z && p[2].z > p[1].z) {
-    i = i.zxy;
-    p = array<vec4f, 3>(p[2], p[0], p[1]);
-  }
+  let i = vec3u(mesh[3u * face], mesh[3u * face + 1u], mesh[3u * face + 2u]);
+  let c = array<Corner, 3>(corner_at(i.x), corner_at(i.y), corner_at(i.z));
+  let p = array<vec4f, 3>(c[0].p, c[1].p, c[2].p);
   let visible = vec3<bool>(p[0].z > 0.0, p[1].z > 0.0, p[2].z > 0.0);
   if (!any(visible)) { return false; }
   var box = vec2u(0xffffffffu);
@@ -194,23 +249,30 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
   } else if (!(opacity > 0.0) && !TRANSPARENT) {
     return false;
   }
-  var e = array<Edge, 3>(edge(p[1], p[2], o), edge(p[2], p[0], o), edge(p[0], p[1], o));
+  var e = array<Edge, 3>(edge(c[1], c[2], o), edge(c[2], c[0], o), edge(c[0], c[1], o));
   var flip = 1.0;
   var inverse = 0.0;
   var scale = vec3f(p[0].z, p[1].z, p[2].z);
   var farthest = min(min(p[0].z, p[1].z), p[2].z);
   var nearest = max(max(p[0].z, p[1].z), p[2].z);
+  var places: array<Place, 3>;
+  for (var k = 0u; k < 3u; k++) {
+    places[k] = Place(
+      add_pairs(vec2f(p[k].x, c[k].rest.x), vec2f(-core_corner.x, 0.0)),
+      add_pairs(vec2f(p[k].y, c[k].rest.y), vec2f(-core_corner.y, 0.0)), vec2f(p[k].z, c[k].rest.z));
+  }
   if (all(visible)) {
-    let u = (p[1].xy - p[0].xy) + (rest_of(p[1]) - rest_of(p[0]));
-    let w = (p[2].xy - p[0].xy) + (rest_of(p[2]) - rest_of(p[0]));
-    let d = u.x * w.y - w.x * u.y;
-    if (!(abs(d) > 1e-30)) { return false; }
-    if (d < 0.0) { flip = -1.0; }
+    let d = cross_of(
+      between(places[0].x, places[1].x), between(places[0].y, places[2].y),
+      between(places[0].x, places[2].x), between(places[0].y, places[1].y));
+    if (!(abs(d.x) > 1e-30)) { return false; }
+    if (d.x < 0.0) { flip = -1.0; }
+    depths[slot] = depth_plane(places, d);
   } else {
     var h: array<vec3f, 3>;
     for (var k = 0u; k < 3u; k++) {
-      let c = homogeneous(p[k]);
-      h[k] = vec3f(c.xy - o * c.z, c.z);
+      let v = homogeneous(p[k]);
+      h[k] = vec3f(v.xy - o * v.z, v.z);
     }
     let det = dot(h[0], cross(h[1], h[2]));
     if (!(abs(det) > 1e-30)) { return false; }
@@ -224,17 +286,30 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
     nearest = 1.0 / frame.near;
   }
   var bits = face;
+  var constant = vec4f(0.0);
   for (var k = 0u; k < 3u; k++) {
-    let line = vec4f(flip * e[k].a, flip * e[k].b, e[k].x, e[k].y);
+    let j = (k + 1u) % 3u;
+    let l = (k + 2u) % 3u;
+    var line = vec4f(flip * e[k].a, flip * e[k].b, e[k].x, e[k].y);
     let c = flip * e[k].c;
+    var room = 0.0;
+    constant[k] = NO_CONSTANT;
+    if (visible[j] && visible[l]) {
+      line.x = flip * between(places[l].y, places[j].y).x;
+      line.y = flip * between(places[j].x, places[l].x).x;
+      constant[k] = flip * cross_of(places[j].x, places[l].y, places[l].x, places[j].y).x;
+      room = 2.5e-7 * (abs(line.x) + abs(line.y)) * (32.0 + abs(line.z) + abs(line.w));
+    }
     let far = f32(TILE) - 0.5;
     let best = edge_at(line, vec2f(select(0.5, far, line.x > 0.0), select(0.5, far, line.y > 0.0)), c);
-    if (!(best >= 0.0)) { return false; }
+    if (!(best >= -room)) { return false; }
+    constant.w = max(constant.w, room);
     edges[3u * slot + k] = line;
     e[k].c = c;
     if (owns(line.x, line.y)) { bits |= OWNER << k; }
     corners[3u * slot + k] = v[k];
   }
+  constants[slot] = constant;
   ends[slot] = vec4f(e[0].c, e[1].c, e[2].c, inverse);
   scales[slot] = vec4f(scale, nearest);
   least[slot] = farthest;
@@ -248,8 +323,8 @@ fn set_up(slot: u32, face: u32, o: vec2f) -> bool {
     let g = mesh[frame.face_groups_at + face];
     planes[slot] = vec4f(0.0);
     if (g != NO_GROUP) {
-      let anchor = projected[frame.vertices + 2u * g];
-      let plane = projected[frame.vertices + 2u * g + 1u];
+      let anchor = bitcast<vec4f>(projected[frame.vertices + 2u * g]);
+      let plane = bitcast<vec4f>(projected[frame.vertices + 2u * g + 1u]);
       planes[slot] = vec4f(plane.xy, fma(plane.x, o.x - anchor.x, fma(plane.y, o.y - anchor.y, anchor.z)), 1.0);
       ranges[slot] = plane.zw;
     }
@@ -269,8 +344,7 @@ fn add_fragment(slot: u32, p: vec2f, tile: vec2f, key: f32, source: u32) {
   let inverse = ends[slot].w;
   var depth = 0.0;  // 1 / z
   if (inverse == 0.0) {
-    // Differences of 1 / z are small and nearly exact, so little is lost.
-    depth = scale.x + (e.y * (scale.y - scale.x) + e.z * (scale.z - scale.x)) / (e.x + (e.y + e.z));
+    depth = at_sample(depths[slot]);
   } else {
     depth = sum * inverse;
     if (depth > scale.w) { return; }  // nearer than the near plane
@@ -346,6 +420,7 @@ fn raster(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) t: 
   count = 0u;
   effort = 0u;
   var open = in_image;
+  find_block(vec2u(o), vec2u(x, y));
   begin_sample(t, x, y);
   if (item.w > 0u && in_image) {
     open = resume(index, state_index);

@@ -22,6 +22,9 @@ WINDOW_SAMPLES = 1 << 22
 FIRST_PAIRS = 1 << 18
 """Room for pairs of a run and a tile, until a frame needs more."""
 
+CORE_TILE = 16
+"""Samples along each side of a tile of the core, from whose corners the core's depths are rounded."""
+
 MAX_FAN = 8192
 """Most triangles of a splat with a low-pass filter: one invocation goes through all of them three times."""
 
@@ -595,9 +598,13 @@ def _tiles(samples: int) -> int:
 
 
 def halves(window: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
+    """Two windows (x, y, width, height) in pixels; large ones begin at a tile of the core."""
     x, y, w, h = window
     if max(w, h) == 1:
         raise MemoryError("the GPU cannot hold the triangles of a single pixel: use device='cpu'")
+    half = max(w, h) // 2
+    if half >= 4 * CORE_TILE:
+        half -= half % CORE_TILE
     if w >= h:
-        return [(x, y, w // 2, h), (x + w // 2, y, w - w // 2, h)]
-    return [(x, y, w, h // 2), (x, y + h // 2, w, h - h // 2)]
+        return [(x, y, half, h), (x + half, y, w - half, h)]
+    return [(x, y, w, half), (x, y + half, w, h - half)]

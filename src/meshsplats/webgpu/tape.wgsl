@@ -25,7 +25,9 @@ var<private> last: u32;        // of the sample, on the tape
 var<private> gradient: vec3f;  // of its RGB
 var<private> queue_source: array<u32, K>;  // 8 * pair + triangle of its run
 
-fn value_of(vertex: u32) -> vec4f { return projected[frame.vertices + 2u * frame.groups + vertex]; }
+fn value_of(vertex: u32) -> vec4f {
+  return bitcast<vec4f>(projected[frame.vertices + 2u * frame.groups + vertex]);
+}
 
 fn pixel_gradient(x: u32, y: u32) -> vec4f {
   let s = frame.samples;
