@@ -16,7 +16,14 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, Progress, RunOptions, finetune, make_config, starting_mesh
-from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction, softness, with_soft_splats
+from meshsplats.finetuning.hybrid import (
+    COLOR_SLOPE,
+    ColorLimits,
+    opaque_fraction,
+    soft_fraction,
+    softness,
+    with_soft_splats,
+)
 from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of, visible_faces
 from meshsplats.finetuning.state import Gradients, State
 from meshsplats.finetuning.step import make_step
@@ -247,6 +254,62 @@ def test_opaque_triangles_of_a_hybrid_mesh_keep_their_edges(foggy):
     assert (end.vertices[~solid] != start.vertices[~solid]).any()
     assert (end.colors[~solid, 3] <= np.float32(254 / 255)).all()
     assert np.array_equal(solid_faces(end), solid_faces(start))
+
+
+def test_colors_of_small_opaque_triangles_change_slowly_in_the_image():
+    """A right triangle in each of four places, parallel to the image."""
+    view = camera(64, 32)
+    pixel = 4 / np.sqrt(view.fx * view.fy)  # at depth 4
+    places = ((-2, 4, 8 * pixel), (0, 4, pixel), (2, 4, pixel), (0, -4, pixel))  # the last one behind it
+    corners = [[(x, 0, z), (x + s, 0, z), (x, s, z)] for x, z, s in places]
+    colors = np.full((12, 4), 0.5, np.float32)
+    colors[::3, 0] = 0.8
+    colors[:, 3] = np.repeat([1, 1, 0.9, 1], 3)
+    faces = np.arange(12).reshape(4, 3)
+    mesh = SplatMesh(np.reshape(corners, (12, 3)), faces, colors)
+    changed = mesh.colors.copy()
+    ColorLimits(mesh, [View(view, ViewImage(np.zeros((32, 64, 3), np.float32)))]).apply(changed)
+    # The second one is small, opaque and in the image. Its least height is 1 / sqrt(2) pixels.
+    assert np.flatnonzero((changed != colors).any(axis=1)).tolist() == [3, 4, 5]
+    assert changed[3:6].mean(axis=0) == pytest.approx(colors[3:6].mean(axis=0))
+    assert np.ptp(changed[3:6, 0]) == pytest.approx(1.5 * COLOR_SLOPE / np.sqrt(2), rel=1e-4)
+    assert np.array_equal(changed[4], changed[5])
+    assert (changed[:, 1:] == colors[:, 1:]).all()
+
+
+def test_colors_of_triangles_with_common_corners_come_within_their_limits():
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(6), np.arange(6)), axis=-1).reshape(-1, 2)
+    vertices = np.concatenate([0.1 * grid, np.full((36, 1), 4)], axis=1)
+    a = (np.arange(5)[:, None] * 6 + np.arange(5)).ravel()
+    faces = np.concatenate([np.stack([a, a + 1, a + 6], 1), np.stack([a + 1, a + 7, a + 6], 1)])
+    colors = np.concatenate([rng.random((36, 3)), np.ones((36, 1))], axis=1).astype(np.float32)
+    view = camera(64, 32)
+    limits = ColorLimits(
+        SplatMesh(vertices, faces, colors), [View(view, ViewImage(np.zeros((32, 64, 3), np.float32)))]
+    )
+    mean = colors.mean(axis=0)
+    for _ in range(100):
+        limits.apply(colors)
+    corners = colors[faces, :3]
+    most = np.abs(corners - corners.mean(axis=1, keepdims=True)).max()
+    height = 0.1 / np.sqrt(2) * np.sqrt(view.fx * view.fy) / 4
+    assert 0.5 * COLOR_SLOPE * height < most < 1.01 * COLOR_SLOPE * height
+    assert colors.mean(axis=0) == pytest.approx(mean, abs=0.03)
+
+
+def test_a_run_with_blended_triangles_limits_the_colors_of_opaque_ones(foggy):
+    dataset, mesh, _ = foggy
+
+    def beyond(mesh: SplatMesh) -> float:
+        """Mean excess over the limits."""
+        colors = mesh.colors.copy()
+        ColorLimits(mesh, dataset.train).apply(colors)
+        return float(np.abs(colors - mesh.colors).mean())
+
+    config = make_config(steps=20, opacity="cutoff", soft_share=0.2)
+    opaque, hybrid = finetune(mesh, dataset, replace(config, soft_share=0)), finetune(mesh, dataset, config)
+    assert beyond(opaque) > 5 * beyond(hybrid)
 
 
 def square(x: float, depth: float, opacity: float) -> SplatMesh:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
+import struct
 import sys
 
 import numpy as np
@@ -163,6 +165,26 @@ def test_from_a_splat_file_to_a_base_by_command(tmp_path, capsys):
     assert main(["base", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "b.txt")]) == 2
     assert main(["base", str(out), "-o", str(out), "--force"]) == 2
     assert "is read by this command" in capsys.readouterr().err
+
+
+@needs_extra
+def test_a_collider_lies_where_the_mesh_is_in_other_programs(tmp_path):
+    save_gaussians(discs(), tmp_path / "scene.ply")
+    paths = [tmp_path / name for name in ("engine.glb", "collider.glb")]
+    assert main(["convert", str(tmp_path / "scene.ply"), "-o", str(paths[0]), "--up", "x"]) == 0
+    options = ["--faces", "200", "--resolution", "24", "--views", "16"]
+    assert main(["base", str(paths[0]), "-o", str(paths[1]), *options]) == 0
+    documents = []
+    for path in paths:
+        data = path.read_bytes()
+        (length,) = struct.unpack_from("<I", data, 12)
+        documents.append(json.loads(data[20 : 20 + length]))
+    assert documents[0]["nodes"] == documents[1]["nodes"]
+    scene, collider = (load_mesh(path) for path in paths)
+    for limit in (np.min, np.max):
+        assert limit(scene.vertices, axis=0) == pytest.approx(limit(collider.vertices, axis=0), abs=0.2)
+    assert open_edges(collider.faces) == 0
+    assert len(collider.faces) == pytest.approx(200, abs=2)
 
 
 @needs_extra

@@ -25,7 +25,12 @@ from meshsplats.finetuning.checkpoint import (
     mesh_fingerprint,
 )
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
-from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction, with_soft_splats
+from meshsplats.finetuning.hybrid import (
+    ColorLimits,
+    opaque_fraction,
+    soft_fraction,
+    with_soft_splats,
+)
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
@@ -272,6 +277,7 @@ class TrainingLoop:
         share = config.opaque_share
         self.most_opaque = None if share == 1 else max(1, round(share * len(start.mesh.faces)))
         self.source = start.mesh if config.soft_share else None
+        self.limits: ColorLimits | None = None
         # A resumed run may have removed hidden triangles before its checkpoint.
         self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - config.settle_share
 
@@ -351,6 +357,8 @@ class TrainingLoop:
             self._cut()
         if self._due(self.config.prune_interval(len(views)), before) and not self._done():
             self.state = self.state.prune(kept_faces(self.state, views))
+        if self.state.solid is not None:
+            self._limit_colors()
         due = self._due(self.config.relocate_interval(len(views)), before)
         if due and self.fraction <= RELOCATION_END:
             relocate(self.state, views)
@@ -392,6 +400,11 @@ class TrainingLoop:
                 core, self.source, self.dataset.train, self.config.soft_share, self.options.threads
             )
             self.state = State.begin_hybrid(mesh, self.config, self.options.threads)
+
+    def _limit_colors(self) -> None:
+        if self.limits is None or self.limits.faces is not self.state.mesh.faces:
+            self.limits = ColorLimits(self.state.result(), self.dataset.train)
+        self.limits.apply(self.state.colors)
 
     def _done(self) -> bool:
         if self.limit is not None:
