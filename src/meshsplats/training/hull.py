@@ -94,7 +94,7 @@ def _reduced(inside: np.ndarray, width: int, height: int) -> np.ndarray:
         edges = np.arange(count + 1) * size
         first, last = edges[:-1] // count, -(-edges[1:] // count)
         sums = np.zeros((size + 1, inside.shape[1 - axis]), np.int32)
-        np.cumsum(np.moveaxis(inside, axis, 0), axis=0, out=sums[1:])
+        np.cumsum(np.moveaxis(inside, axis, 0), axis=0, dtype=np.int32, out=sums[1:])
         inside = np.moveaxis(sums[last] > sums[first], 0, axis)
     return np.ascontiguousarray(inside)
 
