@@ -98,14 +98,14 @@ def train(
         save_mesh(mesh, journal.folder / START)
     loop = GrowingLoop(start, dataset, config, run, journal, on_progress)
     try:
-        result = loop.run()
+        mesh = loop.run()
     except Interrupted:
         if journal is not None:
             save_mesh(loop.result(), journal.folder / SO_FAR)
         raise
     if journal is not None:
         (journal.folder / SO_FAR).unlink(missing_ok=True)
-    return result
+    return mesh
 
 
 def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes: int) -> int:
