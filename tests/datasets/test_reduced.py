@@ -48,6 +48,20 @@ def test_cameras_see_the_same_at_every_size():
     assert reduced_views([view], 1, ImageCache(0)) == (view,)
 
 
+@pytest.mark.parametrize("kind", ["bare", "alpha", "mask"])
+def test_the_memory_of_an_image_is_bounded_in_advance(kind):
+    more = {
+        "bare": {},
+        "alpha": {"alpha": np.ones((64, 64), np.uint8)},
+        "mask": {"alpha": np.ones((64, 64), np.uint8), "mask": np.ones((64, 64), bool)},
+    }[kind]
+    view = View(cameras_around(3)[0], ViewImage(np.zeros((64, 64, 3), np.uint8), **more))
+    (opaque,) = opaque_views([view])
+    (small,) = reduced_views([opaque], 0.5, ImageCache(0))
+    for made in (opaque, small):
+        assert made.load().nbytes <= made.source.nbytes <= 2 * made.load().nbytes
+
+
 def test_photographs_without_alpha_become_opaque():
     camera = cameras_around(3)[0]
     for color, one in ((np.zeros((64, 64, 3), np.uint8), 255), (np.zeros((64, 64, 3), np.float32), 1)):

@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 
 from meshsplats import Camera, SplatMesh, convert, load_cameras, load_gaussians
 from meshsplats.rendering import api, reference, render
+from meshsplats.rendering.backward import TapedRendering
 
 BLACK = (0, 0, 0)
 seeds = st.integers(0, 10_000)
@@ -401,3 +402,19 @@ def test_light_left_out_by_stopping_early():
     half = layers([1, 2, 3, 4], 0.5)
     assert render(half, camera(1, 1), min_transmittance=0.3).fragments == 2
     assert render(half, camera(1, 1), min_transmittance=0.25).fragments == 3
+
+
+def test_a_taped_rendering_of_a_mesh_has_its_groups_and_its_filter():
+    """Each of which changes the image."""
+    view = camera(48, 40)
+    groups = np.random.default_rng(0).integers(0, 6, 60)
+    for whole, without in (
+        (replace(soup(3), depth_group=groups), soup(3)),
+        (replace(fan(5, 8, 0.6), face_splat=np.zeros(8, np.int32), filter_px2=9.0), fan(5, 8, 0.6)),
+    ):
+        image = TapedRendering.of(whole, view, background=(0, 0, 1)).color
+        assert np.array_equal(image, render(whole, view, background=(0, 0, 1)).color)
+        assert not np.array_equal(image, render(without, view, background=(0, 0, 1)).color)
+    black = np.zeros_like(whole.colors)
+    image = TapedRendering.of(whole, view, colors=black, background=(0, 0, 1)).color
+    assert np.array_equal(image, render(replace(whole, colors=black), view, background=(0, 0, 1)).color)

@@ -10,6 +10,7 @@ from _balls import ball_view, cameras_around
 
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.views import View, ViewImage
+from meshsplats.training import hull
 from meshsplats.training.hull import carve, has_silhouettes, in_silhouettes
 from meshsplats.training.initial import (
     colored,
@@ -80,6 +81,45 @@ def test_silhouettes_need_alpha_that_leaves_something_out(ball, room):
     assert not has_silhouettes([replace(view, source=full)])
 
 
+def test_one_view_with_alpha_is_enough_for_silhouettes(ball, room):
+    """Whichever it is; the others take no part."""
+    assert has_silhouettes([room[0], ball[1]])
+    surface = carve([*ball[::2], *room[1::2]], 500)
+    assert np.linalg.norm(surface.points, axis=1).min() > 1 - surface.side
+    assert np.quantile(np.linalg.norm(surface.points, axis=1), 0.9) < 1.5
+    assert in_silhouettes(room, 1.5 * on_sphere(50), np.full(50, 0.01)).all()
+    patches, shell = starting_patches([room[0], *ball[1:]], 500)
+    assert shell is None
+    assert len(patches.points) > 100
+
+
+def test_large_silhouettes_are_made_smaller(ball, monkeypatch):
+    """The hull still holds the ball."""
+    whole = carve(ball, 500)
+    monkeypatch.setattr(hull, "SILHOUETTE_BYTES", hull.PIXEL_BYTES * len(ball) * 30**2)
+    assert hull.silhouette_factor(ball) == pytest.approx(30 / 64)
+    assert hull.carving_bytes(ball, 0) == hull.SILHOUETTE_BYTES
+    small = carve(ball, 500)
+    assert not np.array_equal(small.points, whole.points)
+    for surface in (whole, small):
+        radius = np.linalg.norm(surface.points, axis=1)
+        assert radius.min() > 1 - surface.side
+        assert np.quantile(radius, 0.9) < 1.15 + surface.side
+
+
+def test_a_hull_has_a_largest_number_of_cells(ball, monkeypatch):
+    fine = carve(ball, 4000)
+    monkeypatch.setattr(hull, "MOST_CELLS", 100_000)
+    assert len(carve(ball, 4000).points) < 4000 <= len(fine.points)
+    monkeypatch.undo()
+    monkeypatch.setattr(hull, "CELLS_AT_ONCE", 7000)
+    parts = carve(ball, 1500, lambda points: points[:, 2] < 0.5)
+    monkeypatch.undo()
+    whole = carve(ball, 1500, lambda points: points[:, 2] < 0.5)
+    assert np.array_equal(parts.points, whole.points)
+    assert np.array_equal(parts.normals, whole.normals)
+
+
 def test_points_beside_a_silhouette_are_found(ball):
     points = np.concatenate([0.9 * on_sphere(50), 1.5 * on_sphere(50)])
     inside = in_silhouettes(ball, points, np.full(100, 0.01))
@@ -143,6 +183,20 @@ def test_a_point_that_nothing_confirms_is_left_out():
     points = np.concatenate([np.random.default_rng(0).uniform(0, 1, (500, 3)), [[9.0, 9, 9]]])
     patches = merged(points, np.zeros((501, 3)), np.full(501, 0.1), np.ones(501), 50)
     assert patches.points.max() < 2
+
+
+@pytest.mark.parametrize("far", [-3e3, -1e6, 1e8])
+def test_one_far_point_changes_no_patch(far):
+    """Sparse models of outdoor scenes have such points."""
+    rng = np.random.default_rng(1)
+    across = rng.uniform(-1, 1, (20000, 2)) * 5
+    points = np.column_stack([across, 0.5 * across[:, 0] + rng.normal(0, 0.002, 20000)])
+    alone = merged(points, np.zeros((20000, 3)), np.full(20000, 0.01), np.ones(20000), 10000)
+    points = np.concatenate([points, [[far, 0.1, 0.2]]])
+    patches = merged(points, np.zeros((20001, 3)), np.full(20001, 0.01), np.ones(20001), 10000)
+    assert len(patches.points) == pytest.approx(len(alone.points), rel=0.1)
+    assert np.median(patches.sides) == pytest.approx(np.median(alone.sides), rel=0.2)
+    assert np.abs(patches.normals @ np.array([-0.5, 0, 1]) / np.sqrt(1.25)).min() > 0.99
 
 
 @pytest.mark.parametrize("masked", [True, False])

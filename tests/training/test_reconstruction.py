@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import builtins
 import os
+import sqlite3
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from _balls import cameras_around
 from _datasets import save, simple_colmap
 
-from meshsplats.errors import MissingDependencyError
+from meshsplats.camera import Camera
+from meshsplats.datasets.folder import load_dataset
+from meshsplats.datasets.points import load_points
+from meshsplats.errors import DataWarning, MissingDependencyError
+from meshsplats.training import reconstruction
 from meshsplats.training.reconstruction import bare_photographs, find_cameras
 
 
@@ -53,3 +62,140 @@ def test_photographs_that_do_not_match_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"of 3 photographs match each other, at least 3 must"):
         find_cameras(folder)
     assert sorted(os.listdir(folder)) == ["p0.png", "p1.png", "p2.png"]
+
+
+class Colmap:
+    """What ``find_cameras`` uses of pycolmap: it finds the ``cameras`` of images by their names, if they have
+    one. Poses are methods or properties, as in different versions."""
+
+    class CameraMode:
+        SINGLE, PER_IMAGE = "single", "per image"
+
+    class Device:
+        cpu = "cpu"
+
+    def __init__(self, cameras: dict[str, Camera], methods: bool) -> None:
+        self.logging = SimpleNamespace()
+        self.cameras, self.methods, self.calls = cameras, methods, []
+
+    def set_random_seed(self, seed):
+        self.calls.append("seed")
+
+    def extract_features(self, database, folder, names, *, camera_mode, device, sift_options):
+        assert sift_options == {"max_image_size": 1600, "max_num_features": 3000}
+        self.names, self.mode, self.folder = names, camera_mode, Path(folder)
+
+    def match_exhaustive(self, database, *, device):
+        self.calls.append("match")
+
+    def incremental_mapping(self, database, folder, work):
+        assert Path(folder) == self.folder
+        images, lenses = {}, {}
+        for i, name in enumerate(reversed(self.names)):
+            camera = self.cameras.get(name)
+            shown = camera or next(iter(self.cameras.values()))
+            pose = SimpleNamespace(matrix=lambda shown=shown: shown.world_to_camera[:3])
+            params = [shown.fx, shown.cx, shown.cy, 0.0]
+            lenses[i] = SimpleNamespace(params=params, width=shown.width, height=shown.height)
+            images[i] = SimpleNamespace(
+                name=name,
+                has_pose=camera is not None,
+                camera_id=i,
+                cam_from_world=(lambda pose=pose: pose) if self.methods else pose,
+            )
+        points = {
+            7 * i: SimpleNamespace(xyz=[i, 2.5, -1], color=np.array([10 * i, 20, 30], np.uint8))
+            for i in range(4)
+        }
+        count = len(self.cameras)
+        best = SimpleNamespace(images=images, cameras=lenses, points3D=points, num_reg_images=lambda: count)
+        return {0: SimpleNamespace(num_reg_images=lambda: 2), 1: best}
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    """A folder of five photographs, and a stand-in for pycolmap that places four of them."""
+
+    def made(under="", methods=True):
+        folder = photographs(tmp_path / "scene" / under, 5) if under else photographs(tmp_path / "scene", 5)
+        cameras = {}
+        for i, camera in enumerate(cameras_around(4)):
+            cameras[f"p{i}.png"] = Camera(camera.world_to_camera, 70, 70, 29, 21, 60, 40)
+        colmap = Colmap(cameras, methods)
+        monkeypatch.setitem(sys.modules, "pycolmap", colmap)
+        return tmp_path / "scene", colmap, folder
+
+    return made
+
+
+@pytest.mark.parametrize(("under", "methods"), [("", True), ("images", False)])
+def test_cameras_are_found_and_written_beside_the_photographs(scene, under, methods):
+    """The data set that is read from them has the cameras and the points that were found."""
+    folder, colmap, place = scene(under, methods)
+    save(place / "previews" / "p0.png", np.zeros((40, 60), np.uint8))
+    lines = []
+    with pytest.warns(DataWarning, match=r"1 of 5 photographs match no others and are left out: p4\.png"):
+        find_cameras(folder, lines.append)
+    assert colmap.names == [f"p{i}.png" for i in range(5)]
+    assert colmap.mode == "single"
+    assert "4 photographs and 4 points" in lines[-1]
+    dataset = load_dataset(folder, test_every=0)
+    assert len(dataset.train) == 4
+    for view, (name, camera) in zip(dataset.train, sorted(colmap.cameras.items()), strict=True):
+        assert view.name.endswith(name)
+        assert view.camera.world_to_camera == pytest.approx(camera.world_to_camera)
+        found = [getattr(view.camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")]
+        assert found == pytest.approx([70, 70, 29, 21, 60, 40])
+        assert view.load().color.shape == (40, 60, 3)
+    points = load_points(folder)
+    assert points.positions.tolist() == [[i, 2.5, -1] for i in range(4)]
+    assert points.colors.tolist() == [[10 * i, 20, 30] for i in range(4)]
+
+
+def test_points_that_are_there_are_not_overwritten(scene):
+    folder, colmap, _ = scene()
+    (folder / "sparse_points.ply").write_text("ours")
+    with pytest.raises(FileExistsError, match="move it away"):
+        find_cameras(folder)
+    assert not colmap.calls  # before the work
+    assert (folder / "sparse_points.ply").read_text() == "ours"
+
+
+def test_cameras_and_points_are_written_both_or_not_at_all(scene, monkeypatch):
+    folder, _, _ = scene()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(reconstruction, "write_text", full)
+    with pytest.warns(DataWarning), pytest.raises(OSError, match="No space"):
+        find_cameras(folder)
+    assert sorted(os.listdir(folder)) == [f"p{i}.png" for i in range(5)]
+
+
+def test_photographs_of_several_sizes_have_cameras_of_their_own(scene):
+    folder, colmap, _ = scene()
+    save(folder / "p4.png", np.zeros((60, 40, 3), np.uint8))
+    with pytest.warns(DataWarning):
+        find_cameras(folder)
+    assert colmap.mode == "per image"
+
+
+def test_only_the_photographs_are_read(tmp_path):
+    """By the library itself: none of the folders below, which hold masks and previews."""
+    pycolmap = pytest.importorskip("pycolmap")
+    folder = photographs(tmp_path / "scene", 3)
+    photographs(folder / "masks", 3)
+    seen = []
+    real = pycolmap.match_exhaustive
+
+    def match(database, **more):
+        with sqlite3.connect(database) as connection:
+            seen.extend(row[0] for row in connection.execute("select name from images"))
+        return real(database, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pycolmap, "match_exhaustive", match)
+        with pytest.raises(ValueError, match="of 3 photographs"):
+            find_cameras(folder)
+    assert sorted(seen) == ["p0.png", "p1.png", "p2.png"]

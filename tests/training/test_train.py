@@ -12,10 +12,13 @@ from _photographs import write_photographs
 from PIL import Image
 
 from meshsplats.cli import main
-from meshsplats.datasets.views import Dataset
+from meshsplats.datasets.views import Dataset, ViewImage
+from meshsplats.errors import MissingDependencyError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions
 from meshsplats.finetuning.checkpoint import OtherRunError
+from meshsplats.finetuning.ranks import Ranks
+from meshsplats.finetuning.run import run_start
 from meshsplats.finetuning.state import State
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
@@ -25,7 +28,7 @@ from meshsplats.training import starting_fans, train, train_config
 from meshsplats.training.as_splats import splats_of_fans
 from meshsplats.training.growth import NearFields, Scores, colors_at, fan_count, grow, score, select_fans
 from meshsplats.training.initial import fans_of
-from meshsplats.training.run import SO_FAR
+from meshsplats.training.run import SO_FAR, GrowingLoop, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
 
 SMALL = {"start_splats": 150, "max_splats": 600, "growth_events": 3}
@@ -251,6 +254,7 @@ def test_a_resumed_run_ends_with_the_same_bits(ball, tmp_path):
         so_far = load_mesh(folder / SO_FAR)
         assert 0 < fan_count(so_far) <= 600
     assert same(train(ball, config, run=RunOptions(folder, resume=True)), whole)
+    assert not (folder / SO_FAR).exists()  # it would be that of the last interruption
     with pytest.raises(OtherRunError, match="max_splats was 600 and is 700"):
         train(ball, replace(config, max_splats=700), run=RunOptions(folder, resume=True))
 
@@ -262,10 +266,77 @@ def test_bad_input_is_refused_before_the_work(ball, tmp_path):
         train_config(sides=2)
     with pytest.raises(ValueError, match="opacity must be 'blended'"):
         train_config(opacity="cutoff")
+    with pytest.raises(ValueError, match="blending 'linear' is not for training"):
+        train_config(blending="linear")
+    for name, value in (("prune_opacity", 0.1), ("prune_importance", 2), ("relocate_epochs", 2)):
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            train_config(**{name: value})
+    with pytest.raises(ValueError, match=r"point_share must be 0\.4"):
+        train_config(point_share=0.1)
+    run = RunOptions(tmp_path / "ranks", ranks=TwoRanks())
+    with pytest.raises(ValueError, match="one process, got 2 ranks"):
+        train(ball, train_config(steps=1), run=run)
     with pytest.raises(TypeError, match="did you mean 'max_splats'"):
         train_config(max_splat=3)
     with pytest.raises(FileNotFoundError, match=r"no .*start\.npz: leave out --resume"):
         train(ball, train_config(steps=1), run=RunOptions(tmp_path / "none", resume=True))
+
+
+class TwoRanks(Ranks):
+    count = 2
+
+
+def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):
+    """And before files of an earlier run are deleted."""
+    from meshsplats.training import run
+
+    def fail(*_):
+        raise AssertionError
+
+    def no_gpu():
+        raise MissingDependencyError("no GPU was found")
+
+    monkeypatch.setattr(run, "starting_fans", fail)
+    monkeypatch.setattr(run, "open_device", no_gpu)
+    with pytest.raises(MissingDependencyError, match="no GPU"):
+        train(ball, train_config(steps=1), run=RunOptions(tmp_path / "run", device="gpu"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_growth_event_happens_twice(ball, start, monkeypatch):
+    """In a run by minutes, the share that is over may fall."""
+    config, options = train_config(steps=60, **SMALL), RunOptions()
+    loop = GrowingLoop(run_start(start, ball, config, options, None), ball, config, options, None, None)
+    passed = []
+    for step in (9, 11, 9, 11, 21):
+        loop.step = step
+        loop._adapt(step)
+        passed.append(loop.events)
+    assert passed == [0, 1, 1, 1, 2]
+
+
+def test_the_estimate_of_memory_holds_reduced_images_and_silhouettes(ball, room):
+    """Reduced images have more bytes a pixel than photographs."""
+    config = train_config(start_splats=2, max_splats=2)
+    pixels = 64 * 64 * len(room.train)
+
+    photographs = Dataset(tuple(replace(view, source=Photograph(view)) for view in room.train))
+    most, least = (check_training_memory(photographs, config, cache_bytes=n) for n in (10**9, 0))
+    assert most - least >= (3 + 8 * (1 / 4 + 1 / 16)) * pixels
+    many = train_config(start_splats=10**6, max_splats=10**6)
+    bare, masked = (check_training_memory(data, many, cache_bytes=0) for data in (room, ball))
+    assert masked > bare + 10**9
+
+
+class Photograph:
+    """An image of 8 bits a value."""
+
+    def __init__(self, view) -> None:
+        self.image = ViewImage((255 * view.load().color).astype(np.uint8))
+        self.nbytes = self.image.nbytes
+
+    def load(self) -> ViewImage:
+        return self.image
 
 
 def test_memory_is_estimated_up_front(ball, monkeypatch):
@@ -274,6 +345,43 @@ def test_memory_is_estimated_up_front(ball, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 10**8)
     with pytest.raises(MemoryError, match=r"training 100,000 fans on 23 images needs about .*--max-splats"):
         train(ball, train_config(steps=1))
+
+
+def test_a_resumed_run_keeps_its_shell(room, tmp_path, monkeypatch):
+    """The same bits as without a stop, where fans of the shell would be dropped."""
+    from meshsplats.training import run
+
+    room = Dataset(room.train[:8])
+    config = train_config(steps=10, start_splats=300, max_splats=400, growth_events=2)
+    start = starting_fans(room, config)
+    fans = start.vertices.reshape(-1, 7, 3).copy()
+    shell = start.attributes["shell"].reshape(-1, 7)[:, 0] > 0
+    fans[shell] = fans[shell, :1] + np.float32(1e-4) * (fans[shell] - fans[shell, :1])  # no pixel shows them
+    start = replace(start, vertices=fans.reshape(-1, 3))
+    monkeypatch.setattr(run, "starting_fans", lambda *_: start)
+    whole = train(room, config)
+
+    def stop(progress):
+        if progress.step == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        train(room, config, run=RunOptions(tmp_path / "run"), on_progress=stop)
+    assert same(train(room, config, run=RunOptions(tmp_path / "run", resume=True)), whole)
+
+
+def test_a_new_run_removes_the_mesh_of_an_earlier_one(ball, start, tmp_path, monkeypatch):
+    from meshsplats.training import run
+
+    monkeypatch.setattr(run, "starting_fans", lambda *_: start)
+    tmp_path.joinpath(SO_FAR).write_bytes(b"")
+
+    def fail(_progress):
+        raise OSError
+
+    with pytest.raises(OSError):
+        train(ball, train_config(steps=2, **SMALL), run=RunOptions(tmp_path), on_progress=fail)
+    assert not (tmp_path / SO_FAR).exists()
 
 
 # ---- As splats
@@ -338,7 +446,26 @@ def test_the_command_trains_and_writes_splats(ball, tmp_path, capsys):
     np.testing.assert_allclose(mesh.up, [0, 0, 1], atol=0.1)  # as the cameras are held
     assert main(words) == 3  # what is there is not overwritten
     assert main(["train", str(folder), "-o", str(tmp_path / "b.npz"), "--as-splats", "b.spz"]) == 2
+    for option in ("--blending", "--prune-opacity", "--point-share", "--cutoff", "--soft-share"):
+        assert main([*words, "--force", option, "0.5"]) == 2  # options without effect do not exist
     capsys.readouterr()
+
+
+def test_a_trained_mesh_outlives_a_failure_to_write_its_splats(ball, tmp_path, monkeypatch):
+    from meshsplats.formats import gaussians
+
+    def full(*_args, **_more):
+        raise OSError(28, "No space left on device", "splats.ply")
+
+    monkeypatch.setattr(gaussians, "save_gaussians", full)
+    views = ball.train[:4]
+    folder = write_photographs(
+        tmp_path / "photos", [view.camera for view in views], [straight(view) for view in views]
+    )
+    words = ["train", str(folder), "-o", str(tmp_path / "mesh.npz"), "--steps", "1", "--start-splats", "100"]
+    words += ["--max-splats", "100", "--test-every", "0", "--as-splats", str(tmp_path / "splats.ply")]
+    assert main(words) != 0
+    assert fan_count(load_mesh(tmp_path / "mesh.npz")) <= 100
 
 
 def straight(view) -> np.ndarray:

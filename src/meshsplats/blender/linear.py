@@ -81,15 +81,11 @@ def linear_colors(
             seen = render(mesh, camera, background=(0, 0, 0), samples=samples, threads=threads)
             targets[id(camera)] = seen
         target = seen.color + (1 - seen.alpha)[:, :, None] * np.array(background, np.float32)
-        drawn = TapedRendering(
-            mesh.vertices,
-            mesh.faces,
-            colors,
-            None,
+        drawn = TapedRendering.of(
+            mesh,
             camera,
+            colors=colors,
             background=srgb_to_linear(np.array(background, np.float32)),
-            face_splat=mesh.face_splat,
-            depth_group=mesh.depth_group,
             samples=samples,
             threads=threads,
         )

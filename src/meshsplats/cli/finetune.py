@@ -183,7 +183,7 @@ class Finetune(TrainingCommand):
         summary = f"{len(scene):,} splats in {plural(count, 'cell')}"
         return Plan(None, dataset, summary, background, optimise)
 
-    def save_more(self, files: RunFiles, plan: Plan) -> None:
+    def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         if self.target.data is None and plan.dataset.test:
             save_cameras([view.camera for view in plan.dataset.test], files.held_out)
 

@@ -23,7 +23,7 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import BLACK, Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
 from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS
+from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS, OF_CUTOFF
 from meshsplats.finetuning.step import samples_of
 from meshsplats.training.config import FIXED, TrainConfig, train_config
 from meshsplats.training.run import SO_FAR, check_training_memory, train
@@ -34,7 +34,7 @@ else:
     GrowingOptions = as_cli_options(
         TrainConfig,
         "Default: see docs/training.md.",
-        without=("preset", *LENGTHS, *FIXED),
+        without=("preset", "blending", *LENGTHS, *FIXED, *OF_CUTOFF),
         defaults=lambda name: f"(default: {getattr(TrainConfig, name)})",
         checked=False,
     )
@@ -104,8 +104,6 @@ class Train(TrainingCommand):
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
         from meshsplats.datasets.points import load_points
-        from meshsplats.formats.gaussians import save_gaussians
-        from meshsplats.training.as_splats import splats_of_fans
         from meshsplats.training.reconstruction import bare_photographs, find_cameras
 
         assert isinstance(config, TrainConfig)
@@ -117,8 +115,6 @@ class Train(TrainingCommand):
 
         def optimise(run: RunOptions, show: ShowProgress) -> Trained:
             mesh = train(dataset, config, points=points, run=run, on_progress=show)
-            if self.as_splats is not None:
-                save_gaussians(splats_of_fans(mesh), self.as_splats)
             counts: dict[str, int] = {"fans": mesh.splat_count or 0, "triangles": len(mesh.faces)}
             return Trained(
                 mesh, mesh, counts, f"{counts['triangles']:,} triangles of {counts['fans']:,} fans"
@@ -127,6 +123,13 @@ class Train(TrainingCommand):
         needed = check_training_memory(dataset, config, cache_bytes=self.target.cache_bytes)
         summary = f"up to {config.max_splats:,} fans of {config.sides} triangles; {known}"
         return Plan(None, dataset, summary, background, optimise, needed)
+
+    def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
+        from meshsplats.formats.gaussians import save_gaussians
+        from meshsplats.training.as_splats import splats_of_fans
+
+        if self.as_splats is not None:
+            save_gaussians(splats_of_fans(trained.saved), self.as_splats)
 
     def preview_camera(self, plan: Plan) -> Camera:
         # From elsewhere, it would show what no photograph shows.

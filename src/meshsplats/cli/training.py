@@ -1,4 +1,4 @@
-"""Base of ``finetune`` and ``prior``: options of an optimisation, its files, its progress and its result."""
+"""Base of ``finetune``, ``prior`` and ``train``: options, files, progress and result of an optimisation."""
 
 from __future__ import annotations
 
@@ -290,7 +290,7 @@ class TrainingCommand(Command):
         save_mesh(trained.saved, files.mesh, alpha=trained.alpha)
         result = None if plan.background is None else plan.background.to_dict()
         write_configuration(files.config, self._name, self, result)
-        self.save_more(files, plan)
+        self.save_more(files, plan, trained)
         draw_preview(trained.shown, files.preview, self.preview_camera(plan))
         self._print_result(files, time.perf_counter() - start, earlier, trained)
         if not self.json:
@@ -320,7 +320,7 @@ class TrainingCommand(Command):
         say("  --resume continues from there")
         return 128 + (stop.signal or signal.SIGINT)
 
-    def save_more(self, files: RunFiles, plan: Plan) -> None:
+    def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         """Further files of the run."""
 
     def explicit_settings(self) -> dict[str, Any]:

@@ -84,17 +84,8 @@ def visibility(
     chosen = subsample(cameras, min(max(len(cameras) // 8, fewest), most))
     for own in chosen:
         camera = own.within(SIDE)
-        rendering = TapedRendering(
-            mesh.vertices,
-            mesh.faces,
-            mesh.colors,
-            np.zeros((len(owner), 2), np.float32),
-            camera,
-            background=(0, 0, 0),
-            samples=samples,
-            face_splat=mesh.face_splat,
-            filter_px2=mesh.filter_px2,
-        )
+        values = np.zeros((len(owner), 2), np.float32)
+        rendering = TapedRendering.of(mesh, camera, values, background=(0, 0, 0), samples=samples)
         # Colours over black and alpha: then no background hides a difference.
         target = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples)
         square = np.square(rendering.color - target.color).sum(axis=2)

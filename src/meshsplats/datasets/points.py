@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from array import array
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,12 +17,21 @@ from meshsplats.errors import FileFormatError
 from meshsplats.formats.ply.header import read_header
 from meshsplats.formats.ply.table import FloatTable
 
-MAX_POINTS = 20_000_000
+MAX_POINTS = 5_000_000
 """More points than this are refused."""
 UNKNOWN_VIEWS = 3
 """The count for points of files that do not say which images show them."""
-_POINT = struct.Struct("<Q3d3BdQ")
+_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
+"""A point in COLMAP's binary file, before the images that show it."""
+_TRACK = struct.Struct("<Q")
+_TRACK_AT = 43
+"""Offset of the number of these images."""
 _TRACK_BYTES = 8
+"""Bytes of each image of a point."""
+_BLOCK_BYTES = 1 << 22
+"""Bytes that are read at a time."""
+_MAX_LINE = 1 << 22
+"""The longest line that is read, bytes."""
 
 
 class ScenePoints(NamedTuple):
@@ -56,44 +66,68 @@ def load_points(path: str | os.PathLike[str]) -> ScenePoints | None:
 
 
 def _binary(path: Path) -> ScenePoints:
-    data = path.read_bytes()
-    (count,) = struct.unpack_from("<Q", data) if len(data) >= 8 else (0,)
-    if count > MAX_POINTS or count * _POINT.size > len(data) - 8:
-        raise FileFormatError(
-            f"{path}: says it holds {count:,} points, but has {len(data):,} bytes (truncated?)"
-        )
-    positions, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
-    views = np.empty(count, np.int64)
-    at = 8
-    for i in range(count):
-        if at + _POINT.size > len(data):
-            raise FileFormatError(f"{path}: ends within point {i} (truncated?)")
-        _, x, y, z, r, g, b, _, track = _POINT.unpack_from(data, at)
-        at += _POINT.size + _TRACK_BYTES * track
-        if at > len(data):
-            raise FileFormatError(f"{path}: ends within the images of point {i} (truncated?)")
-        positions[i], colors[i], views[i] = (x, y, z), (r, g, b), track
-    return _checked(positions, colors, views, path)
+    with open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        head = file.read(_TRACK.size)
+        count = _TRACK.unpack(head)[0] if len(head) == _TRACK.size else 0
+        if len(head) < _TRACK.size or count * _POINT.itemsize > size - len(head):
+            raise FileFormatError(
+                f"{path}: says it holds {count:,} points, but has {size:,} bytes (truncated?)"
+            )
+        if count > MAX_POINTS:
+            raise FileFormatError(f"{path}: more than {MAX_POINTS:,} points: {count:,}")
+        rows = np.empty(count, np.dtype([("xyz", "f8", 3), ("rgb", "u1", 3), ("track", "i8")]))
+        done, block = 0, b""
+        while done < count:
+            block += file.read(_BLOCK_BYTES)
+            starts, end = _starts(block, count - done)
+            if not starts:
+                raise FileFormatError(f"{path}: ends within point {done} (truncated?)")
+            found = np.frombuffer(block, np.uint8)[np.add.outer(starts, np.arange(_POINT.itemsize))]
+            points = found.view(_POINT)[:, 0]
+            for name in ("xyz", "rgb", "track"):
+                rows[name][done : done + len(points)] = points[name]
+            done += len(points)
+            if end > len(block):
+                if file.tell() + end - len(block) > size:
+                    raise FileFormatError(f"{path}: ends within the images of point {done - 1} (truncated?)")
+                file.seek(end - len(block), os.SEEK_CUR)
+            block = block[end:]
+    return _checked(rows["xyz"].copy(), rows["rgb"].copy(), rows["track"].copy(), path)
+
+
+def _starts(block: bytes, most: int) -> tuple[list[int], int]:
+    """Where points start in ``block``, those that lie in it but for their images, ``most`` at most; and where
+    the next one starts, which may lie beyond."""
+    starts: list[int] = []
+    at, last = 0, len(block) - _POINT.itemsize
+    size, fixed, track = _TRACK_BYTES, _POINT.itemsize, _TRACK.unpack_from
+    while at <= last and len(starts) < most:
+        starts.append(at)
+        at += fixed + size * track(block, at + _TRACK_AT)[0]
+    return starts, at
 
 
 def _text(path: Path) -> ScenePoints:
-    rows: list[list[float]] = []
+    rows = array("d")
+    count = 0
     with open(path, "rb") as file:
-        for number, line in enumerate(file, 1):
+        for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), b""), 1):
             words = line.split()
             if not words or words[0].startswith(b"#"):
                 continue
             try:
-                rows.append([*map(float, words[1:7]), (len(words) - 8) // 2])
-                if len(words) < 8:
+                if len(words) < 8 or len(line) == _MAX_LINE:
                     raise ValueError
+                rows.extend([*map(float, words[1:7]), (len(words) - 8) // 2])
             except ValueError:
                 raise FileFormatError(
                     f"{path}: line {number}: a point is 'ID X Y Z R G B ERROR', then pairs of numbers"
                 ) from None
-            if len(rows) > MAX_POINTS:
+            count += 1
+            if count > MAX_POINTS:
                 raise FileFormatError(f"{path}: more than {MAX_POINTS:,} points")
-    table = np.array(rows, np.float64).reshape(-1, 7)
+    table = np.frombuffer(rows, np.float64).reshape(-1, 7)
     if not np.isfinite(table).all():
         raise FileFormatError(f"{path}: a point has a value that is not finite")
     colors = np.clip(table[:, 3:6], 0, 255).astype(np.uint8)
@@ -117,8 +151,19 @@ def _ply(path: Path) -> ScenePoints:
         chunks = [chunk[:, order] for chunk in table.chunks()] if element.count else []
     rows = np.concatenate([np.empty((0, len(wanted)), np.float32), *chunks])
     positions = rows[:, :3].astype(np.float64)
-    colors = np.clip(rows[:, 3:], 0, 255) if has_color else np.full((len(rows), 3), 128.0)
-    return _checked(positions, colors.astype(np.uint8), np.zeros(len(rows), np.int64), path)
+    colors = np.full((len(rows), 3), 128, np.uint8)
+    if has_color:
+        kind = next(prop.dtype for prop in element.properties if prop.name == "red")
+        scaled = rows[:, 3:] * np.float32(_color_scale(kind, rows[:, 3:]))
+        colors[:] = np.clip(np.nan_to_num(scaled), 0, 255)
+    return _checked(positions, colors, np.zeros(len(rows), np.int64), path)
+
+
+def _color_scale(dtype: np.dtype, values: np.ndarray) -> float:
+    """Factor from colour ``values`` (n, 3) of properties of type ``dtype`` to 0 to 255."""
+    if dtype.kind == "f":
+        return 255.0 if values.max(initial=0) <= 1 else 1.0  # some tools write 0 to 255 as floats
+    return 255 / 65535 if dtype.itemsize == 2 else 1.0
 
 
 def _checked(positions: np.ndarray, colors: np.ndarray, views: np.ndarray, path: Path) -> ScenePoints:

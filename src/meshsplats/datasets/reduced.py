@@ -31,8 +31,9 @@ class ReducedImage:
 
     @property
     def nbytes(self) -> int:
-        share = self.width * self.height / (self.view.camera.width * self.view.camera.height)
-        return int(self.view.source.nbytes * share)
+        """Upper bound of the memory of the image in bytes: it has float16 colours, and may have alpha and a
+        mask."""
+        return (6 + 2 + 1) * self.width * self.height
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,8 @@ class OpaqueImage:
 
     @property
     def nbytes(self) -> int:
-        return self.view.source.nbytes
+        """Upper bound of the memory of the image in bytes."""
+        return self.view.source.nbytes + 2 * self.view.camera.width * self.view.camera.height
 
 
 def opaque_views(views: Sequence[View]) -> tuple[View, ...]:

@@ -142,7 +142,7 @@ class FinetuneConfig:
             self._check_cutoff()
         else:
             for f in fields(self):
-                if f.name in _OF_CUTOFF and getattr(self, f.name) != f.default:
+                if f.name in OF_CUTOFF and getattr(self, f.name) != f.default:
                     raise ValueError(f"{f.name} has no effect without opacity 'cutoff'")
         if self.batch > 1 and (self.exposure or self.opacity == "cutoff"):
             raise ValueError("a batch of several views is not for exposure and opacity 'cutoff'")
@@ -185,7 +185,7 @@ class FinetuneConfig:
         return asdict(self)
 
 
-_OF_CUTOFF = (
+OF_CUTOFF = (
     "cutoff",
     "anneal_share",
     "expected_share",

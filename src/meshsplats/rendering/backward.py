@@ -5,13 +5,13 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from meshsplats._core import library
 from meshsplats.camera import Camera
-from meshsplats.mesh import checked_cutoff, checked_filter
+from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
 from meshsplats.rendering.api import (
     MIN_TRANSMITTANCE,
     Pointers,
@@ -147,6 +147,35 @@ class TapedRendering:
                 ctypes.byref(self._tape),
             )
         self.fragments = int(image.fragments)
+
+    @classmethod
+    def of(
+        cls,
+        mesh: SplatMesh,
+        camera: Camera,
+        attributes: np.ndarray | None = None,
+        *,
+        colors: np.ndarray | None = None,
+        **options: Any,
+    ) -> TapedRendering:
+        """The rendering of ``mesh``, with its splats, depth groups and filter.
+
+        Args:
+            attributes: (v, k) float32, in place of those of the mesh.
+            colors: (v, 4) float32, in place of those of the mesh.
+            options: the other keywords of the constructor.
+        """
+        return cls(
+            mesh.vertices,
+            mesh.faces,
+            mesh.colors if colors is None else colors,
+            attributes,
+            camera,
+            face_splat=mesh.face_splat,
+            depth_group=mesh.depth_group,
+            filter_px2=mesh.filter_px2,
+            **options,
+        )
 
     @property
     def vertex_count(self) -> int:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from meshsplats._options import Range, check_names, check_ranges
-from meshsplats.finetuning.config import LENGTHS, FinetuneConfig
+from meshsplats.finetuning.config import LENGTHS, BackgroundMode, FinetuneConfig
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,10 @@ class TrainConfig(FinetuneConfig):
     """First share of the run, in which images have a quarter of the photographs' sides."""
     half_share: float = 0.4
     """Share of the run until which they have half of them; then they have all."""
+    background: BackgroundMode = "mixed"
+    """Background of the images. random: a new colour in every step, which masked photographs show around the
+    subject, and others where nothing covers it. mixed: random in every fourth step, otherwise that of the
+    data set."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,6 +44,8 @@ class TrainConfig(FinetuneConfig):
         for name, only in FIXED.items():
             if getattr(self, name) != only:
                 raise ValueError(f"{name} must be {only!r} while the set of fans grows; finetune has it")
+        if self.blending == "linear":
+            raise ValueError("blending 'linear' is not for training: fine-tune the result with it")
 
 
 _RANGES: list[Range] = [
@@ -52,8 +58,15 @@ _RANGES: list[Range] = [
     ("half_share", 0, 1, False),
 ]
 
-FIXED = {"opacity": "blended", "prune_epochs": 0.0, "relocate_share": 0.0, "batch": 1}
-"""Options of fine-tuning that change its set of triangles, or share its steps."""
+FIXED: dict[str, Any] = {
+    **{"opacity": "blended", "prune_epochs": 0.0, "relocate_share": 0.0, "batch": 1},
+    **{
+        name: getattr(FinetuneConfig, name)
+        for name in ("prune_opacity", "prune_importance", "relocate_epochs", "point_share")
+    },
+}
+"""Options of fine-tuning that change its set of triangles, or share its steps, those that belong to them, and
+one for rendered images."""
 
 
 def train_config(**changes: Any) -> TrainConfig:

@@ -16,7 +16,7 @@ from meshsplats.finetuning.step import MIN_TRANSMITTANCE, samples_of
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import TapedRendering
 
-SCORED_VIEWS = 20
+JUDGED_VIEWS = 20
 """Maximum number of training views, evenly spread, in which fans are judged."""
 SHELL = "shell"
 """Attribute of a mesh in training: 1 for the fans of the shell, which are never dropped, else 0."""
@@ -47,26 +47,23 @@ class Scores(NamedTuple):
 
 
 def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
-    """Judges the fans of ``state`` in up to ``SCORED_VIEWS`` of ``views``, others in each ``turn``."""
-    mesh = state.mesh
+    """Judges the fans of ``state`` in up to ``JUDGED_VIEWS`` of ``views``, others in each ``turn``."""
+    mesh = state.result()
     corners = corners_of(mesh)
     n = fan_count(mesh)
     total, most, pixels = np.zeros(n), np.zeros(n), np.zeros(n)
     all_pixels, clear_pixels = np.zeros(n), np.zeros(n)
     in_view = np.zeros(n, bool)
-    step = -(-len(views) // SCORED_VIEWS)
+    step = -(-len(views) // JUDGED_VIEWS)
     for index in range(turn % step, len(views), step):
         view = views[index]
-        rendering = TapedRendering(
-            state.vertices,
-            mesh.faces,
-            state.colors,
-            np.zeros((len(mesh.vertices), 3), np.float32),
+        rendering = TapedRendering.of(
+            mesh,
             view.camera,
+            np.zeros((len(mesh.vertices), 3), np.float32),
             background=view.background,
             samples=samples_of(view, state.config),
             min_transmittance=MIN_TRANSMITTANCE[mesh.blending],
-            face_splat=mesh.face_splat,
             threads=state.threads,
         )
         image = rendering.color
@@ -87,7 +84,7 @@ def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
         np.maximum(pixels, count, out=pixels)
         all_pixels += count
         clear_pixels += outside
-        in_view |= view.camera.sees(state.vertices[::corners])
+        in_view |= view.camera.sees(mesh.vertices[::corners])
     clear_share = clear_pixels / np.maximum(all_pixels, 1e-9)
     return Scores(total - most, pixels, clear_share, in_view)
 

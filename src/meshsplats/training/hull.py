@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.datasets.views import View
 
 FIRST_LEVEL = 32
@@ -25,6 +26,16 @@ OPAQUE = 0.5
 """Alpha from which a pixel belongs to the silhouette."""
 SEEN_SHARE = 0.5
 """Share of the views that must have a cell in their image."""
+SILHOUETTE_BYTES = 1 << 30
+"""Limit on the silhouettes of all views together. Larger ones are made smaller."""
+PIXEL_BYTES = 5
+"""Memory of a pixel of a silhouette."""
+MOST_CELLS = 1 << 25
+"""Limit on the cells of a grid, those inside of the hull included."""
+CELL_BYTES = 64
+"""Memory of a cell while the next finer grid is carved."""
+CELLS_AT_ONCE = 1 << 20
+"""Cells that are tested at a time."""
 
 
 class Surface(NamedTuple):
@@ -39,9 +50,10 @@ class Surface(NamedTuple):
 
 
 class _Silhouette:
-    """The silhouette of one view, as sums over all rectangles from the image's corner."""
+    """The silhouette of one view, as sums over all rectangles from the image's corner. ``factor``: size of
+    the silhouette relative to the image."""
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: View, factor: float = 1.0) -> None:
         image = view.load()
         assert image.alpha is not None
         unit = 255 if image.alpha.dtype == np.uint8 else 1
@@ -49,6 +61,9 @@ class _Silhouette:
         if image.mask is not None:
             inside |= ~image.mask  # pixels that do not count rule nothing out
         self.camera: Camera = view.camera
+        if factor < 1:
+            self.camera = view.camera.scaled(factor)
+            inside = _reduced(inside, self.camera.width, self.camera.height)
         self.inside = inside
         self.sums = np.zeros((inside.shape[0] + 1, inside.shape[1] + 1), np.int32)
         self.sums[1:, 1:] = inside.cumsum(axis=0, dtype=np.int32).cumsum(axis=1, dtype=np.int32)
@@ -72,19 +87,54 @@ class _Silhouette:
         return in_image, empty
 
 
+def _reduced(inside: np.ndarray, width: int, height: int) -> np.ndarray:
+    """``inside`` (h, w) bool at a smaller size: a pixel is inside if any that it covers is."""
+    for axis, count in enumerate((height, width)):
+        size = inside.shape[axis]
+        edges = np.arange(count + 1) * size
+        first, last = edges[:-1] // count, -(-edges[1:] // count)
+        sums = np.zeros((size + 1, inside.shape[1 - axis]), np.int32)
+        np.cumsum(np.moveaxis(inside, axis, 0), axis=0, dtype=np.int32, out=sums[1:])
+        inside = np.moveaxis(sums[last] > sums[first], 0, axis)
+    return np.ascontiguousarray(inside)
+
+
 def has_silhouettes(views: Sequence[View]) -> bool:
-    """Whether the images of ``views`` have alpha that leaves out a part of them, judged by the first."""
-    if not views:
-        return False
-    alpha = views[0].alpha
-    return alpha is not None and bool((alpha < OPAQUE).any()) and bool((alpha >= OPAQUE).any())
+    """Whether the image of any of ``views`` has alpha that leaves out a part of it."""
+    for view in filter(_has_alpha, views):
+        alpha = view.alpha
+        if alpha is not None and bool((alpha < OPAQUE).any()) and bool((alpha >= OPAQUE).any()):
+            return True
+    return False
+
+
+def _has_alpha(view: View) -> bool:
+    """Whether the image has alpha. Photographs are not read for that."""
+    if isinstance(view.source, PhotoFile):
+        return view.source.has_alpha
+    return view.load().alpha is not None
+
+
+def silhouette_factor(views: Sequence[View]) -> float:
+    """Size of silhouettes relative to the images of ``views``, at most 1, for ``SILHOUETTE_BYTES``."""
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    return min(1.0, float(np.sqrt(SILHOUETTE_BYTES / (PIXEL_BYTES * max(pixels, 1)))))
+
+
+def carving_bytes(views: Sequence[View], cells: int) -> int:
+    """Estimated memory of ``carve`` in bytes; 0 where no image can have alpha."""
+    if not any(map(_has_alpha, views)):
+        return 0
+    pixels = sum(view.camera.width * view.camera.height for view in views)
+    # The inside of a ball: a compact subject has most cells inside for those on its surface.
+    return min(PIXEL_BYTES * pixels, SILHOUETTE_BYTES) + CELL_BYTES * min(int(cells**1.5), MOST_CELLS)
 
 
 def in_silhouettes(views: Sequence[View], points: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """(n,) bool: ``points`` (n, 3) that lie within the silhouettes, give or take ``reach`` (n,) scene units,
     of all views that have them in the image but ``ASTRAY`` of them."""
     seen, against = np.zeros(len(points)), np.zeros(len(points))
-    for view in views:
+    for view in filter(_has_alpha, views):
         in_image, empty = _Silhouette(view).test(points, reach)
         seen += in_image
         against += empty
@@ -94,38 +144,52 @@ def in_silhouettes(views: Sequence[View], points: np.ndarray, reach: np.ndarray)
 def carve(
     views: Sequence[View], cells: int, solid: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> Surface | None:
-    """The surface of the visual hull, of at least ``cells`` cells where the finest grid has as many.
+    """The surface of the visual hull of ``views`` with alpha, of at least ``cells`` cells where the finest
+    grid has as many. Grids have ``LAST_LEVEL`` cells to a side, or ``MOST_CELLS`` in the hull, at most.
 
     A cell is empty where views see it outside of their silhouettes. Views with wrong poses are found by their
     silhouettes and left out. ``solid`` gives (n,) bool for points (n, 3): cells that it rules out are empty,
     too. None if nothing is left, as for alpha that is not of one subject.
     """
-    outlines = [_Silhouette(view) for view in views]
+    views = [view for view in views if _has_alpha(view)]
+    factor = silhouette_factor(views)
+    outlines = [_Silhouette(view, factor) for view in views]
     low, side = _root(outlines)
     count, tolerance = FIRST_LEVEL, int(TOLERANCE * len(outlines))
-    index = np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = _grid(count)
     index = _kept(outlines, index, low, side / count, tolerance)
     if not len(index):
         return None
     # The root cube is a guess: the grid is laid anew around what the first carving left.
     first, last = index.min(axis=0), index.max(axis=0) + 1
     low, side = low + (first - 1) * side / count, float((last - first + 2).max()) * side / count
-    index = np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = _grid(count)
     index = _kept(outlines, index, low, side / count, tolerance)
     if tolerance and len(index):
         outlines = _placed(outlines, low + (index + 0.5) * side / count, side / count)
         index = _kept(outlines, index, low, side / count, 0)
     while len(index):
         surface = _surface(index, count, low, side / count)
-        if len(surface.points) >= cells or count >= LAST_LEVEL:
+        if len(surface.points) >= cells or count >= LAST_LEVEL or 8 * len(index) > MOST_CELLS:
             return surface
         count *= 2
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.int32)
         index = (2 * index[:, None] + corners).reshape(-1, 3)
         index = _kept(outlines, index, low, side / count, 0)
         if solid is not None and len(index):
-            index = index[solid(low + (index + 0.5) * side / count)]
+            parts = [part[solid(low + (part + 0.5) * side / count)] for part in _parts(index)]
+            index = np.concatenate(parts)
     return None
+
+
+def _grid(count: int) -> np.ndarray:
+    """(count^3, 3) int32 indices of the cells of a cube."""
+    return np.stack(np.meshgrid(*[np.arange(count, dtype=np.int32)] * 3, indexing="ij"), -1).reshape(-1, 3)
+
+
+def _parts(index: np.ndarray) -> list[np.ndarray]:
+    """``index`` in pieces of ``CELLS_AT_ONCE``."""
+    return np.split(index, list(range(CELLS_AT_ONCE, len(index), CELLS_AT_ONCE)))
 
 
 def _root(outlines: Sequence[_Silhouette]) -> tuple[np.ndarray, float]:
@@ -157,6 +221,8 @@ def _kept(
     outlines: Sequence[_Silhouette], index: np.ndarray, low: np.ndarray, side: float, tolerance: int
 ) -> np.ndarray:
     """The cells ``index`` (n, 3) of the given ``side`` that at most ``tolerance`` views rule out."""
+    if len(index) > CELLS_AT_ONCE:
+        return np.concatenate([_kept(outlines, part, low, side, tolerance) for part in _parts(index)])
     points = low + (index + 0.5) * side
     seen, against = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     rows = np.arange(len(points))
@@ -201,18 +267,19 @@ def _surface(index: np.ndarray, count: int, low: np.ndarray, side: float) -> Sur
     x, y, z = (index - first).T
     filled[x, y, z] = True
     inner = np.ones(len(index), bool)
-    slope = np.zeros((len(index), 3))
+    for axis in range(3):
+        for step in (-1, 1):
+            i, j, k = (step if other == axis else 0 for other in range(3))
+            inner &= filled[x + i, y + j, z + k]
+    outer = ~inner
+    x, y, z = (index[outer] - first).T
+    slope = np.zeros((len(x), 3))
     for i in (-2, -1, 0, 1, 2):
         for j in (-2, -1, 0, 1, 2):
             for k in (-2, -1, 0, 1, 2):
-                there = filled[x + i, y + j, z + k]
-                if abs(i) + abs(j) + abs(k) == 1:
-                    inner &= there
                 length = np.sqrt(i * i + j * j + k * k)
                 if length:
-                    slope -= there[:, None] * (np.array([i, j, k]) / length**2)
-    outer = ~inner
-    slope = slope[outer]
+                    slope -= filled[x + i, y + j, z + k][:, None] * (np.array([i, j, k]) / length**2)
     length = np.linalg.norm(slope, axis=1, keepdims=True)
     normals = np.where(length > 1e-9, slope / np.maximum(length, 1e-9), [0.0, 0.0, 1.0])
     return Surface(low + (index[outer] + 0.5) * side, normals, side)

@@ -38,15 +38,16 @@ FEWEST_POINTS = 30
 NEARER, FARTHER = 0.6, 3.0
 """Depths are tried from this multiple of the least depth of the points to that of the greatest."""
 SHELL_SHARE = 0.25
-"""Share of the fans at the start for the shell around everything..."""
+"""Share of the fans at the start that the shell around everything has."""
 SHELL_DISTANCE = 1.3
-"""Radius of the shell, as a multiple of the distance of the farthest points but one in fifty..."""
+"""Radius of the shell, as a multiple of the distance of the farthest points but one in fifty."""
 SHELL_VIEWS, SHELL_SIDE = 48, 100
-"""... found in this many views, of images of at most this side..."""
+"""Maximum number of views, evenly spread, and of pixels along a side of their images, in which it is found
+where the shell is needed."""
 SHELL_MARGIN = 0.25
-"""... widened to each side by this share..."""
+"""Share of these images by which they are widened to each side, for the views between them."""
 COVERED = 0.98
-"""... where the other fans have less alpha than this."""
+"""Alpha of the other fans from which the shell is not needed behind them."""
 FILL_WEIGHT = 2
 """Weight of a point that was not matched itself against one that was: it stands for more pixels."""
 FREE_VIEWS = 3
@@ -273,15 +274,8 @@ def colored(
     sums = np.zeros((len(mesh.vertices), 4))
     for view in subsample(views, COLOR_VIEWS):
         image = view.load()
-        rendering = TapedRendering(
-            mesh.vertices,
-            mesh.faces,
-            mesh.colors,
-            np.zeros((len(mesh.vertices), 4), np.float32),
-            view.camera,
-            face_splat=mesh.face_splat,
-            threads=threads,
-        )
+        values = np.zeros((len(mesh.vertices), 4), np.float32)
+        rendering = TapedRendering.of(mesh, view.camera, values, threads=threads)
         # Colour times alpha, and alpha: mixed pixels on the outline show other things, too.
         alpha = np.ones(image.color.shape[:2], np.float32) if view.alpha is None else view.alpha.copy()
         if image.mask is not None:

@@ -9,6 +9,9 @@ import numpy as np
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _NEAREST = 8
 """Points that determine a plane, at least, where there are as many."""
+_REACH = 2**17
+"""Cells from the median of the points to each side in which planes are fitted: squares of offsets by more
+lose the digits that tell a plane."""
 
 
 class Patches(NamedTuple):
@@ -72,9 +75,16 @@ def merged(
 
 
 def _keys(offsets: np.ndarray, octave: np.ndarray, side: float) -> np.ndarray:
-    """(n,) int64 key of the cell of each point: 19 bits for each axis, and the octave."""
-    cells = np.minimum(offsets / (side * 2.0**octave)[:, None], 2**19 - 1).astype(np.int64)
-    return ((octave + 8) << 57) | (cells[:, 0] << 38) | (cells[:, 1] << 19) | cells[:, 2]
+    """(n,) int64 key of the cell of each point, from ``offsets`` (n, 3), which are not negative. Keys sort by
+    octave, x, y and z."""
+    steps = offsets / (side * 2.0**octave)[:, None]
+    cells = np.minimum(steps, 2**31 - 1).astype(np.int64)
+    if cells.max() < 2**19:
+        return ((octave + 8) << 57) | (cells[:, 0] << 38) | (cells[:, 1] << 19) | cells[:, 2]
+    # A few points lie far away: the rows and columns of cells that hold points are numbered.
+    pairs = (((octave + 8) << 31) | cells[:, 0], (cells[:, 1] << 31) | cells[:, 2])
+    outer, inner = (np.unique(pair, return_inverse=True)[1].reshape(-1) for pair in pairs)
+    return outer * len(cells) + inner
 
 
 def plane_normals(points: np.ndarray, places: np.ndarray, sides: np.ndarray) -> np.ndarray:
@@ -88,6 +98,7 @@ def plane_normals(points: np.ndarray, places: np.ndarray, sides: np.ndarray) -> 
     if len(points) < 3:
         return normals
     low = np.minimum(points.min(axis=0), places.min(axis=0))
+    low = np.maximum(low, np.median(points, axis=0) - _REACH * float(sides.min()))
     octave = np.floor(np.log2(sides / sides.min())).astype(int)
     open_ = np.ones(len(places), bool)
     for level in range(int(octave.max()) + 7):
@@ -109,10 +120,11 @@ def sums_around(
     points: np.ndarray, places: np.ndarray, low: np.ndarray, side: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """For each of ``places`` (m, 3): count (m,), sum (m, 3) and sum of products (m, 3, 3) of the points in
-    its cell of ``side`` and the 26 beside it, relative to ``low``."""
+    its cell of ``side`` and the 26 beside it, relative to ``low``. Points and places below ``low``, or 2^20
+    cells above it, count to the cells at the edge."""
 
     def cell_of(positions: np.ndarray) -> np.ndarray:
-        cells = np.minimum((positions - low) / side, 2**20 - 4).astype(np.int64) + 1
+        cells = np.clip((positions - low) / side, 0, 2**20 - 4).astype(np.int64) + 1
         return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
     keys, group = np.unique(cell_of(points), return_inverse=True)

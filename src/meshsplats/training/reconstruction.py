@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import tempfile
@@ -47,6 +48,7 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
     Raises:
         MissingDependencyError: pycolmap is not installed.
         ValueError: fewer than ``FEWEST`` photographs, or so few that match each other.
+        FileExistsError: ``sparse_points.ply`` is there already.
         OSError: the folder cannot be written.
 
     Warns with a DataWarning about photographs that found no place.
@@ -59,6 +61,12 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
         )
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{folder}: no permission to write the cameras beside the photographs")
+    if (folder / POINTS).exists():
+        raise FileExistsError(
+            errno.EEXIST,
+            "is in the place of the points that come with the cameras: move it away",
+            str(folder / POINTS),
+        )
     try:
         import pycolmap
     except ImportError:
@@ -74,6 +82,7 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
         pycolmap.extract_features(
             database,
             place,
+            [path.name for path in photographs],  # else all images in folders below, too
             camera_mode=mode,
             device=pycolmap.Device.cpu,
             **_feature_options(pycolmap),
@@ -99,9 +108,14 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
             DataWarning,
             stacklevel=2,
         )
-    write_bytes(folder / POINTS, _points(best))
     prefix = "images/" if place != folder else ""
-    write_text(folder / CAMERAS, json.dumps(_transforms(best, prefix), indent=1) + "\n")
+    cameras = json.dumps(_transforms(best, prefix), indent=1) + "\n"
+    write_bytes(folder / POINTS, _points(best))
+    try:
+        write_text(folder / CAMERAS, cameras)
+    except BaseException:
+        (folder / POINTS).unlink(missing_ok=True)
+        raise
     say(f"cameras of {count} photographs and {len(best.points3D):,} points: {folder / CAMERAS}")
 
 

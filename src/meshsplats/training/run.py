@@ -29,13 +29,17 @@ from meshsplats.training.growth import (
     score,
     select_fans,
 )
+from meshsplats.training.hull import carving_bytes
 from meshsplats.training.initial import colored, fans_of, flat_splats, starting_patches
 from meshsplats.training.patches import Patches
 from meshsplats.training.schedule import budget, events_passed, image_factor
 from meshsplats.training.stereo import MATCHING_BYTES
+from meshsplats.webgpu.device import open_device
 
 START, SO_FAR = "start.npz", "mesh.npz"
 """Files in the folder of a run: the fans that it started from, and those at an interruption."""
+REDUCED_PART = 3
+"""Reduced images are kept up to the limit of the image cache divided by this."""
 
 
 def train(
@@ -55,8 +59,8 @@ def train(
     views see are halved, those that contribute nothing are dropped.
 
     Args:
-        dataset: the training views, and held-out views to score. Photographs without alpha are taken over
-            the ``background`` of their views.
+        dataset: the training views, and held-out views to score. Photographs without alpha count as opaque:
+            the random background of some steps must be covered.
         config: the configuration; ``train_config()`` by default.
         points: known points of the scene, from ``load_points``.
         run: output folder, resumption from a checkpoint, logging and resources.
@@ -69,14 +73,18 @@ def train(
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: fewer than two training views, or masks that do not fit the cameras.
-        OtherRunError, MemoryError, DivergenceError, Interrupted: as by ``finetune``. Interrupted leaves the
-            mesh so far in the folder, too.
+        ValueError: fewer than two training views, several ranks, or masks that do not fit the cameras.
+        OtherRunError, MemoryError, DivergenceError, MissingDependencyError, DeviceError, Interrupted: as by
+            ``finetune``. Interrupted leaves the mesh so far in the folder, too.
     """
     began = time.perf_counter()
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
+    if run.ranks.count > 1:
+        raise ValueError(f"train runs in one process, got {run.ranks.count} ranks; finetune shares views")
+    if run.device == "gpu":
+        open_device()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     if run.resume and journal is not None:
@@ -86,22 +94,28 @@ def train(
     run = replace(run, spent=run.spent + time.perf_counter() - began)
     start = run_start(mesh, dataset, config, run, journal)
     if journal is not None and not run.resume:
+        (journal.folder / SO_FAR).unlink(missing_ok=True)
         save_mesh(mesh, journal.folder / START)
     loop = GrowingLoop(start, dataset, config, run, journal, on_progress)
     try:
-        return loop.run()
+        mesh = loop.run()
     except Interrupted:
         if journal is not None:
             save_mesh(loop.result(), journal.folder / SO_FAR)
         raise
+    if journal is not None:
+        (journal.folder / SO_FAR).unlink(missing_ok=True)
+    return mesh
 
 
 def check_training_memory(dataset: Dataset, config: TrainConfig, *, cache_bytes: int) -> int:
     """Estimated peak memory in bytes of a process that trains. MemoryError if there is less."""
     fans = max(config.max_splats, config.start_splats)
     needed = estimate_bytes(fans * (1 + config.sides), fans * config.sides, dataset, cache_bytes)
-    # Reduced images have 1/4 and 1/16 of the pixels.
-    needed += MATCHING_BYTES + min(dataset.memory, cache_bytes) // 3
+    views, store = dataset.train, ImageCache(0)
+    reduced = [*reduced_views(views, 0.25, store), *reduced_views(views, 0.5, store)]
+    needed += min(sum(view.source.nbytes for view in reduced), cache_bytes // REDUCED_PART)
+    needed += max(MATCHING_BYTES, carving_bytes(views, min(config.start_splats, config.max_splats)))
     what = f"training {config.max_splats:,} fans on {len(dataset.views):,} images"
     check_bytes(needed, what, "allow fewer fans (--max-splats)")
     return needed
@@ -154,7 +168,7 @@ class GrowingLoop(TrainingLoop):
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
         super().__init__(start, dataset, config, options, journal, on_progress)
-        self._store = ImageCache(options.cache_bytes // 3)
+        self._store = ImageCache(options.cache_bytes // REDUCED_PART)
         self._reduced: dict[float, Sequence[View]] = {}
         self.first_fans = fan_count(start.mesh)
         self.near = NearFields.around(dataset.train, start.mesh)
@@ -176,7 +190,8 @@ class GrowingLoop(TrainingLoop):
         return self._reduced[factor]
 
     def _adapt(self, before: int) -> None:
-        before, self.events = self.events, events_passed(self.config, self.fraction)
+        # In a run by minutes, a slow step or report may put the fraction back.
+        before, self.events = self.events, max(self.events, events_passed(self.config, self.fraction))
         if self.events <= before or self._done():
             return
         state = self.state
