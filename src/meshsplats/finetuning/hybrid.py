@@ -97,10 +97,10 @@ def softness(
 
 
 class ColorLimits:
-    """Limits how fast the colors of opaque triangles change in the image.
+    """Limits how fast the colours of opaque triangles change in the image.
 
-    With MSAA, a GPU shades a pixel once, at its center, also where a triangle covers only other samples of
-    it. A triangle much smaller than a pixel then shows colors that are extrapolated far beyond its corners.
+    With MSAA, a GPU shades a pixel once, at its centre, also where a triangle covers only other samples of
+    it. A triangle much smaller than a pixel then shows colours that are extrapolated far beyond its corners.
 
     Attributes:
         faces: those of the mesh that the limits are for.
