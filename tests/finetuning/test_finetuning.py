@@ -362,6 +362,16 @@ def test_positions_move_by_the_size_of_their_splats(scene):
     assert np.median(share) == pytest.approx(0.05, rel=0.02)
 
 
+def test_black_fans_on_black_take_on_colors(scene):
+    """Their opacities have no gradient."""
+    _, dataset, mesh = scene
+    colors = mesh.colors * np.array([0, 0, 0, 1], np.float32)
+    view = replace(dataset.train[0], source=ViewImage(dataset.train[0].image), background=(0.0, 0.0, 0.0))
+    state = State.begin(replace(mesh, colors=colors), 1, make_config(steps=10), None)
+    make_step(state, [view], 0, 0.0)
+    assert (state.colors[:, :3] > 0).any()
+
+
 def test_colors_stay_in_range(scene):
     _, dataset, mesh = scene
     tuned = finetune(mesh, dataset, make_config(steps=20, color_rate=0.9))

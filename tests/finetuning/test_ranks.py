@@ -8,7 +8,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning import RunOptions, starting_mesh
+from meshsplats.finetuning import ranks as ranks_module
 from meshsplats.finetuning import step as steps
 from meshsplats.finetuning.config import learning_rates
 from meshsplats.finetuning.ranks import ALONE, Part, Ranks, is_started_by_torchrun
@@ -154,6 +157,76 @@ def test_torchrun_is_known_by_what_it_sets():
     assert is_started_by_torchrun({"TORCHELASTIC_RUN_ID": "x", "WORLD_SIZE": "2"})
     assert ALONE.any(True)
     assert not ALONE.any(False)
+
+
+# ---- Exchange
+
+
+class InThreads:
+    """Stands in for torch.distributed, in one of several threads."""
+
+    def __init__(self, index: int, slots: list, barrier: threading.Barrier) -> None:
+        self.index, self.slots, self.barrier = index, slots, barrier
+
+    def get_rank(self):
+        return self.index
+
+    def get_world_size(self):
+        return len(self.slots)
+
+    def all_gather(self, out, array):
+        self.slots[self.index] = array
+        self.barrier.wait()
+        for into, found in zip(out, self.slots, strict=True):
+            into[:] = found
+        self.barrier.wait()
+
+    def broadcast(self, array, sender):
+        if self.index == sender:
+            self.slots[sender] = array
+        self.barrier.wait()
+        array[:] = self.slots[sender]
+        self.barrier.wait()
+
+
+def exchanged(parts, monkeypatch):
+    """The total of each rank, of these ``parts``."""
+    monkeypatch.setattr(ranks_module, "_tensor", lambda array: array)
+    slots, barrier = [None] * len(parts), threading.Barrier(len(parts), timeout=60)
+    ranks = [ranks_module._TorchRanks(InThreads(i, slots, barrier)) for i in range(len(parts))]
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return list(pool.map(lambda rank, part: rank.total(part), ranks, parts))
+
+
+def part_of(seed):
+    """Gradients of vertices: of the opacity alone, of the colour alone, of the position alone, or none."""
+    rng = np.random.default_rng(seed)
+    kind = rng.integers(0, 6, 60)
+    vertices = rng.normal(size=(60, 3)).astype(np.float32) * (kind >= 3)[:, None]
+    colors = rng.normal(size=(60, 4)).astype(np.float32)
+    colors[:, 3] *= kind % 3 != 1
+    colors[:, :3] *= (kind % 3 == 1)[:, None]
+    colors[kind >= 4] = 0
+    return Part(vertices, colors, float(rng.random()), 1, 0)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_all_ranks_have_the_sum_in_their_order(count, monkeypatch):
+    """Whichever of its gradients a vertex has."""
+    parts = [part_of(seed) for seed in range(count)]
+    vertices, colors = (np.zeros((60, width), np.float32) for width in (3, 4))
+    for part in parts:
+        vertices, colors = vertices + part.vertices, colors + part.colors
+    loss = sum(part.loss for part in parts)
+    for found in exchanged(parts, monkeypatch):
+        np.testing.assert_array_equal(found.vertices, vertices)
+        np.testing.assert_array_equal(found.colors, colors)
+        assert (found.loss, found.views, found.failed) == (pytest.approx(loss), count, 0)
+
+
+def test_all_ranks_know_the_first_view_that_failed(monkeypatch):
+    parts = [part_of(seed)._replace(failed=failed) for seed, failed in enumerate((0, 4, 6))]
+    assert [found.failed for found in exchanged(parts, monkeypatch)] == [4, 4, 4]
 
 
 # ---- Processes

@@ -75,6 +75,17 @@ def test_steps_are_those_of_the_cpu(scene, options):
         assert np.linalg.norm(getattr(state, name) - after) <= CHANGES * change
 
 
+def test_black_fans_on_black_take_on_the_colors_of_the_cpu(scene):
+    """Their opacities have no gradient."""
+    need_gpu()
+    dataset, mesh = scene
+    views = [replace(v, source=ViewImage(v.image), background=(0.0, 0.0, 0.0)) for v in dataset.train]
+    black = replace(mesh, colors=mesh.colors * np.array([0, 0, 0, 1], np.float32))
+    found, known = (steps((replace(dataset, train=tuple(views)), black), d, 1)[1] for d in ("gpu", "cpu"))
+    assert (known.colors[:, :3] > 0).any()
+    assert np.linalg.norm(found.colors - known.colors) <= CHANGES * np.linalg.norm(known.colors - black.colors)
+
+
 def test_a_mesh_on_a_base_with_depth_groups():
     need_gpu()
     base = bumpy(4)

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import nonzero_rows
 from meshsplats._core.library import processors
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 
@@ -109,8 +110,7 @@ class _TorchRanks(Ranks):
         self._sent, self._received = _Rows(), _Rows()
 
     def total(self, part: Part) -> Part:
-        # A vertex has a gradient only if its opacity has one.
-        rows = np.flatnonzero(part.colors[:, 3])
+        rows = np.flatnonzero(nonzero_rows(part.colors) | nonzero_rows(part.vertices))
         heads = self._gather(np.array([len(rows), part.loss, part.views, part.failed], np.float64))
         own = self._sent.take(len(rows))
         own[0][:] = rows

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import checked_array, nonzero_rows
 from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
@@ -211,10 +211,8 @@ class State:
         reached."""
         self._download()
         self._trainer = None
-        # A vertex has a gradient only if its opacity has one, and a single column is quick to scan.
-        reached = gradients.colors[:, 3] != 0
-        if self.config.opacity == "cutoff":  # but where opaque, only its colour
-            reached |= (gradients.colors[:, :3] != 0).any(axis=1)
+        # Opaque vertices, and those of the colour behind them, have a gradient of their colour alone.
+        reached = nonzero_rows(gradients.colors)
         if self.frozen is not None:
             reached &= ~self.frozen
         if self.solid is not None:
