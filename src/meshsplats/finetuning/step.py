@@ -23,6 +23,7 @@ from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
 from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
+from meshsplats.webgpu.gradients import WindowLimit
 from meshsplats.webgpu.renderer import DrawSettings
 
 IMPORTANCE_VIEWS = 64
@@ -156,6 +157,7 @@ def render_view(
         filter_px2=state.mesh.filter_px2,
         ramp=ramp,
         threads=state.threads,
+        limit=state.limit,
     )
     return RenderedView(rendering, linear)
 
@@ -389,7 +391,10 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
     vertices, colors = state.vertices, state.colors
     pixels = np.zeros(len(vertices), np.float32)
     in_view = np.zeros(len(pixels), bool)
-    count = partial(visible_pixels, threads=state.threads) if state.device == "cpu" else gpu_visible_pixels
+    if state.device == "cpu":
+        count = partial(visible_pixels, threads=state.threads)
+    else:
+        count = partial(gpu_visible_pixels, limit=WindowLimit())
     for view in views:
         pixels += count(
             vertices,

@@ -205,8 +205,8 @@ class MeshRenderer:
             )
         if not len(mesh.faces):
             return
-        self._check_size("vertices", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
-        self._check_size("triangles", 4 * sum(map(len, parts)))
+        check_size(device, "vertices", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
+        check_size(device, "triangles", 4 * sum(map(len, parts)))
         self._upload("vertices", mesh.vertices)
         self._upload("values", mesh.colors)
         self._upload("mesh", np.concatenate(parts))
@@ -223,13 +223,6 @@ class MeshRenderer:
         self._upload("digits", digits)
 
     # ------------------------------------------------------------------------------------------ buffers
-
-    def _check_size(self, name: str, size: int) -> None:
-        if size > self.device.binding_limit:
-            raise MemoryError(
-                f"the mesh has too many {name} for the GPU: {size / 2**20:.0f} MiB; a buffer holds"
-                f" {self.device.binding_limit >> 20} MiB. Use device='cpu'"
-            )
 
     def _usage(self, name: str) -> int:
         import wgpu
@@ -310,18 +303,7 @@ class MeshRenderer:
     def _prepare_filter(self, settings: DrawSettings) -> None:
         if not settings.filter_px2 or "fans" in self._buffers:
             return
-        splat = self.mesh.face_splat
-        assert splat is not None
-        starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
-        if np.diff(starts).max() > self.max_fan:
-            raise DeviceError(
-                f"the filter of the GPU takes splats of up to {self.max_fan:,} triangles; one has"
-                f" {np.diff(starts).max():,}. Use device='cpu'"
-            )
-        owner = np.full(len(self.mesh.vertices), -1, np.int32)
-        owner[self.mesh.faces] = splat[:, None]
-        if (owner[self.mesh.faces] != splat[:, None]).any():
-            raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
+        starts = checked_fans(self.mesh, self.max_fan)
         self._upload("fans", starts)
         self._fans = len(starts) - 1
 
@@ -572,6 +554,37 @@ def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
     return (first.astype(np.uint32) | ((ends - first - 1).astype(np.uint32) << np.uint32(29))).astype(
         np.uint32
     )
+
+
+def check_size(device: Device, name: str, size: int) -> None:
+    """MemoryError if ``size`` bytes for the vertices or triangles of a mesh are too many for a buffer."""
+    if size > device.binding_limit:
+        raise MemoryError(
+            f"the mesh has too many {name} for the GPU: {size / 2**20:.0f} MiB; a buffer holds"
+            f" {device.binding_limit >> 20} MiB. Use device='cpu'"
+        )
+
+
+def checked_fans(mesh: SplatMesh, most: int) -> np.ndarray:
+    """(s + 1,) uint32 first triangle of each splat, and their count, for the filter.
+
+    Raises:
+        DeviceError: a splat of more than ``most`` triangles.
+        ValueError: two splats share a vertex.
+    """
+    splat = mesh.face_splat
+    assert splat is not None
+    starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
+    if np.diff(starts).max() > most:
+        raise DeviceError(
+            f"the filter of the GPU takes splats of up to {most:,} triangles; one has"
+            f" {np.diff(starts).max():,}. Use device='cpu'"
+        )
+    owner = np.full(len(mesh.vertices), -1, np.int32)
+    owner[mesh.faces] = splat[:, None]
+    if (owner[mesh.faces] != splat[:, None]).any():
+        raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
+    return starts
 
 
 def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:
