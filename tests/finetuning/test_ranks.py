@@ -11,12 +11,13 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
 from meshsplats import finetune, load_mesh, make_config, save_gaussians, splat_dataset
-from meshsplats.cli import main
+from meshsplats.cli import main, toml, training
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning import RunOptions, starting_mesh
@@ -227,6 +228,23 @@ def test_all_ranks_have_the_sum_in_their_order(count, monkeypatch):
 def test_all_ranks_know_the_first_view_that_failed(monkeypatch):
     parts = [part_of(seed)._replace(failed=failed) for seed, failed in enumerate((0, 4, 6))]
     assert [found.failed for found in exchanged(parts, monkeypatch)] == [4, 4, 4]
+
+
+# ---- Records
+
+
+def test_the_batch_of_ranks_is_recorded(splats, tmp_path, monkeypatch, capsys):
+    """So that --config repeats it in one process, and a run resumed by other ranks says why not."""
+    out = tmp_path / "mesh.npz"
+    ranks = Ranks()
+    monkeypatch.setattr(training, "joined_ranks", lambda threads: nullcontext((ranks, threads)))
+    ranks.count = 2
+    assert main(["finetune", str(splats), "-o", str(out), *WORDS]) == 0
+    config = toml.load(tmp_path / "mesh.npz.config.toml")
+    assert config["options"]["batch"] == config["resolved"]["batch"] == 2
+    ranks.count = 3
+    assert main(["finetune", str(splats), "-o", str(out), *WORDS, "--resume", "--force"]) != 0
+    assert "--batch was 2 and is 3" in capsys.readouterr().err
 
 
 # ---- Processes
