@@ -31,6 +31,7 @@ from meshsplats.cli import main
 from meshsplats.cluster import ANY_PORT, Shared, Workers, _with_warnings, open_workers
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import ClusterError, DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.finetuning.memory import available_memory
 from meshsplats.tiles import building
 from meshsplats.tiles.building import build_tiles
 
@@ -63,6 +64,10 @@ def results(folder):
 
 def squared(task):
     return task * task, os.getpid()
+
+
+def memory(task):
+    return available_memory()
 
 
 def picky(task):
@@ -170,6 +175,16 @@ def test_tasks_in_threads_of_one_process_keep_their_warnings_apart():
         assert other.result() == (2, [(DataWarning, f"of the second: {i}") for i in range(2)])
         assert shown == ["not for users"]
         assert (warnings.showwarning, list(warnings.filters)) == before
+
+
+def test_tasks_share_the_memory_of_their_worker():
+    distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, memory_limit="400MB", dashboard_address=ANY_PORT
+    ) as cluster:
+        with open_workers(cluster.scheduler_address) as workers:
+            assert dict(workers.run(memory, [0])) == {0: 200_000_000}
+        assert memory(0) != 200_000_000
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")

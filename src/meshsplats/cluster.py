@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import secrets
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -88,6 +89,19 @@ class Shared(Generic[T]):
 
 _made: dict[str, Any] = {}
 _lock = threading.RLock()
+
+
+def memory_of_task() -> int | None:
+    """Bytes that a task may use by the limit of its Dask worker; None outside of one, or without a limit."""
+    dask = sys.modules.get("distributed")  # which workers have loaded
+    if dask is None:
+        return None
+    try:
+        worker = dask.get_worker()
+    except ValueError:
+        return None
+    limit = worker.memory_manager.memory_limit
+    return None if limit is None else int(limit) // int(worker.state.nthreads)
 
 
 @contextmanager

@@ -74,6 +74,11 @@ def is_started_by_torchrun(environment: Mapping[str, str] | None = None) -> bool
     return _STARTED in found and int(found.get("WORLD_SIZE", "1")) > 1
 
 
+def ranks_of_machine() -> int:
+    """The number of ranks on this machine; 1 without torchrun."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if is_started_by_torchrun() else 1
+
+
 @contextmanager
 def joined_ranks(threads: int | None = None) -> Iterator[tuple[Ranks, int | None]]:
     """The ranks that torchrun has started, for the length of the block, and the threads of this one: those
@@ -91,8 +96,7 @@ def joined_ranks(threads: int | None = None) -> Iterator[tuple[Ranks, int | None
         raise MissingDependencyError(
             f"ranks need torch: pip install 'meshsplats[torch]' ({GET_TORCH})"
         ) from None
-    local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    each = threads or max(1, processors() // local)
+    each = threads or max(1, processors() // ranks_of_machine())
     torch.set_num_threads(each)
     distributed.init_process_group("gloo")
     try:
