@@ -229,10 +229,11 @@ def end_once(folder, function, task):
     def watch():
         while not list(folder.glob("run/cells/*/checkpoint.safetensors")):
             time.sleep(0.01)
+        (folder / "ended").touch()
         os.kill(os.getpid(), signal.SIGKILL)
 
     try:
-        os.close(os.open(folder / "ended", os.O_CREAT | os.O_EXCL))
+        os.close(os.open(folder / "watched", os.O_CREAT | os.O_EXCL))
         threading.Thread(target=watch, daemon=True).start()
     except FileExistsError:
         pass
