@@ -27,7 +27,7 @@ from meshsplats.finetuning.checkpoint import OtherRunError, load_checkpoint
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
-    MIN_TRANSMITTANCE,
+    TRAINING_MIN_TRANSMITTANCE,
     importance,
     kept_faces,
     make_step,
@@ -143,7 +143,9 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]
     exposure = torch.tensor([*gain, *offset], requires_grad=True)
     behind = srgb_to_linear(np.float32(background)) if blending == "linear" else np.float32(background)
-    options = dict(face_splat=mesh.face_splat, min_transmittance=MIN_TRANSMITTANCE[blending], samples=2)
+    options = dict(
+        face_splat=mesh.face_splat, min_transmittance=TRAINING_MIN_TRANSMITTANCE[blending], samples=2
+    )
     rendered = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
     if blending == "linear":
         curve = 1.055 * rendered.clamp(min=0.0031308) ** (1 / 2.4) - 0.055

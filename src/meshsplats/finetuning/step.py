@@ -29,7 +29,7 @@ from meshsplats.webgpu.renderer import DrawSettings
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""
 
-MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
+TRAINING_MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
 """Early termination: a pixel stops below this transmittance, and the background gets the rest. It saves a
 tenth to a sixth of the time and changes images by 0.0002 (rms). The limit is lower in linear light, since
 encoding for display amplifies dark values."""
@@ -151,7 +151,7 @@ def render_view(
         view.camera,
         background=srgb_to_linear(display) if linear else display,
         samples=samples,
-        min_transmittance=MIN_TRANSMITTANCE[state.mesh.blending],
+        min_transmittance=TRAINING_MIN_TRANSMITTANCE[state.mesh.blending],
         face_splat=state.mesh.face_splat,
         depth_group=state.mesh.depth_group,
         filter_px2=state.mesh.filter_px2,
@@ -162,33 +162,55 @@ def render_view(
     return RenderedView(rendering, linear)
 
 
+class LossRates(NamedTuple):
+    """Derivatives of the loss that ``FinetuneConfig`` defines, with respect to sums over all channels of the
+    pixels that count."""
+
+    l1: float
+    """Of the sum of |x - y|."""
+    ssim: float
+    """Of the sum of SSIM."""
+    l2: float
+    """Of the sum of (x - y)^2."""
+    at_zero: float
+    """The loss where all sums are 0."""
+
+    def loss(self, l1: float, ssim: float, l2: float) -> float:
+        """The loss with these sums."""
+        return self.at_zero + self.l1 * l1 + self.ssim * ssim + self.l2 * l2
+
+
+def loss_rates(config: FinetuneConfig, target: Target) -> LossRates:
+    mask, share = target.mask, config.ssim_weight
+    count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
+    return LossRates((1 - share) / count, -share / count, config.l2_weight / count, share)
+
+
 def loss_of(
     image: np.ndarray, target: Target, config: FinetuneConfig, threads: int | None
 ) -> tuple[float, np.ndarray]:
-    """The loss that ``FinetuneConfig`` defines, and its gradient, (h, w, 3) float32 like the ``image``."""
+    """The loss (see ``LossRates``), and its gradient, (h, w, 3) float32 like the ``image``."""
     mask = target.mask
-    count = image.size if mask is None else int(mask.sum()) * image.shape[2]
-    share = config.ssim_weight
+    rates = loss_rates(config, target)
     compared = compare_images(
         image[None],
         target.color[None],
         None if mask is None else mask[None],
-        l1_rate=(1 - share) / count,
-        ssim_rate=-share / count,
+        l1_rate=rates.l1,
+        ssim_rate=rates.ssim,
         gradient=True,
         threads=threads,
     )
     assert compared.gradient is not None
-    loss = (1 - share) * compared.l1 / count + share * (1 - compared.ssim / count)
-    gradient = compared.gradient[0]
+    gradient, squares = compared.gradient[0], 0.0
     if config.l2_weight:
         difference = image - target.color
         if mask is not None:
             difference[~mask] = 0  # masked values may be anything
-        loss += config.l2_weight * float(np.square(difference).sum()) / count
-        difference *= np.float32(2 * config.l2_weight / count)
+        squares = float(np.square(difference).sum())
+        difference *= np.float32(2 * rates.l2)
         gradient += difference
-    return loss, gradient
+    return rates.loss(compared.l1, compared.ssim, squares), gradient
 
 
 class ViewGradients(NamedTuple):
@@ -320,16 +342,14 @@ def _step_on_gpu(state: State, view: View, step: int, fraction: float) -> float 
         return None
     samples = 1 if points else samples_of(view, config)
     rates = learning_rates(config, step, fraction)
-    count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
-    share = config.ssim_weight
+    loss_by = loss_rates(config, target)
     settings = DrawSettings(
         samples=samples,
-        min_transmittance=MIN_TRANSMITTANCE["display"],
+        min_transmittance=TRAINING_MIN_TRANSMITTANCE["display"],
         filter_px2=state.mesh.filter_px2,
     )
-    derivatives = ((1 - share) / count, -share / count, config.l2_weight / count)
-    sums = state.step_on_gpu(view.camera, settings, target.color, mask, target.background, derivatives, rates)
-    loss = share + float(np.dot(derivatives, sums[:3]))
+    sums = state.step_on_gpu(view.camera, settings, target.color, mask, target.background, loss_by[:3], rates)
+    loss = loss_by.loss(*sums[:3])
     if not (np.isfinite(loss) and sums.finite):
         raise _divergence(step, view, "a gradient" if np.isfinite(loss) else "the loss")
     return loss

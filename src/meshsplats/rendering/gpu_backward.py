@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.mesh import checked_filter
-from meshsplats.rendering.api import MIN_TRANSMITTANCE, Device, Pointers, checked_options
+from meshsplats.mesh import MIN_TRANSMITTANCE, checked_filter
+from meshsplats.rendering.api import Device, Pointers, checked_options
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, OpacityRamp, TapedRendering
 from meshsplats.webgpu.gradients import WindowLimit, gradient_renderer
 from meshsplats.webgpu.renderer import DrawSettings, gpu_errors

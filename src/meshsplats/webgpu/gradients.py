@@ -312,9 +312,7 @@ class GradientRenderer(MeshRenderer):
         )
 
     def _part(self, forward: Forward, area: tuple[int, int, int, int]) -> Camera:
-        x, y, w, h = area
-        camera = forward.camera
-        return replace(camera, cx=camera.cx - x, cy=camera.cy - y, width=w, height=h)
+        return forward.camera.window(*area)
 
     def _mark_window(
         self, forward: Forward, area: tuple[int, int, int, int], limit: WindowLimit

@@ -12,7 +12,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, splat_starts
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import BUDGET, Device, open_device
 
@@ -41,7 +41,7 @@ class DrawSettings:
 
     samples: int = 1
     max_layers: int = 0
-    min_transmittance: float = 1e-6
+    min_transmittance: float = MIN_TRANSMITTANCE
     cutoff: float = -1.0
     filter_px2: float = 0.0
     queue: int = kernels.QUEUE
@@ -322,7 +322,7 @@ class MeshRenderer:
     ) -> bool:
         """Draws a window; False if it has too many pairs."""
         x0, y0, w, h = window
-        part = replace(camera, cx=camera.cx - x0, cy=camera.cy - y0, width=w, height=h)
+        part = camera.window(x0, y0, w, h)
         counts = self._begin(part, settings)
         work = images.work
         while True:
