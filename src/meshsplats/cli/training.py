@@ -1,4 +1,4 @@
-"""Base of ``finetune``, ``train`` and ``prior``: options, files, progress and result of an optimisation."""
+"""Base of ``finetune``, ``prior`` and ``train``: options, files, progress and result of an optimisation."""
 
 from __future__ import annotations
 

@@ -19,12 +19,10 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device, open_device
 from meshsplats.webgpu.renderer import (
-    MAX_ROUNDS,
     WINDOW_SAMPLES,
     DrawSettings,
     Images,
     MeshRenderer,
-    Work,
     check_size,
     checked_fans,
     find_groups,
@@ -353,7 +351,7 @@ class GradientRenderer(MeshRenderer):
         counts = self._begin(part, settings, forward.pose)
         work = forward.images.work
         while True:
-            rounds, counters = self._walk(counts, settings, work)
+            rounds, counters = self._repeat(_MARK_STEPS, _MARK_AGAIN_STEPS, "color", counts, settings, work)
             needed = int(counters[0])
             if needed <= self._capacity:
                 break
@@ -369,23 +367,6 @@ class GradientRenderer(MeshRenderer):
         if area[2:] == (forward.camera.width, forward.camera.height):
             self._marked = forward
         return window
-
-    def _walk(self, counts: dict[str, int], settings: DrawSettings, work: Work) -> tuple[int, np.ndarray]:
-        """Renders and marks until all tiles are finished; the repetitions, and the counters."""
-        steps = _MARK_STEPS
-        work.frames += 1
-        work.dispatches = 0
-        previous = None
-        for rounds in range(MAX_ROUNDS):
-            self._run(steps, "color", counts, settings, work)
-            counters = self._counters()
-            if counters[0] > self._capacity or counters[2] == counts["tiles"]:
-                return rounds, counters
-            if counters[9] or counters[12] or (previous is not None and previous == counters[3]):
-                break
-            previous = counters[3]
-            steps = _MARK_AGAIN_STEPS
-        raise self._unfinished(counts, counters)
 
     # ------------------------------------------------------------------------------------------ backward pass
 
@@ -466,12 +447,6 @@ class GradientRenderer(MeshRenderer):
         encoder = self.device.device.create_command_encoder()
         encoder.clear_buffer(self._buffers[name])
         self.device.device.queue.submit([encoder.finish()])
-
-    def _unfinished(self, counts: dict[str, int], counters: np.ndarray) -> DeviceError:
-        return DeviceError(
-            f"the GPU did not finish {counts['tiles'] - int(counters[2]):,} of {counts['tiles']:,} tiles"
-            f" ({self.device.name}): use device='cpu'"
-        )
 
 
 def _triples(forward: Forward) -> Iterator[tuple[slice, np.ndarray]]:

@@ -394,22 +394,36 @@ class MeshRenderer:
     ) -> np.ndarray:
         """Renders one frame to the samples, until all tiles are finished; returns the counters."""
         steps = (*_LIST_STEPS, *_RASTER_STEPS) if output == "color" else _RASTER_STEPS
+        return self._repeat(steps, _AGAIN_STEPS, output, counts, settings, work)[1]
+
+    def _repeat(
+        self,
+        steps: Sequence[dict[str, Any]],
+        again: Sequence[dict[str, Any]],
+        output: _Output,
+        counts: dict[str, int],
+        settings: DrawSettings,
+        work: Work | None,
+    ) -> tuple[int, np.ndarray]:
+        """Takes ``steps``, then those of ``again`` until all tiles are finished or the lists are too short;
+        the repetitions, and the counters."""
         if work is not None:
             work.frames += 1
             work.dispatches = 0
         previous = None
-        for _ in range(MAX_ROUNDS):
+        for rounds in range(MAX_ROUNDS):
             self._run(steps, output, counts, settings, work)
             counters = self._counters()
-            if counters[0] > self._capacity:
-                return counters
-            if counters[2] == counts["tiles"]:
-                return counters
+            if counters[0] > self._capacity or counters[2] == counts["tiles"]:
+                return rounds, counters
             if counters[9] or counters[12] or (previous is not None and previous == counters[3]):
                 break
             previous = counters[3]
-            steps = _AGAIN_STEPS
-        raise DeviceError(
+            steps = again
+        raise self._unfinished(counts, counters)
+
+    def _unfinished(self, counts: dict[str, int], counters: np.ndarray) -> DeviceError:
+        return DeviceError(
             f"the GPU did not finish {counts['tiles'] - int(counters[2]):,} of {counts['tiles']:,} tiles"
             f" ({self.device.name}): use device='cpu'"
         )
