@@ -17,8 +17,9 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DeviceError, DivergenceError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
+from meshsplats.finetuning.ranks import Part
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import importance, make_step, view_of_step
+from meshsplats.finetuning.step import _part, importance, make_step, view_of_step
 from meshsplats.prior import bind
 from meshsplats.webgpu import gradients
 from meshsplats.webgpu.device import open_device
@@ -214,6 +215,26 @@ def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch
 
     assert (fits(2), fits(3)) == (False, True)
     check_resumed(dataset, mesh, config, tmp_path)
+
+
+def test_ranks_find_the_gradients_of_one_process(scene, monkeypatch):
+    """Also of a view that fits, after one that has too many fragments."""
+    need_gpu()
+    dataset, mesh = scene
+    config = make_config(steps=8, batch=2)
+    near = dataset.train[view_of_step(make_config(steps=8), 2, len(dataset.train))]
+    far = replace(near.camera, fx=near.camera.fx / 8, fy=near.camera.fy / 8)
+    views = [near, replace(near, camera=far, source=near.load())]
+    monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 20_000)  # as if there were more fragments
+
+    def part(*places: int) -> Part:
+        state = State.begin(mesh, 2, config, None, device="gpu")
+        return _part(state, views, [0, 1], 0, 0.0, range(places[0], places[-1] + 1))
+
+    whole, first, second = part(0, 1), part(0), part(1)
+    for name in ("vertices", "colors"):
+        assert np.array_equal(getattr(whole, name), getattr(first, name) + getattr(second, name))
+    assert whole.window_samples == first.window_samples < second.window_samples == WINDOW_SAMPLES
 
 
 def test_a_resumed_run_has_the_same_bits(scene, tmp_path):

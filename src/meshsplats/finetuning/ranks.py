@@ -36,6 +36,8 @@ class Part(NamedTuple):
     """Count of its views with pixels that count."""
     failed: int
     """1 + index of a view without finite loss or gradient; 0 if there is none."""
+    window_samples: int = 1 << 62
+    """The limit of windows on the GPU after these views (``WindowLimit``)."""
 
 
 class Ranks:
@@ -115,7 +117,8 @@ class _TorchRanks(Ranks):
 
     def total(self, part: Part) -> Part:
         rows = np.flatnonzero(nonzero_rows(part.colors) | nonzero_rows(part.vertices))
-        heads = self._gather(np.array([len(rows), part.loss, part.views, part.failed], np.float64))
+        head = [len(rows), part.loss, part.views, part.failed, part.window_samples]
+        heads = self._gather(np.array(head, np.float64))
         own = self._sent.take(len(rows))
         own[0][:] = rows
         vertices, colors = part.vertices, part.colors
@@ -124,8 +127,8 @@ class _TorchRanks(Ranks):
             np.take(array, rows, axis=0, out=copied, mode="clip")
         if self.index > 1:  # to add to those of the first two, in whatever order, is to add in their order
             vertices, colors = np.zeros_like(vertices), np.zeros_like(colors)
-        for sender, head in enumerate(heads):
-            found = own if sender == self.index else self._received.take(int(head[0]))
+        for sender, (count, *_) in enumerate(heads):
+            found = own if sender == self.index else self._received.take(int(count))
             # Several times as fast as gathering, and each sends as many rows as it has.
             for array in found:
                 self._distributed.broadcast(_tensor(array), sender)
@@ -135,7 +138,7 @@ class _TorchRanks(Ranks):
                 _add_rows(array, found[0], added)
         loss, views = (float(sum(head[i] for head in heads)) for i in (1, 2))
         failed = next((int(head[3]) for head in heads if head[3]), 0)
-        return Part(vertices, colors, loss, int(views), failed)
+        return Part(vertices, colors, loss, int(views), failed, min(int(head[4]) for head in heads))
 
     def any(self, flag: bool) -> bool:
         return any(found[0] for found in self._gather(np.array([flag], np.int32)))

@@ -251,6 +251,7 @@ def make_step(
         failed = 0 if found.finite else 1
     else:
         total = ranks.total(_part(state, views, indices, step, fraction, ranks.share(batch)))
+        state.limit.samples = total.window_samples
         if not total.views and not total.failed:
             return None
         loss, failed = total.loss / max(total.views, 1), total.failed
@@ -276,9 +277,12 @@ def _part(
     state: State, views: Sequence[View], indices: Sequence[int], step: int, fraction: float, share: range
 ) -> Part:
     """The sum over the places of a batch in ``share``."""
-    total = Part(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), 0.0, 0, 0)
+    limit = state.limit.samples
+    total = Part(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), 0.0, 0, 0, limit)
     for place in share:
+        state.limit.samples = limit  # whichever rank computes the view
         found = view_gradients(state, views, indices[place], step + place, fraction)
+        total = total._replace(window_samples=min(total.window_samples, state.limit.samples))
         if found is None:
             continue
         if found.gradients is None or not found.finite:
