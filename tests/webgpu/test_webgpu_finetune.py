@@ -15,7 +15,7 @@ from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DeviceError, DivergenceError, MissingDependencyError
+from meshsplats.errors import DeviceError, DivergenceError, FileFormatError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
 from meshsplats.finetuning.ranks import Part
 from meshsplats.finetuning.state import State
@@ -215,6 +215,19 @@ def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch
 
     assert (fits(2), fits(3)) == (False, True)
     check_resumed(dataset, mesh, config, tmp_path)
+
+
+BROKEN = [np.int64(0), np.int64(WINDOW_SAMPLES + 1), np.zeros(2, np.int64), np.float32(9)]
+
+
+@pytest.mark.parametrize("value", BROKEN, ids=str)
+def test_a_broken_limit_of_windows_is_refused(scene, value):
+    need_gpu()
+    _, mesh = scene
+    config = make_config(steps=8)
+    arrays = State.begin(mesh, 6, config, None, device="gpu").arrays()
+    with pytest.raises(FileFormatError, match="window_samples must be a whole number"):
+        State.resume(arrays | {"window_samples": np.asarray(value)}, "display", 6, config, None, "gpu")
 
 
 def test_ranks_find_the_gradients_of_one_process(scene, monkeypatch):
