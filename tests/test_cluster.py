@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -27,9 +28,10 @@ from meshsplats import (
     stream_gaussians,
 )
 from meshsplats.cli import main
-from meshsplats.cluster import ANY_PORT, Shared, Workers, open_workers
+from meshsplats.cluster import ANY_PORT, Shared, Workers, _with_warnings, open_workers
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import ClusterError, DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.finetuning.memory import available_memory
 from meshsplats.tiles import building
 from meshsplats.tiles.building import build_tiles
 
@@ -62,6 +64,10 @@ def results(folder):
 
 def squared(task):
     return task * task, os.getpid()
+
+
+def memory(task):
+    return available_memory()
 
 
 def picky(task):
@@ -139,6 +145,46 @@ def test_warnings_and_errors_of_tasks_reach_the_user(scheduler):
         with pytest.raises(FileFormatError, match="file 3: broken"):
             dict(workers.run(picky, [3]))
         assert dict(workers.run(squared, [5]))[0][0] == 25  # after an error, too
+
+
+def test_tasks_in_threads_of_one_process_keep_their_warnings_apart():
+    steps = threading.Barrier(2, timeout=60)
+
+    def first(task):
+        warnings.warn("of the first", DataWarning, stacklevel=1)
+        steps.wait()
+        warnings.warn("not for users", RuntimeWarning, stacklevel=1)
+        return task
+
+    def second(task):
+        steps.wait()
+        steps.wait()  # the first one has ended
+        for i in range(2):
+            warnings.warn(f"of the second: {i}", DataWarning, stacklevel=1)
+        return task
+
+    with warnings.catch_warnings(), ThreadPoolExecutor(1) as pool:
+        warnings.simplefilter("always")
+        warnings.simplefilter("error", DataWarning)
+        shown = []
+        warnings.showwarning = lambda message, *where, **more: shown.append(str(message))
+        before = warnings.showwarning, list(warnings.filters)
+        other = pool.submit(_with_warnings, second, 2)
+        assert _with_warnings(first, 1) == (1, [(DataWarning, "of the first")])
+        steps.wait()
+        assert other.result() == (2, [(DataWarning, f"of the second: {i}") for i in range(2)])
+        assert shown == ["not for users"]
+        assert (warnings.showwarning, list(warnings.filters)) == before
+
+
+def test_tasks_share_the_memory_of_their_worker():
+    distributed = pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, memory_limit="400MB", dashboard_address=ANY_PORT
+    ) as cluster:
+        with open_workers(cluster.scheduler_address) as workers:
+            assert dict(workers.run(memory, [0])) == {0: 200_000_000}
+        assert memory(0) != 200_000_000
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")

@@ -29,6 +29,15 @@ def spread_indices(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
 
 
+def nonzero_rows(array: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether ``array`` (n, k) has a value other than 0 in each row. Several times as fast as
+    ``any``."""
+    found = array[:, 0] != 0
+    for column in array.T[1:]:
+        found |= column != 0
+    return np.asarray(found)
+
+
 def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[int | None, ...]) -> np.ndarray:
     """``value`` as a C-contiguous array of ``dtype``; ``None`` in ``shape`` admits any length.
 

@@ -87,6 +87,11 @@ class Camera:
             self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y
         )
 
+    def window(self, x: int, y: int, width: int, height: int) -> Camera:
+        """The camera of ``width`` x ``height`` pixels of the image, from column ``x`` and row ``y`` on. They
+        may lie outside of it."""
+        return replace(self, cx=self.cx - x, cy=self.cy - y, width=width, height=height)
+
     def within(self, side: int) -> Camera:
         """The same view with no side of the image longer than ``side`` pixels; never a larger image."""
         return self.scaled(min(1.0, side / max(self.width, self.height)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import secrets
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -23,6 +24,8 @@ from meshsplats.errors import ClusterError, DataWarning, MissingDependencyError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 T = TypeVar("T")
+_Warning = tuple[type[Warning], str]
+"""Category and message."""
 LOCAL = "local"
 """Address of the processors of this machine."""
 WAITING = 2
@@ -86,6 +89,19 @@ class Shared(Generic[T]):
 
 _made: dict[str, Any] = {}
 _lock = threading.RLock()
+
+
+def memory_of_task() -> int | None:
+    """Bytes that a task may use by the limit of its Dask worker; None outside of one, or without a limit."""
+    dask = sys.modules.get("distributed")  # which workers have loaded
+    if dask is None:
+        return None
+    try:
+        worker = dask.get_worker()
+    except ValueError:
+        return None
+    limit = worker.memory_manager.memory_limit
+    return None if limit is None else int(limit) // int(worker.state.nthreads)
 
 
 @contextmanager
@@ -188,10 +204,60 @@ class _DaskWorkers(Workers):
         return max(0, max(1, WAITING * threads) - running)
 
 
-def _with_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[tuple[type, str]]]:
+def _with_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[_Warning]]:
     """The result of a task, and the warnings that its user should see."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", DataWarning)
+    with _task_warnings.collected() as found:
         result = function(task)
-    found = [(w.category, str(w.message)) for w in caught if issubclass(w.category, DataWarning)]
     return result, found
+
+
+class _TaskWarnings:
+    """Collects the DataWarnings of tasks in the threads of this process. Others are shown as ever.
+
+    Filters of warnings, and what shows them, belong to the process, so tasks that overlap share one change of
+    them.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._found: dict[int, list[_Warning]] = {}
+        self._before: warnings.catch_warnings[None] | None = None
+
+    @contextmanager
+    def collected(self) -> Iterator[list[_Warning]]:
+        """The list of the warnings of this thread, while the block runs."""
+        here = threading.get_ident()
+        with self._lock:
+            if self._before is None:
+                self._before = warnings.catch_warnings()
+                self._before.__enter__()
+                warnings.simplefilter("always", DataWarning)
+                warnings.showwarning = partial(self._show, warnings.showwarning)
+            found = self._found[here] = []
+        try:
+            yield found
+        finally:
+            with self._lock:
+                del self._found[here]
+                if not self._found:
+                    self._before.__exit__(None, None, None)
+                    self._before = None
+
+    def _show(
+        self,
+        show: Callable[..., None],
+        message: Warning | str,
+        category: type[Warning],
+        *where: Any,
+        **more: Any,
+    ) -> None:
+        with self._lock:
+            # A thread that a task has started has no list: without knowing whose it is, one task reports it.
+            found = self._found.get(threading.get_ident(), next(iter(self._found.values()), None))
+            if found is not None and issubclass(category, DataWarning):
+                found.append((category, str(message)))
+                return
+        show(message, category, *where, **more)
+
+
+_task_warnings = _TaskWarnings()

@@ -17,6 +17,9 @@ Blending = Literal["display", "linear"]
 MAX_FILTER_PX2 = 100.0
 """Largest ``filter_px2``."""
 
+MIN_TRANSMITTANCE = 1e-6
+"""Early termination: a sample stops once its transmittance is below this. The error stays below it, too."""
+
 
 @dataclass(frozen=True, eq=False)
 class SplatMesh:

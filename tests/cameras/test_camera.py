@@ -240,6 +240,16 @@ def test_scaled_keeps_the_view(factor, width, height):
     assert abs(larger.width - width * factor) <= max(0.5, 1 - width * factor)
 
 
+def test_a_window_sees_the_same_at_other_columns_and_rows():
+    camera = orbit(np.zeros((1, 3)), 1, width=40, height=30, distance=3)[0]
+    points = np.random.default_rng(0).normal(size=(20, 3)) * 0.3
+    part = camera.window(5, -9, 60, 31)
+    assert (part.width, part.height) == (60, 31)
+    found, whole = part.project(points), camera.project(points)
+    np.testing.assert_allclose(found[0] + [5, -9], whole[0], rtol=1e-12)
+    np.testing.assert_array_equal(found[1], whole[1])
+
+
 def test_camera_file_of_ours(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps([OURS, {**OURS, "name": "c", "near": 0.5}]))

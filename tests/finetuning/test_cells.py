@@ -33,10 +33,12 @@ from meshsplats.datasets.views import Dataset, ImageCache, View, ViewImage
 from meshsplats.datasets.windows import window_of
 from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.city import city_blocks
+from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import Interrupted, RunOptions, starting_mesh
 from meshsplats.finetuning import cells as in_cells
 from meshsplats.finetuning.cells import CellOptions, CellScene, divide, finetune_cells, waves
 from meshsplats.finetuning.checkpoint import OtherRunError
+from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.run import held_out_scores
 from meshsplats.gaussians import joined
 
@@ -227,10 +229,11 @@ def end_once(folder, function, task):
     def watch():
         while not list(folder.glob("run/cells/*/checkpoint.safetensors")):
             time.sleep(0.01)
+        (folder / "ended").touch()
         os.kill(os.getpid(), signal.SIGKILL)
 
     try:
-        os.close(os.open(folder / "ended", os.O_CREAT | os.O_EXCL))
+        os.close(os.open(folder / "watched", os.O_CREAT | os.O_EXCL))
         threading.Thread(target=watch, daemon=True).start()
     except FileExistsError:
         pass
@@ -279,10 +282,20 @@ def test_a_run_that_stops_anywhere_is_resumed(held, whole_run, tmp_path, monkeyp
         if resumed and first is not None:
             assert first == taken[name] + 1
         taken[name] = steps[-1] if steps else taken.get(name, 0)
+    metrics = [Journal(folder).metrics() for folder in (tmp_path / "run", whole_run.files[0].parents[1])]
+    assert [line["step"] for line in metrics[0]] == [line["step"] for line in metrics[1]]
     with pytest.raises(OtherRunError, match="other configuration"):
         tuned(tmp_path / "run", held, config=make_config(steps=61), resume=True)
     with pytest.raises(OtherRunError, match="other cell_splats"):
         tuned(tmp_path / "run", held, most=1000, resume=True)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "7", "[" * 100_000, '{"cells": "' + 2**20 * "x" + '"}'])
+def test_a_broken_record_is_refused(held, tmp_path, content):
+    (tmp_path / "cells.json").write_text(content)
+    with pytest.raises(FileFormatError, match=r"cells\.json"):
+        tuned(tmp_path, held, resume=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["cells.json"]
 
 
 RUN = """
@@ -358,7 +371,14 @@ def test_the_command_tunes_in_cells(tmp_path, capsys):
     assert "cells.json is left from an earlier run" in capsys.readouterr().err
     assert main([*words, "--resume", "--force"]) == 0
     np.testing.assert_array_equal(load_mesh(out).vertices, mesh.vertices)
+    cells = out.with_name("city.npz.run") / "cells"
+    foreign = [cells / "notes.txt", cells / "cell-plan.npz", cells / "cell-00000" / "notes.txt"]
+    for path in foreign:
+        path.write_text("of someone else")
+    before = (cells / "cell-00000.npz").stat().st_mtime_ns
     assert main([*words, "--force", "--preset", "paper", "--steps", "4"]) == 0
+    assert all(path.read_text() == "of someone else" for path in foreign)
+    assert (cells / "cell-00000.npz").stat().st_mtime_ns > before
 
 
 @pytest.mark.parametrize("kind", ["splats", "photographs"])

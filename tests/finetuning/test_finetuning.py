@@ -27,7 +27,7 @@ from meshsplats.finetuning.checkpoint import OtherRunError, load_checkpoint
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
-    MIN_TRANSMITTANCE,
+    TRAINING_MIN_TRANSMITTANCE,
     importance,
     kept_faces,
     make_step,
@@ -143,7 +143,9 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]
     exposure = torch.tensor([*gain, *offset], requires_grad=True)
     behind = srgb_to_linear(np.float32(background)) if blending == "linear" else np.float32(background)
-    options = dict(face_splat=mesh.face_splat, min_transmittance=MIN_TRANSMITTANCE[blending], samples=2)
+    options = dict(
+        face_splat=mesh.face_splat, min_transmittance=TRAINING_MIN_TRANSMITTANCE[blending], samples=2
+    )
     rendered = rasterize(leaves[0], mesh.faces, leaves[1], view.camera, background=behind, **options).color
     if blending == "linear":
         curve = 1.055 * rendered.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
@@ -360,6 +362,16 @@ def test_positions_move_by_the_size_of_their_splats(scene):
     moved = step.max(axis=1) > 0
     share = step[moved].max(axis=1) / state.sizes[moved]
     assert np.median(share) == pytest.approx(0.05, rel=0.02)
+
+
+def test_black_fans_on_black_take_on_colors(scene):
+    """Their opacities have no gradient."""
+    _, dataset, mesh = scene
+    colors = mesh.colors * np.array([0, 0, 0, 1], np.float32)
+    view = replace(dataset.train[0], source=ViewImage(dataset.train[0].image), background=(0.0, 0.0, 0.0))
+    state = State.begin(replace(mesh, colors=colors), 1, make_config(steps=10), None)
+    make_step(state, [view], 0, 0.0)
+    assert (state.colors[:, :3] > 0).any()
 
 
 def test_colors_stay_in_range(scene):

@@ -279,6 +279,16 @@ def test_memory_is_refused_with_advice(monkeypatch):
     memory.check_memory(mesh, data)
 
 
+@pytest.mark.skipif(memory.available_memory() is None, reason="the system does not say what is free")
+def test_ranks_share_the_memory_of_their_machine(monkeypatch):
+    whole = memory.available_memory()
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")  # of another program
+    assert memory.available_memory() > whole / 2
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "x")
+    monkeypatch.setenv("WORLD_SIZE", "8")
+    assert whole / 8 < memory.available_memory() < whole / 2
+
+
 def test_splats_that_targets_are_drawn_from_count():
     mesh, cloud = convert(make_scene(200)), make_scene(4000)
     views = splat_views(cloud, [view.camera for view in dataset(2).train])

@@ -8,16 +8,20 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
 from meshsplats import finetune, load_mesh, make_config, save_gaussians, splat_dataset
-from meshsplats.cli import main
+from meshsplats.cli import main, toml, training
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning import RunOptions, starting_mesh
+from meshsplats.finetuning import ranks as ranks_module
 from meshsplats.finetuning import step as steps
 from meshsplats.finetuning.config import learning_rates
 from meshsplats.finetuning.ranks import ALONE, Part, Ranks, is_started_by_torchrun
@@ -139,7 +143,7 @@ def test_ranks_without_a_view_to_count_take_no_step(scene):
         count = 2
 
         def total(self, part):
-            return Part(part.vertices, part.colors, 0.0, 0, 0)
+            return part._replace(loss=0.0, views=0)
 
     state = State.begin(mesh, 9, make_config(steps=10, batch=2), 1)
     before = state.colors.copy()
@@ -154,6 +158,93 @@ def test_torchrun_is_known_by_what_it_sets():
     assert is_started_by_torchrun({"TORCHELASTIC_RUN_ID": "x", "WORLD_SIZE": "2"})
     assert ALONE.any(True)
     assert not ALONE.any(False)
+
+
+# ---- Exchange
+
+
+class InThreads:
+    """Stands in for torch.distributed, in one of several threads."""
+
+    def __init__(self, index: int, slots: list, barrier: threading.Barrier) -> None:
+        self.index, self.slots, self.barrier = index, slots, barrier
+
+    def get_rank(self):
+        return self.index
+
+    def get_world_size(self):
+        return len(self.slots)
+
+    def all_gather(self, out, array):
+        self.slots[self.index] = array
+        self.barrier.wait()
+        for into, found in zip(out, self.slots, strict=True):
+            into[:] = found
+        self.barrier.wait()
+
+    def broadcast(self, array, sender):
+        if self.index == sender:
+            self.slots[sender] = array
+        self.barrier.wait()
+        array[:] = self.slots[sender]
+        self.barrier.wait()
+
+
+def exchanged(parts, monkeypatch):
+    """The total of each rank, of these ``parts``."""
+    monkeypatch.setattr(ranks_module, "_tensor", lambda array: array)
+    slots, barrier = [None] * len(parts), threading.Barrier(len(parts), timeout=60)
+    ranks = [ranks_module._TorchRanks(InThreads(i, slots, barrier)) for i in range(len(parts))]
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return list(pool.map(lambda rank, part: rank.total(part), ranks, parts))
+
+
+def part_of(seed):
+    """Gradients of vertices: of the opacity alone, of the colour alone, of the position alone, or none."""
+    rng = np.random.default_rng(seed)
+    kind = rng.integers(0, 6, 60)
+    vertices = rng.normal(size=(60, 3)).astype(np.float32) * (kind >= 3)[:, None]
+    colors = rng.normal(size=(60, 4)).astype(np.float32)
+    colors[:, 3] *= kind % 3 != 1
+    colors[:, :3] *= (kind % 3 == 1)[:, None]
+    colors[kind >= 4] = 0
+    return Part(vertices, colors, float(rng.random()), 1, 0, 1000 - seed)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_all_ranks_have_the_sum_in_their_order(count, monkeypatch):
+    """Whichever of its gradients a vertex has."""
+    parts = [part_of(seed) for seed in range(count)]
+    vertices, colors = (np.zeros((60, width), np.float32) for width in (3, 4))
+    for part in parts:
+        vertices, colors = vertices + part.vertices, colors + part.colors
+    loss = sum(part.loss for part in parts)
+    for found in exchanged(parts, monkeypatch):
+        np.testing.assert_array_equal(found.vertices, vertices)
+        np.testing.assert_array_equal(found.colors, colors)
+        assert found[2:] == (pytest.approx(loss), count, 0, 1001 - count)
+
+
+def test_all_ranks_know_the_first_view_that_failed(monkeypatch):
+    parts = [part_of(seed)._replace(failed=failed) for seed, failed in enumerate((0, 4, 6))]
+    assert [found.failed for found in exchanged(parts, monkeypatch)] == [4, 4, 4]
+
+
+# ---- Records
+
+
+def test_the_batch_of_ranks_is_recorded(splats, tmp_path, monkeypatch, capsys):
+    """So that --config repeats it in one process, and a run resumed by other ranks says why not."""
+    out = tmp_path / "mesh.npz"
+    ranks = Ranks()
+    monkeypatch.setattr(training, "joined_ranks", lambda threads: nullcontext((ranks, threads)))
+    ranks.count = 2
+    assert main(["finetune", str(splats), "-o", str(out), *WORDS]) == 0
+    config = toml.load(tmp_path / "mesh.npz.config.toml")
+    assert config["options"]["batch"] == config["resolved"]["batch"] == 2
+    ranks.count = 3
+    assert main(["finetune", str(splats), "-o", str(out), *WORDS, "--resume", "--force"]) != 0
+    assert "--batch was 2 and is 3" in capsys.readouterr().err
 
 
 # ---- Processes
@@ -183,6 +274,8 @@ def splats(tmp_path_factory):
 
 
 WORDS = ["--steps", "24", "--views", "9", "--width", "40", "--held-out", "2", "--threads", "1"]
+LONG = ["--steps", "200", *WORDS[2:]]
+"""Of a run that is to be killed on the way."""
 
 
 @pytest.fixture(scope="module")
@@ -209,9 +302,9 @@ def test_two_ranks_give_the_bits_of_a_batch_of_two(splats, batch_of_two, tmp_pat
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_a_run_with_a_killed_rank_is_resumed(splats, batch_of_two, tmp_path):
+def test_a_run_with_a_killed_rank_is_resumed(splats, tmp_path):
     out = tmp_path / "mesh.npz"
-    process = torchrun("finetune", splats, "-o", out, *WORDS)
+    process = torchrun("finetune", splats, "-o", out, *LONG)
     checkpoint = tmp_path / "mesh.npz.run" / "checkpoint.safetensors"
     until = time.monotonic() + 120
     while not checkpoint.exists() and process.poll() is None and time.monotonic() < until:
@@ -220,16 +313,17 @@ def test_a_run_with_a_killed_rank_is_resumed(splats, batch_of_two, tmp_path):
         ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True, check=True
     )
     ranks = [int(word) for word in children.stdout.split()]
-    if process.poll() is None and ranks:
-        os.kill(ranks[-1], signal.SIGKILL)
+    assert len(ranks) == 2
+    os.kill(ranks[-1], signal.SIGKILL)
     process.communicate(timeout=300)
-    if process.returncode == 0:
-        pytest.skip("the run was over before its rank was killed")
+    assert process.returncode != 0
     assert not out.exists()
-    again = torchrun("finetune", splats, "-o", out, *WORDS, "--resume")
+    again = torchrun("finetune", splats, "-o", out, *LONG, "--resume")
     _, errors = again.communicate(timeout=300)
     assert again.returncode == 0, errors
-    assert equal(load_mesh(out), batch_of_two)
+    single = tmp_path / "single.npz"
+    assert main(["finetune", str(splats), "-o", str(single), *LONG, "--batch", "2"]) == 0
+    assert equal(load_mesh(out), load_mesh(single))
 
 
 def test_what_torchrun_is_not_for(splats, tmp_path):

@@ -15,13 +15,15 @@ from meshsplats.conversion import convert
 from meshsplats.datasets.splat_targets import splat_dataset
 from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
-from meshsplats.errors import DivergenceError, MissingDependencyError
+from meshsplats.errors import DeviceError, DivergenceError, FileFormatError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
+from meshsplats.finetuning.ranks import Part
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import importance, make_step
+from meshsplats.finetuning.step import _part, importance, make_step, view_of_step
 from meshsplats.prior import bind
 from meshsplats.webgpu import gradients
-from meshsplats.webgpu.renderer import DrawSettings
+from meshsplats.webgpu.device import open_device
+from meshsplats.webgpu.renderer import WINDOW_SAMPLES, DrawSettings
 
 GPU = RunOptions(device="gpu")
 TOLERANCE = 1e-4
@@ -73,6 +75,18 @@ def test_steps_are_those_of_the_cpu(scene, options):
         change = np.linalg.norm(after - before)
         assert change > 0 or (name == "vertices" and options.get("position_rate") == 0)
         assert np.linalg.norm(getattr(state, name) - after) <= CHANGES * change
+
+
+def test_black_fans_on_black_take_on_the_colors_of_the_cpu(scene):
+    """Their opacities have no gradient."""
+    need_gpu()
+    dataset, mesh = scene
+    views = [replace(v, source=ViewImage(v.image), background=(0.0, 0.0, 0.0)) for v in dataset.train]
+    black = replace(mesh, colors=mesh.colors * np.array([0, 0, 0, 1], np.float32))
+    found, known = (steps((replace(dataset, train=tuple(views)), black), d, 1)[1] for d in ("gpu", "cpu"))
+    assert (known.colors[:, :3] > 0).any()
+    change = np.linalg.norm(known.colors - black.colors)
+    assert np.linalg.norm(found.colors - known.colors) <= CHANGES * change
 
 
 def test_a_mesh_on_a_base_with_depth_groups():
@@ -128,7 +142,7 @@ def test_steps_in_windows_where_a_tape_does_not_fit(scene, monkeypatch):
     monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 10_000)  # as if there were more fragments
     losses, state = steps(scene, "gpu")
     assert state._trainer is not None
-    assert state._trainer._window_samples < 1 << 22
+    assert state.limit.samples < 1 << 22
     assert np.allclose(losses, expected, rtol=TOLERANCE)
     change = np.linalg.norm(known.vertices - known.mesh.vertices)
     assert np.linalg.norm(state.vertices - known.vertices) <= CHANGES * change
@@ -180,10 +194,70 @@ def test_the_same_bits_every_time(scene):
     assert one.colors.tobytes() == two.colors.tobytes()
 
 
+@pytest.mark.parametrize("options", [{}, {"relocate_share": 0.1}], ids=lambda options: ", ".join(options))
+def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch, options):
+    """Also where it stops between an image that has too many fragments and one that has not."""
+    need_gpu()
+    dataset, mesh = scene
+    config = make_config(steps=8, **options)
+    next_view = view_of_step(config, 3, len(dataset.train))
+    views = list(dataset.train)
+    camera = views[next_view].camera
+    far = replace(camera, fx=camera.fx / 8, fy=camera.fy / 8)
+    views[next_view] = replace(views[next_view], camera=far, source=views[next_view].load())
+    dataset = replace(dataset, train=tuple(views))
+    monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 20_000)  # as if there were more fragments
+
+    def fits(number: int) -> bool:
+        state = State.begin(mesh, len(views), config, None, device="gpu")
+        make_step(state, [views[view_of_step(config, number, len(views))]], 0, 0.0)
+        return state.limit.samples == WINDOW_SAMPLES
+
+    assert (fits(2), fits(3)) == (False, True)
+    check_resumed(dataset, mesh, config, tmp_path)
+
+
+BROKEN = [np.int64(0), np.int64(WINDOW_SAMPLES + 1), np.zeros(2, np.int64), np.float32(9)]
+
+
+@pytest.mark.parametrize("value", BROKEN, ids=str)
+def test_a_broken_limit_of_windows_is_refused(scene, value):
+    need_gpu()
+    _, mesh = scene
+    config = make_config(steps=8)
+    arrays = State.begin(mesh, 6, config, None, device="gpu").arrays()
+    with pytest.raises(FileFormatError, match="window_samples must be a whole number"):
+        State.resume(arrays | {"window_samples": np.asarray(value)}, "display", 6, config, None, "gpu")
+
+
+def test_ranks_find_the_gradients_of_one_process(scene, monkeypatch):
+    """Also of a view that fits, after one that has too many fragments."""
+    need_gpu()
+    dataset, mesh = scene
+    config = make_config(steps=8, batch=2)
+    near = dataset.train[view_of_step(make_config(steps=8), 2, len(dataset.train))]
+    far = replace(near.camera, fx=near.camera.fx / 8, fy=near.camera.fy / 8)
+    views = [near, replace(near, camera=far, source=near.load())]
+    monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 20_000)  # as if there were more fragments
+
+    def part(*places: int) -> Part:
+        state = State.begin(mesh, 2, config, None, device="gpu")
+        return _part(state, views, [0, 1], 0, 0.0, range(places[0], places[-1] + 1))
+
+    whole, first, second = part(0, 1), part(0), part(1)
+    for name in ("vertices", "colors"):
+        assert np.array_equal(getattr(whole, name), getattr(first, name) + getattr(second, name))
+    assert whole.window_samples == first.window_samples < second.window_samples == WINDOW_SAMPLES
+
+
 def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
     need_gpu()
     dataset, mesh = scene
-    config = make_config(steps=8)
+    check_resumed(dataset, mesh, make_config(steps=8), tmp_path)
+
+
+def check_resumed(dataset, mesh, config, tmp_path):
+    """A run that is stopped after three steps, and resumed by a process that has rendered nothing before."""
     whole = finetune(mesh, dataset, config, run=replace(GPU, report_every=0))
     folder = tmp_path / "run"
 
@@ -197,6 +271,7 @@ def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
     run = RunOptions(folder, device="gpu", report_every=0, preview_every=0, checkpoint_seconds=1e-9)
     with pytest.raises(Stop):
         finetune(mesh, dataset, config, run=run, on_progress=after)
+    gradients._last = None
     tuned = finetune(mesh, dataset, config, run=replace(run, resume=True))
     assert tuned.vertices.tobytes() == whole.vertices.tobytes()
     assert tuned.colors.tobytes() == whole.colors.tobytes()
@@ -236,10 +311,48 @@ def test_what_needs_the_cpu_is_an_error_before_anything_is_written(scene, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
+def test_what_the_gpu_cannot_hold_is_an_error_before_anything_is_written(scene, tmp_path, monkeypatch):
+    """An earlier run of that name is not lost."""
+    need_gpu()
+    dataset, mesh = scene[0], replace(scene[1], filter_px2=0.3)
+    run = RunOptions(tmp_path / "run", device="gpu", preview_every=0)
+    finetune(mesh, dataset, make_config(steps=1), run=replace(run, device="cpu"))
+    before = {path: path.read_bytes() for path in sorted(run.folder.iterdir())}
+    assert run.folder / "checkpoint.safetensors" in before
+    limits = [
+        (gradients, "MAX_VALENCE", 3, DeviceError, "up to 3 triangles; one has"),
+        (gradients, "MAX_FAN", 3, DeviceError, "splats of up to 3 triangles; one has"),
+        (open_device(), "binding_limit", 32 * len(mesh.vertices) - 1, MemoryError, "too many vertices for"),
+        (open_device(), "binding_limit", 64 * len(mesh.faces) - 1, MemoryError, "too many triangles for"),
+    ]
+    for where, name, value, error, message in limits:
+        for resume in (False, True):
+            with monkeypatch.context() as patch:
+                patch.setattr(where, name, value)
+                with pytest.raises(error, match=message):
+                    finetune(mesh, dataset, make_config(steps=1), run=replace(run, resume=resume))
+            assert {path: path.read_bytes() for path in sorted(run.folder.iterdir())} == before
+
+
+def test_moments_that_start_again_are_those_after_the_last_step(scene):
+    need_gpu()
+    dataset, mesh = scene
+    (one, two) = (
+        State.begin(mesh, 6, make_config(steps=5), None, device=device) for device in ("gpu", "cpu")
+    )
+    rows = np.arange(0, len(mesh.vertices), 3)
+    for state in (one, two):
+        make_step(state, dataset.train, 0, 0.0)
+        state.restart(rows)
+        make_step(state, dataset.train, 1, 0.2)
+    for name in ("vertices", "colors"):
+        change = np.linalg.norm(getattr(two, name) - getattr(mesh, name))
+        assert np.linalg.norm(getattr(one, name) - getattr(two, name)) <= CHANGES * change
+
+
 def test_without_wgpu_there_is_an_error_and_nothing_is_written(scene, tmp_path, monkeypatch, capsys):
     from meshsplats import save_mesh
     from meshsplats.cli import main
-    from meshsplats.webgpu.device import open_device
 
     dataset, mesh = scene
     save_mesh(mesh, tmp_path / "mesh.npz")

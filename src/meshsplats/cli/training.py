@@ -260,9 +260,10 @@ class TrainingCommand(Command):
                 return self._execute(self.configured(), ranks)
             if not self.RANKS:
                 raise UsageError("torchrun is for meshsplats finetune")
-            command, config = replace(self, threads=threads), self.configured()
-            if config.batch == 1:
-                config = replace(config, batch=ranks.count)
+            batch = self.configured().batch
+            tuning = replace(self.tuning, batch=ranks.count if batch == 1 else batch)
+            command = replace(self, threads=threads, tuning=tuning)
+            config = command.configured()
             return command._assist(config, ranks) if ranks.index else command._execute(config, ranks)
 
     def _execute(self, config: FinetuneConfig, ranks: Ranks) -> int:

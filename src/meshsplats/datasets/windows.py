@@ -16,8 +16,7 @@ def window_of(view: View, left: int, top: int, right: int, bottom: int, store: I
 
     Images of splats are rendered for the window alone and kept in ``store``; others are cut out of the whole.
     """
-    camera = view.camera
-    part = replace(camera, width=right - left, height=bottom - top, cx=camera.cx - left, cy=camera.cy - top)
+    part = view.camera.window(left, top, right - left, bottom - top)
     if isinstance(view.source, RenderedSplats):
         return replace(view, camera=part, source=replace(view.source, camera=part, store=store))
     return replace(view, camera=part, source=_Part(view.source, left, top, right, bottom))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshsplats._files.atomic import write_text
+from meshsplats._json import json_object
 from meshsplats.camera import Camera
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
@@ -53,6 +55,10 @@ BORDER = 16
 """Pixels around the window of a cell in a view."""
 RECORD = "cells.json"
 """In the folder of the run."""
+RECORD_BYTES = 1 << 20
+"""Largest size of such a file."""
+_CELL_FILE = re.compile(r"cell-\d{5,}(\.npz)?|coarse-\d{5,}\.ply")
+"""Names in the folder of the cells: tuned meshes, folders of runs, splats that stand for a cell."""
 
 
 @dataclass(frozen=True)
@@ -208,6 +214,7 @@ def finetune_cells(
     Raises:
         ValueError: options that are for whole scenes, no training views, no splats.
         OtherRunError: the folder is of another run.
+        FileFormatError: the record of the run that is resumed is broken.
         MemoryError, DivergenceError, Interrupted: as ``finetune``.
         ClusterError: the workers are lost; what is done stays.
     """
@@ -232,14 +239,15 @@ def finetune_cells(
         pass
     before: tuple[int, ...] = ()
     done = {cell for cell in range(count) if task.file(cell).is_file()}
-    fresh = steps = 0
+    journal = Journal(run.folder)
+    fresh, steps = 0, max((line["step"] for line in journal.metrics()), default=0)
     for wave in waves(cells, here.cloud.means):
         todo = [(cell, before) for cell in wave if cell not in done]
         for i, taken in workers.run(task.tune, todo):
             done.add(todo[i][0])
             fresh += 1
             steps += taken
-            Journal(run.folder).log_metrics(steps, cell=todo[i][0], cells=count, done=len(done))
+            journal.log_metrics(steps, cell=todo[i][0], cells=count, done=len(done))
             if on_progress is not None:
                 seconds = time.perf_counter() - start
                 left = seconds / fresh * (count - len(done))
@@ -283,18 +291,29 @@ def _begin(
     }
     path = run.folder / RECORD
     if run.resume:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        with open(path, "rb") as file:
+            before = json_object(file.read(RECORD_BYTES + 1), RECORD_BYTES, path)
         for name, value in facts.items():
             if before.get(name) != value:
                 raise OtherRunError(f"the cells in {folder} are of another run: other {name}")
         return
     run.folder.mkdir(exist_ok=True)
     folder.mkdir(exist_ok=True)
-    for old in [path, *folder.rglob("*")]:
-        if old.is_file():
-            old.unlink()
+    path.unlink(missing_ok=True)
+    _remove_cells(folder)
     Journal(run.folder).begin(config.to_dict())
     write_text(path, json.dumps(facts, indent=1) + "\n")
+
+
+def _remove_cells(folder: Path) -> None:
+    """Removes what an earlier run has left in the ``folder`` of its cells, and nothing else."""
+    for path in list(folder.iterdir()):
+        if not _CELL_FILE.fullmatch(path.name):
+            continue
+        if path.is_dir():
+            Journal(path).remove()
+        else:
+            path.unlink()
 
 
 @dataclass(frozen=True, eq=False)

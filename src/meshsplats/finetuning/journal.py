@@ -42,11 +42,16 @@ class Journal:
     def begin(self, config: dict[str, Any]) -> None:
         """Creates the folder if needed (but not its parent) and removes the files of an earlier run."""
         self.folder.mkdir(exist_ok=True)
-        self.checkpoint_path.unlink(missing_ok=True)
-        for preview in self._previews():
-            preview.unlink()
+        self.remove()
         self._write_config(config)
         write_text(self.folder / METRICS, "")
+
+    def remove(self) -> None:
+        """Removes the files of a run, if there was one."""
+        for path in (self.checkpoint_path, self.folder / METRICS, self.folder / CONFIGURATION):
+            path.unlink(missing_ok=True)
+        for preview in self._previews():
+            preview.unlink()
 
     def _write_config(self, config: dict[str, Any]) -> None:
         write_text(self.folder / CONFIGURATION, json.dumps(config, indent=1) + "\n")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from meshsplats.cluster import memory_of_task
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
+from meshsplats.finetuning.ranks import ranks_of_machine
 from meshsplats.mesh import SplatMesh
 
 VERTEX_BYTES = 7 * 4 * 6 + 4
@@ -54,7 +56,8 @@ def estimate_bytes(vertices: int, faces: int, dataset: Dataset, cache_bytes: int
 
 
 def available_memory() -> int | None:
-    """Bytes that this process may still allocate, by the system and the container; None if unknown."""
+    """Bytes that this process may still allocate, by the system, the container and its Dask worker; None if
+    unknown. The ranks on a machine have equal shares."""
     found = []
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
@@ -72,7 +75,9 @@ def available_memory() -> int | None:
                 found.append(max(int(most) - int(Path(used).read_text()), 0))
         except (OSError, ValueError):
             continue
-    return min(found, default=None)
+    found = [size // ranks_of_machine() for size in found]
+    of_task = memory_of_task()
+    return min(found if of_task is None else [*found, of_task], default=None)
 
 
 def check_memory(mesh: SplatMesh, dataset: Dataset, *, cache_bytes: int = CACHE_BYTES) -> int:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import nonzero_rows
 from meshsplats._core.library import processors
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 
@@ -35,6 +36,8 @@ class Part(NamedTuple):
     """Count of its views with pixels that count."""
     failed: int
     """1 + index of a view without finite loss or gradient; 0 if there is none."""
+    window_samples: int = 1 << 62
+    """The limit of windows on the GPU after these views (``WindowLimit``)."""
 
 
 class Ranks:
@@ -73,6 +76,11 @@ def is_started_by_torchrun(environment: Mapping[str, str] | None = None) -> bool
     return _STARTED in found and int(found.get("WORLD_SIZE", "1")) > 1
 
 
+def ranks_of_machine() -> int:
+    """The number of ranks on this machine; 1 without torchrun."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", "1")) if is_started_by_torchrun() else 1
+
+
 @contextmanager
 def joined_ranks(threads: int | None = None) -> Iterator[tuple[Ranks, int | None]]:
     """The ranks that torchrun has started, for the length of the block, and the threads of this one: those
@@ -90,8 +98,7 @@ def joined_ranks(threads: int | None = None) -> Iterator[tuple[Ranks, int | None
         raise MissingDependencyError(
             f"ranks need torch: pip install 'meshsplats[torch]' ({GET_TORCH})"
         ) from None
-    local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    each = threads or max(1, processors() // local)
+    each = threads or max(1, processors() // ranks_of_machine())
     torch.set_num_threads(each)
     distributed.init_process_group("gloo")
     try:
@@ -109,9 +116,9 @@ class _TorchRanks(Ranks):
         self._sent, self._received = _Rows(), _Rows()
 
     def total(self, part: Part) -> Part:
-        # A vertex has a gradient only if its opacity has one.
-        rows = np.flatnonzero(part.colors[:, 3])
-        heads = self._gather(np.array([len(rows), part.loss, part.views, part.failed], np.float64))
+        rows = np.flatnonzero(nonzero_rows(part.colors) | nonzero_rows(part.vertices))
+        head = [len(rows), part.loss, part.views, part.failed, part.window_samples]
+        heads = self._gather(np.array(head, np.float64))
         own = self._sent.take(len(rows))
         own[0][:] = rows
         vertices, colors = part.vertices, part.colors
@@ -120,8 +127,8 @@ class _TorchRanks(Ranks):
             np.take(array, rows, axis=0, out=copied, mode="clip")
         if self.index > 1:  # to add to those of the first two, in whatever order, is to add in their order
             vertices, colors = np.zeros_like(vertices), np.zeros_like(colors)
-        for sender, head in enumerate(heads):
-            found = own if sender == self.index else self._received.take(int(head[0]))
+        for sender, (count, *_) in enumerate(heads):
+            found = own if sender == self.index else self._received.take(int(count))
             # Several times as fast as gathering, and each sends as many rows as it has.
             for array in found:
                 self._distributed.broadcast(_tensor(array), sender)
@@ -131,7 +138,7 @@ class _TorchRanks(Ranks):
                 _add_rows(array, found[0], added)
         loss, views = (float(sum(head[i] for head in heads)) for i in (1, 2))
         failed = next((int(head[3]) for head in heads if head[3]), 0)
-        return Part(vertices, colors, loss, int(views), failed)
+        return Part(vertices, colors, loss, int(views), failed, min(int(head[4]) for head in heads))
 
     def any(self, flag: bool) -> bool:
         return any(found[0] for found in self._gather(np.array([flag], np.int32)))

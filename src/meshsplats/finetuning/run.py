@@ -156,10 +156,12 @@ def finetune(
         ValueError: no training view, an empty mesh, ``frozen`` of another shape; a batch that the ranks
             cannot share, or that has more views than there are.
         OtherRunError: the checkpoint is of another run.
-        MemoryError: the estimated memory is not available; nothing was written.
+        MemoryError: the estimated memory is not available, or the mesh does not fit on the GPU; of a run that
+            starts, nothing was written.
         DivergenceError: the loss or a gradient is not finite; the message names the view.
         MissingDependencyError: device 'gpu' without a GPU, or no library for it; nothing was written.
-        DeviceError: the GPU failed, or did not finish an image.
+        DeviceError: the mesh has too many triangles at a vertex, or in a splat with a filter, for the GPU; of
+            a run that starts, nothing was written. Or the GPU failed, or did not finish an image.
         Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
     """
     config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import checked_array, nonzero_rows
 from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
@@ -23,7 +23,8 @@ from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation
 from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering.api import Device
 from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.renderer import DrawSettings, gpu_errors
+from meshsplats.webgpu.gradients import WindowLimit, check_limits
+from meshsplats.webgpu.renderer import WINDOW_SAMPLES, DrawSettings, gpu_errors
 from meshsplats.webgpu.training import MAX_PIXELS, Moments, Rates, Sums, Trainer
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)
@@ -62,6 +63,7 @@ class State:
         solid: for a mesh of opaque and blended triangles, (v,) bool: the vertices of opaque ones, whose
             positions and opacities stay; otherwise None.
         frozen: (v,) bool: vertices whose positions and colours stay; None if there are none.
+        limit: of windows on the GPU.
     """
 
     def __init__(
@@ -94,6 +96,7 @@ class State:
         self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
         self.solid: np.ndarray | None = None
         self.frozen: np.ndarray | None = None
+        self.limit = WindowLimit()
 
     @property
     def vertices(self) -> np.ndarray:
@@ -119,6 +122,8 @@ class State:
         """The state before the first step, for ``views`` training views and vertices that are ``frozen``."""
         if config.opacity == "cutoff":
             _check_for_cutoff(mesh, config)
+        if device == "gpu":
+            check_limits(open_device(), mesh)
         mesh = replace(mesh, normals=None)  # positions change, normals would not
         if mesh.binding is not None:
             mesh = replace(mesh, vertices=mesh.binding.positions())
@@ -160,6 +165,8 @@ class State:
     ) -> State:
         """The state in a checkpoint's arrays. FileFormatError if they do not fit each other."""
         mesh = stored_mesh(arrays, blending)
+        if device == "gpu":
+            check_limits(open_device(), mesh)
         try:
             sizes = _checked_shape(arrays["sizes"], (len(mesh.vertices),)).copy()
             exposures = _checked_shape(arrays["exposure.values"], (views, 6)) if config.exposure else None
@@ -171,6 +178,8 @@ class State:
                 state.solid = _solid_vertices(mesh)
             if "frozen" in arrays:
                 state.frozen = checked_array("frozen", arrays["frozen"], bool, (len(mesh.vertices),))
+            if device == "gpu" and "window_samples" in arrays:
+                state.limit.samples = _checked_limit(arrays["window_samples"])
             if state._sums is not None:
                 shape = (len(mesh.vertices),)
                 parts = (_checked_shape(arrays[name], shape) for name in state._sums.arrays())
@@ -195,6 +204,8 @@ class State:
             arrays["solid"] = np.ones((), np.int32)
         if self.frozen is not None:
             arrays["frozen"] = self.frozen
+        if self.device == "gpu":
+            arrays["window_samples"] = np.array(self.limit.samples, np.int64)
         return arrays
 
     def result(self) -> SplatMesh:
@@ -211,10 +222,8 @@ class State:
         reached."""
         self._download()
         self._trainer = None
-        # A vertex has a gradient only if its opacity has one, and a single column is quick to scan.
-        reached = gradients.colors[:, 3] != 0
-        if self.config.opacity == "cutoff":  # but where opaque, only its colour
-            reached |= (gradients.colors[:, :3] != 0).any(axis=1)
+        # Opaque vertices, and those of the colour behind them, have a gradient of their colour alone.
+        reached = nonzero_rows(gradients.colors)
         if self.frozen is not None:
             reached &= ~self.frozen
         if self.solid is not None:
@@ -321,6 +330,7 @@ class State:
             Moments(self._colors.mean, self._colors.square),
             np.ones(count, np.float32) if scale is None else scale,
             np.zeros(count, bool) if self._boundary is None else self._boundary,
+            self.limit,
         )
 
     def _download(self) -> None:
@@ -342,6 +352,8 @@ class State:
         """
         if self._sums is None:
             return 0
+        self._download()
+        self._trainer = None
         idle, needed = plan_relocation(self.mesh, self._sums, in_view, self.config.relocate_share)
         if len(idle):
             positions, colors = self.vertices, self.colors
@@ -394,6 +406,8 @@ class State:
 
     def restart(self, rows: np.ndarray) -> None:
         """Zeroes the first moments of the vertices ``rows``, after their values were replaced."""
+        self._download()
+        self._trainer = None
         self._positions.restart(rows, rows)
         self._colors.restart(rows, rows)
 
@@ -421,6 +435,12 @@ def _check_for_cutoff(mesh: SplatMesh, config: FinetuneConfig) -> None:
         raise ValueError("opacity 'cutoff' is for meshes in display colours, this one is in linear light")
     if config.soft_share and mesh.face_splat is None:
         raise ValueError("soft_share chooses splats, but the mesh does not know its own (face_splat)")
+
+
+def _checked_limit(array: np.ndarray) -> int:
+    if array.shape != () or array.dtype != np.int64 or not 0 < array <= WINDOW_SAMPLES:
+        raise ValueError(f"window_samples must be a whole number from 1 to {WINDOW_SAMPLES}, got {array}")
+    return int(array)
 
 
 def _checked_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -23,12 +23,13 @@ from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
 from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
+from meshsplats.webgpu.gradients import WindowLimit
 from meshsplats.webgpu.renderer import DrawSettings
 
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""
 
-MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
+TRAINING_MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
 """Early termination: a pixel stops below this transmittance, and the background gets the rest. It saves a
 tenth to a sixth of the time and changes images by 0.0002 (rms). The limit is lower in linear light, since
 encoding for display amplifies dark values."""
@@ -150,43 +151,66 @@ def render_view(
         view.camera,
         background=srgb_to_linear(display) if linear else display,
         samples=samples,
-        min_transmittance=MIN_TRANSMITTANCE[state.mesh.blending],
+        min_transmittance=TRAINING_MIN_TRANSMITTANCE[state.mesh.blending],
         face_splat=state.mesh.face_splat,
         depth_group=state.mesh.depth_group,
         filter_px2=state.mesh.filter_px2,
         ramp=ramp,
         threads=state.threads,
+        limit=state.limit,
     )
     return RenderedView(rendering, linear)
+
+
+class LossRates(NamedTuple):
+    """Derivatives of the loss that ``FinetuneConfig`` defines, with respect to sums over all channels of the
+    pixels that count."""
+
+    l1: float
+    """Of the sum of |x - y|."""
+    ssim: float
+    """Of the sum of SSIM."""
+    l2: float
+    """Of the sum of (x - y)^2."""
+    at_zero: float
+    """The loss where all sums are 0."""
+
+    def loss(self, l1: float, ssim: float, l2: float) -> float:
+        """The loss with these sums."""
+        return self.at_zero + self.l1 * l1 + self.ssim * ssim + self.l2 * l2
+
+
+def loss_rates(config: FinetuneConfig, target: Target) -> LossRates:
+    mask, share = target.mask, config.ssim_weight
+    count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
+    return LossRates((1 - share) / count, -share / count, config.l2_weight / count, share)
 
 
 def loss_of(
     image: np.ndarray, target: Target, config: FinetuneConfig, threads: int | None
 ) -> tuple[float, np.ndarray]:
-    """The loss that ``FinetuneConfig`` defines, and its gradient, (h, w, 3) float32 like the ``image``."""
+    """The loss (see ``LossRates``), and its gradient, (h, w, 3) float32 like the ``image``."""
     mask = target.mask
-    count = image.size if mask is None else int(mask.sum()) * image.shape[2]
-    share = config.ssim_weight
+    rates = loss_rates(config, target)
     compared = compare_images(
         image[None],
         target.color[None],
         None if mask is None else mask[None],
-        l1_rate=(1 - share) / count,
-        ssim_rate=-share / count,
+        l1_rate=rates.l1,
+        ssim_rate=rates.ssim,
         gradient=True,
         threads=threads,
     )
     assert compared.gradient is not None
-    loss = (1 - share) * compared.l1 / count + share * (1 - compared.ssim / count)
-    gradient = compared.gradient[0]
+    gradient, squares = compared.gradient[0], 0.0
     if config.l2_weight:
         difference = image - target.color
         if mask is not None:
             difference[~mask] = 0  # masked values may be anything
-        loss += config.l2_weight * float(np.square(difference).sum()) / count
-        difference *= np.float32(2 * config.l2_weight / count)
+        squares = float(np.square(difference).sum())
+        difference *= np.float32(2 * rates.l2)
         gradient += difference
-    return loss, gradient
+    return rates.loss(compared.l1, compared.ssim, squares), gradient
 
 
 class ViewGradients(NamedTuple):
@@ -227,6 +251,7 @@ def make_step(
         failed = 0 if found.finite else 1
     else:
         total = ranks.total(_part(state, views, indices, step, fraction, ranks.share(batch)))
+        state.limit.samples = total.window_samples
         if not total.views and not total.failed:
             return None
         loss, failed = total.loss / max(total.views, 1), total.failed
@@ -252,9 +277,12 @@ def _part(
     state: State, views: Sequence[View], indices: Sequence[int], step: int, fraction: float, share: range
 ) -> Part:
     """The sum over the places of a batch in ``share``."""
-    total = Part(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), 0.0, 0, 0)
+    limit = state.limit.samples
+    total = Part(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), 0.0, 0, 0, limit)
     for place in share:
+        state.limit.samples = limit  # whichever rank computes the view
         found = view_gradients(state, views, indices[place], step + place, fraction)
+        total = total._replace(window_samples=min(total.window_samples, state.limit.samples))
         if found is None:
             continue
         if found.gradients is None or not found.finite:
@@ -318,16 +346,14 @@ def _step_on_gpu(state: State, view: View, step: int, fraction: float) -> float 
         return None
     samples = 1 if points else samples_of(view, config)
     rates = learning_rates(config, step, fraction)
-    count = target.color.size if mask is None else int(mask.sum()) * target.color.shape[2]
-    share = config.ssim_weight
+    loss_by = loss_rates(config, target)
     settings = DrawSettings(
         samples=samples,
-        min_transmittance=MIN_TRANSMITTANCE["display"],
+        min_transmittance=TRAINING_MIN_TRANSMITTANCE["display"],
         filter_px2=state.mesh.filter_px2,
     )
-    derivatives = ((1 - share) / count, -share / count, config.l2_weight / count)
-    sums = state.step_on_gpu(view.camera, settings, target.color, mask, target.background, derivatives, rates)
-    loss = share + float(np.dot(derivatives, sums[:3]))
+    sums = state.step_on_gpu(view.camera, settings, target.color, mask, target.background, loss_by[:3], rates)
+    loss = loss_by.loss(*sums[:3])
     if not (np.isfinite(loss) and sums.finite):
         raise _divergence(step, view, "a gradient" if np.isfinite(loss) else "the loss")
     return loss
@@ -389,7 +415,10 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
     vertices, colors = state.vertices, state.colors
     pixels = np.zeros(len(vertices), np.float32)
     in_view = np.zeros(len(pixels), bool)
-    count = partial(visible_pixels, threads=state.threads) if state.device == "cpu" else gpu_visible_pixels
+    if state.device == "cpu":
+        count = partial(visible_pixels, threads=state.threads)
+    else:
+        count = partial(gpu_visible_pixels, limit=WindowLimit())
     for view in views:
         pixels += count(
             vertices,

@@ -12,10 +12,7 @@ import numpy as np
 from meshsplats._core import library
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
-
-MIN_TRANSMITTANCE = 1e-6
-"""Early termination: a sample stops once its transmittance is below this. The error stays below it, too."""
+from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
 
 MAX_SAMPLES = 16
 """Largest side of the grid of samples in each pixel."""

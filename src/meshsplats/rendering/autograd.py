@@ -9,7 +9,8 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
-from meshsplats.rendering.api import MIN_TRANSMITTANCE, Device, check_device
+from meshsplats.mesh import MIN_TRANSMITTANCE
+from meshsplats.rendering.api import Device, check_device
 from meshsplats.rendering.backward import TAPE_BYTES
 from meshsplats.rendering.gpu_backward import AnyRendering, taped_rendering
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from meshsplats._core import library
 from meshsplats.camera import Camera
-from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
+from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
 from meshsplats.rendering.api import (
-    MIN_TRANSMITTANCE,
     Pointers,
     camera_struct,
     checked_options,

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.mesh import checked_filter
-from meshsplats.rendering.api import MIN_TRANSMITTANCE, Device, Pointers, checked_options
+from meshsplats.mesh import MIN_TRANSMITTANCE, checked_filter
+from meshsplats.rendering.api import Device, Pointers, checked_options
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, OpacityRamp, TapedRendering
-from meshsplats.webgpu.gradients import gradient_renderer
+from meshsplats.webgpu.gradients import WindowLimit, gradient_renderer
 from meshsplats.webgpu.renderer import DrawSettings, gpu_errors
 
 
@@ -44,8 +44,10 @@ class GpuRendering:
         filter_px2: float = 0.0,
         samples: int = 1,
         min_transmittance: float = MIN_TRANSMITTANCE,
+        limit: WindowLimit | None = None,
     ) -> None:
-        """Runs the forward pass. Arguments are those of ``backward.TapedRendering``.
+        """Runs the forward pass. Arguments are those of ``backward.TapedRendering``, and ``limit`` as in
+        ``GradientRenderer.forward``.
 
         Raises:
             ValueError: options out of range; two splats that share a vertex, with a filter.
@@ -65,7 +67,7 @@ class GpuRendering:
         with gpu_errors():
             self._renderer = gradient_renderer(faces, len(vertices), face_splat, depth_group)
             self.forward = self._renderer.forward(
-                vertices, colors, camera, settings, pose=world_to_camera, values=values
+                vertices, colors, camera, settings, pose=world_to_camera, values=values, limit=limit
             )
         images = self.forward.images
         self.color = images.color + images.transmittance[:, :, None] * self._background
@@ -127,11 +129,13 @@ def taped_rendering(
     ramp: OpacityRamp | None = None,
     threads: int | None = None,
     tape_bytes: int | None = TAPE_BYTES,
+    limit: WindowLimit | None = None,
     **options: Any,
 ) -> AnyRendering:
     """The rendering of a device, with its backward pass.
 
-    Arguments are those of ``TapedRendering``; ``threads`` and ``tape_bytes`` are for the CPU.
+    Arguments are those of ``TapedRendering``; ``threads`` and ``tape_bytes`` are for the CPU, ``limit`` is
+    for the GPU (see ``GpuRendering``).
 
     Raises:
         ValueError: an option out of range, or a ramp on the GPU.
@@ -150,7 +154,7 @@ def taped_rendering(
         )
     if ramp is not None:
         raise ValueError("opacity ramps need device='cpu'")
-    return GpuRendering(vertices, faces, colors, attributes, camera, **options)
+    return GpuRendering(vertices, faces, colors, attributes, camera, limit=limit, **options)
 
 
 def gpu_visible_pixels(

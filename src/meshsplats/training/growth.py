@@ -12,7 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.relocation import HALF, split_in_halves
 from meshsplats.finetuning.state import GAIN, OFFSET, State
-from meshsplats.finetuning.step import MIN_TRANSMITTANCE, samples_of
+from meshsplats.finetuning.step import TRAINING_MIN_TRANSMITTANCE, samples_of
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import TapedRendering
 
@@ -63,7 +63,7 @@ def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
             np.zeros((len(mesh.vertices), 3), np.float32),
             background=view.background,
             samples=samples_of(view, state.config),
-            min_transmittance=MIN_TRANSMITTANCE[mesh.blending],
+            min_transmittance=TRAINING_MIN_TRANSMITTANCE[mesh.blending],
             threads=state.threads,
         )
         image = rendering.color

@@ -19,11 +19,12 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device, open_device
 from meshsplats.webgpu.renderer import (
-    MAX_ROUNDS,
+    WINDOW_SAMPLES,
     DrawSettings,
     Images,
     MeshRenderer,
-    Work,
+    check_size,
+    checked_fans,
     find_groups,
     frame_uniform,
     halves,
@@ -74,6 +75,40 @@ class Forward:
     settings: DrawSettings
     images: Images
     windows: list[_Window]
+
+
+@dataclass
+class WindowLimit:
+    """Most samples of the windows that are tried: one less than had too many fragments.
+
+    The rounding of gradients depends on the windows. So a run whose bits are to be repeated has a limit of
+    its own, which it keeps when it is resumed.
+    """
+
+    samples: int = WINDOW_SAMPLES
+
+
+def check_limits(device: Device, mesh: SplatMesh) -> None:
+    """Checks that gradients of ``mesh`` fit on the GPU.
+
+    Raises:
+        MemoryError: a mesh that does not fit into buffers of 128 MiB.
+        DeviceError: a vertex with too many triangles, or a splat with too many for the filter.
+        ValueError: two splats share a vertex, and there is a filter.
+    """
+    vertices, faces = len(mesh.vertices), len(mesh.faces)
+    groups = 0 if mesh.depth_group is None else len(np.unique(mesh.depth_group[mesh.depth_group >= 0]))
+    check_size(device, "vertices", 16 * (2 * vertices + 2 * groups))
+    check_size(device, "triangles", SUM_BYTES * faces)
+    check_size(device, "triangles", 4 * (vertices + 1 + 3 * faces))
+    most = int(np.bincount(mesh.faces.ravel()).max(initial=0))
+    if most > MAX_VALENCE:
+        raise DeviceError(
+            f"gradients on the GPU take vertices of up to {MAX_VALENCE:,} triangles; one has {most:,}."
+            " Use device='cpu'"
+        )
+    if mesh.filter_px2 and faces:
+        checked_fans(mesh, MAX_FAN)
 
 
 _lock = threading.Lock()
@@ -137,11 +172,11 @@ class GradientRenderer(MeshRenderer):
     max_fan = MAX_FAN
 
     def __init__(self, device: Device, mesh: SplatMesh) -> None:
-        self._check_corners(device, mesh)
+        check_limits(device, mesh)
         super().__init__(device, mesh)
         self._loaded: Forward | None = None  # whose positions and colours are on the GPU
         self._marked: Forward | None = None  # whose only window is marked
-        self._window_samples = 1 << 22
+        self._limit = WindowLimit()
         runs = self._counts["runs"]
         self._counts["run_columns"] = min(runs, ROWS)
         self._counts["run_rows"] = -(-runs // ROWS)
@@ -149,13 +184,9 @@ class GradientRenderer(MeshRenderer):
             return
         vertices = self._counts["vertices"] + 2 * self._counts["groups"]
         self._values_at = 16 * vertices
-        self._check_size("vertices", 16 * (vertices + len(mesh.vertices)))
-        self._check_size("vertices", 32 * len(mesh.vertices))
-        self._check_size("triangles", SUM_BYTES * len(mesh.faces))
         corners = mesh.faces.ravel()
         starts = np.append(0, np.cumsum(np.bincount(corners, minlength=len(mesh.vertices))))
         parts = [starts, np.argsort(corners, kind="stable")]
-        self._check_size("triangles", 4 * sum(map(len, parts)))
         self._allocate("projected", 16 * (vertices + len(mesh.vertices)))
         self._allocate("gradients", 32 * len(mesh.vertices))
         self._allocate("face_sums", SUM_BYTES * len(mesh.faces))
@@ -163,15 +194,6 @@ class GradientRenderer(MeshRenderer):
         modes = np.zeros((len(kernels.MODES), 64), np.uint32)
         modes[:, :4] = kernels.MODES
         self._upload("modes", modes)
-
-    @staticmethod
-    def _check_corners(device: Device, mesh: SplatMesh) -> None:
-        most = int(np.bincount(mesh.faces.ravel()).max(initial=0))
-        if most > MAX_VALENCE:
-            raise DeviceError(
-                f"gradients on the GPU take vertices of up to {MAX_VALENCE:,} triangles; one has {most:,}."
-                " Use device='cpu'"
-            )
 
     def _usage(self, name: str) -> int:
         return super()._usage("frame" if name == "modes" else name)
@@ -218,6 +240,7 @@ class GradientRenderer(MeshRenderer):
         *,
         pose: np.ndarray | None = None,
         values: np.ndarray | None = None,
+        limit: WindowLimit | None = None,
     ) -> Forward:
         """Renders the mesh with these positions and colours, and finds the windows of its tape.
 
@@ -226,6 +249,7 @@ class GradientRenderer(MeshRenderer):
             camera, settings: as in ``draw``; without ``max_layers`` and ``cutoff``.
             pose: (4, 4) float64 world to camera, overrides that of the camera.
             values: (v, c) float32 further values of the vertices to blend.
+            limit: of windows; by default that of all images of this renderer that have none.
 
         Raises:
             DeviceError: the GPU did not finish.
@@ -243,7 +267,7 @@ class GradientRenderer(MeshRenderer):
             waiting = [(0, 0, w, h)]
             while waiting:
                 area = waiting.pop()
-                window = self._mark_window(result, area)
+                window = self._mark_window(result, area, limit or self._limit)
                 if window is None:
                     waiting += halves(area)
                     continue
@@ -286,18 +310,18 @@ class GradientRenderer(MeshRenderer):
         )
 
     def _part(self, forward: Forward, area: tuple[int, int, int, int]) -> Camera:
-        x, y, w, h = area
-        camera = forward.camera
-        return replace(camera, cx=camera.cx - x, cy=camera.cy - y, width=w, height=h)
+        return forward.camera.window(*area)
 
-    def _mark_window(self, forward: Forward, area: tuple[int, int, int, int]) -> _Window | None:
+    def _mark_window(
+        self, forward: Forward, area: tuple[int, int, int, int], limit: WindowLimit
+    ) -> _Window | None:
         """``_mark``, which is left out for windows as large as one that had too many fragments."""
         samples = area[2] * area[3] * forward.settings.samples**2
-        if samples > self._window_samples and area[2:] != (1, 1):
+        if samples > limit.samples and area[2:] != (1, 1):
             return None
         window = self._mark(forward, area)
         if window is None:
-            self._window_samples = samples - 1
+            limit.samples = samples - 1
         return window
 
     def _mark(self, forward: Forward, area: tuple[int, int, int, int]) -> _Window | None:
@@ -327,7 +351,7 @@ class GradientRenderer(MeshRenderer):
         counts = self._begin(part, settings, forward.pose)
         work = forward.images.work
         while True:
-            rounds, counters = self._walk(counts, settings, work)
+            rounds, counters = self._repeat(_MARK_STEPS, _MARK_AGAIN_STEPS, "color", counts, settings, work)
             needed = int(counters[0])
             if needed <= self._capacity:
                 break
@@ -343,23 +367,6 @@ class GradientRenderer(MeshRenderer):
         if area[2:] == (forward.camera.width, forward.camera.height):
             self._marked = forward
         return window
-
-    def _walk(self, counts: dict[str, int], settings: DrawSettings, work: Work) -> tuple[int, np.ndarray]:
-        """Renders and marks until all tiles are finished; the repetitions, and the counters."""
-        steps = _MARK_STEPS
-        work.frames += 1
-        work.dispatches = 0
-        previous = None
-        for rounds in range(MAX_ROUNDS):
-            self._run(steps, "color", counts, settings, work)
-            counters = self._counters()
-            if counters[0] > self._capacity or counters[2] == counts["tiles"]:
-                return rounds, counters
-            if counters[9] or counters[12] or (previous is not None and previous == counters[3]):
-                break
-            previous = counters[3]
-            steps = _MARK_AGAIN_STEPS
-        raise self._unfinished(counts, counters)
 
     # ------------------------------------------------------------------------------------------ backward pass
 
@@ -440,12 +447,6 @@ class GradientRenderer(MeshRenderer):
         encoder = self.device.device.create_command_encoder()
         encoder.clear_buffer(self._buffers[name])
         self.device.device.queue.submit([encoder.finish()])
-
-    def _unfinished(self, counts: dict[str, int], counters: np.ndarray) -> DeviceError:
-        return DeviceError(
-            f"the GPU did not finish {counts['tiles'] - int(counters[2]):,} of {counts['tiles']:,} tiles"
-            f" ({self.device.name}): use device='cpu'"
-        )
 
 
 def _triples(forward: Forward) -> Iterator[tuple[slice, np.ndarray]]:

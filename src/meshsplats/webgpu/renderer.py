@@ -12,7 +12,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, splat_starts
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import BUDGET, Device, open_device
 
@@ -44,7 +44,7 @@ class DrawSettings:
 
     samples: int = 1
     max_layers: int = 0
-    min_transmittance: float = 1e-6
+    min_transmittance: float = MIN_TRANSMITTANCE
     cutoff: float = -1.0
     filter_px2: float = 0.0
     queue: int = kernels.QUEUE
@@ -208,8 +208,8 @@ class MeshRenderer:
             )
         if not len(mesh.faces):
             return
-        self._check_size("vertices", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
-        self._check_size("triangles", 4 * sum(map(len, parts)))
+        check_size(device, "vertices", 16 * (len(mesh.vertices) + 2 * self._counts["groups"]))
+        check_size(device, "triangles", 4 * sum(map(len, parts)))
         self._upload("vertices", mesh.vertices)
         self._upload("values", mesh.colors)
         self._upload("mesh", np.concatenate(parts))
@@ -226,13 +226,6 @@ class MeshRenderer:
         self._upload("digits", digits)
 
     # ------------------------------------------------------------------------------------------ buffers
-
-    def _check_size(self, name: str, size: int) -> None:
-        if size > self.device.binding_limit:
-            raise MemoryError(
-                f"the mesh has too many {name} for the GPU: {size / 2**20:.0f} MiB; a buffer holds"
-                f" {self.device.binding_limit >> 20} MiB. Use device='cpu'"
-            )
 
     def _usage(self, name: str) -> int:
         import wgpu
@@ -313,18 +306,7 @@ class MeshRenderer:
     def _prepare_filter(self, settings: DrawSettings) -> None:
         if not settings.filter_px2 or "fans" in self._buffers:
             return
-        splat = self.mesh.face_splat
-        assert splat is not None
-        starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
-        if np.diff(starts).max() > self.max_fan:
-            raise DeviceError(
-                f"the filter of the GPU takes splats of up to {self.max_fan:,} triangles; one has"
-                f" {np.diff(starts).max():,}. Use device='cpu'"
-            )
-        owner = np.full(len(self.mesh.vertices), -1, np.int32)
-        owner[self.mesh.faces] = splat[:, None]
-        if (owner[self.mesh.faces] != splat[:, None]).any():
-            raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
+        starts = checked_fans(self.mesh, self.max_fan)
         self._upload("fans", starts)
         self._fans = len(starts) - 1
 
@@ -343,7 +325,7 @@ class MeshRenderer:
     ) -> bool:
         """Draws a window; False if it has too many pairs."""
         x0, y0, w, h = window
-        part = replace(camera, cx=camera.cx - x0, cy=camera.cy - y0, width=w, height=h)
+        part = camera.window(x0, y0, w, h)
         counts = self._begin(part, settings)
         work = images.work
         while True:
@@ -415,22 +397,36 @@ class MeshRenderer:
     ) -> np.ndarray:
         """Renders one frame to the samples, until all tiles are finished; returns the counters."""
         steps = (*_LIST_STEPS, *_RASTER_STEPS) if output == "color" else _RASTER_STEPS
+        return self._repeat(steps, _AGAIN_STEPS, output, counts, settings, work)[1]
+
+    def _repeat(
+        self,
+        steps: Sequence[dict[str, Any]],
+        again: Sequence[dict[str, Any]],
+        output: _Output,
+        counts: dict[str, int],
+        settings: DrawSettings,
+        work: Work | None,
+    ) -> tuple[int, np.ndarray]:
+        """Takes ``steps``, then those of ``again`` until all tiles are finished or the lists are too short;
+        the repetitions, and the counters."""
         if work is not None:
             work.frames += 1
             work.dispatches = 0
         previous = None
-        for _ in range(MAX_ROUNDS):
+        for rounds in range(MAX_ROUNDS):
             self._run(steps, output, counts, settings, work)
             counters = self._counters()
-            if counters[0] > self._capacity:
-                return counters
-            if counters[2] == counts["tiles"]:
-                return counters
+            if counters[0] > self._capacity or counters[2] == counts["tiles"]:
+                return rounds, counters
             if counters[9] or counters[12] or (previous is not None and previous == counters[3]):
                 break
             previous = counters[3]
-            steps = _AGAIN_STEPS
-        raise DeviceError(
+            steps = again
+        raise self._unfinished(counts, counters)
+
+    def _unfinished(self, counts: dict[str, int], counters: np.ndarray) -> DeviceError:
+        return DeviceError(
             f"the GPU did not finish {counts['tiles'] - int(counters[2]):,} of {counts['tiles']:,} tiles"
             f" ({self.device.name}): use device='cpu'"
         )
@@ -575,6 +571,37 @@ def find_runs(faces: np.ndarray, face_splat: np.ndarray | None) -> np.ndarray:
     return (first.astype(np.uint32) | ((ends - first - 1).astype(np.uint32) << np.uint32(29))).astype(
         np.uint32
     )
+
+
+def check_size(device: Device, name: str, size: int) -> None:
+    """MemoryError if ``size`` bytes for the vertices or triangles of a mesh are too many for a buffer."""
+    if size > device.binding_limit:
+        raise MemoryError(
+            f"the mesh has too many {name} for the GPU: {size / 2**20:.0f} MiB; a buffer holds"
+            f" {device.binding_limit >> 20} MiB. Use device='cpu'"
+        )
+
+
+def checked_fans(mesh: SplatMesh, most: int) -> np.ndarray:
+    """(s + 1,) uint32 first triangle of each splat, and their count, for the filter.
+
+    Raises:
+        DeviceError: a splat of more than ``most`` triangles.
+        ValueError: two splats share a vertex.
+    """
+    splat = mesh.face_splat
+    assert splat is not None
+    starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
+    if np.diff(starts).max() > most:
+        raise DeviceError(
+            f"the filter of the GPU takes splats of up to {most:,} triangles; one has"
+            f" {np.diff(starts).max():,}. Use device='cpu'"
+        )
+    owner = np.full(len(mesh.vertices), -1, np.int32)
+    owner[mesh.faces] = splat[:, None]
+    if (owner[mesh.faces] != splat[:, None]).any():
+        raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
+    return starts
 
 
 def find_groups(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import CORE_BINDING, Device
-from meshsplats.webgpu.gradients import Forward, GradientRenderer
+from meshsplats.webgpu.gradients import Forward, GradientRenderer, WindowLimit
 from meshsplats.webgpu.renderer import DrawSettings, Images, halves
 
 DERIVATIVE_BYTES = 48
@@ -73,6 +73,7 @@ class Trainer(GradientRenderer):
         position_moments, color_moments: of the same shapes.
         units: (v,) float32 factors of the learning rate of positions.
         transparent: (v,) bool: vertices whose opacity stays 0 once it is 0.
+        limit: of windows.
 
     Raises:
         MemoryError: a mesh that does not fit into buffers of 128 MiB.
@@ -89,8 +90,10 @@ class Trainer(GradientRenderer):
         color_moments: Moments,
         units: np.ndarray,
         transparent: np.ndarray,
+        limit: WindowLimit,
     ) -> None:
         super().__init__(device, mesh)
+        self._limit = limit
         assert not self._counts["groups"]
         count = len(mesh.vertices)
         self._upload("vertices", vertices)
@@ -152,7 +155,7 @@ class Trainer(GradientRenderer):
             waiting = [(0, 0, camera.width, camera.height)]
             while waiting:
                 area = waiting.pop()
-                window = self._mark_window(forward, area)
+                window = self._mark_window(forward, area, self._limit)
                 if window is None:
                     waiting += halves(area)
                     continue

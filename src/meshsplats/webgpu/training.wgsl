@@ -220,7 +220,7 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
   let i = id.x;
   if (i >= frame.vertices || (atomicLoad(&results[4]) | atomicLoad(&results[5])) != 0u) { return; }
   let g = gradients[2u * i + 1u];
-  if (g.w == 0.0) { return; }
+  if (all(g == vec4f(0.0))) { return; }
   let value = values[i];
   let mean = fma(g - color_moments[2u * i], vec4f(step_of.one_minus_beta1), color_moments[2u * i]);
   let square = fma(g * g - color_moments[2u * i + 1u], vec4f(step_of.one_minus_beta2), color_moments[2u * i + 1u]);
