@@ -141,13 +141,13 @@ def test_a_run_keeps_its_budget(scene):
 
 def test_a_vertex_with_a_gradient_of_its_colour_alone_moves(scene):
     _, mesh = scene
-    for opacity, moves in (("cutoff", True), ("blended", False)):
+    for opacity in ("cutoff", "blended"):  # blended: of the colour behind it
         state = State.begin(mesh, 1, make_config(opacity=opacity), 1)
         before = state.colors.copy()
         gradients = Gradients(np.zeros((len(before), 3), np.float32), np.zeros((len(before), 4), np.float32))
         gradients.colors[5, 0] = -1 if before[5, 0] < 0.5 else 1
         state.step(gradients, 0.02, 0.02, 0)
-        assert (state.colors[5, 0] != before[5, 0]) == moves
+        assert state.colors[5, 0] != before[5, 0]
         assert (np.delete(state.colors, 5, axis=0) == np.delete(before, 5, axis=0)).all()
 
 
