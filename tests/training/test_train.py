@@ -12,7 +12,7 @@ from _photographs import write_photographs
 from PIL import Image
 
 from meshsplats.cli import main
-from meshsplats.datasets.views import Dataset
+from meshsplats.datasets.views import Dataset, View
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions
@@ -71,6 +71,12 @@ def blurred(layer: np.ndarray | None) -> np.ndarray | None:
     return layer
 
 
+def lit(view: View, gain: float) -> View:
+    """``view`` in other light."""
+    image = view.load()
+    return replace(view, source=replace(image, color=image.color * np.float32(gain)))
+
+
 def psnr_of(mesh: SplatMesh, dataset: Dataset) -> float:
     return evaluate(mesh, dataset).method("mesh").mean("psnr")
 
@@ -122,6 +128,17 @@ def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
     with pytest.warns(DataWarning, match=rf"^1 of 19 photographs do not fit the others: {views[6].name}\."):
         mesh = train(Dataset(tuple(views)), train_config(steps=120, **size))
     assert psnr_of(mesh, dataset) > (19 if scene == "ball" else 14.5)
+
+
+def test_changing_light_is_fitted(ball):
+    """Each photograph has a gain of its own; held-out views have their mean."""
+    gains = np.random.default_rng(5).uniform(0.6, 1.0, len(ball.train))
+    dataset = Dataset(
+        tuple(lit(view, gain) for view, gain in zip(ball.train, gains, strict=True)),
+        tuple(lit(view, gains.mean()) for view in ball.test),
+    )
+    plain, fitted = (train(dataset, train_config(steps=120, exposure=e, **SMALL)) for e in (False, True))
+    assert psnr_of(fitted, dataset) > psnr_of(plain, dataset) + 0.3
 
 
 def test_photographs_that_fit_are_not_named(ball, recwarn):

@@ -20,6 +20,7 @@ class TrainConfig(FinetuneConfig):
     rate_steps: int = 1000
     prune_epochs: float = 0.0
     opacity_decay: float = 0.01
+    exposure_rate: float = 0.01
     max_splats: int = 100_000
     """Largest number of fans."""
     start_splats: int = 40_000
