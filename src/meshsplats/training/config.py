@@ -37,11 +37,11 @@ class TrainConfig(FinetuneConfig):
     """Share of the run until which they have half of them; then they have all."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ranges(self, _RANGES)
         for name, only in FIXED.items():
             if getattr(self, name) != only:
                 raise ValueError(f"{name} must be {only!r} while the set of fans grows; finetune has it")
+        super().__post_init__()
+        check_ranges(self, _RANGES)
 
 
 _RANGES: list[Range] = [
