@@ -157,6 +157,7 @@ def test_a_vertex_with_a_gradient_of_its_colour_alone_moves(scene):
         ({"exposure": True}, "exposure is for opacity 'blended'"),
         ({"relocate_share": 0.1}, "relocate_share is for opacity 'blended'"),
         ({"prune_importance": 2.0}, "prune_importance is for opacity 'blended'"),
+        ({"opacity_decay": 0.1}, "opacity_decay is for opacity 'blended'"),
         ({"blending": "linear"}, "opaque triangles are not blended"),
         ({"l2_weight": 0.0}, "expected_share is a share of l2_weight"),
         ({"cutoff": 1.5}, "cutoff"),

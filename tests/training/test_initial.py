@@ -224,7 +224,7 @@ def test_the_shell_lies_behind_everything(room):
 
 def test_known_points_are_part_of_the_start(room):
     """Also where no photographs match: there are none of these colours."""
-    spot = np.random.default_rng(0).normal([0, 0, 1.4], 0.03, (200, 3))
+    spot = np.random.default_rng(0).normal([0, 0, 1.4], 0.06, (200, 3))
     points = ScenePoints(
         np.concatenate([spot, on_sphere(200)]),
         np.repeat([[255, 0, 255], [128, 128, 128]], 200, axis=0).astype(np.uint8),

@@ -12,14 +12,14 @@ from _photographs import write_photographs
 from PIL import Image
 
 from meshsplats.cli import main
-from meshsplats.datasets.views import Dataset, ViewImage
-from meshsplats.errors import MissingDependencyError
+from meshsplats.datasets.views import Dataset, View, ViewImage
+from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions
 from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.ranks import Ranks
 from meshsplats.finetuning.run import run_start
-from meshsplats.finetuning.state import State
+from meshsplats.finetuning.state import Gradients, State
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.mesh import SplatMesh
@@ -31,6 +31,7 @@ from meshsplats.training.initial import fans_of
 from meshsplats.training.run import SO_FAR, GrowingLoop, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
 
+LAYERS = ("color", "alpha")
 SMALL = {"start_splats": 150, "max_splats": 600, "growth_events": 3}
 
 
@@ -62,6 +63,20 @@ def same(a: SplatMesh, b: SplatMesh) -> bool:
     return all(
         np.array_equal(getattr(a, n), getattr(b, n)) for n in ("vertices", "faces", "colors", "face_splat")
     )
+
+
+def blurred(layer: np.ndarray | None) -> np.ndarray | None:
+    """An image layer (h, w, ...), each pixel the mean of 7 x 7; None for None."""
+    if layer is not None:
+        for axis in (0, 1):
+            layer = np.mean([np.roll(layer, shift, axis) for shift in range(-3, 4)], axis=0)
+    return layer
+
+
+def lit(view: View, gain: float) -> View:
+    """``view`` in other light."""
+    image = view.load()
+    return replace(view, source=replace(image, color=image.color * np.float32(gain)))
 
 
 def psnr_of(mesh: SplatMesh, dataset: Dataset) -> float:
@@ -96,6 +111,41 @@ def test_the_budget_holds(ball, trained):
     assert fan_count(trained) == trained.splat_count <= 600
     tight = train(ball, train_config(steps=20, start_splats=600, max_splats=100))
     assert fan_count(tight) <= 100
+
+
+# ---- Photographs that are not what they should be
+
+
+@pytest.mark.parametrize("scene", ["ball", "room"])
+def test_a_photograph_with_a_wrong_camera_is_named(scene, request):
+    """The others still give a mesh, and none of them is named, not even blurred ones."""
+    dataset = request.getfixturevalue(scene)
+    views = list(dataset.train)
+    views[7] = replace(views[7], source=views[15].source)
+    for i in (3, 11):
+        sharp = views[i].load()
+        views[i] = replace(views[i], source=replace(sharp, **{n: blurred(getattr(sharp, n)) for n in LAYERS}))
+    views = [view for i, view in enumerate(views) if i != 5]
+    size = SMALL if scene == "ball" else {"start_splats": 1500, "max_splats": 2000, "growth_events": 2}
+    with pytest.warns(DataWarning, match=rf"^1 of 19 photographs do not fit the others: {views[6].name}\."):
+        mesh = train(Dataset(tuple(views)), train_config(steps=120, **size))
+    assert psnr_of(mesh, dataset) > (19 if scene == "ball" else 14.5)
+
+
+def test_changing_light_is_fitted(ball):
+    """Each photograph has a gain of its own; held-out views have their mean."""
+    gains = np.random.default_rng(5).uniform(0.6, 1.0, len(ball.train))
+    dataset = Dataset(
+        tuple(lit(view, gain) for view, gain in zip(ball.train, gains, strict=True)),
+        tuple(lit(view, gains.mean()) for view in ball.test),
+    )
+    plain, fitted = (train(dataset, train_config(steps=120, exposure=e, **SMALL)) for e in (False, True))
+    assert psnr_of(fitted, dataset) > psnr_of(plain, dataset) + 0.3
+
+
+def test_photographs_that_fit_are_not_named(ball, recwarn):
+    train(ball, train_config(steps=60, **SMALL))
+    assert not recwarn.list
 
 
 # ---- Growth
@@ -207,6 +257,27 @@ def test_a_stray_in_a_near_field_does_not_survive(ball, start, monkeypatch):
     monkeypatch.setattr(run, "starting_fans", lambda *_: replace(start, vertices=stray))
     mesh = train(ball, train_config(steps=3, **SMALL | {"growth_events": 0}))
     assert fan_count(mesh) == fan_count(start) - 1
+
+
+# ---- Opacities
+
+
+def test_opacities_decay_where_a_view_reaches_them(ball, start):
+    """By their share, in proportion to the learning rate."""
+    reached = np.arange(len(start.vertices)) % 3 == 1
+    colors = np.zeros((len(reached), 4), np.float32)
+    colors[reached] = [1e-3, 0, 0, -1e-3]
+    after = []
+    for decay in (0.0, 0.2):
+        config = train_config(steps=10, opacity_decay=decay, soft_edges=False)
+        state = State.begin(start, len(ball.train), config, None)
+        state.step(Gradients(np.zeros_like(start.vertices), colors.copy()), 0.5 * config.color_rate, 0.0, 0)
+        after.append(state.colors)
+    whole, decayed = after
+    assert np.array_equal(decayed[~reached], start.colors[~reached])
+    assert np.array_equal(decayed[:, :3], whole[:, :3])
+    np.testing.assert_allclose(decayed[reached, 3], 0.9 * whole[reached, 3], rtol=1e-6)
+    assert (whole[reached, 3] > 0).any()
 
 
 # ---- Schedule

@@ -72,6 +72,10 @@ class FinetuneConfig:
     """Background of images with alpha. random: a new colour in every step, so that empty regions become
     transparent. mixed: random in every fourth step, otherwise the background of the data set, on which images
     are shown and evaluated. Photographs without alpha always use the background of the data set."""
+    opacity_decay: float = 0.0
+    """Share of its opacity that a vertex loses in each step whose view reaches it. It falls as the colour
+    learning rate does. Opacities stay high only where the views keep them there: what floats in front of
+    surfaces fades, and what is hidden behind others gets gradients. For opacity 'blended'."""
     exposure: bool = False
     """For photographs: fit a gain and an offset per colour channel for each training image, so that exposure
     differences are not baked into the mesh. Their means over all images stay 1 and 0."""
@@ -156,6 +160,7 @@ class FinetuneConfig:
             ("exposure", False),
             ("relocate_share", 0.0),
             ("prune_importance", 0.0),
+            ("opacity_decay", 0.0),
         ):
             if getattr(self, name) != standard:
                 raise ValueError(f"{name} is for opacity 'blended', not for 'cutoff'")
@@ -218,6 +223,7 @@ _RANGES: list[Range] = [
     ("epsilon", 1e-30, 1, False),
     ("ssim_weight", 0, 1, False),
     ("l2_weight", 0, 1000, False),
+    ("opacity_decay", 0, 0.5, False),
     ("exposure_rate", 1e-9, 1, False),
     ("prune_epochs", 0, 1e6, False),
     ("prune_opacity", 0, 1, False),
@@ -291,6 +297,7 @@ class FinetuneChanges(TypedDict, total=False):
     ssim_weight: float
     l2_weight: float
     background: BackgroundMode
+    opacity_decay: float
     exposure: bool
     exposure_rate: float
     prune_epochs: float

@@ -322,8 +322,7 @@ class TrainingLoop:
                 self.step_cost = time.perf_counter() - start
                 self.step += batch
                 if loss is not None:
-                    self.losses.append(loss)
-                    self.last_loss = loss
+                    self._note(before, loss)
                 self._adapt(before)
                 if self._due(self.options.report_every, before) and not self._done():
                     self._report()
@@ -349,6 +348,11 @@ class TrainingLoop:
     def _views(self) -> Sequence[View]:
         """The training views of the next step."""
         return self.dataset.train
+
+    def _note(self, step: int, loss: float) -> None:
+        """Notes the loss of step ``step`` (from 0)."""
+        self.losses.append(loss)
+        self.last_loss = loss
 
     def _adapt(self, before: int) -> None:
         """Removes and relocates triangles where the steps since ``before`` make that due."""

@@ -234,6 +234,10 @@ class State:
             self._sums.add(gradients.colors, gradients.vertices, self.sizes, reached)
         self._colors.lr = color_rate
         self._colors.step(gradients.colors, reached)
+        if self.config.opacity_decay:
+            # In proportion to the rate: its balance with the gradients is the same in runs of any length.
+            lost = self.config.opacity_decay * color_rate / self.config.color_rate
+            opacity[reached] *= np.float32(max(1 - lost, 0))
         if transparent is not None:
             opacity[transparent] = 0
         if self.solid is not None:
@@ -264,7 +268,7 @@ class State:
         """Whether ``step_on_gpu`` takes steps with images of that size.
 
         Others render on the GPU, and compare images and take their step here: those of base meshes,
-        exposures, linear light, relocation, frozen vertices and depth groups.
+        exposures, linear light, relocation, decaying opacities, frozen vertices and depth groups.
         """
         return (
             self.device == "gpu"
@@ -273,6 +277,7 @@ class State:
             and self._sums is None
             and self.solid is None
             and self.frozen is None
+            and not self.config.opacity_decay
             and self.mesh.blending == "display"
             and self.mesh.depth_group is None
             and camera.width * camera.height <= MAX_PIXELS

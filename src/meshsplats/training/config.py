@@ -19,6 +19,8 @@ class TrainConfig(FinetuneConfig):
     minutes: float | None = 10.0
     rate_steps: int = 1000
     prune_epochs: float = 0.0
+    opacity_decay: float = 0.01
+    exposure_rate: float = 0.01
     max_splats: int = 100_000
     """Largest number of fans."""
     start_splats: int = 40_000
@@ -39,13 +41,13 @@ class TrainConfig(FinetuneConfig):
     data set."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check_ranges(self, _RANGES)
         for name, only in FIXED.items():
             if getattr(self, name) != only:
                 raise ValueError(f"{name} must be {only!r} while the set of fans grows; finetune has it")
         if self.blending == "linear":
             raise ValueError("blending 'linear' is not for training: fine-tune the result with it")
+        super().__post_init__()
+        check_ranges(self, _RANGES)
 
 
 _RANGES: list[Range] = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,11 +14,12 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import opaque_views, reduced_views
 from meshsplats.datasets.views import Dataset, ImageCache, View
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_bytes, estimate_bytes
 from meshsplats.finetuning.run import Progress, RunOptions, RunStart, TrainingLoop, run_start
+from meshsplats.finetuning.step import view_of_step
 from meshsplats.formats.meshes import load_mesh, save_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.training.config import TrainConfig, with_train_changes
@@ -36,6 +38,10 @@ from meshsplats.training.schedule import budget, events_passed, image_factor
 from meshsplats.training.stereo import MATCHING_BYTES
 from meshsplats.webgpu.device import open_device
 
+MISFIT = 3.0
+"""A photograph whose mean loss is this many times the median of all does not fit the others."""
+SHOWN_NAMES = 10
+"""Maximum number of such photographs that are named."""
 START, SO_FAR = "start.npz", "mesh.npz"
 """Files in the folder of a run: the fans that it started from, and those at an interruption."""
 REDUCED_PART = 3
@@ -76,6 +82,8 @@ def train(
         ValueError: fewer than two training views, several ranks, or masks that do not fit the cameras.
         OtherRunError, MemoryError, DivergenceError, MissingDependencyError, DeviceError, Interrupted: as by
             ``finetune``. Interrupted leaves the mesh so far in the folder, too.
+
+    Warns with a DataWarning of photographs that do not fit the others.
     """
     began = time.perf_counter()
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
@@ -105,6 +113,14 @@ def train(
         raise
     if journal is not None:
         (journal.folder / SO_FAR).unlink(missing_ok=True)
+    if names := loop.misfits():
+        shown = ", ".join(names[:SHOWN_NAMES]) + (" ..." if len(names) > SHOWN_NAMES else "")
+        warnings.warn(
+            f"{len(names)} of {len(dataset.train)} photographs do not fit the others: {shown}. Their cameras"
+            " may be wrong, or the scene or its light has changed. Without them, the mesh may be better",
+            DataWarning,
+            stacklevel=2,
+        )
     return mesh
 
 
@@ -173,6 +189,23 @@ class GrowingLoop(TrainingLoop):
         self.first_fans = fan_count(start.mesh)
         self.near = NearFields.around(dataset.train, start.mesh)
         self.events = events_passed(config, self.fraction)
+        self._loss_sums, self._loss_counts = np.zeros((2, len(dataset.train)))
+
+    def misfits(self) -> list[str]:
+        """Names of the training views whose images the mesh cannot show as it shows the others, judged by
+        the losses since the last growth event. Those of a resumed run since then do not count."""
+        known = np.flatnonzero(self._loss_counts)
+        if not len(known):
+            return []
+        means = self._loss_sums[known] / self._loss_counts[known]
+        return [self.dataset.train[i].name for i in known[means > MISFIT * np.median(means)]]
+
+    def _note(self, step: int, loss: float) -> None:
+        super()._note(step, loss)
+        if self.fraction >= max(self.config.growth_end, self.config.half_share):
+            view = view_of_step(self.config, step, len(self.dataset.train))
+            self._loss_sums[view] += loss
+            self._loss_counts[view] += 1
 
     def result(self) -> SplatMesh:
         """The current fans, but those in the near field of a camera."""

@@ -46,7 +46,7 @@ FILL_AGREEMENT = 4.0
 """Planes by which filled depths of two views of a point may differ."""
 FILL_WITNESSES = 4
 """Other views that must agree with a filled depth."""
-FILL_FREE = 2
+FILL_FREE = 1
 """Views that must see past a filled point to refute it."""
 FARNESS = 4
 """Power of the depth in the weights of the depths that others are filled from."""
@@ -93,7 +93,7 @@ class Depths(NamedTuple):
         """Points (m, 3) and colours (m, 3) where nothing could be matched: on walls without texture, say.
 
         Each view fills its unknown pixels from the depths around them, the farther ones above all. A point
-        stays if the filled depths of ``FILL_WITNESSES`` other views agree, and hardly a view sees past it.
+        stays if the filled depths of ``FILL_WITNESSES`` other views agree, and no view sees past it.
         """
         full = [view._replace(inverse=_filled(view.inverse)) for view in self.views]
         points, colors = [], []
