@@ -19,6 +19,7 @@ from meshsplats.formats.ply.table import FloatTable
 
 MAX_POINTS = 5_000_000
 """More points than this are refused."""
+_THIN = "thin them, or remove the file (the photographs are matched in any case)"
 UNKNOWN_VIEWS = 3
 """The count for points of files that do not say which images show them."""
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
@@ -75,7 +76,7 @@ def _binary(path: Path) -> ScenePoints:
                 f"{path}: says it holds {count:,} points, but has {size:,} bytes (truncated?)"
             )
         if count > MAX_POINTS:
-            raise FileFormatError(f"{path}: more than {MAX_POINTS:,} points: {count:,}")
+            raise FileFormatError(f"{path}: more than {MAX_POINTS:,} points ({count:,}): {_THIN}")
         rows = np.empty(count, np.dtype([("xyz", "f8", 3), ("rgb", "u1", 3), ("track", "i8")]))
         done, block = 0, b""
         while done < count:
@@ -126,7 +127,7 @@ def _text(path: Path) -> ScenePoints:
                 ) from None
             count += 1
             if count > MAX_POINTS:
-                raise FileFormatError(f"{path}: more than {MAX_POINTS:,} points")
+                raise FileFormatError(f"{path}: more than {MAX_POINTS:,} points: {_THIN}")
     table = np.frombuffer(rows, np.float64).reshape(-1, 7)
     if not np.isfinite(table).all():
         raise FileFormatError(f"{path}: a point has a value that is not finite")
@@ -139,7 +140,9 @@ def _ply(path: Path) -> ScenePoints:
         header = read_header(file, path)
         element = header.element("vertex")
         if element is None or element.count > MAX_POINTS:
-            raise FileFormatError(f"{path}: expected up to {MAX_POINTS:,} points in an element 'vertex'")
+            raise FileFormatError(
+                f"{path}: expected an element 'vertex' of at most {MAX_POINTS:,} points: {_THIN}"
+            )
         names = {prop.name for prop in element.properties}
         if not {"x", "y", "z"} <= names:
             raise FileFormatError(f"{path}: its points lack x, y or z")
