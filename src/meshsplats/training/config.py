@@ -19,7 +19,7 @@ class TrainConfig(FinetuneConfig):
     minutes: float | None = 10.0
     rate_steps: int = 1000
     prune_epochs: float = 0.0
-    opacity_decay: float = 0.01
+    opacity_decay: float = 0.003
     exposure_rate: float = 0.01
     max_splats: int = 100_000
     """Largest number of fans."""
