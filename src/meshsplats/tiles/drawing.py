@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -209,11 +208,10 @@ def join_tiles(tileset: Tileset, tiles: Sequence[Tile]) -> SplatMesh:
 
 def _halves(camera: Camera, axis: int, middle: int) -> tuple[Camera, Camera]:
     """Cameras of the upper and the lower (``axis`` 0) or the left and the right part of the image."""
+    width, height = camera.width, camera.height
     if axis == 0:
-        return replace(camera, height=middle), replace(
-            camera, height=camera.height - middle, cy=camera.cy - middle
-        )
-    return replace(camera, width=middle), replace(camera, width=camera.width - middle, cx=camera.cx - middle)
+        return camera.window(0, 0, width, middle), camera.window(0, middle, width, height - middle)
+    return camera.window(0, 0, middle, height), camera.window(middle, 0, width - middle, height)
 
 
 def _side_by_side(parts: Sequence[Rendering], axis: int) -> Rendering:

@@ -9,12 +9,10 @@ import numpy as np
 
 from meshsplats.blender.inside import baking, meshes, objects, scene, stage
 from meshsplats.blender.options import LIGHTS, LightOptions
-from meshsplats.blender.subject import ground_height
-from meshsplats.cameras.framing import scene_bounds, weighted_quantile
+from meshsplats.blender.subject import ground_height, lowest
+from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 
-_FLOOR = 0.002
-"""Share of the vertices that may lie below the ground."""
 UP = (0.0, 0.0, 1.0)
 
 
@@ -32,7 +30,7 @@ def set_up(view: Any, objs: list[Any], lights: str = "sun", *, camera: bool = Tr
     if not len(points):
         raise ValueError("there is no splat mesh in the scene: import one, or choose Unlit or Lit for a mesh")
     light, bounds = LIGHTS[lights], scene_bounds(points)
-    low = weighted_quantile(bounds.points[:, 2], bounds.weights, _FLOOR)
+    low = lowest(bounds, np.array(UP))
     for obj in objs:
         places, normals, size = baking.places_of(obj)
         low = ground_height(low, places[:, 2], normals[:, 2], size)
