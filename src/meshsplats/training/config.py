@@ -61,7 +61,10 @@ _RANGES: list[Range] = [
 ]
 
 FIXED: dict[str, Any] = {
-    **{"opacity": "blended", "prune_epochs": 0.0, "relocate_share": 0.0, "batch": 1},
+    "opacity": "blended",
+    "prune_epochs": 0.0,
+    "relocate_share": 0.0,
+    "batch": 1,
     **{
         name: getattr(FinetuneConfig, name)
         for name in ("prune_opacity", "prune_importance", "relocate_epochs", "point_share")
