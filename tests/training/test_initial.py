@@ -10,6 +10,7 @@ from _balls import ball_view, cameras_around
 
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.views import View, ViewImage
+from meshsplats.rendering import render
 from meshsplats.training import hull
 from meshsplats.training.hull import carve, has_silhouettes, in_silhouettes
 from meshsplats.training.initial import (
@@ -18,9 +19,10 @@ from meshsplats.training.initial import (
     flat_splats,
     ranges_of_cameras,
     ranges_of_points,
+    shell_patches,
     starting_patches,
 )
-from meshsplats.training.patches import merged
+from meshsplats.training.patches import SurfacePoints, merged
 from meshsplats.training.stereo import dense_points
 
 
@@ -32,6 +34,10 @@ def ball():
 @pytest.fixture(scope="module")
 def room():
     return [ball_view(camera, backdrop=True) for camera in cameras_around(24)]
+
+
+def surface(points: np.ndarray) -> SurfacePoints:
+    return SurfacePoints.alike(points, np.full(points.shape, 0.3), 1, 0.8)
 
 
 def on_sphere(count: int = 400) -> np.ndarray:
@@ -160,7 +166,7 @@ def test_patches_of_points_on_a_plane_lie_in_it():
     rng = np.random.default_rng(1)
     across = rng.uniform(-1, 1, (4000, 2))
     points = np.column_stack([across, 0.5 * across[:, 0] + rng.normal(0, 0.002, 4000)])
-    patches = merged(points, np.full((4000, 3), 0.3), np.full(4000, 0.01), np.ones(4000), 300)
+    patches = merged(surface(points), np.full(4000, 0.01), 300)
     assert 100 < len(patches.points) <= 300
     normal = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
     assert np.median(np.abs(patches.normals @ normal)) > 0.99
@@ -174,14 +180,14 @@ def test_patches_follow_the_size_of_a_pixel():
     near = np.column_stack([rng.uniform(-1, 1, (3000, 2)), np.zeros(3000)])
     far = np.column_stack([rng.uniform(-8, 8, (3000, 2)), np.full(3000, 8.0)])
     pixels = np.repeat([0.01, 0.08], 3000)
-    patches = merged(np.concatenate([near, far]), np.zeros((6000, 3)), pixels, np.ones(6000), 500)
+    patches = merged(surface(np.concatenate([near, far])), pixels, 500)
     behind = patches.points[:, 2] > 4
     assert np.median(patches.sides[behind]) == 8 * np.median(patches.sides[~behind])
 
 
 def test_a_point_that_nothing_confirms_is_left_out():
     points = np.concatenate([np.random.default_rng(0).uniform(0, 1, (500, 3)), [[9.0, 9, 9]]])
-    patches = merged(points, np.zeros((501, 3)), np.full(501, 0.1), np.ones(501), 50)
+    patches = merged(surface(points), np.full(501, 0.1), 50)
     assert patches.points.max() < 2
 
 
@@ -191,9 +197,9 @@ def test_one_far_point_changes_no_patch(far):
     rng = np.random.default_rng(1)
     across = rng.uniform(-1, 1, (20000, 2)) * 5
     points = np.column_stack([across, 0.5 * across[:, 0] + rng.normal(0, 0.002, 20000)])
-    alone = merged(points, np.zeros((20000, 3)), np.full(20000, 0.01), np.ones(20000), 10000)
+    alone = merged(surface(points), np.full(20000, 0.01), 10000)
     points = np.concatenate([points, [[far, 0.1, 0.2]]])
-    patches = merged(points, np.zeros((20001, 3)), np.full(20001, 0.01), np.ones(20001), 10000)
+    patches = merged(surface(points), np.full(20001, 0.01), 10000)
     assert len(patches.points) == pytest.approx(len(alone.points), rel=0.1)
     assert np.median(patches.sides) == pytest.approx(np.median(alone.sides), rel=0.2)
     assert np.abs(patches.normals @ np.array([-0.5, 0, 1]) / np.sqrt(1.25)).min() > 0.99
@@ -217,9 +223,41 @@ def test_the_start_has_the_scale_of_the_scene(masked):
 
 def test_the_shell_lies_behind_everything(room):
     patches, shell = starting_patches(room, 1500)
-    assert 0 < len(shell.points) <= 1500
+    assert 0.8 * 375 < len(shell.points) < 1.5 * 375  # a quarter, and a coarse backdrop
     inner = np.quantile(np.linalg.norm(patches.points, axis=1), 0.98)
     assert np.linalg.norm(shell.points, axis=1).min() > inner
+
+
+def test_a_backdrop_fills_what_views_beside_the_photographs_show(room):
+    """Also three times as far from the middle of an image, where the shell in them ends; not behind the
+    cameras."""
+    ahead = [view for view in room if view.camera.world_to_camera[2, 0] > 0.7]
+    assert 2 < len(ahead) < 10
+    pieces = shell_patches(ahead, None, 8.0, 800)
+    behind = np.linalg.norm(pieces.points, axis=1)
+    assert behind.max() > 1.15 * behind.min()
+    mesh = fans_of(flat_splats(pieces), 6)
+    colors = colored(mesh, ahead, None, 0).colors[:, :3]
+    assert np.abs(colors - 0.5).max(axis=1).min() > 0  # from the photographs, or from the nearest piece
+    for view in ahead:
+        camera, margin = view.camera, round(0.9 * view.camera.width)
+        side = camera.width + 2 * margin
+        assert render(mesh, camera.window(-margin, -margin, side, side)).alpha.min() > 0.8
+    away = np.mean([view.camera.world_to_camera[2, :3] for view in ahead], axis=0)
+    assert (pieces.points @ away / behind).min() > -0.9
+
+
+def test_surfaces_between_matched_depths_start_faint():
+    """So that the views decide whether they are there: they may hang in front of a sky."""
+    found = SurfacePoints.joined(
+        SurfacePoints.alike(np.zeros((3, 3)), np.full((3, 3), 0.2, np.float32), 1, 0.8),
+        SurfacePoints.alike(np.zeros((1, 3)), np.full((1, 3), 0.6, np.float32), 2, 0.2),
+        SurfacePoints.alike(np.full((5, 3), 10.0), np.full((5, 3), 0.6, np.float32), 2, 0.2),
+    )
+    patches = merged(found, np.full(9, 0.1), 10)
+    order = patches.points[:, 0].argsort()
+    assert patches.opacities[order] == pytest.approx([(3 * 0.8 + 2 * 0.2) / 5, 0.2])
+    assert flat_splats(patches).opacities == pytest.approx(patches.opacities)
 
 
 def test_known_points_are_part_of_the_start(room):

@@ -15,7 +15,7 @@ from meshsplats.cli import main
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.evaluation.report import evaluate
-from meshsplats.finetuning import Interrupted, RunOptions
+from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.ranks import Ranks
 from meshsplats.finetuning.run import run_start
@@ -283,8 +283,22 @@ def test_opacities_decay_where_a_view_reaches_them(ball, start):
 # ---- Schedule
 
 
+def test_the_unit_of_the_scene_does_not_matter(start):
+    """Neither Adam's epsilon nor a rate has the dimension of a length."""
+    config, moved = make_config(steps=12, epsilon=train_config().epsilon), []
+    for scale in (1.0, 1024.0):
+        cameras = cameras_around(6, scale=scale)
+        views = tuple(ball_view(camera, scale) for camera in cameras)
+        mesh = replace(start, vertices=start.vertices * np.float32(scale))
+        tuned = finetune(mesh, Dataset(views), config)
+        moved.append((tuned.vertices - mesh.vertices) / np.float32(scale))
+    size = np.abs(moved[0]).mean()
+    assert size > 1e-3
+    assert np.abs(moved[1] - moved[0]).mean() < 0.05 * size
+
+
 def test_the_schedule_grows_images_and_budget():
-    config = train_config(steps=100, max_splats=1000, growth_events=5, growth_end=0.5)
+    config = train_config(steps=100, max_splats=1000, growth_events=5, growth_end=0.5, half_share=0.4)
     assert [image_factor(config, f) for f in (0, 0.0999, 0.1, 0.3999, 0.4, 1)] == [
         *(0.25, 0.25, 0.5),
         *(0.5, 1.0, 1.0),

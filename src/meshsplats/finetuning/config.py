@@ -17,6 +17,8 @@ BackgroundMode = Literal["mixed", "random", "white", "black"]
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
 
+_POSITION_EPSILON = 1e-15
+
 FEWEST_VIEWS, MOST_VIEWS = 200, 1000
 """Number of training images rendered from splats: for a short run, and for the longest."""
 
@@ -63,7 +65,8 @@ class FinetuneConfig:
     beta2: float = 0.9
     """Adam's decay rate of the second moment. Low: a vertex is seen tens of times, not thousands."""
     epsilon: float = 1e-15
-    """Adam's epsilon, added to the denominator."""
+    """Adam's epsilon, added to the denominator. With ``position_unit`` 'splat', positions have 1e-15: their
+    gradients depend on the unit of the scene."""
     ssim_weight: float = 0.4
     """Weight of SSIM against L1 in the loss, 0 to 1."""
     l2_weight: float = 50.0
@@ -130,6 +133,9 @@ class FinetuneConfig:
     """For rendered images that are means over each pixel's area: for this initial fraction of the run, train
     on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
     pixel without averaging. 0: train on means only."""
+    one_sample_share: float = 0.0
+    """For photographs: for this initial fraction of the run, draw one sample per pixel. A step then takes about
+    half the time."""
     batch: int = 1
     """Views whose gradients are summed for a step, which then counts as that many steps: a run of the same
     length sees as many views. Learning rates are multiplied by its square root. For runs on several ranks,
@@ -240,6 +246,7 @@ _RANGES: list[Range] = [
     ("soft_share", 0, 1, False),
     ("soft_phase", 0.01, 0.99, False),
     ("point_share", 0, 1, False),
+    ("one_sample_share", 0, 1, False),
     ("batch", 1, 4096, True),
     ("seed", 0, 2**63 - 1, True),
 ]
@@ -317,6 +324,7 @@ class FinetuneChanges(TypedDict, total=False):
     soft_share: float
     soft_phase: float
     point_share: float
+    one_sample_share: float
     batch: int
     seed: int
 
@@ -352,6 +360,11 @@ def worthwhile_views(config: FinetuneConfig) -> int:
     """
     wanted = 60 * config.minutes if config.minutes is not None else (config.steps or 0) / 2
     return round(min(max(wanted, FEWEST_VIEWS), MOST_VIEWS))
+
+
+def epsilons(config: FinetuneConfig) -> tuple[float, float]:
+    """Adam's epsilon for colours, and for positions."""
+    return config.epsilon, config.epsilon if config.position_unit == "scene" else _POSITION_EPSILON
 
 
 def learning_rates(config: FinetuneConfig, step: float, fraction: float) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from meshsplats.errors import FileFormatError
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
-from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.config import FinetuneConfig, epsilons
 from meshsplats.finetuning.hybrid import MAX_OPACITY
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
@@ -81,17 +81,20 @@ class State:
         self._trainer: Trainer | None = None
         self._ahead = False  # whether the trainer has taken steps that the arrays here do not have
         self.exposures = None if exposures is None else exposures.copy()
-        adam = partial(RowAdam, betas=(config.beta1, config.beta2), eps=config.epsilon, threads=threads)
+        adam = partial(RowAdam, betas=(config.beta1, config.beta2), threads=threads)
+        color_epsilon, position_epsilon = epsilons(config)
         self.bound = None if mesh.binding is None else BoundPositions(mesh.binding)
         if self.bound is not None:
-            self._positions = adam(self.bound.weights, lr=1.0, scale=sizes)
+            self._positions = adam(self.bound.weights, lr=1.0, scale=sizes, eps=position_epsilon)
         else:
             unit = sizes if config.position_unit == "splat" else None
-            self._positions = adam(self._vertices, lr=1.0, scale=unit)
-        self._colors = adam(self._rgba, lr=1.0, bounds=(0, 1))
+            self._positions = adam(self._vertices, lr=1.0, scale=unit, eps=position_epsilon)
+        self._colors = adam(self._rgba, lr=1.0, bounds=(0, 1), eps=color_epsilon)
         # Depends on the triangles alone, so that a resumed run finds the same boundary.
         self._boundary = boundary_vertices(mesh.faces, len(mesh.vertices)) if config.soft_edges else None
-        self._exposures = None if self.exposures is None else adam(self.exposures, lr=config.exposure_rate)
+        self._exposures = None
+        if self.exposures is not None:
+            self._exposures = adam(self.exposures, lr=config.exposure_rate, eps=color_epsilon)
         relocates = config.relocate_share and self.bound is None
         self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
         self.solid: np.ndarray | None = None
@@ -315,7 +318,7 @@ class State:
                 target,
                 mask,
                 background,
-                Rates(*loss, steps[0], (*steps, 0.0)[1], (config.beta1, config.beta2), config.epsilon),
+                Rates(*loss, steps[0], (*steps, 0.0)[1], (config.beta1, config.beta2), epsilons(config)),
             )
         if sums.finite:
             self._ahead = True

@@ -124,12 +124,14 @@ class RenderedView:
         return gradients
 
 
-def samples_of(view: View, config: FinetuneConfig) -> int:
-    """Samples along each side of a pixel when the mesh is compared with ``view``."""
+def samples_of(view: View, config: FinetuneConfig, fraction: float = 1.0) -> int:
+    """Samples along each side of a pixel when the mesh is compared with ``view``, after this ``fraction`` of
+    the run."""
     if config.samples is not None:
         return config.samples
-    viewer = isinstance(view.source, RenderedSplats) and view.source.look == "splats"
-    return 1 if viewer else AREA_SAMPLES
+    if isinstance(view.source, RenderedSplats):
+        return 1 if view.source.look == "splats" else AREA_SAMPLES
+    return 1 if fraction < config.one_sample_share else AREA_SAMPLES
 
 
 def render_view(
@@ -314,7 +316,7 @@ def view_gradients(
         return None
     # Viewers shade a pixel once, with MSAA too: values at pixel centres must be right as well as means.
     centers = points or (hybrid and config.samples is None and step % 2 == 1)
-    samples = 1 if centers else samples_of(view, config)
+    samples = 1 if centers else samples_of(view, config, fraction)
     ramp = None if hybrid else ramp_of(config, fraction)
     rendered = render_view(state, view, target.background, samples, ramp)
     image = rendered.color
@@ -344,7 +346,7 @@ def _step_on_gpu(state: State, view: View, step: int, fraction: float) -> float 
     mask = target.mask
     if mask is not None and not mask.any():
         return None
-    samples = 1 if points else samples_of(view, config)
+    samples = 1 if points else samples_of(view, config, fraction)
     rates = learning_rates(config, step, fraction)
     loss_by = loss_rates(config, target)
     settings = DrawSettings(

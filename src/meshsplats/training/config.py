@@ -20,6 +20,10 @@ class TrainConfig(FinetuneConfig):
     rate_steps: int = 1000
     prune_epochs: float = 0.0
     opacity_decay: float = 0.003
+    epsilon: float = 1e-8
+    """Adam's epsilon for colours, added to the denominator. It is about a hundredth of the gradient of a
+    pixel that has an error: what views hardly reach, at their borders, does not take whole steps."""
+    one_sample_share: float = 0.85
     exposure_rate: float = 0.01
     max_splats: int = 100_000
     """Largest number of fans."""
@@ -33,7 +37,7 @@ class TrainConfig(FinetuneConfig):
     """Share of the run at the last of these times."""
     quarter_share: float = 0.1
     """First share of the run, in which images have a quarter of the photographs' sides."""
-    half_share: float = 0.4
+    half_share: float = 0.6
     """Share of the run until which they have half of them; then they have all."""
     background: BackgroundMode = "mixed"
     """Background of the images. random: a new colour in every step, which masked photographs show around the

@@ -18,7 +18,7 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TapedRendering
 from meshsplats.training.hull import carve, has_silhouettes, in_silhouettes
-from meshsplats.training.patches import Patches, merged, sums_around
+from meshsplats.training.patches import Patches, SurfacePoints, merged, sums_around
 from meshsplats.training.stereo import SIDE, WITNESSES, dense_points
 
 COLOR_VIEWS = 40
@@ -27,6 +27,8 @@ NEAREST_POINTS = 2000
 """Points, at most, among which the nearest is looked for."""
 OPACITY = 0.8
 """Opacity of fans at the start."""
+FILL_OPACITY = 0.2
+"""That of fans between matched depths, which may hang in front of a sky: the views decide."""
 SIGMA = 0.6
 """Standard deviation of a fan on a surface, in sides of its patch."""
 ROUGH_CELLS = 5000
@@ -46,6 +48,12 @@ SHELL_VIEWS, SHELL_SIDE = 48, 100
 where the shell is needed."""
 SHELL_MARGIN = 0.25
 """Share of these images by which they are widened to each side, for the views between them."""
+BACKDROP_MARGIN = 1.0
+"""The same for the coarse backdrop of the shell: views from new places see past what the photographs show."""
+BACKDROP_SHARE = 0.2
+"""Pieces of a whole sphere as coarse as the backdrop, as a share of those of the shell."""
+BACKDROP_DISTANCE = 1.25
+"""Radius of the backdrop, as a multiple of that of the shell."""
 COVERED = 0.98
 """Alpha of the other fans from which the shell is not needed behind them."""
 FILL_WEIGHT = 2
@@ -69,19 +77,19 @@ def starting_patches(
         known = None
     near, far, targets = ranges_of_points(views, known) if known is not None else ranges_of_cameras(views)
     depths = dense_points(views, near, far, targets)
-    between, tints_between = depths.between()
-    places = np.concatenate([depths.points, between])
-    colors = np.concatenate([depths.colors, tints_between])
-    weights = np.concatenate([np.full(len(depths.points), 1.0), np.full(len(between), float(FILL_WEIGHT))])
+    parts = [
+        SurfacePoints.alike(depths.points, depths.colors, 1, OPACITY),
+        SurfacePoints.alike(*depths.between(), FILL_WEIGHT, FILL_OPACITY),
+    ]
     if known is not None and points is not None:
-        tracked = points.views >= MIN_TRACK
-        tints = points.colors[tracked].astype(np.float32) / np.float32(255)
-        places, colors = np.concatenate([places, known]), np.concatenate([colors, tints])
-        weights = np.concatenate([weights, np.full(len(known), float(WITNESSES))])
+        tints = points.colors[points.views >= MIN_TRACK].astype(np.float32) / np.float32(255)
+        parts.append(SurfacePoints.alike(known, tints, WITNESSES, OPACITY))
+    surfaces = SurfacePoints.joined(*parts)
+    places = surfaces.positions
     shell = int(SHELL_SHARE * count)
     dense = None
     if len(places):
-        dense = merged(places, colors, pixel_sizes(views, places), weights, count - shell)
+        dense = merged(surfaces, pixel_sizes(views, places), count - shell)
     return dense, shell_patches(views, dense, shell_radius(views, places, far), shell)
 
 
@@ -100,11 +108,11 @@ def _masked_patches(views: Sequence[View], count: int) -> Patches:
     points, colors = depths.points[inside], depths.colors[inside]
     hull = carve(views, count // 2, lambda points: depths.free(points) < FREE_VIEWS)
     hull = rough if hull is None else hull
-    grey = np.full((len(hull.points), 3), 0.5, np.float32)
-    rest = Patches(hull.points, hull.normals, grey, np.full(len(hull.points), hull.side))
+    rest = _uncolored(hull.points, hull.normals, hull.side)
     if not len(points):
         return rest
-    dense = merged(points, colors, pixel_sizes(views, points), np.ones(len(points)), count)
+    surfaces = SurfacePoints.alike(points, colors, 1, OPACITY)
+    dense = merged(surfaces, pixel_sizes(views, points), count)
     return Patches.joined(dense, rest.select(apart(hull.points, dense.points, 1.5 * hull.side)))
 
 
@@ -175,7 +183,7 @@ def shell_patches(
     views: Sequence[View], patches: Patches | None, radius: float, count: int
 ) -> Patches | None:
     """About ``count`` pieces of a sphere of ``radius`` around the cameras, where views see it past
-    ``patches``."""
+    ``patches``, and a coarse backdrop behind them, which is much wider."""
     middle = np.median(np.array([view.camera.center for view in views]), axis=0)
     mesh = None if patches is None else fans_of(flat_splats(patches), 4)
     looks = []
@@ -185,11 +193,9 @@ def shell_patches(
         if mesh is not None:
             covered = render(mesh, camera).alpha
         # Views between these see a little more than they do.
-        x, y = (round(SHELL_MARGIN * side) for side in (camera.width, camera.height))
-        covered = np.pad(covered, ((y, y), (x, x)))
-        height, width = covered.shape
-        wider = replace(camera, width=width, height=height, cx=camera.cx + x, cy=camera.cy + y)
-        looks.append((wider, covered))
+        wider = _widened(camera, SHELL_MARGIN)
+        x, y = (wider.width - camera.width) // 2, (wider.height - camera.height) // 2
+        looks.append((wider, np.pad(covered, ((y, y), (x, x)))))
     total = 4 * count
     for _ in range(4):
         directions = _sphere(total)
@@ -203,13 +209,37 @@ def shell_patches(
         found = int(needed.sum())
         if not found:
             return None
-        if found > 0.8 * count or total >= 64 * count:
+        if 0.8 * count < found <= 1.2 * count or (found < count and total >= 64 * count):
             break
-        total = min(int(total * count / found), 64 * count)
+        total = min(max(int(total * count / found), 1), 64 * count)
+    backdrop = _sphere(max(round(BACKDROP_SHARE * count), 1))
+    behind = middle + BACKDROP_DISTANCE * radius * backdrop
+    seen = np.any([_widened(view.camera, BACKDROP_MARGIN).sees(behind) for view in views], axis=0)
+    return Patches.joined(
+        _pieces(middle, radius, directions[needed], len(directions)),
+        _pieces(middle, BACKDROP_DISTANCE * radius, backdrop[seen], len(backdrop)),
+    )
+
+
+def _widened(camera: Camera, margin: float) -> Camera:
+    """``camera`` with an image that is wider by a ``margin``, as a share of it, on each side."""
+    x, y = (round(margin * side) for side in (camera.width, camera.height))
+    return camera.window(-x, -y, camera.width + 2 * x, camera.height + 2 * y)
+
+
+def _pieces(middle: np.ndarray, radius: float, directions: np.ndarray, total: int) -> Patches:
+    """Those in the given ``directions`` (n, 3) of ``total`` pieces of a sphere around ``middle``."""
     side = radius * np.sqrt(4 * np.pi / total)
-    grey = np.full((found, 3), 0.5, np.float32)
     # Pieces overlap, as nothing is behind them.
-    return Patches(places[needed], -directions[needed], grey, np.full(found, 1.6 * side))
+    return _uncolored(middle + radius * directions, -directions, 1.6 * side)
+
+
+def _uncolored(points: np.ndarray, normals: np.ndarray, side: float) -> Patches:
+    """Grey patches of equal ``side`` at ``points`` (n, 3)."""
+    n = len(points)
+    return Patches(
+        points, normals, np.full((n, 3), 0.5, np.float32), np.full(n, float(side)), np.full(n, OPACITY)
+    )
 
 
 def _sphere(count: int) -> np.ndarray:
@@ -240,7 +270,7 @@ def depth_ranges(views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray,
 
 def flat_splats(patches: Patches) -> GaussianCloud:
     """A flat splat on each of ``patches``."""
-    normals, n = patches.normals, len(patches.points)
+    normals = patches.normals
     least = np.eye(3)[np.abs(normals).argmin(axis=1)]
     first = np.cross(normals, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -249,7 +279,7 @@ def flat_splats(patches: Patches) -> GaussianCloud:
         patches.points,
         quaternions_of(frames),
         SIGMA * patches.sides[:, None] * [1, 1, 0],
-        np.full(n, OPACITY),
+        patches.opacities,
         (patches.colors[:, None] - 0.5) / SH_C0,
         kernel="2dgs",
     )

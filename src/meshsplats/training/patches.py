@@ -14,6 +14,28 @@ _REACH = 2**17
 lose the digits that tell a plane."""
 
 
+class SurfacePoints(NamedTuple):
+    """Points on surfaces, to be merged to patches."""
+
+    positions: np.ndarray
+    """(n, 3) float64."""
+    colors: np.ndarray
+    """(n, 3) float32 display RGB."""
+    weights: np.ndarray
+    """(n,) float64 weight of each in a patch."""
+    opacities: np.ndarray
+    """(n,) float64 opacity that its patch has at the start."""
+
+    @classmethod
+    def alike(cls, positions: np.ndarray, colors: np.ndarray, weight: float, opacity: float) -> SurfacePoints:
+        """Points of equal ``weight`` and ``opacity``."""
+        return cls(positions, colors, *(np.full(len(positions), float(v)) for v in (weight, opacity)))
+
+    @classmethod
+    def joined(cls, *parts: SurfacePoints) -> SurfacePoints:
+        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
 class Patches(NamedTuple):
     """Small pieces of surfaces."""
 
@@ -25,6 +47,8 @@ class Patches(NamedTuple):
     """(n, 3) float32 display RGB."""
     sides: np.ndarray
     """(n,) float64 side of the piece, scene units."""
+    opacities: np.ndarray
+    """(n,) float64 opacity at the start."""
 
     def select(self, rows: np.ndarray) -> Patches:
         """Those of a mask or of indices."""
@@ -35,15 +59,13 @@ class Patches(NamedTuple):
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def merged(
-    points: np.ndarray, colors: np.ndarray, pixels: np.ndarray, weights: np.ndarray, count: int
-) -> Patches:
-    """About ``count`` patches, at most, for ``points`` (n, 3).
+def merged(found: SurfacePoints, pixels: np.ndarray, count: int) -> Patches:
+    """About ``count`` patches, at most, for n points ``found``.
 
     Cells have sides in proportion to ``pixels`` (n,), the size of a pixel at each point, in powers of 2.
-    Points are merged with their ``weights`` (n,); cells with a weight of 1 or less are left out if others
-    have more.
+    Points are merged with their weights; cells with a weight of 1 or less are left out if others have more.
     """
+    points, weights = found.positions, found.weights
     octave = np.round(np.log2(pixels / np.median(pixels))).astype(np.int64)
     octave = np.clip(octave, -8, 12)
     low = points.min(axis=0)
@@ -64,14 +86,15 @@ def merged(
         columns = [np.bincount(group, weights * column) / total for column in values.T]
         return np.stack(columns, axis=1)
 
-    places, tints = mean(points), mean(colors)
+    places, tints = mean(points), mean(found.colors)
     side = large * 2.0 ** octave[first]
     total = np.bincount(group, weights)
     keep = total > 1
     if not keep.any():
         keep[:] = True
     normals = plane_normals(points, places, side)
-    return Patches(places[keep], normals[keep], tints[keep].astype(np.float32), side[keep])
+    opacities = mean(found.opacities[:, None])[:, 0]
+    return Patches(places[keep], normals[keep], tints[keep].astype(np.float32), side[keep], opacities[keep])
 
 
 def _keys(offsets: np.ndarray, octave: np.ndarray, side: float) -> np.ndarray:

@@ -51,7 +51,8 @@ class Rates:
     positions: float
     """Learning rates with Adam's bias corrections; 0: positions are fixed."""
     betas: tuple[float, float]
-    epsilon: float
+    epsilons: tuple[float, float]
+    """Adam's, for colours and for positions."""
 
 
 class Sums(NamedTuple):
@@ -250,7 +251,7 @@ class Trainer(GradientRenderer):
         words = data.view(np.uint32)
         camera = forward.camera
         words[:8] = camera.width, camera.height, *area, forward.settings.samples, tiles
-        data[8:11] = background
-        data[12:16] = rates.l1, rates.ssim, rates.l2, rates.epsilon
+        data[8:12] = *background, rates.epsilons[1]
+        data[12:16] = rates.l1, rates.ssim, rates.l2, rates.epsilons[0]
         data[16:20] = rates.colors, rates.positions, 1 - rates.betas[0], 1 - rates.betas[1]
         self.device.device.queue.write_buffer(self._buffers["step"], 0, data)

@@ -6,9 +6,9 @@ struct Step {
   columns: u32, rows: u32,               // size of the window
   samples: u32,                          // side of the grid of samples in a pixel
   tiles: u32,                            // of the window
-  background: vec4f,                     // RGB
+  background: vec4f,                     // RGB; Adam's epsilon for positions
   l1_rate: f32, ssim_rate: f32, l2_rate: f32,  // derivatives of the loss with respect to the sums
-  epsilon: f32,
+  epsilon: f32,                          // Adam's for colours
   color_step: f32, position_step: f32,   // learning rates with bias corrections; 0: positions are fixed
   one_minus_beta1: f32, one_minus_beta2: f32,
 };
@@ -237,6 +237,6 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
     p * p - position_moments[2u * i + 1u].xyz, vec3f(step_of.one_minus_beta2), position_moments[2u * i + 1u].xyz);
   position_moments[2u * i] = vec4f(p_mean, 0.0);
   position_moments[2u * i + 1u] = vec4f(p_square, 0.0);
-  let change = step_of.position_step * traits[i].x * (p_mean / (sqrt(p_square) + step_of.epsilon));
+  let change = step_of.position_step * traits[i].x * (p_mean / (sqrt(p_square) + step_of.background.w));
   for (var k = 0u; k < 3u; k++) { vertices[3u * i + k] -= change[k]; }
 }
