@@ -1,4 +1,4 @@
-"""Photographs of a still life to a mesh: the folder, the training, scores on photographs that it has not seen.
+"""Photographs of a still life to a mesh: the folder, the training, scores on held-out photographs.
 
 python examples/08_photographs.py [count] [pixels] [steps]      Writes into example-output/photos/.
 """

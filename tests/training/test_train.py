@@ -16,6 +16,7 @@ from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.errors import DataWarning, MissingDependencyError
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
+from meshsplats.finetuning import step as training_step
 from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.ranks import Ranks
 from meshsplats.finetuning.run import run_start
@@ -281,6 +282,22 @@ def test_opacities_decay_where_a_view_reaches_them(ball, start):
 
 
 # ---- Schedule
+
+
+def test_photographs_have_one_sample_a_pixel_at_first(ball, start, monkeypatch):
+    drawn = []
+
+    def noted(*args, **more):
+        drawn.append(more["samples"])
+        return real(*args, **more)
+
+    real = training_step.taped_rendering
+    monkeypatch.setattr(training_step, "taped_rendering", noted)
+    finetune(start, ball, make_config(steps=4, one_sample_share=0.5), run=RunOptions(report_every=0))
+    finetune(
+        start, ball, make_config(steps=2, one_sample_share=0.5, samples=3), run=RunOptions(report_every=0)
+    )
+    assert drawn == [1, 1, 2, 2, 3, 3]
 
 
 def test_the_unit_of_the_scene_does_not_matter(start):

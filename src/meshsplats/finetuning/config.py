@@ -134,8 +134,8 @@ class FinetuneConfig:
     on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
     pixel without averaging. 0: train on means only."""
     one_sample_share: float = 0.0
-    """For photographs: for this initial fraction of the run, draw one sample per pixel. A step then takes about
-    half the time."""
+    """For photographs: for this initial fraction of the run, draw one sample per pixel, which takes half the
+    time."""
     batch: int = 1
     """Views whose gradients are summed for a step, which then counts as that many steps: a run of the same
     length sees as many views. Learning rates are multiplied by its square root. For runs on several ranks,

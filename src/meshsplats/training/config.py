@@ -23,7 +23,6 @@ class TrainConfig(FinetuneConfig):
     epsilon: float = 1e-8
     """Adam's epsilon for colours, added to the denominator. It is about a hundredth of the gradient of a
     pixel that has an error: what views hardly reach, at their borders, does not take whole steps."""
-    one_sample_share: float = 0.85
     exposure_rate: float = 0.01
     max_splats: int = 100_000
     """Largest number of fans."""
