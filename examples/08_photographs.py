@@ -1,6 +1,6 @@
 """Photographs of a still life to a mesh: the folder, the training, scores on held-out photographs.
 
-python examples/08_photographs.py [count] [pixels] [steps]      Writes into example-output/photos/.
+python examples/08_photographs.py [count] [pixels] [steps]      Writes into example-output/.
 """
 
 import json
@@ -35,6 +35,7 @@ for i, camera in enumerate(ms.dome(cloud, count, width=side, height=side)):
 (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
 
 # The same as: meshsplats train example-output/photos -o example-output/trained.npz --steps 60
+# --start-splats 3000 --max-splats 8000
 data = ms.load_dataset(folder)
 mesh = ms.train(data, steps=steps, start_splats=3000, max_splats=8000)
 ms.save_mesh(mesh, folder.parent / "trained.npz")

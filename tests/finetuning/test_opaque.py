@@ -16,6 +16,7 @@ from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, Progress, RunOptions, finetune, make_config, starting_mesh
+from meshsplats.finetuning import step as training_step
 from meshsplats.finetuning.hybrid import (
     COLOR_SLOPE,
     ColorLimits,
@@ -255,6 +256,24 @@ def test_opaque_triangles_of_a_hybrid_mesh_keep_their_edges(foggy):
     assert (end.vertices[~solid] != start.vertices[~solid]).any()
     assert (end.colors[~solid, 3] <= np.float32(254 / 255)).all()
     assert np.array_equal(solid_faces(end), solid_faces(start))
+
+
+def test_the_initial_fraction_with_one_sample_does_not_begin_again_with_blended_triangles(foggy, monkeypatch):
+    dataset, mesh, _ = foggy
+    photographs = [replace(view, source=view.load()) for view in dataset.train]
+    start = with_soft_splats(cut_mesh(mesh), mesh, photographs, 0.2)
+    config = make_config(steps=8, opacity="cutoff", soft_share=0.2, one_sample_share=0.5)
+    state, drawn = State.begin_hybrid(start, config, 1), []
+
+    def noted(*args, **more):
+        drawn.append(more["samples"])
+        return real(*args, **more)
+
+    real = training_step.taped_rendering
+    monkeypatch.setattr(training_step, "taped_rendering", noted)
+    for step in range(6, 8):
+        make_step(state, photographs, step, step / 8)
+    assert drawn == [2, 1]  # every other step is at the pixel centres
 
 
 def test_colors_of_small_opaque_triangles_change_slowly_in_the_image():

@@ -58,6 +58,8 @@ OPTIONS = [
     {"ssim_weight": 0.0},
     {"soft_edges": False, "position_unit": "scene", "position_rate": 1e-3},
     {"position_rate": 0.0},
+    {"epsilon": 1e-3},
+    {"epsilon": 1e-3, "position_unit": "scene"},
     {"blending": "linear"},
     {"relocate_share": 0.1},
     {"exposure": True},

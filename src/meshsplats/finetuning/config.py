@@ -18,6 +18,7 @@ BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 LENGTHS = ("epochs", "steps", "minutes")
 
 _POSITION_EPSILON = 1e-15
+"""Adam's epsilon for positions in units of the splat."""
 
 FEWEST_VIEWS, MOST_VIEWS = 200, 1000
 """Number of training images rendered from splats: for a short run, and for the longest."""

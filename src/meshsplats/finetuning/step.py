@@ -316,7 +316,7 @@ def view_gradients(
         return None
     # Viewers shade a pixel once, with MSAA too: values at pixel centres must be right as well as means.
     centers = points or (hybrid and config.samples is None and step % 2 == 1)
-    samples = 1 if centers else samples_of(view, config, fraction)
+    samples = 1 if centers else samples_of(view, config, 1.0 if hybrid else fraction)
     ramp = None if hybrid else ramp_of(config, fraction)
     rendered = render_view(state, view, target.background, samples, ramp)
     image = rendered.color

@@ -214,7 +214,9 @@ def shell_patches(
         total = min(max(int(total * count / found), 1), 64 * count)
     backdrop = _sphere(max(round(BACKDROP_SHARE * count), 1))
     behind = middle + BACKDROP_DISTANCE * radius * backdrop
-    seen = np.any([_widened(view.camera, BACKDROP_MARGIN).sees(behind) for view in views], axis=0)
+    seen = np.zeros(len(behind), bool)
+    for view in views:
+        seen |= _widened(view.camera, BACKDROP_MARGIN).sees(behind)
     return Patches.joined(
         _pieces(middle, radius, directions[needed], len(directions)),
         _pieces(middle, BACKDROP_DISTANCE * radius, backdrop[seen], len(backdrop)),

@@ -6,9 +6,10 @@ struct Step {
   columns: u32, rows: u32,               // size of the window
   samples: u32,                          // side of the grid of samples in a pixel
   tiles: u32,                            // of the window
-  background: vec4f,                     // RGB; Adam's epsilon for positions
+  background: vec3f,                     // RGB
+  position_epsilon: f32,                 // Adam's for positions
   l1_rate: f32, ssim_rate: f32, l2_rate: f32,  // derivatives of the loss with respect to the sums
-  epsilon: f32,                          // Adam's for colours
+  color_epsilon: f32,                    // Adam's for colours
   color_step: f32, position_step: f32,   // learning rates with bias corrections; 0: positions are fixed
   one_minus_beta1: f32, one_minus_beta2: f32,
 };
@@ -50,7 +51,7 @@ fn store_window(@builtin(global_invocation_id) id: vec3u) {
   }
   sum *= 1.0 / f32(s * s);
   image[(step_of.y + id.y) * step_of.width + step_of.x + id.x] =
-    vec4f(sum.xyz + sum.w * step_of.background.xyz, sum.w);
+    vec4f(sum.xyz + sum.w * step_of.background, sum.w);
 }
 
 // Hands the gradient of the image to the samples of a window.
@@ -201,7 +202,7 @@ fn find_image_gradient(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocati
     workgroupBarrier();
   }
   if (here.x < i32(step_of.width) && here.y < i32(step_of.height)) {
-    image_gradient[u32(here.y) * step_of.width + u32(here.x)] = vec4f(gradient, dot(gradient, step_of.background.xyz));
+    image_gradient[u32(here.y) * step_of.width + u32(here.x)] = vec4f(gradient, dot(gradient, step_of.background));
   }
 }
 
@@ -226,7 +227,7 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
   let square = fma(g * g - color_moments[2u * i + 1u], vec4f(step_of.one_minus_beta2), color_moments[2u * i + 1u]);
   color_moments[2u * i] = mean;
   color_moments[2u * i + 1u] = square;
-  var moved = clamp(value - step_of.color_step * (mean / (sqrt(square) + step_of.epsilon)), vec4f(0.0), vec4f(1.0));
+  var moved = clamp(value - step_of.color_step * (mean / (sqrt(square) + step_of.color_epsilon)), vec4f(0.0), vec4f(1.0));
   if (traits[i].y == 1.0 && value.w == 0.0) { moved.w = 0.0; }
   values[i] = moved;
   if (step_of.position_step == 0.0) { return; }
@@ -237,6 +238,6 @@ fn adam(@builtin(global_invocation_id) id: vec3u) {
     p * p - position_moments[2u * i + 1u].xyz, vec3f(step_of.one_minus_beta2), position_moments[2u * i + 1u].xyz);
   position_moments[2u * i] = vec4f(p_mean, 0.0);
   position_moments[2u * i + 1u] = vec4f(p_square, 0.0);
-  let change = step_of.position_step * traits[i].x * (p_mean / (sqrt(p_square) + step_of.background.w));
+  let change = step_of.position_step * traits[i].x * (p_mean / (sqrt(p_square) + step_of.position_epsilon));
   for (var k = 0u; k < 3u; k++) { vertices[3u * i + k] -= change[k]; }
 }
