@@ -39,6 +39,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "8 sides": {"sides": 8},
     "position rates of short runs": {"rate_steps": 250},
     "no decay of opacities": {"opacity_decay": 0.0},
+    "fans of any shape": {"shape_decay": 0.0},
+    "rates and L2 of fine-tuning": {"color_rate": 0.02, "position_rate": 0.02, "l2_weight": 50.0},
 }
 OWN_VIEWS, OWN_SIZE, OWN_FANS = 40, (128, 96), 5_000
 HELD_OUT = 8

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 from _balls import ball_view, cameras_around
 from _photographs import write_photographs
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from PIL import Image
 
+from meshsplats._core.kernels import round_fans
 from meshsplats.cli import main
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.errors import DataWarning, MissingDependencyError
@@ -279,6 +283,84 @@ def test_opacities_decay_where_a_view_reaches_them(ball, start):
     assert np.array_equal(decayed[:, :3], whole[:, :3])
     np.testing.assert_allclose(decayed[reached, 3], 0.9 * whole[reached, 3], rtol=1e-6)
     assert (whole[reached, 3] > 0).any()
+
+
+# ---- Shapes
+
+
+def rims(sides: int) -> np.ndarray:
+    """(sides, 3) float64: a constant, cosines and sines of a regular polygon; affine images combine them."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    return np.stack([np.ones(sides), np.cos(angle), np.sin(angle)], axis=1)
+
+
+@pytest.mark.parametrize("sides", [3, 4, 6, 9, 16])
+def test_fans_move_to_the_nearest_ellipse(sides):
+    """By a share of the distance; the nearest affine image of a regular polygon is that of least squares."""
+    rng = np.random.default_rng(sides)
+    fans = (rng.normal(size=(50, 1 + sides, 3)) + 10 * rng.normal(size=(50, 1, 3))).astype(np.float32)
+    rim = fans[:, 1:].astype(np.float64)
+    found = np.linalg.lstsq(rims(sides), rim.transpose(1, 0, 2).reshape(sides, -1), rcond=None)[0]
+    nearest = (rims(sides) @ found).reshape(sides, 50, 3).transpose(1, 0, 2)
+    expected = np.concatenate([rim.mean(axis=1, keepdims=True), nearest], axis=1)
+    for share in (0.0, 0.25, 1.0):
+        moved = fans.copy()
+        round_fans(moved, share)
+        np.testing.assert_allclose(moved, fans + share * (expected - fans), rtol=0, atol=1e-5)
+
+
+@given(
+    arrays(np.float64, (3, 3), elements=st.floats(-100, 100)),
+    st.integers(3, 16),
+    st.floats(0, 1),
+    st.floats(-3, 3),
+)
+def test_ellipses_stay_whatever_their_affine_map_and_phase(affine, sides, share, phase):
+    turned = np.array([[1, 0, 0], [0, np.cos(phase), -np.sin(phase)], [0, np.sin(phase), np.cos(phase)]])
+    rim = rims(sides) @ turned @ affine
+    fan = np.concatenate([affine[:1], rim])[None].astype(np.float32)
+    moved = fan.copy()
+    round_fans(moved, share)
+    np.testing.assert_allclose(moved, fan, rtol=0, atol=1e-6 * (1 + np.abs(affine).sum()))
+
+
+def test_rounding_has_the_same_bits_with_any_number_of_threads():
+    fans = np.random.default_rng(0).normal(size=(10_000, 7, 3)).astype(np.float32)
+    results = [fans.copy() for _ in range(3)]
+    for threads, result in zip((1, 2, 5), results, strict=True):
+        round_fans(result, 0.3, threads)
+    assert not np.array_equal(results[0], fans)
+    assert all(np.array_equal(results[0], other) for other in results[1:])
+
+
+def test_shapes_decay_in_each_step_as_the_learning_rate_falls(ball, start):
+    """Steps without gradients of positions: each takes its share of the distance."""
+    bent = start.vertices.copy()
+    bent += 0.1 * np.random.default_rng(3).normal(size=bent.shape).astype(np.float32)
+    bent = replace(start, vertices=bent)
+    options = {"position_rate": 0.0, "rate_steps": 0, "shape_decay": 0.4, "final_share": 0.25}
+    config = train_config(steps=4, **SMALL | {"growth_events": 0}, **options)
+    run = RunOptions(report_every=0)
+    loop = GrowingLoop(run_start(bent, ball, config, run, None), ball, config, run, None, None)
+    mesh = loop.run()
+    ellipses = bent.vertices.reshape(-1, 7, 3).copy()
+    round_fans(ellipses, 1.0)
+    left = np.prod([1 - 0.4 * 0.25 ** (step / 4) for step in range(1, 5)])
+    distance = bent.vertices - ellipses.reshape(-1, 3)
+    assert len(mesh.vertices) == len(bent.vertices)
+    np.testing.assert_allclose(mesh.vertices, ellipses.reshape(-1, 3) + left * distance, rtol=0, atol=1e-5)
+
+
+def test_fans_of_a_training_are_nearly_ellipses(trained, ball):
+    def distance(mesh: SplatMesh) -> float:
+        fans = mesh.vertices.reshape(-1, 7, 3)
+        ellipses = fans.copy()
+        round_fans(ellipses, 1.0)
+        extent = np.square(fans - fans.mean(axis=1, keepdims=True)).sum()
+        return float(np.square(fans - ellipses).sum() / extent)
+
+    free = train(ball, train_config(steps=120, shape_decay=0.0, **SMALL))
+    assert distance(trained) < 0.01 < 0.05 < distance(free)
 
 
 # ---- Schedule

@@ -1,4 +1,5 @@
-"""The compiled core's part in fine-tuning, on NumPy arrays: losses between images, and Adam on selected rows.
+"""The compiled core's part in fine-tuning, on NumPy arrays: losses between images, Adam on selected rows, and
+shapes of fans.
 
 Callers have checked their arrays: C-contiguous, of the types and shapes named here.
 """
@@ -55,6 +56,19 @@ class AdamStruct(ctypes.Structure):
         ("epsilon", c_float),
         ("low", c_float),
         ("high", c_float),
+    ]
+
+
+class FansStruct(ctypes.Structure):
+    """MsFans of csrc/fans.h."""
+
+    _fields_ = [
+        ("count", c_int64),
+        ("sides", c_int32),
+        ("threads", c_int32),
+        ("vertices", c_void_p),
+        ("polygon", c_void_p),
+        ("share", c_double),
     ]
 
 
@@ -146,3 +160,24 @@ def adam_rows(
         high=bounds[1],
     )
     run("ms_adam_rows", adam)
+
+
+def round_fans(fans: np.ndarray, share: float, threads: int | None = None) -> None:
+    """Moves the vertices of ``fans`` in place by a ``share``, 0 to 1, of their distances to an ellipse: the
+    nearest affine image of a regular polygon, and its centre.
+
+    ``fans`` is (n, 1 + sides, 3) float32, centres first. The result has the same bits with any number of
+    ``threads`` (all processors by default) and on every instruction set.
+    """
+    sides = fans.shape[1] - 1
+    angle = 2 * np.pi * np.arange(sides) / sides
+    polygon = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    struct = FansStruct(
+        count=len(fans),
+        sides=sides,
+        threads=threads or processors(),
+        vertices=pointer(fans),
+        polygon=pointer(polygon),
+        share=share,
+    )
+    run("ms_round_fans", struct)

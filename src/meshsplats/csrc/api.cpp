@@ -6,6 +6,7 @@
 
 #include "adam.h"
 #include "cpu.h"
+#include "fans.h"
 #include "gradient.h"
 #include "hidden_new.h"
 #ifndef MS_NO_MERGING
@@ -212,7 +213,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 6; }
+MS_EXPORT int ms_interface_version() { return 7; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 
@@ -281,6 +282,10 @@ MS_EXPORT int ms_compare_images(MsComparison *comparison, char *message, int mes
 
 MS_EXPORT int ms_adam_rows(const MsAdam *adam, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::adam_rows(*adam); });
+}
+
+MS_EXPORT int ms_round_fans(const MsFans *fans, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::round_fans(*fans); });
 }
 
 #ifndef MS_NO_MERGING

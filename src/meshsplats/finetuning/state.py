@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._arrays import checked_array, nonzero_rows
+from meshsplats._core.kernels import round_fans
 from meshsplats.camera import Camera
 from meshsplats.colors import srgb_to_linear
 from meshsplats.errors import FileFormatError
@@ -100,6 +101,7 @@ class State:
         self.solid: np.ndarray | None = None
         self.frozen: np.ndarray | None = None
         self.limit = WindowLimit()
+        self._rounds = False  # whether fans change between steps, which the GPU would have to know
 
     @property
     def vertices(self) -> np.ndarray:
@@ -271,7 +273,7 @@ class State:
         """Whether ``step_on_gpu`` takes steps with images of that size.
 
         Others render on the GPU, and compare images and take their step here: those of base meshes,
-        exposures, linear light, relocation, decaying opacities, frozen vertices and depth groups.
+        exposures, linear light, relocation, decaying opacities and shapes, frozen vertices, depth groups.
         """
         return (
             self.device == "gpu"
@@ -281,6 +283,7 @@ class State:
             and self.solid is None
             and self.frozen is None
             and not self.config.opacity_decay
+            and not self._rounds
             and self.mesh.blending == "display"
             and self.mesh.depth_group is None
             and camera.width * camera.height <= MAX_PIXELS
@@ -375,6 +378,13 @@ class State:
                 self._colors.restart(rows, needed)
         self._sums.clear()
         return len(idle)
+
+    def round_fans(self, corners: int, share: float) -> None:
+        """Moves each fan of ``corners`` vertices, centre first, towards a flat ellipse, by a ``share`` of
+        the distance; for meshes that consist of such fans, one after the other."""
+        self._download()
+        self._trainer, self._rounds = None, True
+        round_fans(self._vertices.reshape(-1, corners, 3), share, self.threads)
 
     def prune(self, keep: np.ndarray) -> State:
         """The state with only the triangles marked in ``keep`` (f,) bool, and the vertices they use."""

@@ -18,6 +18,9 @@ class TrainConfig(FinetuneConfig):
     steps: int | None = None
     minutes: float | None = 10.0
     rate_steps: int = 1000
+    color_rate: float = 0.03
+    position_rate: float = 0.12
+    l2_weight: float = 10.0
     prune_epochs: float = 0.0
     opacity_decay: float = 0.003
     epsilon: float = 1e-8
@@ -30,6 +33,10 @@ class TrainConfig(FinetuneConfig):
     """About the number of fans at the start, at most max_splats."""
     sides: int = 6
     """Triangles of a fan, 3 to 16."""
+    shape_decay: float = 0.5
+    """Share of its distance to a flat ellipse that each vertex loses in a step. It falls as the colour
+    learning rate does. Six corners that move freely show each photograph what it alone has; held-out ones
+    lose. 0: they move freely."""
     growth_events: int = 6
     """Number of times that fans are halved and dropped. 0: their set stays as it is."""
     growth_end: float = 0.5
@@ -57,6 +64,7 @@ _RANGES: list[Range] = [
     ("max_splats", 1, 10**7, True),
     ("start_splats", 1, 10**7, True),
     ("sides", 3, 16, True),
+    ("shape_decay", 0, 1, False),
     ("growth_events", 0, 1000, True),
     ("growth_end", 0, 1, False),
     ("quarter_share", 0, 1, False),

@@ -15,6 +15,7 @@ from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import opaque_views, reduced_views
 from meshsplats.datasets.views import Dataset, ImageCache, View
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.finetuning.config import learning_rates
 from meshsplats.finetuning.interruption import Interrupted
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_bytes, estimate_bytes
@@ -26,6 +27,7 @@ from meshsplats.training.config import TrainConfig, with_train_changes
 from meshsplats.training.growth import (
     SHELL,
     NearFields,
+    corners_of,
     fan_count,
     grow,
     score,
@@ -223,6 +225,11 @@ class GrowingLoop(TrainingLoop):
         return self._reduced[factor]
 
     def _adapt(self, before: int) -> None:
+        if self.config.shape_decay:
+            # In proportion to the learning rate, as the steps that it is weighed against.
+            color_rate, _ = learning_rates(self.config, before, self.fraction)
+            share = self.config.shape_decay * color_rate / self.config.color_rate
+            self.state.round_fans(corners_of(self.state.mesh), min(share, 1.0))
         # In a run by minutes, a slow step or report may put the fraction back.
         before, self.events = self.events, max(self.events, events_passed(self.config, self.fraction))
         if self.events <= before or self._done():
