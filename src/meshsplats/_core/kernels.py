@@ -72,6 +72,29 @@ class FansStruct(ctypes.Structure):
     ]
 
 
+class EdgesStruct(ctypes.Structure):
+    """MsEdges of csrc/edges.h."""
+
+    _fields_ = [
+        ("width", c_int32),
+        ("height", c_int32),
+        ("samples", c_int32),
+        ("threads", c_int32),
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("screen", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("beyond", c_void_p),
+        ("front", c_void_p),
+        ("color", c_void_p),
+        ("gradient", c_void_p),
+        ("near", c_double),
+        ("cutoff", c_double),
+        ("result", c_void_p),
+    ]
+
+
 class Comparison(NamedTuple):
     """Sums over the channels and the pixels that count."""
 
@@ -181,3 +204,55 @@ def round_fans(fans: np.ndarray, share: float, threads: int | None = None) -> No
         share=share,
     )
     run("ms_round_fans", struct)
+
+
+def edge_gradients(
+    screen: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    beyond: np.ndarray,
+    front: np.ndarray,
+    image: np.ndarray,
+    gradient: np.ndarray,
+    *,
+    near: float,
+    cutoff: float,
+    threads: int | None = None,
+) -> np.ndarray:
+    """(v, 2) float64 gradient of a loss with respect to the vertices' positions in an image of opaque
+    triangles, in samples, by the motion of visible edges.
+
+    The result has the same bits with any number of ``threads`` (all processors by default).
+
+    Args:
+        screen: (v, 3) float64 x and y in samples, and depth.
+        faces, colors: (f, 3) int32 and (v, 4) float32, those of the mesh.
+        beyond: (f, 3) int32, that of ``corners_beyond`` in rendering/edges.py.
+        front: (h s, w s) int32 triangle in front at each of the s x s samples of a pixel, -1 for none.
+        image: (h s, w s, 3) float32 colour there.
+        gradient: (h, w, 3) float32 gradient of the loss with respect to the colour of each pixel.
+        near: least depth; triangles with a vertex in front of it get nothing.
+        cutoff: least opacity that is drawn.
+    """
+    height, width = gradient.shape[:2]
+    result = np.zeros((len(screen), 2))
+    struct = EdgesStruct(
+        width=width,
+        height=height,
+        samples=front.shape[0] // height,
+        threads=threads or processors(),
+        vertex_count=len(screen),
+        face_count=len(faces),
+        screen=pointer(screen),
+        colors=pointer(colors),
+        faces=pointer(faces),
+        beyond=pointer(beyond),
+        front=pointer(front),
+        color=pointer(image),
+        gradient=pointer(gradient),
+        near=near,
+        cutoff=cutoff,
+        result=pointer(result),
+    )
+    run("ms_edge_gradients", struct)
+    return result

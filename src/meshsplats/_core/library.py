@@ -17,7 +17,7 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 7
+INTERFACE_VERSION = 8
 
 
 class CameraStruct(ctypes.Structure):

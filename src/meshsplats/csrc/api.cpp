@@ -6,6 +6,7 @@
 
 #include "adam.h"
 #include "cpu.h"
+#include "edges.h"
 #include "fans.h"
 #include "gradient.h"
 #include "hidden_new.h"
@@ -213,7 +214,7 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 7; }
+MS_EXPORT int ms_interface_version() { return 8; }
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 
@@ -286,6 +287,10 @@ MS_EXPORT int ms_adam_rows(const MsAdam *adam, char *message, int message_size) 
 
 MS_EXPORT int ms_round_fans(const MsFans *fans, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::round_fans(*fans); });
+}
+
+MS_EXPORT int ms_edge_gradients(const MsEdges *edges, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::EdgePass(*edges).run(); });
 }
 
 #ifndef MS_NO_MERGING

@@ -3,7 +3,8 @@
 The hard cut at the cutoff has no derivative. In its place, a step renders a ramp of opacities around the
 level set, which becomes steeper until it is one pixel wide. A part of the loss is the expected error of
 images of random fragments: unlike that of the image, it does not accept a mean of layers for a color that
-none of them has.
+none of them has. Triangles that end at an edge, not at a level set, move by what the edge shows on its sides
+(``rendering/edges.py``).
 """
 
 from __future__ import annotations
@@ -16,18 +17,19 @@ from meshsplats._arrays import subsample
 from meshsplats.datasets.views import View
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering import render
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp
+from meshsplats.rendering.edges import front_faces
 
 STEEPEST = 30.0
 """Slope of the ramp at the end of the annealing, where it is not limited by its width already."""
 LEAK = 0.05
 """Derivative outside of the ramp at the start, so that hidden fragments can come back. It falls to 0."""
+EDGES_FROM = 0.4
+"""Share of the annealing after which the motion of edges counts: before, many triangles are translucent."""
 HIT_VIEWS = 64
 """Maximum number of training views, evenly spread, in which triangles are looked for."""
 HIT_SAMPLES = 2
 """Samples along each side of a pixel there."""
-_ROOT = 1024
 
 
 def ramp_of(config: FinetuneConfig, fraction: float) -> OpacityRamp | None:
@@ -41,6 +43,12 @@ def ramp_of(config: FinetuneConfig, fraction: float) -> OpacityRamp | None:
         slope=STEEPEST**done if done < 1 else 1e6,
         leak=LEAK * (1 - done),
     )
+
+
+def follows_edges(config: FinetuneConfig, fraction: float) -> bool:
+    """Whether positions follow the edges of opaque triangles, after ``fraction`` of the run."""
+    moves = config.opacity == "cutoff" and config.position_rate > 0
+    return moves and _annealed(config, fraction) >= EDGES_FROM
 
 
 def expected_share(config: FinetuneConfig, fraction: float) -> float:
@@ -76,22 +84,10 @@ def visible_faces(
     ``views`` together: at most ``HIT_VIEWS`` of them, with ``HIT_SAMPLES`` x ``HIT_SAMPLES`` samples. If
     ``cut_mesh`` makes more than ``most`` of them, only those with the most samples."""
     count = len(mesh.faces)
-    # Every triangle has corners of its own with its index, in two digits that float32 interpolates exactly.
-    indices = np.repeat(np.arange(count), 3)
-    indexed = SplatMesh(
-        mesh.vertices[mesh.faces].reshape(-1, 3),
-        np.arange(3 * count).reshape(-1, 3),
-        mesh.colors[mesh.faces].reshape(-1, 4),
-        depth_group=mesh.depth_group,
-        attributes={"index": np.stack([indices % _ROOT, indices // _ROOT], axis=1)},
-    )
     hits = np.zeros(count, np.int64)
     for view in subsample(views, HIT_VIEWS):
-        camera = view.camera.scaled(HIT_SAMPLES)
-        image = render(indexed, camera, cutoff=cutoff, attributes=("index",), threads=threads)
-        digits = np.rint(image.attributes["index"][image.alpha > 0.5]).astype(np.int64)
-        found = digits[:, 0] + _ROOT * digits[:, 1]
-        hits += np.bincount(found, minlength=count)
+        found = front_faces(mesh, view.camera.scaled(HIT_SAMPLES), cutoff, threads=threads).faces
+        hits += np.bincount(found[found >= 0], minlength=count)
     keep = hits >= fewest
     if most is not None:
         order = np.argsort(-hits, kind="stable")

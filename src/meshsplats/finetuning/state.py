@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering.api import Device
+from meshsplats.rendering.edges import corners_beyond
 from meshsplats.webgpu.device import open_device
 from meshsplats.webgpu.gradients import WindowLimit, check_limits
 from meshsplats.webgpu.renderer import WINDOW_SAMPLES, DrawSettings, gpu_errors
@@ -107,6 +108,11 @@ class State:
     def vertices(self) -> np.ndarray:
         self._download()
         return self._vertices
+
+    @cached_property
+    def beyond(self) -> np.ndarray:
+        """``corners_beyond`` of the triangles."""
+        return corners_beyond(self.mesh.faces)
 
     @property
     def colors(self) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -17,11 +18,12 @@ from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
 from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction
-from meshsplats.finetuning.opaque import expected_error, expected_share, ramp_of
+from meshsplats.finetuning.opaque import expected_error, expected_share, follows_edges, ramp_of
 from meshsplats.finetuning.ranks import ALONE, Part, Ranks
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.mesh import splat_starts
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
+from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
 from meshsplats.webgpu.gradients import WindowLimit
 from meshsplats.webgpu.renderer import DrawSettings
@@ -330,11 +332,24 @@ def view_gradients(
     if state.exposures is not None:
         grad_exposure = exposure_gradient(rendered.color, grad_image)
         grad_image = grad_image * exposure[GAIN]
+    edges = None
+    if not hybrid and follows_edges(config, fraction):
+        edges = edge_gradients(
+            replace(state.mesh, vertices=state.vertices, colors=state.colors),
+            view.camera,
+            config.cutoff,
+            grad_image,
+            background=target.background,
+            beyond=state.beyond,
+            threads=state.threads,
+        )
     expected, share = None, 0.0 if hybrid else expected_share(config, fraction)
     if share:
         expected = expected_error(target.color, target.mask, config, share)
         grad_image = grad_image * np.float32(1 - share)
     gradients = rendered.backward(grad_image, expected)._replace(exposure=grad_exposure)
+    if edges is not None:
+        np.add(gradients.vertices, edges, out=gradients.vertices)
     return ViewGradients(loss, gradients, gradients.finite())
 
 
