@@ -373,3 +373,26 @@ def test_only_fans_that_beat_opaque_triangles_stay_blended():
     views = [View(view, ViewImage(render(core, view, background=(1, 1, 1)).color))]
     assert softness(core, start, views)[1] < 0
     assert not is_blended(with_soft_splats(core, start, views, 0.5)).any()
+
+
+def test_opaque_triangles_move_to_where_their_edges_belong(monkeypatch):
+    view = camera(96, 72, fx=90.0, fy=80.0)
+    corners = np.array([(-0.5, -0.4, 2), (0.5, -0.3, 2), (0, 0.5, 2)])
+
+    def triangle(points: np.ndarray) -> SplatMesh:
+        return SplatMesh(points, [(0, 1, 2)], [(0.8, 0.1, 0.2, 1)] * 3)
+
+    target = render(triangle(corners), view, samples=8).color
+    views = (View(view, ViewImage(target)),)
+    start = triangle(corners + [0.06, 0.04, 0])  # about 3 pixels
+    config = make_config(steps=100, opacity="cutoff", anneal_share=0.1)
+
+    def distance(mesh: SplatMesh) -> float:
+        screen, truth = (view.project(points)[0] for points in (mesh.vertices, corners))
+        return float(np.abs(screen - truth).max())
+
+    moved = finetune(start, Dataset(views, ()), config)
+    assert distance(moved) < 0.3
+    # Nothing else draws it there.
+    monkeypatch.setattr(training_step, "follows_edges", lambda *_: False)
+    assert distance(finetune(start, Dataset(views, ()), config)) > 1

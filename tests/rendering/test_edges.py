@@ -128,6 +128,20 @@ def test_a_level_set_is_not_an_edge():
     assert np.abs(found[3]).max() < 1e-3
 
 
+def test_an_edge_just_below_the_cutoff_is_not_what_ends():
+    # The level set lies half a sample in front of the lowest edge: to move the edge moves nothing.
+    points = [(-0.6, 0.5, 2), (0.6, 0.5, 2), (0, -0.6, 2)]
+    loss = np.ones((VIEW.height, VIEW.width, 3), np.float32)
+    shares = []
+    for opacity in (CUTOFF + 0.001, CUTOFF - 0.001):
+        triangle = SplatMesh(points, [(0, 1, 2)], [(1, 0, 0, opacity)] * 2 + [(1, 0, 0, 1)])
+        found = edge_gradients(triangle, VIEW, CUTOFF, loss)
+        shares.append(abs(found[:, 1].sum()) / np.abs(found[:, 1]).sum())
+    # All edges of a triangle together: its area stays where it is shifted.
+    assert shares[0] < 0.02
+    assert shares[1] > 0.5
+
+
 def test_a_surface_ends_where_it_turns_back():
     # Two triangles with a common edge, the one in front of the other, and side by side.
     folded = [(-0.4, -0.5, 2), (0.4, -0.5, 2), (0.05, 0.5, 2), (0, 0.6, 3)]
