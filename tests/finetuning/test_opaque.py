@@ -384,7 +384,7 @@ def test_opaque_triangles_move_to_where_their_edges_belong(monkeypatch):
 
     target = render(triangle(corners), view, samples=8).color
     views = (View(view, ViewImage(target)),)
-    start = triangle(corners + [0.06, 0.04, 0])  # about 3 pixels
+    start = triangle(corners + np.array([0.06, 0.04, 0]))  # about 3 pixels
     config = make_config(steps=100, opacity="cutoff", anneal_share=0.1)
 
     def distance(mesh: SplatMesh) -> float:
