@@ -115,15 +115,15 @@ class FinetuneConfig:
     """opacity 'cutoff': share of the loss, from the end of the annealing on, that is l2_weight times the
     expected square error of images in which each fragment is opaque or not by chance. It makes layers agree
     with the target one by one, not only in their mean."""
-    settle_share: float = 0.15
+    settle_share: float | None = None
     """opacity 'cutoff': before this last fraction of the run, triangles that the training views do not show
-    are removed."""
+    are removed. None: 0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
     hidden_hits: int = 1
     """opacity 'cutoff': triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
     a pixel, are removed. 0: none."""
     opaque_share: float = 1.0
-    """opacity 'cutoff': budget of opaque triangles, as a fraction of the number at the start: about that many
-    stay, those in front at most samples. 1: all."""
+    """opacity 'cutoff': largest number of opaque triangles, as a fraction of the number at the start. Splats
+    become polygons of fewer corners, down to one triangle; the least visible ones go. 1: all stay."""
     soft_share: float = 0.0
     """opacity 'cutoff': faint splats that opaque triangles cannot replace stay blended, with up to this
     fraction of the number of triangles at the start. 0: none."""
@@ -146,7 +146,7 @@ class FinetuneConfig:
     number of threads, unless the length is given in minutes."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, _RANGES, optional=(*LENGTHS, "samples"))
+        check_ranges(self, _RANGES, optional=(*LENGTHS, "samples", "settle_share"))
         check_choices(self, _CHOICES)
         check_flags(self, ("exposure", "soft_edges"))
         if self.opacity == "cutoff":
@@ -319,7 +319,7 @@ class FinetuneChanges(TypedDict, total=False):
     cutoff: float
     anneal_share: float
     expected_share: float
-    settle_share: float
+    settle_share: float | None
     hidden_hits: int
     opaque_share: float
     soft_share: float

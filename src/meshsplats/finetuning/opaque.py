@@ -26,6 +26,8 @@ LEAK = 0.05
 """Derivative outside of the ramp at the start, so that hidden fragments can come back. It falls to 0."""
 EDGES_FROM = 0.4
 """Share of the annealing after which the motion of edges counts: before, many triangles are translucent."""
+SETTLES, SETTLES_IN_BUDGET = 0.15, 0.5
+"""Default of ``settle_share``: with all triangles, and with a budget, which changes their shapes."""
 HIT_VIEWS = 64
 """Maximum number of training views, evenly spread, in which triangles are looked for."""
 HIT_SAMPLES = 2
@@ -60,6 +62,13 @@ def _annealed(config: FinetuneConfig, fraction: float) -> float:
     return min(1.0, fraction / config.anneal_share) if config.anneal_share else 1.0
 
 
+def settle_share(config: FinetuneConfig) -> float:
+    """Last share of the opaque phase, in which the triangles stay that are left then."""
+    if config.settle_share is not None:
+        return config.settle_share
+    return SETTLES if config.opaque_share == 1 else SETTLES_IN_BUDGET
+
+
 def expected_error(
     target: np.ndarray, mask: np.ndarray | None, config: FinetuneConfig, share: float
 ) -> ExpectedError:
@@ -72,25 +81,14 @@ def expected_error(
     return ExpectedError(np.ascontiguousarray(known, np.float32), weight)
 
 
-def visible_faces(
-    mesh: SplatMesh,
-    views: Sequence[View],
-    cutoff: float,
-    fewest: int,
-    most: int | None = None,
-    threads: int | None = None,
+def visible_samples(
+    mesh: SplatMesh, views: Sequence[View], cutoff: float, threads: int | None = None
 ) -> np.ndarray:
-    """(f,) bool: the triangles that are in front, drawn with ``cutoff``, at ``fewest`` samples or more of all
-    ``views`` together: at most ``HIT_VIEWS`` of them, with ``HIT_SAMPLES`` x ``HIT_SAMPLES`` samples. If
-    ``cut_mesh`` makes more than ``most`` of them, only those with the most samples."""
+    """(f,) int64: at how many samples of all ``views`` together each triangle is in front, drawn with
+    ``cutoff``: at most ``HIT_VIEWS`` of them, with ``HIT_SAMPLES`` x ``HIT_SAMPLES`` samples."""
     count = len(mesh.faces)
     hits = np.zeros(count, np.int64)
     for view in subsample(views, HIT_VIEWS):
         found = front_faces(mesh, view.camera.scaled(HIT_SAMPLES), cutoff, threads=threads).faces
         hits += np.bincount(found[found >= 0], minlength=count)
-    keep = hits >= fewest
-    if most is not None:
-        order = np.argsort(-hits, kind="stable")
-        quadrilateral = (mesh.colors[mesh.faces, 3] >= cutoff).sum(axis=1) == 2
-        keep[order[np.cumsum(1 + quadrilateral[order]) > most]] = False
-    return keep
+    return hits

@@ -34,7 +34,8 @@ from meshsplats.finetuning.hybrid import (
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
-from meshsplats.finetuning.opaque import visible_faces
+from meshsplats.finetuning.opaque import settle_share, visible_samples
+from meshsplats.finetuning.outlines import fewer_triangles
 from meshsplats.finetuning.ranks import ALONE, Ranks
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
@@ -281,7 +282,7 @@ class TrainingLoop:
         self.source = start.mesh if config.soft_share else None
         self.limits: ColorLimits | None = None
         # A resumed run may have removed hidden triangles before its checkpoint.
-        self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - config.settle_share
+        self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - settle_share(config)
 
     @property
     def seconds(self) -> float:
@@ -376,22 +377,25 @@ class TrainingLoop:
     def _settles(self) -> bool:
         """Whether it is time to remove the triangles that no training view shows: once."""
         fraction = opaque_fraction(self.config, self.fraction)
-        due = self.config.opacity == "cutoff" and fraction >= 1 - self.config.settle_share
+        due = self.config.opacity == "cutoff" and fraction >= 1 - settle_share(self.config)
         now, self.settled = due and not self.settled, self.settled or due
         removes = self.config.hidden_hits > 0 or self.most_opaque is not None
         return now and removes and not self._done()
 
     def _remove_hidden(self) -> None:
-        keep = visible_faces(
-            self.state.result(),
-            self.dataset.train,
-            self.config.cutoff,
-            self.config.hidden_hits,
-            self.most_opaque,
-            self.options.threads,
-        )
-        if keep.any():
-            self.state = self.state.prune(keep)
+        """Removes what no training view shows, and keeps to the budget of opaque triangles."""
+        config, mesh = self.config, self.state.result()
+        cutoff, views, threads = config.cutoff, self.dataset.train, self.options.threads
+        if self.most_opaque is None:
+            keep = visible_samples(mesh, views, cutoff, threads) >= config.hidden_hits
+            if keep.any():
+                self.state = self.state.prune(keep)
+            return
+        mesh = cut_mesh(mesh, cutoff)
+        hits = visible_samples(mesh, views, cutoff, threads)
+        mesh = fewer_triangles(mesh, hits, self.most_opaque, config.hidden_hits)
+        if len(mesh.faces):
+            self.state = State.begin_opaque(mesh, config, threads)
 
     def _becomes_hybrid(self) -> bool:
         """Whether it is time to cut the mesh and to add blended triangles: once."""

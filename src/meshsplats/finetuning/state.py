@@ -158,6 +158,11 @@ class State:
         return state
 
     @classmethod
+    def begin_opaque(cls, mesh: SplatMesh, config: FinetuneConfig, threads: int | None) -> State:
+        """The state before the first step with the opaque triangles of ``mesh``, whose edges are visible."""
+        return cls(mesh, vertex_sizes(mesh), None, config, threads)
+
+    @classmethod
     def begin_hybrid(cls, mesh: SplatMesh, config: FinetuneConfig, threads: int | None) -> State:
         """The state before the first step with the opaque and blended triangles of ``mesh``."""
         state = cls(mesh, vertex_sizes(mesh), None, config, threads)
