@@ -10,7 +10,7 @@ from _rendering import camera
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats.finetuning.outlines import BEHIND, MAX_GROWTH, fewer_triangles
+from meshsplats.finetuning.outlines import BEHIND, MAX_CORNERS, MAX_GROWTH, fewer_triangles
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 
@@ -149,6 +149,19 @@ def test_triangles_of_splats_with_common_vertices_go_one_by_one():
     mesh = replace(mesh, face_splat=np.repeat([0, 1], 3).astype(np.int32))
     found = fewer_triangles(mesh, np.array([5, 1, 4, 2, 6, 3]), 4)
     assert corners(found) == corners(mesh, [0, 2, 4, 5])
+
+
+def test_triangles_in_an_outline_of_too_many_corners_go_one_by_one():
+    mesh = fan(np.ones(MAX_CORNERS + 1))
+    hits = np.arange(MAX_CORNERS + 1)
+    found = fewer_triangles(mesh, hits, 100)
+    assert corners(found) == corners(mesh, slice(MAX_CORNERS + 1 - 100, None))
+    assert len(fewer_triangles(fan(np.ones(MAX_CORNERS)), hits[1:], 100).vertices) == 102
+
+
+def test_an_empty_mesh_stays_empty():
+    mesh = fan(np.ones(4)).keep_faces(np.zeros(4, bool))
+    assert len(fewer_triangles(mesh, np.zeros(0), 0).faces) == 0
 
 
 def test_triangles_without_splats_go_one_by_one():

@@ -20,6 +20,8 @@ from meshsplats.rendering.backward import TapedRendering
 
 MAX_OPACITY = np.float32(254 / 255)
 """Greatest opacity of a corner of blended triangles, so that they differ from opaque ones."""
+SOLID = 1 - 0.5 / 255
+"""Least opacity of a fragment of opaque triangles, which blended ones do not reach."""
 ERROR_VIEWS = 24
 """Maximum number of training views, evenly spread, in which splats are compared with opaque triangles."""
 ERROR_SAMPLES = 2
@@ -103,15 +105,21 @@ class ColorLimits:
     it. A triangle much smaller than a pixel then shows colours that are extrapolated far beyond its corners.
 
     Attributes:
-        faces: those of the mesh that the limits are for.
+        limits: (n,) greatest difference of a corner from the mean of its triangle, for its opaque triangles.
     """
 
-    def __init__(self, mesh: SplatMesh, views: Sequence[View]) -> None:
+    def __init__(self, mesh: SplatMesh, limits: np.ndarray) -> None:
+        self.limits = limits
+        self._corners = mesh.faces[solid_faces(mesh)]
+        if limits.shape != (len(self._corners),):
+            raise ValueError(f"{len(self._corners)} opaque triangles, but limits of shape {limits.shape}")
+
+    @classmethod
+    def measured(cls, mesh: SplatMesh, views: Sequence[View]) -> ColorLimits:
         """Limits for the opaque triangles of ``mesh``, at the size that they have in ``views``, the median of
         those that see them. Triangles that no view sees have none."""
-        self.faces = mesh.faces
-        self._corners = mesh.faces[solid_faces(mesh)]
-        self._limits = COLOR_SLOPE * _least_heights(mesh.vertices[self._corners], views)
+        corners = mesh.vertices[mesh.faces[solid_faces(mesh)]]
+        return cls(mesh, COLOR_SLOPE * _least_heights(corners, views))
 
     def apply(self, colors: np.ndarray) -> None:
         """Moves RGB of vertices, ``colors`` (v, 4), in place: the corners of each triangle beyond its limit
@@ -120,8 +128,8 @@ class ColorLimits:
         mean = rgb.mean(axis=1, keepdims=True)
         difference = rgb - mean
         largest = np.abs(difference).max(axis=(1, 2))
-        beyond = np.flatnonzero(largest > self._limits)
-        share = (self._limits[beyond] / largest[beyond])[:, None, None]
+        beyond = np.flatnonzero(largest > self.limits)
+        share = (self.limits[beyond] / largest[beyond])[:, None, None]
         moved = (mean[beyond] + share * difference[beyond]).reshape(-1, 3)
         vertices = self._corners[beyond].ravel()
         counts = np.bincount(vertices, minlength=len(colors))

@@ -14,6 +14,8 @@ from meshsplats.mesh import SplatMesh
 
 BEHIND = 0.1
 """Estimated squared difference, summed over RGB, between a splat and what shows where it no longer is."""
+MAX_CORNERS = 128
+"""Greatest number of corners of an outline; those of fans have up to 64."""
 MAX_GROWTH = 2.0
 """Greatest factor by which a polygon grows to keep its area when it loses corners."""
 
@@ -156,11 +158,11 @@ def _loops(faces: np.ndarray, splat: np.ndarray, fan: np.ndarray) -> np.ndarray:
     several = np.bincount(tails[edges], minlength=vertices) > 1
     regular[edge_fan[several[tails[edges]]]] = False
     lengths = np.bincount(edge_fan, minlength=count)
-    regular &= lengths >= 3
+    regular &= (lengths >= 3) & (lengths <= MAX_CORNERS)
 
     first = np.zeros(count, np.int64)
     first[edge_fan] = tails[edges]
-    loops = np.full((count, lengths.max(initial=3)), -1)
+    loops = np.full((count, lengths[regular].max(initial=3)), -1)
     here = first.copy()
     for step in range(loops.shape[1]):
         on = regular & (step < lengths)

@@ -280,7 +280,6 @@ class TrainingLoop:
         share = config.opaque_share
         self.most_opaque = None if share == 1 else max(1, round(share * len(start.mesh.faces)))
         self.source = start.mesh if config.soft_share else None
-        self.limits: ColorLimits | None = None
         # A resumed run may have removed hidden triangles before its checkpoint.
         self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - settle_share(config)
 
@@ -412,9 +411,10 @@ class TrainingLoop:
             self.state = State.begin_hybrid(mesh, self.config, self.options.threads)
 
     def _limit_colors(self) -> None:
-        if self.limits is None or self.limits.faces is not self.state.mesh.faces:
-            self.limits = ColorLimits(self.state.result(), self.dataset.train)
-        self.limits.apply(self.state.colors)
+        state = self.state
+        if state.color_limits is None:
+            state.color_limits = ColorLimits.measured(state.result(), self.dataset.train)
+        state.color_limits.apply(state.colors)
 
     def _done(self) -> bool:
         if self.limit is not None:

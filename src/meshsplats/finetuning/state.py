@@ -18,7 +18,7 @@ from meshsplats.finetuning.adam import RowAdam
 from meshsplats.finetuning.bound import BoundPositions, weight_units
 from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig, epsilons
-from meshsplats.finetuning.hybrid import MAX_OPACITY
+from meshsplats.finetuning.hybrid import MAX_OPACITY, ColorLimits
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh, solid_faces
@@ -63,7 +63,8 @@ class State:
         exposures: (views, 6) float32: gain and offset of red, green and blue for each training view; None if
             they are not fitted.
         solid: for a mesh of opaque and blended triangles, (v,) bool: the vertices of opaque ones, whose
-            positions and opacities stay; otherwise None.
+            opacities stay; otherwise None.
+        color_limits: of opaque triangles beside blended ones; None before they are measured.
         frozen: (v,) bool: vertices whose positions and colours stay; None if there are none.
         limit: of windows on the GPU.
     """
@@ -100,6 +101,7 @@ class State:
         relocates = config.relocate_share and self.bound is None
         self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
         self.solid: np.ndarray | None = None
+        self.color_limits: ColorLimits | None = None
         self.frozen: np.ndarray | None = None
         self.limit = WindowLimit()
         self._rounds = False  # whether fans change between steps, which the GPU would have to know
@@ -192,6 +194,8 @@ class State:
                 adam.load_state(part)
             if arrays.get("solid", np.zeros(())):
                 state.solid = _solid_vertices(mesh)
+            if "color_limits" in arrays:
+                state.color_limits = ColorLimits(state.mesh, arrays["color_limits"])
             if "frozen" in arrays:
                 state.frozen = checked_array("frozen", arrays["frozen"], bool, (len(mesh.vertices),))
             if device == "gpu" and "window_samples" in arrays:
@@ -218,6 +222,8 @@ class State:
             arrays |= self._sums.arrays()
         if self.solid is not None:
             arrays["solid"] = np.ones((), np.int32)
+        if self.color_limits is not None:
+            arrays["color_limits"] = self.color_limits.limits
         if self.frozen is not None:
             arrays["frozen"] = self.frozen
         if self.device == "gpu":
@@ -233,9 +239,18 @@ class State:
             binding=None if self.bound is None else self.bound.binding(),
         )
 
-    def step(self, gradients: Gradients, color_rate: float, position_rate: float, view: int) -> None:
+    def step(
+        self,
+        gradients: Gradients,
+        color_rate: float,
+        position_rate: float,
+        view: int,
+        *,
+        edges: bool = False,
+    ) -> None:
         """One step of Adam along ``gradients`` for the vertices that the training view of index ``view``
-        reached."""
+        reached. ``edges``: they include the motion of edges, without which opaque triangles stay in place.
+        """
         self._download()
         self._trainer = None
         # Opaque vertices, and those of the colour behind them, have a gradient of their colour alone.
@@ -260,8 +275,8 @@ class State:
             np.minimum(opacity, MAX_OPACITY, out=opacity, where=~self.solid)
         if position_rate > 0:
             self._positions.lr = position_rate
-            if self.solid is not None:
-                # Edges of opaque triangles have no gradient: positions would follow the colours alone.
+            if self.solid is not None and not edges:
+                # Positions would follow the colours alone.
                 self._positions.step(gradients.vertices, reached & ~self.solid)
             elif self.bound is None:
                 self._positions.step(gradients.vertices, reached)

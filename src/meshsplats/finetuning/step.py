@@ -17,7 +17,7 @@ from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import View
 from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
-from meshsplats.finetuning.hybrid import opaque_fraction, soft_fraction
+from meshsplats.finetuning.hybrid import SOLID, opaque_fraction, soft_fraction
 from meshsplats.finetuning.opaque import expected_error, expected_share, follows_edges, ramp_of
 from meshsplats.finetuning.ranks import ALONE, Part, Ranks
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
@@ -224,6 +224,8 @@ class ViewGradients(NamedTuple):
     gradients: Gradients | None
     """None if the loss is not finite."""
     finite: bool
+    edges: bool = False
+    """Whether they include the motion of edges."""
 
 
 def make_step(
@@ -242,7 +244,7 @@ def make_step(
     before anything has changed, if a loss or a gradient is not finite.
     """
     config = state.config
-    hybrid, steps_before = state.solid is not None, 0.0
+    hybrid, steps_before, edges = state.solid is not None, 0.0, False
     number = step // config.batch
     indices = [view_of_place(config, number, place, len(views)) for place in range(batch)]
     if batch == config.batch == ranks.count == 1:
@@ -252,7 +254,7 @@ def make_step(
         if found is None:
             return None
         loss, gradients = found.loss, found.gradients
-        failed = 0 if found.finite else 1
+        failed, edges = 0 if found.finite else 1, found.edges
     else:
         total = ranks.total(_part(state, views, indices, step, fraction, ranks.share(batch)))
         state.limit.samples = total.window_samples
@@ -273,7 +275,7 @@ def make_step(
     color_rate, position_rate = learning_rates(config, step - steps_before, fraction)
     if batch > 1:
         color_rate, position_rate = color_rate * math.sqrt(batch), position_rate * math.sqrt(batch)
-    state.step(gradients, color_rate, position_rate, indices[0])
+    state.step(gradients, color_rate, position_rate, indices[0], edges=edges)
     return loss
 
 
@@ -333,11 +335,12 @@ def view_gradients(
         grad_exposure = exposure_gradient(rendered.color, grad_image)
         grad_image = grad_image * exposure[GAIN]
     edges = None
-    if not hybrid and follows_edges(config, fraction):
+    # Blended triangles in front of an edge are neglected: they are few.
+    if follows_edges(config, 1.0 if hybrid else fraction) and not (hybrid and centers):
         edges = edge_gradients(
             replace(state.mesh, vertices=state.vertices, colors=state.colors),
             view.camera,
-            config.cutoff,
+            SOLID if hybrid else config.cutoff,
             grad_image,
             background=target.background,
             beyond=state.beyond,
@@ -350,7 +353,7 @@ def view_gradients(
     gradients = rendered.backward(grad_image, expected)._replace(exposure=grad_exposure)
     if edges is not None:
         np.add(gradients.vertices, edges, out=gradients.vertices)
-    return ViewGradients(loss, gradients, gradients.finite())
+    return ViewGradients(loss, gradients, gradients.finite(), edges is not None)
 
 
 def _step_on_gpu(state: State, view: View, step: int, fraction: float) -> float | None:
