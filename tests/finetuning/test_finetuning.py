@@ -137,7 +137,7 @@ def test_gradients_of_a_step_are_those_of_torch(scene, blending, masked, monkeyp
     image, background = dataset.train[0].load().over((0.2, 0.9, 0.4)), (0.3, 0.1, 0.8)
     view = View(dataset.train[0].camera, ViewImage(image, None, mask), background)
     found = []
-    monkeypatch.setattr(State, "step", lambda state, gradients, *rest: found.extend(gradients))
+    monkeypatch.setattr(State, "step", lambda state, gradients, *rest, **more: found.extend(gradients))
     loss = make_step(state, [view], 0, 0.0)
 
     leaves = [torch.from_numpy(a.copy()).requires_grad_() for a in (state.vertices, state.colors)]

@@ -19,7 +19,7 @@ from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
-from meshsplats.finetuning import memory
+from meshsplats.finetuning import initial, memory
 from meshsplats.finetuning.config import PRESETS, FinetuneConfig, learning_rates, make_config
 from meshsplats.finetuning.initial import boundary_vertices, starting_mesh, vertex_sizes
 from meshsplats.finetuning.interruption import StopSignals
@@ -233,6 +233,22 @@ def test_halves_lie_side_by_side_along_the_longest_axis():
         assert reach(half, 1) == pytest.approx((0, 2), abs=1e-5)
         assert half[0, :, 2] == pytest.approx(2, abs=1e-5)
     assert pytest.approx(0.6) == HALF
+
+
+@pytest.mark.parametrize(("most", "triangles"), [(1600, 8), (1599, 7), (1000, 5), (10, 5)])
+def test_splats_of_large_clouds_begin_with_fewer_triangles(monkeypatch, most, triangles):
+    monkeypatch.setattr(initial, "MANY_TRIANGLES", most)
+    cloud = make_scene(200)
+    cameras = orbit(cloud, 3, width=40, height=40)
+    mesh = starting_mesh(cloud, cameras)
+    assert triangles * 190 < len(mesh.faces) <= triangles * 200
+    assert len(starting_mesh(cloud, cameras, sides=6).faces) > 6 * 190
+    assert len(starting_mesh(cloud, cameras, max_splats=50).faces) <= 8 * 50
+    limited = starting_mesh(cloud, cameras, max_triangles=900)
+    assert np.array_equal(
+        limited.vertices,
+        convert(cloud, cameras=cameras, max_triangles=900, detail="cameras", mode="flat").vertices,
+    )
 
 
 def test_each_preset_begins_with_its_conversion():

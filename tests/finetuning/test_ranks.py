@@ -78,7 +78,7 @@ def test_a_batch_is_a_step_along_the_sum_of_its_gradients(scene, monkeypatch):
         for place in range(3)
     ]
     taken = []
-    monkeypatch.setattr(state, "step", lambda *arguments: taken.append(arguments))
+    monkeypatch.setattr(state, "step", lambda *arguments, **more: taken.append(arguments))
     loss = make_step(state, dataset.train, 6, 0.2, batch=3)
     assert loss == pytest.approx(np.mean([found.loss for found in single]))
     gradients, color_rate, position_rate, _ = taken[0]

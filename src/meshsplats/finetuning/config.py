@@ -70,7 +70,7 @@ class FinetuneConfig:
     gradients depend on the unit of the scene."""
     ssim_weight: float = 0.4
     """Weight of SSIM against L1 in the loss, 0 to 1."""
-    l2_weight: float = 50.0
+    l2_weight: float = 10.0
     """Weight of the mean squared difference (L2) in the loss."""
     background: BackgroundMode = "mixed"
     """Background of images with alpha. random: a new colour in every step, so that empty regions become

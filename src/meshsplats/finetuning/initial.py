@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from meshsplats.conversion.options import ConversionChanges
 
 
+MANY_TRIANGLES = 600_000
+"""Clouds that would have more get fewer for each splat, so that a run of minutes has enough steps."""
+SIDES, FEWEST_SIDES = 8, 5
+"""Triangles of a splat, on average, and in large clouds."""
+
+
 def starting_mesh(
     cloud: GaussianCloud,
     cameras: Sequence[Camera],
@@ -32,10 +38,11 @@ def starting_mesh(
     """``cloud`` converted for the fine-tuning of ``preset``, to be seen from ``cameras``.
 
     For 'paper' and 'published' this is the paper's conversion. For 'default' it is ours, with one ellipse per
-    splat (``mode='flat'``) of 8 triangles on average, more where much is visible (``detail='cameras'``),
-    unless ``options`` or ``changes``, as in ``convert``, say otherwise: two crossed ellipses look better
-    before fine-tuning, but a step takes longer and the result is worse. With ``look='splats'`` the mesh is to
-    be drawn with the filter of 3DGS (``footprint='filter'``), where the splats' kernel has it.
+    splat (``mode='flat'``) of 8 triangles on average, in large clouds fewer, but at least 5
+    (``MANY_TRIANGLES``), and more where much is visible (``detail='cameras'``), unless ``options`` or
+    ``changes``, as in ``convert``, say otherwise: two crossed ellipses look better before fine-tuning, but a
+    step takes longer and the result is worse. With ``look='splats'`` the mesh is to be drawn with the filter
+    of 3DGS (``footprint='filter'``), where the splats' kernel has it.
     """
     chosen = make_options(options, **changes)
     if preset != "default":
@@ -47,6 +54,9 @@ def starting_mesh(
         chosen = replace(chosen, footprint="filter")
     if chosen.detail is None and chosen.mode == "flat" and chosen.rings in (None, 1):
         chosen = replace(chosen, detail="cameras")
+        if chosen.sides is None and chosen.max_triangles is None:
+            splats = max(1, min(len(cloud), chosen.max_splats or len(cloud)))
+            chosen = replace(chosen, sides=min(max(MANY_TRIANGLES // splats, FEWEST_SIDES), SIDES))
     return convert(cloud, chosen, cameras=cameras, up=up)
 
 
