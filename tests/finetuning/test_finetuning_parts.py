@@ -243,6 +243,7 @@ def test_splats_of_large_clouds_begin_with_fewer_triangles(monkeypatch, most, tr
     mesh = starting_mesh(cloud, cameras)
     assert triangles * 190 < len(mesh.faces) <= triangles * 200
     assert len(starting_mesh(cloud, cameras, sides=6).faces) > 6 * 190
+    assert len(starting_mesh(cloud, cameras, look="splats").faces) > 8 * 190
     assert len(starting_mesh(cloud, cameras, max_splats=50).faces) <= 8 * 50
     limited = starting_mesh(cloud, cameras, max_triangles=900)
     assert np.array_equal(

@@ -29,7 +29,6 @@ from meshsplats.finetuning.opaque import (
     expected_error,
     expected_share,
     ramp_of,
-    settle_share,
     visible_samples,
 )
 from meshsplats.finetuning.state import Gradients, State
@@ -122,8 +121,8 @@ def test_visible_triangles_are_those_in_front():
 
 def test_a_run_with_a_budget_settles_earlier():
     config = make_config(opacity="cutoff")
-    assert settle_share(config) < settle_share(replace(config, opaque_share=0.5)) == 0.5
-    assert settle_share(replace(config, opaque_share=0.5, settle_share=0.3)) == 0.3
+    assert config.settling < replace(config, opaque_share=0.5).settling == 0.5
+    assert replace(config, opaque_share=0.5, settle_share=0.3).settling == 0.3
 
 
 @pytest.mark.parametrize("soft_share", [0.0, 0.1])
@@ -166,6 +165,7 @@ def test_a_vertex_with_a_gradient_of_its_colour_alone_moves(scene):
         ({"prune_importance": 2.0}, "prune_importance is for opacity 'blended'"),
         ({"opacity_decay": 0.1}, "opacity_decay is for opacity 'blended'"),
         ({"blending": "linear"}, "opaque triangles are not blended"),
+        ({"opaque_share": 0.5, "anneal_share": 0.6}, "annealing must end before the mesh settles"),
         ({"l2_weight": 0.0}, "expected_share is a share of l2_weight"),
         ({"cutoff": 1.5}, "cutoff"),
         ({"soft_phase": 0.5}, "soft_phase has no effect without soft_share"),

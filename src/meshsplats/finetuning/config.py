@@ -175,8 +175,20 @@ class FinetuneConfig:
             raise ValueError("blending 'linear' is for opacity 'blended': opaque triangles are not blended")
         if self.expected_share and not self.l2_weight:
             raise ValueError("expected_share is a share of l2_weight, which is 0: set l2_weight, or it to 0")
+        if self.opaque_share < 1 and self.anneal_share + self.settling > 1:
+            raise ValueError(
+                f"with opaque_share, the annealing must end before the mesh settles, but anneal_share"
+                f" {self.anneal_share:g} and settle_share {self.settling:g} add up to more than 1: lower one"
+            )
         if not self.soft_share and self.soft_phase != FinetuneConfig.soft_phase:
             raise ValueError("soft_phase has no effect without soft_share")
+
+    @property
+    def settling(self) -> float:
+        """``settle_share``, or its default."""
+        if self.settle_share is not None:
+            return self.settle_share
+        return 0.15 if self.opaque_share == 1 else 0.5
 
     def total_steps(self, views: int) -> int | None:
         """Number of steps with this number of training views; None if the length is given in minutes."""

@@ -26,8 +26,6 @@ LEAK = 0.05
 """Derivative outside of the ramp at the start, so that hidden fragments can come back. It falls to 0."""
 EDGES_FROM = 0.4
 """Share of the annealing after which the motion of edges counts: before, many triangles are translucent."""
-SETTLES, SETTLES_IN_BUDGET = 0.15, 0.5
-"""Default of ``settle_share``: with all triangles, and with a budget, which changes their shapes."""
 HIT_VIEWS = 64
 """Maximum number of training views, evenly spread, in which triangles are looked for."""
 HIT_SAMPLES = 2
@@ -60,13 +58,6 @@ def expected_share(config: FinetuneConfig, fraction: float) -> float:
 
 def _annealed(config: FinetuneConfig, fraction: float) -> float:
     return min(1.0, fraction / config.anneal_share) if config.anneal_share else 1.0
-
-
-def settle_share(config: FinetuneConfig) -> float:
-    """Last share of the opaque phase, in which the triangles stay that are left then."""
-    if config.settle_share is not None:
-        return config.settle_share
-    return SETTLES if config.opaque_share == 1 else SETTLES_IN_BUDGET
 
 
 def expected_error(

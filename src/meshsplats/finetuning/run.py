@@ -34,7 +34,7 @@ from meshsplats.finetuning.hybrid import (
 from meshsplats.finetuning.interruption import Interrupted, StopSignals
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
-from meshsplats.finetuning.opaque import settle_share, visible_samples
+from meshsplats.finetuning.opaque import visible_samples
 from meshsplats.finetuning.outlines import fewer_triangles
 from meshsplats.finetuning.ranks import ALONE, Ranks
 from meshsplats.finetuning.state import State
@@ -281,7 +281,7 @@ class TrainingLoop:
         self.most_opaque = None if share == 1 else max(1, round(share * len(start.mesh.faces)))
         self.source = start.mesh if config.soft_share else None
         # A resumed run may have removed hidden triangles before its checkpoint.
-        self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - settle_share(config)
+        self.settled = start.step > 0 and opaque_fraction(config, self.fraction) >= 1 - config.settling
 
     @property
     def seconds(self) -> float:
@@ -376,7 +376,7 @@ class TrainingLoop:
     def _settles(self) -> bool:
         """Whether it is time to remove the triangles that no training view shows: once."""
         fraction = opaque_fraction(self.config, self.fraction)
-        due = self.config.opacity == "cutoff" and fraction >= 1 - settle_share(self.config)
+        due = self.config.opacity == "cutoff" and fraction >= 1 - self.config.settling
         now, self.settled = due and not self.settled, self.settled or due
         removes = self.config.hidden_hits > 0 or self.most_opaque is not None
         return now and removes and not self._done()
