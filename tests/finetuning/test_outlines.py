@@ -105,6 +105,23 @@ def test_a_centre_of_another_color_stays_longer():
     assert per_splat(fewer_triangles(mesh, np.ones(8), 5), 2) == [1, 4]
 
 
+def test_vertices_without_triangles_and_hidden_fans_change_no_other_fan():
+    one, hidden = fan(np.ones(4)), fan(np.ones(4), (9, 0, 5), rim=(1, 0, 1), tip=(0, 1, 0), splat=1)
+    alone = fewer_triangles(one, np.ones(4), 3)
+    mesh = joined(one, hidden)
+    for other, hits in (
+        (mesh, np.repeat([1, 0], 4)),
+        (replace(mesh, faces=mesh.faces[:4], face_splat=one.face_splat), np.ones(4)),
+    ):
+        found = fewer_triangles(other, hits, 3, 1)
+        assert corners(found) == corners(alone)
+        assert np.array_equal(found.colors, alone.colors)
+    # Without colours of others inside of it, the outline of the first costs nothing.
+    plain = joined(one, fan(np.ones(4), (3, 0, 5), tip=(0.2, 0.4, 0.7), splat=1), hidden)
+    hits = np.repeat([1, 1, 0], 4)
+    assert per_splat(fewer_triangles(plain, hits, 6, 1), 3) == [2, 4, 0]
+
+
 def test_reflex_corners_are_not_drawn_inside_out():
     radii = np.array([1, 0.2, 1, 1, 1, 0.2, 1, 1.0])
     mesh = fan(radii)
@@ -201,4 +218,4 @@ def test_any_fans_keep_to_any_budget(data):
     areas = signed_areas(found)
     assert (areas > 0).all()
     hull = np.pi * MAX_GROWTH**2
-    assert (np.bincount(found.face_splat, areas, len(counts)) <= hull).all() if len(areas) else True
+    assert (np.bincount(found.face_splat, areas, len(counts)) <= hull).all()

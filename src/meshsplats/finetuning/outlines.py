@@ -38,21 +38,12 @@ def fewer_triangles(mesh: SplatMesh, hits: np.ndarray, most: int, fewest: int = 
     splat = np.arange(len(mesh.faces)) if mesh.face_splat is None else mesh.face_splat
     fan, loops = _fans(mesh.faces, splat)
     samples = np.bincount(fan, hits, len(loops))
-    seen = samples[fan] >= fewest
+    hidden = samples < fewest
+    seen = ~hidden[fan]
     if seen.sum() <= most:
         return mesh.keep_faces(seen)
-    order = np.flatnonzero(seen)[np.argsort(fan[seen], kind="stable")]
-    mesh = replace(
-        mesh,
-        faces=mesh.faces[order],
-        face_splat=None if mesh.face_splat is None else splat[order],
-        depth_group=None if mesh.depth_group is None else mesh.depth_group[order],
-    )
-    present, starts, fan, counts = np.unique(
-        fan[order], return_index=True, return_inverse=True, return_counts=True
-    )
-    samples, loops = samples[present], loops[present]
     polygons = _polygons(mesh, fan, loops)
+    _, starts, counts = np.unique(fan, return_index=True, return_counts=True)
 
     # All steps, as columns: fan, saved triangles, cost.
     fans, saved, costs = [], [], []
@@ -63,7 +54,8 @@ def fewer_triangles(mesh: SplatMesh, hits: np.ndarray, most: int, fewest: int = 
         changed = np.column_stack([polygon.colors, BEHIND * polygon.shares])
         costs.append((samples[polygon.fans, None] * changed).ravel())
     owner, saving = np.concatenate(fans), np.concatenate(saved)
-    price = np.concatenate(costs) / np.maximum(saving, 1)
+    # What is hidden goes before all that costs nothing.
+    price = np.where(hidden[owner], -1, np.concatenate(costs) / np.maximum(saving, 1))
     order = np.argsort(owner, kind="stable")  # the steps of a fan stay in their order
     owner, saving, price = owner[order], saving[order], price[order]
     price = _running_maxima(price, owner)
@@ -181,9 +173,9 @@ def _inner_difference(mesh: SplatMesh, fan: np.ndarray, loops: np.ndarray) -> np
     rgb = mesh.colors[:, :3].astype(np.float64)
     around = np.zeros(len(rgb), bool)
     around[loops[loops >= 0]] = True
-    owner = np.zeros(len(rgb), np.int64)
+    owner = np.full(len(rgb), -1)
     owner[mesh.faces] = fan[:, None]
-    rim, inner = np.flatnonzero(around), np.flatnonzero(~around)
+    rim, inner = np.flatnonzero(around), np.flatnonzero(~around & (owner >= 0))
 
     def means(vertices: np.ndarray, values: np.ndarray) -> np.ndarray:
         sums = np.bincount(owner[vertices], values, len(loops))
@@ -224,7 +216,7 @@ def _with_ears(vertices: np.ndarray, fans: np.ndarray, corners: np.ndarray, colo
 
 
 def _running_maxima(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """The greatest of ``values`` >= 0 up to each one in its group; groups are sorted."""
+    """The greatest of ``values`` up to each one in its group; groups are sorted."""
     ranks = np.empty(len(values), np.int64)
     order = np.argsort(values, kind="stable")
     ranks[order] = np.arange(len(values))
