@@ -2,6 +2,7 @@
 
     python benchmarks/engines.py --data DATA --scenes playbot guitar truck [--steps 400] [--views 100]
         [--soft-share 0.05] [--opaque-share 1] [--hidden-hits 1] [--threads 1] [-o FOLDER]
+        [--max-triangles N] [--color-rate 0.05] [--position-rate 0.04] [--anneal-share 0.25]
 
 Trains on images of the splats at degree 0 and judges at DATA/cameras on white, against means over each pixel.
 benchmarks/viewers/viewers.py --mesh draws the meshes of FOLDER with three.js and Babylon.js.
@@ -36,6 +37,11 @@ def main() -> None:
     parser.add_argument("--soft-share", type=float, default=0.05)
     parser.add_argument("--opaque-share", type=float, default=1.0)
     parser.add_argument("--hidden-hits", type=int, default=1)
+    parser.add_argument("--max-triangles", type=int, help="at the start, with similar splats merged")
+    defaults = ms.FinetuneConfig()
+    for name in ("color_rate", "position_rate", "anneal_share"):
+        option = f"--{name.replace('_', '-')}"
+        parser.add_argument(option, type=float, default=getattr(defaults, name))
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("-o", "--output", type=Path, help="folder for the meshes")
     args = parser.parse_args()
@@ -45,6 +51,9 @@ def main() -> None:
         soft_share=args.soft_share,
         opaque_share=args.opaque_share,
         hidden_hits=args.hidden_hits,
+        color_rate=args.color_rate,
+        position_rate=args.position_rate,
+        anneal_share=args.anneal_share,
     )
     print("| scene | triangles | opaque, blended | cameras | 1 x 1 | 2 x 2 | 4 x 4 | processor s |")
     print("|---|---|---|---|---|---|---|---|")
@@ -52,7 +61,8 @@ def main() -> None:
         start = time.process_time()
         cloud = ms.load_gaussians(args.data / SCENES[name])
         dataset = ms.splat_dataset(cloud, train=args.views, test=0, sh_degree=0)
-        mesh = ms.starting_mesh(cloud, [view.camera for view in dataset.train])
+        cameras = [view.camera for view in dataset.train]
+        mesh = ms.starting_mesh(cloud, cameras, max_triangles=args.max_triangles)
         tuned = ms.finetune(mesh, dataset, config, run=ms.RunOptions(report_every=0, threads=args.threads))
         seconds = time.process_time() - start
         if args.output:

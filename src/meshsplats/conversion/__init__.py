@@ -13,7 +13,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.conversion.baking import bake_filter
 from meshsplats.conversion.budget import within_limits
-from meshsplats.conversion.detail import LEVELS, choose_levels, visibility
+from meshsplats.conversion.detail import FIRST_STAR, LEVELS, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.merging import simplify
@@ -26,6 +26,7 @@ from meshsplats.conversion.selection import (
     refuse_empty_box,
     within,
 )
+from meshsplats.conversion.stars import STARS
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.looks import Look
@@ -139,8 +140,10 @@ def convert(
         budget = len(mesh.faces) if chosen.max_triangles is None else chosen.max_triangles
         choice = fans.choice.copy()
         choice[keep] = choose_levels(shown.need[rows[keep]], budget)
+        thick = fans.sigma[:, 2] > chosen.flat_below * fans.sigma[:, :2].min(axis=1)
+        choice[thick & (choice >= FIRST_STAR)] += len(STARS)
         levels = [_ellipse(sides, rings, chosen) for sides, rings in LEVELS]
-        mesh = assembled(fans._replace(shapes=levels, choice=choice), keep)
+        mesh = assembled(fans._replace(shapes=[*levels, *STARS], choice=choice), keep)
     return mesh
 
 
@@ -335,7 +338,9 @@ def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "fl
 
 def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
     """(n,) mean area of a splat's projection over all directions, divided by that of its ellipses, whose mean
-    |cos| is 1/2."""
-    last = np.array([shape.pattern.ellipses - 1 for shape in shapes])[choice]
+    |cos| is 1/2; 1 for stars, whose profile is fitted to the projection."""
+    ellipses = np.array([shape.pattern.ellipses for shape in shapes])[choice]
+    known = ellipses <= areas.shape[1]
+    last = np.where(known, ellipses, 1) - 1
     drawn = 0.5 * np.take_along_axis(np.cumsum(areas, axis=1), last[:, None], axis=1)[:, 0]
-    return np.divide(shadow, drawn, out=np.ones_like(shadow), where=drawn > 0)
+    return np.divide(shadow, drawn, out=np.ones_like(shadow), where=known & (drawn > 0))

@@ -13,6 +13,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
+from meshsplats.conversion.stars import STARS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import TapedRendering
@@ -23,6 +24,9 @@ LEVELS = ((3, 1), (4, 1), (6, 1), (8, 1), (8, 2), (12, 2), (12, 3), (16, 3))
 
 TRIANGLES = np.array([(2 * rings - 1) * sides for sides, rings in LEVELS])
 """Triangle counts of the levels, ascending."""
+
+FIRST_STAR = len(LEVELS) - len(STARS)
+"""From this level on, thick splats become stars of as many triangles."""
 
 LEAST = int(TRIANGLES[0])
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from meshsplats._geometry import rotation_rows
 from meshsplats.conversion.chunks import chunks, thin_product
-from meshsplats.conversion.profiles import Profile
 
 CHUNK = 1 << 13
 """Splats per chunk: its arrays stay in the processor's cache."""
@@ -37,12 +37,23 @@ class Pattern:
     ellipses: int
 
 
+class LevelProfile(Protocol):
+    """Radii and opacities of the centre and the rings of a pattern."""
+
+    @property
+    def level_radii(self) -> tuple[float, ...]:
+        """In standard deviations."""
+
+    def level_opacities(self, opacity: np.ndarray) -> np.ndarray:
+        """(levels, n) float32 in [0, 1], for splats of ``opacity`` (n,)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A pattern and the profile of its rings."""
+    """A pattern and the profile of its levels."""
 
     pattern: Pattern
-    profile: Profile
+    profile: LevelProfile
 
 
 @lru_cache(maxsize=64)
@@ -134,7 +145,7 @@ def build(
         centers, quaternions: (n, 3) and (n, 4) of the splats.
         order, sigma: (n, 3) axes and their standard deviations, as in ``semi_axes``.
         rgb: (n, 3) display colours.
-        opacity: (n,) multiplies the profile; the product is clamped to 1.
+        opacity: (n,) of the splats, may be above 1.
 
     Raises ValueError for more vertices or triangles than int32 can index.
     """
@@ -159,11 +170,10 @@ def build(
                 np.take(array[part], rows, axis=0)
                 for array in (centers, quaternions, order, sigma, rgb, opacity)
             )
-            levels = np.array(shape.profile.opacities, np.float32)
             used = shape.pattern.directions.shape[1]
             axes = semi_axes(own_quaternions, own_order[:, :used], own_sigma[:, :used])
             parts = np.concatenate([own_centers.T, axes.reshape(3 * used, -1)])
-            paint = np.concatenate([own_rgb.T, np.minimum(levels[:, None] * own_opacity, np.float32(1))])
+            paint = np.concatenate([own_rgb.T, shape.profile.level_opacities(own_opacity)])
             _put(vertices, own_first, thin_product(parts.T, place))
             _put(colors, own_first, thin_product(paint.T, tint))
             _put(faces, own_first_face, own_first.astype(np.int32)[:, None] + corners[index])
@@ -192,17 +202,17 @@ def _put(out: np.ndarray, first: np.ndarray, blocks: np.ndarray) -> None:
 def _recipe(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     """Two matrices, each of which gives values of a splat's m vertices in one product.
 
-    (3 + 3 a, 3 m), from centre and semi-axes to positions; (3 + rings + 1, 4 m), of ones and zeros, from r,
-    g, b and the opacities of centre and rings to RGBA.
+    (3 + 3 a, 3 m), from centre and semi-axes to positions; (3 + levels, 4 m), of ones and zeros, from r, g, b
+    and the opacities of the levels to RGBA.
     """
     directions, level = shape.pattern.directions, shape.pattern.level
     m, a = directions.shape
-    radius = np.array((0.0, *shape.profile.radii))[level]
+    radius = np.array(shape.profile.level_radii)[level]
     place = np.zeros((1 + a, 3, m, 3))
     for axis in range(3):
         place[0, axis, :, axis] = 1
         place[1:, axis, :, axis] = (radius[:, None] * directions).T
-    tint = np.zeros((3 + len(shape.profile.opacities), m, 4), np.float32)
+    tint = np.zeros((3 + len(shape.profile.level_radii), m, 4), np.float32)
     tint[[0, 1, 2], :, [0, 1, 2]] = 1
     tint[3 + level, np.arange(m), 3] = 1
     return place.reshape(-1, 3 * m).astype(np.float32), tint.reshape(-1, 4 * m)

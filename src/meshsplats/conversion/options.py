@@ -20,6 +20,11 @@ Detail = Literal["even", "cameras"]
 Budget = Literal["merge", "drop"]
 Preset = Literal["default", "paper"]
 
+FLAT_SIDES = 8
+"""Sides of an ellipse in mode 'flat' by default."""
+THICK = 0.25
+"""``flat_below`` of detail 'cameras' by default."""
+
 
 @dataclass(frozen=True)
 class ConversionOptions:
@@ -50,7 +55,9 @@ class ConversionOptions:
     begins with it. Default and paper: even."""
     flat_below: float | None = None
     """crossed: a splat whose smallest standard deviation (with its footprint) is at most this fraction of the
-    middle one becomes one ellipse of twice as many triangles, 0 to 1. Default: 0.15."""
+    middle one becomes one ellipse of twice as many triangles, 0 to 1. Default: 0.15. detail 'cameras': a
+    splat that is thicker than that and gets 24 triangles or more becomes a star, ellipses in 6 or 10 planes,
+    which looks alike from everywhere. Default there: 0.25; 1: no stars."""
     compensation: float | None = None
     """1: opacities are scaled so that the ellipses of a splat have the same opacity times area as the splat,
     averaged over all directions. 0: opacities stay. Between: a power of that factor. Default: 1; paper:
@@ -110,13 +117,13 @@ class ConversionOptions:
             raise ValueError(f"preset must be one of {', '.join(PRESETS)}, got {preset!r}")
         defaults = PRESETS[preset]
         given = {f.name for f in fields(self) if getattr(self, f.name) is not None}
-        if self.detail == "cameras" and self.mode is None:
-            defaults = replace(defaults, mode="flat")
+        if self.detail == "cameras":
+            defaults = replace(defaults, mode="flat", flat_below=THICK if preset == "default" else 1.0)
         full = replace(
             self, **{f.name: getattr(defaults, f.name) for f in fields(self) if f.name not in given}
         )
         if full.sides is None:
-            full = replace(full, sides=8 if full.mode == "flat" else 4)
+            full = replace(full, sides=FLAT_SIDES if full.mode == "flat" else 4)
         if full.footprint is None:
             source: Footprint = "cameras" if has_cameras else "framing"
             full = replace(full, footprint=source if self.viewing_distance is None else "distance")
@@ -131,8 +138,11 @@ class ConversionOptions:
             raise ValueError(f"sides must be a multiple of 4 in mode '3d', got {self.sides}")
         if self.mode == "crossed" and self.sides % 2:  # type: ignore[operator]
             raise ValueError(f"sides must be even in mode 'crossed', got {self.sides}")
-        if "flat_below" in given and self.mode != "crossed":
-            raise ValueError(f"flat_below is for mode 'crossed', got mode {self.mode!r}")
+        if "flat_below" in given and self.mode != "crossed" and self.detail != "cameras":
+            raise ValueError(
+                f"flat_below is for mode 'crossed' and for detail='cameras', got mode {self.mode!r} and"
+                f" detail {self.detail!r}"
+            )
         if self.detail == "cameras":
             if not has_cameras:
                 raise ValueError("detail='cameras' needs cameras: give some, or choose even")

@@ -27,6 +27,16 @@ class Profile:
     def rings(self) -> int:
         return len(self.radii)
 
+    @property
+    def level_radii(self) -> tuple[float, ...]:
+        """Of centre and rings, in standard deviations."""
+        return (0.0, *self.radii)
+
+    def level_opacities(self, opacity: np.ndarray) -> np.ndarray:
+        """(1 + rings, n) float32 opacities of centre and rings, clamped to [0, 1], for splats of ``opacity``
+        (n,). A ring between a rim that must have an opacity and the centre may be fitted below 0."""
+        return np.clip(np.array(self.opacities, np.float32)[:, None] * opacity, 0, 1).astype(np.float32)
+
     def __call__(self, radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
         """Opacity (as a multiple of the splat's) at polar positions: radius in sigma, angle from a corner."""
         turn = np.pi / self.sides

@@ -10,7 +10,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
-from meshsplats.conversion.options import make_options
+from meshsplats.conversion.options import FLAT_SIDES, make_options
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, splat_starts
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 MANY_TRIANGLES = 600_000
 """Clouds that would have more get fewer for each splat, so that a run of minutes has enough steps. Not with
 ``look='splats'``, where the guitar (90,000 splats) lost 1 dB with 6 for each."""
-SIDES, FEWEST_SIDES = 8, 5
-"""Triangles of a splat, on average, and in large clouds."""
+FEWEST_SIDES = 5
+"""Triangles of a splat, on average, in the largest clouds."""
 
 
 def starting_mesh(
@@ -57,7 +57,7 @@ def starting_mesh(
         chosen = replace(chosen, detail="cameras")
         if chosen.sides is None and chosen.max_triangles is None and chosen.look != "splats":
             splats = max(1, min(len(cloud), chosen.max_splats or len(cloud)))
-            chosen = replace(chosen, sides=min(max(MANY_TRIANGLES // splats, FEWEST_SIDES), SIDES))
+            chosen = replace(chosen, sides=min(max(MANY_TRIANGLES // splats, FEWEST_SIDES), FLAT_SIDES))
     return convert(cloud, chosen, cameras=cameras, up=up)
 
 

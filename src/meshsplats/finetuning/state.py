@@ -167,7 +167,7 @@ class State:
     @classmethod
     def begin_hybrid(cls, mesh: SplatMesh, config: FinetuneConfig, threads: int | None) -> State:
         """The state before the first step with the opaque and blended triangles of ``mesh``."""
-        state = cls(mesh, vertex_sizes(mesh), None, config, threads)
+        state = cls.begin_opaque(mesh, config, threads)
         state.solid = _solid_vertices(mesh)
         return state
 
