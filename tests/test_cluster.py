@@ -393,29 +393,47 @@ def test_tiles_go_on_after_files_that_could_not_be_written(splats, tmp_path):
     assert results(tmp_path / "there") == results(tmp_path / "here")
 
 
-def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, tmp_path):
-    """A disk of one megabyte, where this machine lets us make one."""
-    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
-    small = tmp_path / "small"
-    small.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(small)]
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of two megabytes."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)]
     mount = shutil.which("mount") and subprocess.run(command, capture_output=True)
     if not mount or mount.returncode:
         pytest.skip("no right to mount a disk here")
-    try:
-        with open_workers("local") as workers, pytest.raises(OSError) as caught:
-            build_tiles(stream_gaussians(splats), small / "tiles", SMALL, workers=workers)
-        assert caught.value.errno == errno.ENOSPC
-        assert "no space left" in str(caught.value)
-        for path in (small / "tiles.partial" / "tileset").rglob("*.glb"):
-            load_mesh(path)
-        subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
-        with open_workers("local") as workers:
-            build_tiles(stream_gaussians(splats), small / "tiles", SMALL, workers=workers, resume=True)
-        build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
-        assert results(small / "tiles") == results(tmp_path / "here")
-    finally:
-        subprocess.run(["umount", str(small)], check=True)
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, small_disk, tmp_path):
+    pytest.importorskip("distributed", reason="Dask is not here: pip install distributed")
+    with open_workers("local") as workers, pytest.raises(OSError, match="no space left") as caught:
+        build_tiles(stream_gaussians(splats), small_disk / "tiles", SMALL, workers=workers)
+    assert caught.value.errno == errno.ENOSPC
+    for path in (small_disk / "tiles.partial" / "tileset").rglob("*.glb"):
+        load_mesh(path)
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    with open_workers("local") as workers:
+        build_tiles(stream_gaussians(splats), small_disk / "tiles", SMALL, workers=workers, resume=True)
+    build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
+    assert results(small_disk / "tiles") == results(tmp_path / "here")
+
+
+def test_tiles_say_that_the_disk_is_full_after_the_tiles_of_a_cell(splats, small_disk, monkeypatch):
+    keep = building._Tiles.keep
+
+    def on_a_full_disk(tiles, cell, nodes, merged):
+        if merged.nbytes > 16384:  # more than a buffer takes
+            size = os.statvfs(small_disk)
+            (small_disk / "rest").write_bytes(bytes(size.f_bavail * size.f_frsize))
+        keep(tiles, cell, nodes, merged)
+
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    monkeypatch.setattr(building._Tiles, "keep", on_a_full_disk)
+    with pytest.raises(OSError, match="no space left") as caught:
+        build_tiles(stream_gaussians(splats), small_disk / "tiles", SMALL)
+    assert caught.value.errno == errno.ENOSPC
 
 
 def slow_then(folder, task):

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from meshsplats._files.atomic import atomic_path, write_text
+from meshsplats._files.atomic import atomic_path, write_bytes, write_text
 from meshsplats._files.locks import locked
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
 from meshsplats.cluster import Shared, Workers
@@ -428,8 +428,8 @@ class _Tiles:
 
     def keep(self, cell: str, nodes: list[Node], merged: np.ndarray) -> None:
         """Files what is done of a cell, for the ones above it and for a resumed run."""
-        with atomic_path(self._merged(cell)) as temporary:
-            merged.tofile(temporary)
+        # Not by tofile, whose errors do not say that the disk is full.
+        write_bytes(self._merged(cell), merged.view(np.uint8).data)
         write_text(
             self._work / "done" / f"cell-{cell}.json", json.dumps([asdict(node) for node in nodes]) + "\n"
         )
