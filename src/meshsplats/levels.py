@@ -94,7 +94,7 @@ def make_level(
         cameras = [view.camera for view in targets.test]
         return convert(cloud, options, cameras=cameras, up=up, max_splats=level.splats)
     cameras = [view.camera for view in targets.train]
-    mesh = starting_mesh(cloud, cameras, options, up=up, max_splats=level.splats)
+    mesh = starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
     return finetune(mesh, targets, config, run=run, on_progress=on_progress)
 
 

@@ -226,19 +226,24 @@ def test_another_target_is_not_resumed(tmp_path, capsys, options, message):
 
 
 def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
-    """Its views stay, though so long a run would have more; its time counts, too."""
+    """Its views and its starting mesh stay, though so long a run would have more; its time counts, too."""
     arguments = [splats, "-o", tmp_path / "t.npz", "--held-out", "2", "--width", "8", "--json"]
-    monkeypatch.setattr("meshsplats.cli.training.worthwhile_views", lambda config: 4)
+    monkeypatch.setattr("meshsplats.cli.finetune.worthwhile_views", lambda config: config.steps + 1)
+    monkeypatch.setattr("meshsplats.finetuning.config.LONG_STEPS", 5)
     assert run(*arguments, "--steps", "3") == 0
     first = json.loads(capsys.readouterr().out)
     assert first["seconds_since_resumed"] is None
     begun = load_checkpoint(tmp_path / "t.npz.run" / "checkpoint.safetensors", only_header=True).seconds
     assert 0 < begun <= first["seconds"]
-    monkeypatch.setattr("meshsplats.cli.training.worthwhile_views", lambda config: 5)
     assert run(*arguments, "--steps", "6", "--resume", "--force") == 0
     second = json.loads(capsys.readouterr().out)
     assert second["steps"] == 6
     assert second["seconds"] == pytest.approx(begun + second["seconds_since_resumed"], abs=0.02)
+    assert run(*arguments, "--steps", "7", "--resume", "--force") == 0
+    third = json.loads(capsys.readouterr().out)
+    assert (third["steps"], third["triangles"]) == (7, second["triangles"])
+    assert run(*arguments, "--steps", "6", "--force") == 0
+    assert json.loads(capsys.readouterr().out)["triangles"] > 2 * third["triangles"]
 
 
 def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):

@@ -20,7 +20,7 @@ from meshsplats.datasets.views import Dataset, View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import initial, memory
-from meshsplats.finetuning.config import PRESETS, FinetuneConfig, learning_rates, make_config
+from meshsplats.finetuning.config import PRESETS, FinetuneConfig, is_long, learning_rates, make_config
 from meshsplats.finetuning.initial import boundary_vertices, starting_mesh, vertex_sizes
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
@@ -71,6 +71,12 @@ def test_a_length_takes_the_place_of_the_presets():
     assert make_config("paper").total_steps(100) == 1500
     assert make_config("paper", epochs=0.5).total_steps(9) == 4
     assert make_config("default", minutes=2).total_steps(9) is None
+    assert is_long(make_config(minutes=10), 1)
+    assert not is_long(make_config(minutes=9.9), 9000)
+    assert is_long(make_config(epochs=20), 100)
+    assert not is_long(make_config(epochs=20), 99)
+    assert not is_long(make_config("paper", minutes=60), 100)
+    assert not is_long(make_config(minutes=60, opacity="cutoff"), 100)
     assert make_config("paper").prune_interval(30) == 300
     assert make_config("default", prune_epochs=0).prune_interval(30) == 0
 
@@ -245,6 +251,9 @@ def test_splats_of_large_clouds_begin_with_fewer_triangles(monkeypatch, most, tr
     assert len(starting_mesh(cloud, cameras, sides=6).faces) > 6 * 190
     assert len(starting_mesh(cloud, cameras, look="splats").faces) > 8 * 190
     assert len(starting_mesh(cloud, cameras, max_splats=50).faces) <= 8 * 50
+    with_steps = lambda steps: starting_mesh(cloud, cameras, config=make_config(steps=steps))  # noqa: E731
+    assert np.array_equal(with_steps(1999).vertices, mesh.vertices)
+    assert 32 * 190 < len(with_steps(2000).faces) <= 32 * 200
     limited = starting_mesh(cloud, cameras, max_triangles=900)
     assert np.array_equal(
         limited.vertices,
@@ -336,7 +345,9 @@ def arrays() -> dict[str, np.ndarray]:
 def checkpoint(step: int = 3):
     from meshsplats.finetuning.checkpoint import Checkpoint
 
-    return Checkpoint(step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays(), (0.25, 1 / 3), 7)
+    return Checkpoint(
+        step, 1.5, FinetuneConfig().to_dict(), "mesh", "views", arrays(), (0.25, 1 / 3), {"steps": 7}
+    )
 
 
 def test_checkpoints_come_back_to_the_last_bit(tmp_path):
@@ -349,12 +360,12 @@ def test_checkpoints_come_back_to_the_last_bit(tmp_path):
     assert (found.config, found.losses) == (saved.config, saved.losses)
     assert all((found.arrays[name] == array).all() for name, array in saved.arrays.items())
     header = load_checkpoint(tmp_path / "c.safetensors", only_header=True)
-    assert (header.step, header.views, header.arrays) == (3, 7, {})
+    assert (header.step, header.planned, header.arrays) == (3, {"steps": 7}, {})
     assert [p.name for p in tmp_path.iterdir()] == ["c.safetensors"]
 
 
 def test_broken_checkpoints_are_refused(tmp_path):
-    from meshsplats.finetuning.checkpoint import load_checkpoint, save_checkpoint
+    from meshsplats.finetuning.checkpoint import load_checkpoint, planned_length, save_checkpoint
 
     path = tmp_path / "c.safetensors"
     save_checkpoint(checkpoint(), path)
@@ -366,12 +377,14 @@ def test_broken_checkpoints_are_refused(tmp_path):
     path.write_bytes(whole.replace(b'\\"version\\": 1', b'\\"version\\": 7'))
     with pytest.raises(FileFormatError, match="version 7"):
         load_checkpoint(path)
-    for before, after in ((b'\\"step\\": 3', b'\\"step\\":-3'), (b'\\"views\\": 7', b'\\"views\\":-7')):
+    for before, after in ((b'\\"step\\": 3', b'\\"step\\":-3'), (b'\\"steps\\": 7', b'\\"seeds\\": 7')):
         path.write_bytes(whole.replace(before, after))
         with pytest.raises(FileFormatError, match="broken: step"):
             load_checkpoint(path)
-    path.write_bytes(whole.replace(b', \\"views\\": 7', b"              "))
-    assert load_checkpoint(path).views is None  # by an earlier version
+    path.write_bytes(whole.replace(b', \\"planned\\": {\\"steps\\": 7}', b" " * 29))
+    found = load_checkpoint(path)
+    assert found.planned is None  # by an earlier version
+    assert planned_length(found) == {"epochs": None, "steps": 1000, "minutes": None}
     from meshsplats.formats.safetensors import save_safetensors
 
     save_safetensors(path, arrays(), {})

@@ -29,9 +29,9 @@ from meshsplats.cli.training import (
     ShowProgress,
     Trained,
     TrainingCommand,
+    as_begun,
     default_background,
     over_background,
-    views_for,
 )
 from meshsplats.cluster import Shared
 from meshsplats.conversion import ConversionOptions
@@ -39,8 +39,16 @@ from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
 from meshsplats.evaluation.backgrounds import Background
-from meshsplats.finetuning import FinetuneConfig, RunOptions, finetune, make_config, starting_mesh
+from meshsplats.finetuning import (
+    FinetuneConfig,
+    RunOptions,
+    finetune,
+    make_config,
+    starting_mesh,
+    worthwhile_views,
+)
 from meshsplats.finetuning.checkpoint import Checkpoint
+from meshsplats.finetuning.config import is_long
 from meshsplats.finetuning.ranks import is_started_by_torchrun
 from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores
 from meshsplats.finetuning.step import samples_of
@@ -114,7 +122,8 @@ class Finetune(TrainingCommand):
             )
         if self.cell_splats is not None:
             return self._plan_of_cells(config, scene, dataset, background)
-        mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset)
+        begun = as_begun(config, earlier)
+        mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset, begun)
         summary = f"{len(mesh.faces):,} triangles"
         if isinstance(scene, GaussianCloud) and (mesh.splat_count or 0) < len(scene):
             summary += f" of {mesh.splat_count:,} splats, {len(scene):,} before"
@@ -136,13 +145,16 @@ class Finetune(TrainingCommand):
         if isinstance(scene, GaussianCloud) and self.conversion.crop is not None:
             # Cropped splats must not be in the targets; other selections leave gaps that the rest fills.
             scene = choose_splats(scene, crop=self.conversion.crop)
+        begun = as_begun(config, earlier)
+        views = worthwhile_views(begun)
         dataset = self.target.make(
             scene,
             self.input,
             default_background(config),
             self.threads,
-            views_for(config, earlier),
+            views,
             self.preset,
+            self.cell_splats is None and is_long(begun, self.target.views or views),
         )
         return scene, dataset
 
@@ -214,10 +226,10 @@ class Finetune(TrainingCommand):
     def _start_preset(self) -> str:
         return self.preset if self.start == "same" else self.start
 
-    def _converted(self, cloud: GaussianCloud, dataset: Dataset) -> SplatMesh:
+    def _converted(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig) -> SplatMesh:
         cameras = [view.camera for view in dataset.train]
-        options = replace(self.conversion, crop=None)  # cropped already
-        return starting_mesh(cloud, cameras, options, preset=self._start_preset, look=dataset.look)
+        options = replace(self.conversion, crop=None, look=dataset.look)  # cropped already
+        return starting_mesh(cloud, cameras, options, preset=self._start_preset, config=config)
 
 
 def _cell_scene(command: Finetune, background: tuple[float, float, float] | None) -> CellScene:

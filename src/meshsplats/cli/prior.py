@@ -19,13 +19,13 @@ from meshsplats.cli.training import (
     ShowProgress,
     Trained,
     TrainingCommand,
+    as_begun,
     default_background,
     over_background,
     tuning_options,
-    views_for,
 )
 from meshsplats.datasets.views import Dataset
-from meshsplats.finetuning import FinetuneConfig, RunOptions
+from meshsplats.finetuning import FinetuneConfig, RunOptions, worthwhile_views
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.mesh import SplatMesh
 from meshsplats.prior import MeshPrior, bind, prior_config, train_prior
@@ -148,7 +148,7 @@ class Prior(TrainingCommand):
             mesh = SplatMesh(base.vertices, base.faces, _grey(base))
             return self.target.make(mesh, self.input, background, self.threads)
         cloud = self.reading.load(self.splats)
-        views = views_for(config, earlier)
+        views = worthwhile_views(as_begun(config, earlier))
         return self.target.make(cloud, self.splats, background, self.threads, views)
 
 

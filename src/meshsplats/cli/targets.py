@@ -15,7 +15,7 @@ from meshsplats.cli.common import Count, File, Folder, Text, cameras_beside, par
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset
-from meshsplats.finetuning import FEWEST_VIEWS
+from meshsplats.finetuning.config import FEWEST_VIEWS, LONG_ZOOMS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -94,8 +94,10 @@ class TargetOptions:
         threads: int | None,
         worthwhile: int = FEWEST_VIEWS,
         preset: str = "default",
+        long: bool = False,
     ) -> Dataset:
-        """The data set: by default with ``worthwhile`` views, and with the look of the ``preset``."""
+        """The data set: by default with ``worthwhile`` views, and with the look of the ``preset``; ``long``:
+        for a long run."""
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
@@ -118,6 +120,10 @@ class TargetOptions:
             cameras: list[Camera] | None = load_cameras(self.cameras)
         else:
             cameras = None if any(map(self._is_set, PLACING)) else cameras_beside(source)
+        look = self.look or ("area" if preset == "default" else "splats")
+        zooms: Sequence[int] | None = None if preset == "default" else (1,)
+        if long and look == "area":
+            zooms = LONG_ZOOMS
         return splat_dataset(
             scene,
             placement=self.placement,
@@ -127,8 +133,8 @@ class TargetOptions:
             width=self.width,
             distance=self.distance,
             up=None if self.up is None else parse_up(self.up),
-            look=self.look or ("area" if preset == "default" else "splats"),
-            zooms=None if preset == "default" else (1,),
+            look=look,
+            zooms=zooms,
             sh_degree=self.sh_degree,
             background=background,
             threads=threads,

@@ -41,9 +41,9 @@ from meshsplats.cli.records import (
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import Background
-from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions, worthwhile_views
-from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError
-from meshsplats.finetuning.config import LENGTHS
+from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
+from meshsplats.finetuning.config import LENGTHS, with_changes
 from meshsplats.finetuning.ranks import Ranks, joined_ranks
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -420,9 +420,10 @@ def default_background(config: FinetuneConfig) -> tuple[float, float, float]:
     return (0.0, 0.0, 0.0) if config.background == "black" else (1.0, 1.0, 1.0)
 
 
-def views_for(config: FinetuneConfig, earlier: Checkpoint | None) -> int:
-    """Number of images of splats. A run that is made longer keeps its views."""
-    return earlier.views if earlier and earlier.views else worthwhile_views(config)
+def as_begun(config: FinetuneConfig, earlier: Checkpoint | None) -> FinetuneConfig:
+    """``config`` with the length that the run began with: one that is made longer keeps its views and its
+    starting mesh."""
+    return config if earlier is None else with_changes(config, **planned_length(earlier))
 
 
 def over_background(

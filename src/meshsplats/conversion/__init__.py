@@ -338,9 +338,8 @@ def _ellipse(sides: int, rings: int, options: ConversionOptions, mode: str = "fl
 
 def _missing(areas: np.ndarray, shadow: np.ndarray, shapes: list[Shape], choice: np.ndarray) -> np.ndarray:
     """(n,) mean area of a splat's projection over all directions, divided by that of its ellipses, whose mean
-    |cos| is 1/2; 1 for stars, whose profile is fitted to the projection."""
-    ellipses = np.array([shape.pattern.ellipses for shape in shapes])[choice]
-    known = ellipses <= areas.shape[1]
-    last = np.where(known, ellipses, 1) - 1
-    drawn = 0.5 * np.take_along_axis(np.cumsum(areas, axis=1), last[:, None], axis=1)[:, 0]
-    return np.divide(shadow, drawn, out=np.ones_like(shadow), where=known & (drawn > 0))
+    |cos| is 1/2; 1 where the shape's profile is that of the projection."""
+    of_ellipses = ~np.array([shape.fits_projection for shape in shapes])[choice]
+    ellipses = np.array([1 if shape.fits_projection else shape.pattern.ellipses for shape in shapes])[choice]
+    drawn = 0.5 * np.take_along_axis(np.cumsum(areas, axis=1), ellipses[:, None] - 1, axis=1)[:, 0]
+    return np.divide(shadow, drawn, out=np.ones_like(shadow), where=of_ellipses & (drawn > 0))

@@ -54,6 +54,8 @@ class Shape:
 
     pattern: Pattern
     profile: LevelProfile
+    fits_projection: bool = False
+    """Whether the profile is that of the splat's projection in all directions, not in that of an ellipse."""
 
 
 @lru_cache(maxsize=64)

@@ -61,7 +61,11 @@ def star(ellipses: int, sides: int) -> Shape:
     level[0] = 0
     polygon = sides * np.sin(2 * np.pi / sides) / 2
     profile = StarProfile(ellipses, RADIUS * float(np.sqrt(np.pi / polygon)))
-    return Shape(Pattern(directions, level, np.concatenate(faces).astype(np.int32), ellipses), profile)
+    return Shape(
+        Pattern(directions, level, np.concatenate(faces).astype(np.int32), ellipses),
+        profile,
+        fits_projection=True,
+    )
 
 
 def _axes(count: int) -> np.ndarray:

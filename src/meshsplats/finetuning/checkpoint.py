@@ -46,13 +46,14 @@ class Checkpoint:
     """Arrays of ``State``, by name."""
     losses: tuple[float, ...] = ()
     """Losses of the steps since the last line of the metrics."""
-    views: int | None = None
-    """Number of training views; None: unknown, in checkpoints of earlier versions."""
+    planned: dict[str, Any] | None = None
+    """The length that the run began with (``LENGTHS``), if it was made longer since; None: that of
+    ``config``."""
 
 
 def save_checkpoint(checkpoint: Checkpoint, path: str | Path) -> None:
     """Writes ``checkpoint`` to ``path``, atomically replacing an earlier one."""
-    names = ("step", "seconds", "config", "mesh", "dataset", "losses", "views")
+    names = ("step", "seconds", "config", "mesh", "dataset", "losses", "planned")
     header = {name: getattr(checkpoint, name) for name in names}
     save_safetensors(path, checkpoint.arrays, {_KEY: json.dumps({"version": VERSION, **header})})
 
@@ -78,7 +79,7 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
             f"{path}: a checkpoint of version {header['version']}, this program reads version {VERSION}"
         )
     step, seconds, config, losses = (header[name] for name in ("step", "seconds", "config", "losses"))
-    views = header.get("views")
+    planned = header.get("planned")
     if (
         not isinstance(step, int)
         or step < 0
@@ -86,11 +87,18 @@ def load_checkpoint(path: str | Path, *, only_header: bool = False) -> Checkpoin
         or not isinstance(config, dict)
         or not isinstance(losses, list)
         or not all(isinstance(loss, float) for loss in losses)
-        or not (views is None or (isinstance(views, int) and views > 0))
+        or not (planned is None or (isinstance(planned, dict) and set(planned) <= set(LENGTHS)))
     ):
         raise FileFormatError(f"{path}: broken: step {step!r}, seconds {seconds!r}")
     fingerprints = str(header["mesh"]), str(header["dataset"])
-    return Checkpoint(step, float(seconds), config, *fingerprints, arrays, tuple(losses), views)
+    return Checkpoint(step, float(seconds), config, *fingerprints, arrays, tuple(losses), planned)
+
+
+def planned_length(checkpoint: Checkpoint) -> dict[str, Any]:
+    """The length that the run of ``checkpoint`` began with, by the names in ``LENGTHS``."""
+    if checkpoint.planned is not None:
+        return checkpoint.planned
+    return {name: checkpoint.config.get(name) for name in LENGTHS}
 
 
 class OtherRunError(ValueError):

@@ -23,6 +23,12 @@ _POSITION_EPSILON = 1e-15
 FEWEST_VIEWS, MOST_VIEWS = 200, 1000
 """Number of training images rendered from splats: for a short run, and for the longest."""
 
+LONG_MINUTES, LONG_STEPS = 10.0, 2000
+"""Least length of a long run."""
+LONG_ZOOMS = (1,) * 7 + (2,)
+"""``splat_dataset(zooms=...)`` of long runs, for the look 'area'. Windows add detail for large images and
+take some of what whole images gain, which a short run cannot spare."""
+
 
 @dataclass(frozen=True)
 class FinetuneConfig:
@@ -373,6 +379,16 @@ def worthwhile_views(config: FinetuneConfig) -> int:
     """
     wanted = 60 * config.minutes if config.minutes is not None else (config.steps or 0) / 2
     return round(min(max(wanted, FEWEST_VIEWS), MOST_VIEWS))
+
+
+def is_long(config: FinetuneConfig, views: int) -> bool:
+    """Whether a run with this number of training views is long enough for a mesh of more triangles, and for
+    ``LONG_ZOOMS``. Of the preset 'default', with blended triangles."""
+    if config.preset != "default" or config.opacity != "blended":
+        return False
+    if config.minutes is not None:
+        return config.minutes >= LONG_MINUTES
+    return (config.total_steps(views) or 0) >= LONG_STEPS
 
 
 def epsilons(config: FinetuneConfig) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import numpy as np
 from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.options import FLAT_SIDES, make_options
+from meshsplats.finetuning.config import FinetuneConfig, is_long
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, splat_starts
 
@@ -25,6 +26,10 @@ MANY_TRIANGLES = 600_000
 ``look='splats'``, where the guitar (90,000 splats) lost 1 dB with 6 for each."""
 FEWEST_SIDES = 5
 """Triangles of a splat, on average, in the largest clouds."""
+LONG_SIDES = 32
+"""Triangles of a splat, on average, for long runs."""
+LONG_TRIANGLES = 1_500_000
+"""``MANY_TRIANGLES`` of long runs."""
 
 
 def starting_mesh(
@@ -33,17 +38,20 @@ def starting_mesh(
     options: ConversionOptions | None = None,
     *,
     preset: str = "default",
+    config: FinetuneConfig | None = None,
     up: Sequence[float] | np.ndarray | None = None,
     **changes: Unpack[ConversionChanges],
 ) -> SplatMesh:
-    """``cloud`` converted for the fine-tuning of ``preset``, to be seen from ``cameras``.
+    """``cloud`` converted for the fine-tuning of ``preset``, to be seen from ``cameras``, those of all its
+    training views.
 
     For 'paper' and 'published' this is the paper's conversion. For 'default' it is ours, with one ellipse per
-    splat (``mode='flat'``) of 8 triangles on average, in large clouds fewer, but at least 5
-    (``MANY_TRIANGLES``), and more where much is visible (``detail='cameras'``), unless ``options`` or
-    ``changes``, as in ``convert``, say otherwise: two crossed ellipses look better before fine-tuning, but a
-    step takes longer and the result is worse. With ``look='splats'`` the mesh is to be drawn with the filter
-    of 3DGS (``footprint='filter'``), where the splats' kernel has it.
+    splat (``mode='flat'``) of 8 triangles on average, 32 if ``config`` is of a long run (``is_long``), in
+    large clouds fewer, but at least 5 (``MANY_TRIANGLES``, ``LONG_TRIANGLES``), and more where much is
+    visible (``detail='cameras'``), unless ``options`` or ``changes``, as in ``convert``, say otherwise: two
+    crossed ellipses look better before fine-tuning, but a step takes longer and the result is worse. With
+    ``look='splats'`` the mesh is to be drawn with the filter of 3DGS (``footprint='filter'``), where the
+    splats' kernel has it.
     """
     chosen = make_options(options, **changes)
     if preset != "default":
@@ -57,7 +65,9 @@ def starting_mesh(
         chosen = replace(chosen, detail="cameras")
         if chosen.sides is None and chosen.max_triangles is None and chosen.look != "splats":
             splats = max(1, min(len(cloud), chosen.max_splats or len(cloud)))
-            chosen = replace(chosen, sides=min(max(MANY_TRIANGLES // splats, FEWEST_SIDES), FLAT_SIDES))
+            long = config is not None and is_long(config, len(cameras))
+            most, sides = (LONG_TRIANGLES, LONG_SIDES) if long else (MANY_TRIANGLES, FLAT_SIDES)
+            chosen = replace(chosen, sides=min(max(most // splats, FEWEST_SIDES), sides))
     return convert(cloud, chosen, cameras=cameras, up=up)
 
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from meshsplats.finetuning.checkpoint import (
     dataset_fingerprint,
     load_checkpoint,
     mesh_fingerprint,
+    planned_length,
 )
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.hybrid import (
@@ -214,6 +215,8 @@ class RunStart:
     """Time used for them."""
     losses: tuple[float, ...] = ()
     """Losses of the steps since the last line of the metrics."""
+    planned: dict[str, Any] | None = None
+    """``Checkpoint.planned``."""
 
 
 def run_start(
@@ -248,7 +251,7 @@ def run_start(
         found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
     state = State.resume(found.arrays, blending, views, config, options.threads, options.device)
-    return RunStart(state, fingerprints, mesh, found.step, found.seconds, found.losses)
+    return RunStart(state, fingerprints, mesh, found.step, found.seconds, found.losses, planned_length(found))
 
 
 class TrainingLoop:
@@ -267,7 +270,7 @@ class TrainingLoop:
         self.journal, self.on_progress = journal, on_progress
         # The start itself is not kept: pruning replaces its state, whose memory is then free.
         self.state, self.step, self.losses = start.state, start.step, list(start.losses)
-        self.fingerprints, self.first_step = start.fingerprints, start.step
+        self.fingerprints, self.first_step, self.planned = start.fingerprints, start.step, start.planned
         self.steps = config.total_steps(len(dataset.train))
         self.start_time = time.perf_counter() - (start.seconds or options.spent)
         self.first_seconds = self.seconds
@@ -472,7 +475,7 @@ class TrainingLoop:
                 *self.fingerprints,
                 self.state.arrays(),
                 tuple(self.losses),
-                len(self.dataset.train),
+                self.planned,
             )
         )
         self.save_cost = time.perf_counter() - self.save_time
