@@ -122,7 +122,8 @@ class Finetune(TrainingCommand):
             )
         if self.cell_splats is not None:
             return self._plan_of_cells(config, scene, dataset, background)
-        begun = as_begun(config, earlier)
+        # Photographs are few: what more triangles for them are worth was not measured.
+        begun = as_begun(config, earlier) if self.target.data is None else None
         mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset, begun)
         summary = f"{len(mesh.faces):,} triangles"
         if isinstance(scene, GaussianCloud) and (mesh.splat_count or 0) < len(scene):
@@ -226,7 +227,7 @@ class Finetune(TrainingCommand):
     def _start_preset(self) -> str:
         return self.preset if self.start == "same" else self.start
 
-    def _converted(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig) -> SplatMesh:
+    def _converted(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig | None) -> SplatMesh:
         cameras = [view.camera for view in dataset.train]
         options = replace(self.conversion, crop=None, look=dataset.look)  # cropped already
         return starting_mesh(cloud, cameras, options, preset=self._start_preset, config=config)
