@@ -31,6 +31,7 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
+from meshsplats.finetuning.config import is_long
 
 
 @dataclass(frozen=True)
@@ -98,12 +99,15 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
     else:
         source = options.data / scene.splats
         target = TargetOptions(sh_degree=options.sh_degree, held_out=1, look=options.look)
-        data = target.make(cloud, source, (1, 1, 1), options.threads, worthwhile_views(config), preset)
+        count = worthwhile_views(config)
+        long = is_long(config, count)
+        data = target.make(cloud, source, (1, 1, 1), options.threads, count, preset, long)
         cameras = ms.load_cameras(options.data / scene.cameras)
         views = splat_views(cloud, cameras, look=options.look, sh_degree=options.sh_degree)
         judged = ms.Dataset((), views, look=options.look)
     cameras = [view.camera for view in data.train]
-    mesh = starting_mesh(cloud, cameras, preset=preset, look=data.look)
+    of_images = None if scene.photographs else config
+    mesh = starting_mesh(cloud, cameras, preset=preset, config=of_images, look=data.look)
     reports = []
     run = RunOptions(threads=options.threads, report_every=0, spent=seconds())
     if options.clock == "wall" or options.steps:

@@ -26,6 +26,7 @@ import meshsplats as ms
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import RunOptions, make_config, starting_mesh, worthwhile_views
+from meshsplats.finetuning.config import is_long
 
 SIZES = {"200": (200, 1), "400": (400, 1), "800": (800, 1), "1600": (1600, 1), "near": (800, 2)}
 SAMPLES = {"area": 2, "splats": 1}
@@ -94,11 +95,13 @@ def tune(
     config = make_config("default", **length, samples=samples)
     if zooms is None:
         target = TargetOptions(look=look)  # type: ignore[arg-type]
-        data = target.make(cloud, Path("splats.ply"), (1, 1, 1), options.threads, worthwhile_views(config))
+        views = worthwhile_views(config)
+        long = is_long(config, views)
+        data = target.make(cloud, Path("splats.ply"), (1, 1, 1), options.threads, views, long=long)
     else:
         count = worthwhile_views(config)
         data = ms.splat_dataset(cloud, train=count, look=look, zooms=zooms, threads=options.threads)
-    mesh = starting_mesh(cloud, [view.camera for view in data.train], look=look, **start)
+    mesh = starting_mesh(cloud, [view.camera for view in data.train], config=config, look=look, **start)
     steps = []
     spent = time.perf_counter() - began
     run = RunOptions(threads=options.threads, report_every=0, spent=spent)
