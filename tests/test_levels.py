@@ -55,6 +55,17 @@ def test_tuning_makes_a_level_better():
     assert likeness(tuned, cloud, cameras, sh_degree=0) > likeness(plain, cloud, cameras, sh_degree=0)
 
 
+def test_all_levels_have_the_triangles_of_a_splat_of_the_finest(monkeypatch):
+    from meshsplats.finetuning import initial, make_config
+
+    monkeypatch.setattr(initial, "MANY_TRIANGLES", 6000)
+    cloud = make_scene(600)
+    level = Level(150, 40)
+    config = make_config("default", steps=1)
+    mesh = make_level(cloud, level, level_targets(cloud, level, config, sh_degree=0), config)
+    assert 9 * mesh.splat_count < len(mesh.faces) <= 10 * 150
+
+
 @pytest.fixture
 def splats(tmp_path):
     save_gaussians(make_scene(400), tmp_path / "scene.ply")

@@ -22,6 +22,7 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
+from meshsplats.finetuning.initial import starting_sides
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -86,7 +87,8 @@ def make_level(
     on_progress: Callable[[Progress], None] | None = None,
 ) -> SplatMesh:
     """The mesh of ``level``: splats merged to its number, converted, and fine-tuned on ``targets`` as
-    ``config`` says; without one, converted only.
+    ``config`` says; without one, converted only. Without ``options``, splats have as many triangles as on the
+    finest level, so that the numbers of triangles follow those of splats.
 
     ``options`` and ``up`` are those of ``convert``; ``run`` and ``on_progress`` those of ``finetune``.
     """
@@ -94,6 +96,7 @@ def make_level(
         cameras = [view.camera for view in targets.test]
         return convert(cloud, options, cameras=cameras, up=up, max_splats=level.splats)
     cameras = [view.camera for view in targets.train]
+    options = options or ConversionOptions(sides=starting_sides(len(cloud), config, len(cameras)))
     mesh = starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
     return finetune(mesh, targets, config, run=run, on_progress=on_progress)
 

@@ -90,8 +90,8 @@ class Finetune(TrainingCommand):
     preset: Literal["default", "paper", "published"] = "default"
     """default: best quality at equal time. paper: the text of the MeshSplats paper. published: its code."""
     start: Literal["same", "default", "paper"] = "same"
-    """Conversion of splats; same: that of --preset. default: one ellipse of 8 triangles per splat. paper: the
-    paper's conversion, also for published."""
+    """Conversion of splats; same: that of --preset. default: an ellipse of 5 to 32 triangles a splat. paper:
+    the paper's conversion, also for published."""
     conversion: StartOptions = field(default_factory=StartOptions)
     cell_splats: Count = None
     """Tune splats in cells of at most N, in the memory of a cell, one after the other or by --cluster."""

@@ -44,12 +44,16 @@ STANDS = 12
 HELD_OUT = 8
 """Least number of views that are never trained on, used or not: a mesh can be evaluated on them later,
 however it was trained."""
-ZOOMS = {"area": (1,), "splats": (1, 1, 2, 4)}
+ZOOMS = {"area": (1,), "splats": (1, 2, 4)}
 """Zooms of the training views of each look, in turn: 1 is the whole image; 2 is a window of the same size of
 an image twice as large. The filter of splat viewers has another width in the scene at every image size, and
-a mesh that is drawn with it has to take the unfiltered shape. Means over areas hold for all sizes."""
+a mesh that is drawn with it has to take the unfiltered shape. Means over areas hold for all sizes. Not four
+zooms: four of ``STEPS[0]`` are almost whole turns, so that views of one zoom follow each other closely."""
 TRAINING_SAMPLES = 2
 """Side of the grid of samples in each pixel of training views, for the look 'area'."""
+WINDOW_CENTERS = 4096
+"""Number of splats around which windows are cut out. Windows that are spread over the image show little but
+background where the subject is slim."""
 CANDIDATES = 512
 """Number of points that are tried as such places."""
 ROOMY = 0.4
@@ -107,6 +111,8 @@ def splat_dataset(
 
     Raises ValueError for an empty cloud or an option out of its range.
     """
+    if len(cloud) == 0:
+        raise ValueError("the scene is empty: there is nothing to make images of")
     if placement not in ("auto", "object", "surrounded", "inside"):
         raise ValueError(f"placement must be auto, object, surrounded or inside, got {placement!r}")
     if train < 1 or test < 0:
@@ -139,7 +145,10 @@ def splat_dataset(
     zooms = ZOOMS[look] if zooms is None else zooms
     if not zooms or min(zooms) < 1:
         raise ValueError(f"zooms must be whole numbers from 1 on, got {zooms!r}")
-    learned_from = [_window(camera, zooms[i % len(zooms)], i) for i, camera in enumerate(placed[first:])]
+    centers = _window_centers(cloud)
+    learned_from = [
+        _window(camera, zooms[i % len(zooms)], i, centers) for i, camera in enumerate(placed[first:])
+    ]
     quick = TRAINING_SAMPLES if look == "area" else None
     held_out, learned = (
         splat_views(
@@ -294,15 +303,26 @@ def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np
     return tried[chosen], clearance[chosen]
 
 
-def _window(camera: Camera, zoom: int, number: int) -> Camera:
-    """As large an image, cut out of that of ``camera`` drawn ``zoom`` times as large; ``number`` spreads such
-    windows over the middle of the image."""
+def _window_centers(cloud: GaussianCloud) -> np.ndarray:
+    """(WINDOW_CENTERS, 3): means of splats, evenly spread over the opacity in the order of the file."""
+    opacity = np.cumsum(cloud.opacities, dtype=np.float64)
+    shares = (np.arange(WINDOW_CENTERS) + 0.5) / WINDOW_CENTERS
+    chosen = np.searchsorted(opacity, shares * opacity[-1])
+    return cloud.means[np.minimum(chosen, len(cloud) - 1)]
+
+
+def _window(camera: Camera, zoom: int, number: int, centers: np.ndarray) -> Camera:
+    """As large an image, cut out of that of ``camera`` drawn ``zoom`` times as large, around one of
+    ``centers``, scene points (k, 3), that ``camera`` sees; ``number`` spreads such windows over them."""
     if zoom == 1:
         return camera
-    # Most of what there is to see lies in the middle, and windows reach half their size beyond their own.
-    u, v = 0.15 + 0.7 * ((0.5 + np.array(STEPS[:2]) * number) % 1)
-    left = round(min(max(u * zoom - 0.5, 0), zoom - 1) * camera.width)
-    top = round(min(max(v * zoom - 0.5, 0), zoom - 1) * camera.height)
+    x, y = camera.width / 2, camera.height / 2
+    positions, _ = camera.project(centers)
+    seen = positions[camera.in_image(positions)]
+    if len(seen):
+        x, y = seen[int((0.5 + STEPS[2] * number) % 1 * len(seen))].tolist()
+    left = round(min(max(x * zoom - camera.width / 2, 0), (zoom - 1) * camera.width))
+    top = round(min(max(y * zoom - camera.height / 2, 0), (zoom - 1) * camera.height))
     return replace(
         camera,
         fx=camera.fx * zoom,
