@@ -15,8 +15,9 @@
 // triangles (x, y, k / z), where k scales depth to DEPTH_SHARE of its extent parallel to the image.
 #pragma once
 
+#include <algorithm>
 #include <atomic>
-#include <cstring>
+#include <cmath>
 #include <stdexcept>
 
 #include "parallel.h"
@@ -29,56 +30,104 @@ struct SharedVertices : std::runtime_error {
     SharedVertices() : std::runtime_error("two splats share a vertex") {}
 };
 
+// The vertices of each fan, as one list of slots in the order of the fans: fan i has the faces
+// [faces[i], faces[i + 1]) and the slots [slots[i], slots[i + 1]). Where the vertices of each fan follow
+// those of the fan before, as conversion makes them, a slot is a vertex, and slots may include vertices of no
+// face.
+class FanVertices {
+  public:
+    std::vector<int32_t> faces, slots;
+
+    explicit FanVertices(const MsMesh &mesh) {
+        faces.reserve(mesh.face_count / 6 + 2);
+        slots.reserve(faces.capacity());
+        if (!list_in_order(mesh)) list_in_any_order(mesh);
+    }
+    int32_t fan_count() const { return (int32_t)faces.size() - 1; }
+    int32_t slot(int32_t vertex) const { return slot_of_vertex_.empty() ? vertex : slot_of_vertex_[vertex]; }
+    int32_t vertex(int32_t slot) const { return vertex_of_slot_.empty() ? slot : vertex_of_slot_[slot]; }
+
+  private:
+    // False if a fan has a vertex below the last one of the fans before.
+    bool list_in_order(const MsMesh &mesh) {
+        int32_t end = 0;  // vertices up to here are of the fans before
+        bool in_order = true;
+        for (int64_t i = 0; i < mesh.face_count;) {
+            faces.push_back((int32_t)i);
+            slots.push_back(end);
+            int32_t least = INT32_MAX, most = end - 1;
+            const int32_t splat = mesh.face_splat[i];
+            for (; i < mesh.face_count && mesh.face_splat[i] == splat; ++i) {
+                const int32_t *f = mesh.faces + 3 * i;
+                least = std::min(least, std::min(f[0], std::min(f[1], f[2])));
+                most = std::max(most, std::max(f[0], std::max(f[1], f[2])));
+            }
+            in_order &= least >= end;
+            end = most + 1;
+        }
+        faces.push_back((int32_t)mesh.face_count);
+        slots.push_back(end);
+        return in_order;
+    }
+    void list_in_any_order(const MsMesh &mesh) {
+        slots.clear();
+        slot_of_vertex_.assign(mesh.vertex_count, -1);
+        for (int32_t fan = 0; fan < fan_count(); ++fan) {
+            const int32_t first = (int32_t)vertex_of_slot_.size();
+            slots.push_back(first);
+            for (int64_t i = 3 * (int64_t)faces[fan]; i < 3 * (int64_t)faces[fan + 1]; ++i) {
+                int32_t &slot = slot_of_vertex_[mesh.faces[i]];
+                if (slot >= 0 && slot < first) throw SharedVertices();
+                if (slot >= 0) continue;
+                slot = (int32_t)vertex_of_slot_.size();
+                vertex_of_slot_.push_back(mesh.faces[i]);
+            }
+        }
+        slots.push_back((int32_t)vertex_of_slot_.size());
+    }
+
+    // Empty where a slot is a vertex.
+    std::vector<int32_t> slot_of_vertex_, vertex_of_slot_;
+};
+
 class FanFilter {
   public:
-    // Filters the projected vertices that faces use. Fans without area and fans with a vertex nearer than the
-    // near plane stay as they are. Keeps a pointer to the arrays of the mesh for backward(). Throws
+    // Projects the vertices that faces use, and filters them. Fans without area and fans with a vertex nearer
+    // than the near plane stay as they are. Keeps a pointer to the arrays of the mesh for backward(). Throws
     // SharedVertices.
-    FanFilter(const MsMesh &mesh, const Projection &projection, int samples,
-              PooledVector<Projected> &&unfiltered, int threads)
+    FanFilter(const MsMesh &mesh, const Projection &projection, int samples, int threads)
         : mesh_(mesh),
           projection_(projection),
           variance_(mesh.filter_px2 * samples * samples),
           depth_scale_(DEPTH_SHARE * std::sqrt(projection.fx * projection.fy)),
-          unfiltered_(std::move(unfiltered)),
-          filtered_(mesh.vertex_count),
-          owner_(mesh.vertex_count) {
+          fans_(mesh),
+          filtered_(mesh.vertex_count) {
         MS_ASSERT(mesh.face_splat && variance_ > 0);
-        MS_ASSERT((int64_t)unfiltered_.size() == mesh.vertex_count);
-        for (int64_t i = 0; i < mesh.face_count; ++i)
-            if (i == 0 || mesh.face_splat[i] != mesh.face_splat[i - 1]) starts_.push_back((int32_t)i);
-        fans_.resize(starts_.size());
-        starts_.push_back((int32_t)mesh.face_count);
-        // Each fan claims its vertices; a vertex of two fans keeps either claim, and the other fan notices.
-        for_fan_blocks(threads, [&](int32_t begin, int32_t end, int) {
-            for (int32_t fan = begin; fan < end; ++fan)
-                for_each_corner(fan, [&](int32_t v) { __atomic_store_n(&owner_[v], fan, __ATOMIC_RELAXED); });
+        for_blocks(threads, [&](int32_t begin, int32_t end, Block &block) {
+            project(begin, end, block);
+            for (int32_t fan = begin; fan < end; ++fan) block.order.push_back(fan);
+            for_batches(block, [&](const Batch &batch) {
+                for (int lane = 0; lane < batch.size; ++lane) filter(batch, lane, block);
+            });
         });
-        std::atomic<bool> shared{false};
-        for_fan_blocks(threads, [&](int32_t begin, int32_t end, int) {
-            // Separate loops: the steps of one solve_transform wait for each other, but not for other fans.
-            for (int32_t fan = begin; fan < end; ++fan) accumulate_moments(fan);
-            for (int32_t fan = begin; fan < end; ++fan) solve_transform(fans_[fan]);
-            bool clash = false;
-            for (int32_t fan = begin; fan < end; ++fan) clash |= !transform_vertices(fan);
-            if (clash) shared = true;
-        });
-        if (shared) throw SharedVertices();
     }
 
     // (vertex_count,) in samples; undefined for vertices that no face uses.
     const Projected *filtered() const { return filtered_.data(); }
 
+    // (fan_count + 1,) of fans in the order of the faces, and face_count.
+    const std::vector<int32_t> &first_faces() const { return fans_.faces; }
+
     // Backward pass. Adds to `out` the gradients of positions in world space and of opacities. `grad` holds
     // those of the filtered vertices in camera space, (vertex_count, 3).
     void backward(const float *grad, const MsVertexGradients &out, int threads) const {
-        // owner_, but -1 - i for the vertices of the current fan, where i is the index in its list of
-        // gradients.
-        PooledVector<int32_t> index(owner_);
-        std::vector<std::vector<FanVertexGradient>> buffers(threads);
-        for_fan_blocks(threads, [&](int32_t begin, int32_t end, int thread) {
+        for_blocks(threads, [&](int32_t begin, int32_t end, Block &block) {
             for (int32_t fan = begin; fan < end; ++fan)
-                backward_fan(fan, grad, index.data(), buffers[thread], out);
+                if (has_gradient(fan, grad)) block.order.push_back(fan);
+            if (block.order.empty()) return;
+            project(begin, end, block);
+            block.gradients.resize(block.vertices.size());
+            for_batches(block, [&](const Batch &batch) { backward_batch(batch, grad, block, out); });
         });
     }
 
@@ -87,107 +136,200 @@ class FanFilter {
     static constexpr double DEPTH_SHARE = 0.1;
     static constexpr double OPACITY_BIAS = 1e-6;  // added to opacities: transparent fans need moments, too
 
-    struct Fan {
-        // Until solve_transform, the first three are sums relative to the origin: see accumulate_moments.
-        double inverse_mass;  // 1 / (60 integral of opacity over doubled areas)
-        double x, y;          // mean c
-        double m[3];          // covariance M: xx, xy, yy
-        double x0, y0;        // origin of the sums: a vertex of the fan
-        double k;             // scale of depths
-        double a[3];          // A: xx, xy, yy
-        bool active;          // false: the fan stays as it is
-    };
-    // Gradient of the fan's density at q, relative to the mean: (q^T h q + c . q - level) inverse_mass.
-    struct DensityGradient {
-        double h[3], c[2], level;
-    };
-    struct FanVertexGradient {
-        int32_t vertex;
+    // Fans are processed WD at a time, one in each lane. No lane depends on its neighbours.
+
+    struct VertexGradient {
         double x, y;  // of the position in samples
         double z;     // of the camera depth
         double alpha;
     };
-    // Triangles are processed eight at a time. Lanes are summed in a fixed order.
-    typedef double Double8 __attribute__((vector_size(64)));
-    static constexpr int BATCH = 8;
+    // A projected vertex: position in samples, 1 / depth, opacity with its bias.
+    struct Vertex {
+        double x, y, w, a;
+    };
+    // The working memory of a thread: consecutive fans, and the vertices in their slots from `base` on.
+    struct Block {
+        int32_t base;
+        PooledVector<Vertex> vertices;
+        PooledVector<VertexGradient> gradients;
+        std::vector<int32_t> order, sorted, bins;  // fans to process
+    };
     struct Batch {
-        Double8 x[3], y[3], w[3], a[3];  // corners: position relative to an origin, 1 / depth, opacity
-        Double8 alpha_sum;               // over the corners
-        Double8 u[3], v[3], n[3];        // edges 0 to 1 and 0 to 2 in (x, y, k / z), and their cross product
-        Double8 area;                    // doubled: |n|
-        int size;                        // lanes in use; corners are 0 in the others
-        bool visible;                    // all corners are beyond the near plane
+        int size;  // lanes in use; the others repeat the last fan
+        int32_t fan[WD];
+        int32_t first[WD];    // first triangles
+        int32_t count[WD];    // numbers of triangles
+        int32_t least, most;  // of the counts
+        vd inverse_mass;      // 1 / (60 integral of opacity over doubled areas)
+        vd x, y;              // mean c
+        vd m[3];              // covariance M: xx, xy, yy
+        vd inverse[3];        // of M with MIN_VARIANCE added
+        vd k;                 // scale of depths: that of the fan's first vertex
+        vd a[3];              // A: xx, xy, yy
+        bool active[WD];      // false: the fan stays as it is
+    };
+    // The triangles of one number in all fans of a batch.
+    struct Triangles {
+        int32_t slot[3][WD];        // corners, in the block
+        vd x[3], y[3], w[3], a[3];  // corners: position relative to an origin, 1 / depth, opacity
+        vd alpha_sum;               // over the corners
+        vd u[3], v[3], n[3];        // edges 0 to 1 and 0 to 2 in (x, y, k / z), and their cross product
+        vd area;                    // doubled: |n|; 0 in the lanes of fans that have no such triangle
+    };
+    // Gradients of the densities at q, relative to the mean: (q^T h q + c . q - level) inverse_mass.
+    struct DensityGradient {
+        vd h[3], c[2], level;
     };
 
+    // Calls body(begin, end, block) with an empty order for blocks of fans.
     template <class Body>
-    void for_fan_blocks(int threads, Body body) const {
-        parallel_blocks(threads, (int64_t)fans_.size(), 1 << 10, [&](int64_t begin, int64_t end, int thread) {
-            body((int32_t)begin, (int32_t)end, thread);
+    void for_blocks(int threads, Body body) const {
+        std::vector<Block> blocks(threads);
+        parallel_blocks(threads, fans_.fan_count(), 1 << 6, [&](int64_t begin, int64_t end, int thread) {
+            blocks[thread].order.clear();
+            body((int32_t)begin, (int32_t)end, blocks[thread]);
         });
     }
-    // Calls body(vertex) at least once for each vertex of a fan. Repetitions are few if all triangles list
-    // the centre first and continue along the rim.
+
+    void project(int32_t begin, int32_t end, Block &block) const {
+        block.base = fans_.slots[begin];
+        const size_t count = fans_.slots[end] - block.base;
+        block.vertices.resize(count);
+        const Projection projection = projection_;
+        for (size_t i = 0; i < count; ++i) {
+            const int64_t v = fans_.vertex(block.base + (int32_t)i);
+            const Projected p = projection.project(projection.to_camera(mesh_.vertices + 3 * v));
+            block.vertices[i] = {p.x, p.y, p.w, mesh_.colors[4 * v + 3] + OPACITY_BIAS};
+        }
+    }
+
+    // Calls body(batch) for all fans of block.order, those with equally many triangles together, and with
+    // their transforms.
     template <class Body>
-    __attribute__((always_inline)) void for_each_corner(int32_t fan, Body body) const {
-        int32_t head = -1, tail = -1;
-        for (int64_t i = starts_[fan]; i < starts_[fan + 1]; ++i) {
-            const int32_t *f = mesh_.faces + 3 * i;
-            if (f[0] != head) body(f[0]);
-            if (f[1] != tail) body(f[1]);
-            body(f[2]);
-            head = f[0], tail = f[2];
-        }
-    }
-
-    // Loads up to BATCH triangles [first, end), relative to the origin (x0, y0).
-    __attribute__((always_inline)) void load_batch(int64_t first, int64_t end, double x0, double y0, double k,
-                                                   Batch &t) const {
-        MS_ASSERT(first < end && end <= mesh_.face_count);
-        t.visible = true;
-        t.size = (int)std::min<int64_t>(BATCH, end - first);
-        for (int j = 0; j < 3 && t.size < BATCH; ++j) t.x[j] = t.y[j] = t.w[j] = t.a[j] = Double8{};
-        const int32_t *face = mesh_.faces + 3 * first;
-        for (int lane = 0; lane < t.size; ++lane) {
-            for (int j = 0; j < 3; ++j) {
-                const int64_t v = *face++;
-                const Projected &p = unfiltered_[v];
-                t.x[j][lane] = p.x - x0;
-                t.y[j][lane] = p.y - y0;
-                t.w[j][lane] = p.w;
-                t.a[j][lane] = mesh_.colors[4 * v + 3] + OPACITY_BIAS;
-                t.visible &= p.w > 0;
+    __attribute__((always_inline)) void for_batches(Block &block, Body body) const {
+        sort_by_count(block);
+        const int count = (int)block.order.size();
+        Batch batch;
+        for (int i = 0; i < count; i += WD) {
+            batch.size = std::min(WD, count - i);
+            batch.least = INT32_MAX, batch.most = 0;
+            for (int lane = 0; lane < WD; ++lane) {
+                const int32_t fan = block.order[i + std::min(lane, batch.size - 1)];
+                batch.fan[lane] = fan;
+                batch.first[lane] = fans_.faces[fan];
+                batch.count[lane] = fans_.faces[fan + 1] - fans_.faces[fan];
+                batch.least = std::min(batch.least, batch.count[lane]);
+                batch.most = std::max(batch.most, batch.count[lane]);
             }
+            solve_transforms(block, batch);
+            body(batch);
         }
-        t.alpha_sum = t.a[0] + t.a[1] + t.a[2];
-        t.u[0] = t.x[1] - t.x[0], t.u[1] = t.y[1] - t.y[0], t.u[2] = k * (t.w[1] - t.w[0]);
-        t.v[0] = t.x[2] - t.x[0], t.v[1] = t.y[2] - t.y[0], t.v[2] = k * (t.w[2] - t.w[0]);
-        cross(t.u, t.v, t.n);
-        const Double8 square = t.n[0] * t.n[0] + t.n[1] * t.n[1] + t.n[2] * t.n[2];
-        for (int lane = 0; lane < BATCH; ++lane) t.area[lane] = std::sqrt(square[lane]);
     }
 
-    // The sums over the triangles of a fan, from which solve_transform finds its mean and covariance.
-    void accumulate_moments(int32_t fan_index) {
-        const int64_t first = starts_[fan_index], end = starts_[fan_index + 1];
-        const Projected &origin = unfiltered_[mesh_.faces[3 * first]];
-        Fan &fan = fans_[fan_index];
-        fan.k = origin.w > 0 ? depth_scale_ / origin.w : 0;
-        bool visible = true;
-        Batch t;
-        Double8 mass = {}, sx = {}, sy = {}, xx = {}, xy = {}, yy = {};
-        for (int64_t i = first; i < end; i += BATCH) {
-            load_batch(i, end, origin.x, origin.y, fan.k, t);
-            visible &= t.visible;
+    // A stable counting sort of block.order, which is not empty; large fans share the last bin.
+    void sort_by_count(Block &block) const {
+        constexpr int BINS = 128;
+        const auto bin = [&](int32_t fan) {
+            return std::min(fans_.faces[fan + 1] - fans_.faces[fan], BINS - 1);
+        };
+        const int first_bin = bin(block.order[0]);
+        bool sorted = true;
+        for (int32_t fan : block.order) sorted &= bin(fan) == first_bin;
+        if (sorted) return;
+        block.bins.assign(BINS + 1, 0);
+        for (int32_t fan : block.order) ++block.bins[bin(fan) + 1];
+        for (int i = 0; i < BINS; ++i) block.bins[i + 1] += block.bins[i];
+        block.sorted.resize(block.order.size());
+        for (int32_t fan : block.order) block.sorted[block.bins[bin(fan)]++] = fan;
+        block.order.swap(block.sorted);
+    }
+
+    // The vertices with the indices i, by field.
+    static void gather(const Block &block, const int32_t *i, vd fields[4]) {
+        const double *rows[WD];
+        for (int lane = 0; lane < WD; ++lane) rows[lane] = &block.vertices[i[lane]].x;
+        transpose(rows, fields);
+    }
+    static vd root(const vd &a) {
+        vd roots;
+        for (int lane = 0; lane < WD; ++lane) roots[lane] = std::sqrt(a[lane]);
+        return roots;
+    }
+    static void cross(const vd a[3], const vd b[3], vd out[3]) {
+        out[0] = a[1] * b[2] - a[2] * b[1];
+        out[1] = a[2] * b[0] - a[0] * b[2];
+        out[2] = a[0] * b[1] - a[1] * b[0];
+    }
+    // a b a for symmetric 2 x 2 matrices xx, xy, yy.
+    static void congruence(const vd a[3], const vd b[3], vd out[3]) {
+        const vd p = a[0] * b[0] + a[1] * b[1], q = a[0] * b[1] + a[1] * b[2], r = a[1] * b[0] + a[2] * b[1],
+                 t = a[1] * b[1] + a[2] * b[2];
+        out[0] = p * a[0] + q * a[1];
+        out[1] = p * a[1] + q * a[2];
+        out[2] = r * a[1] + t * a[2];
+    }
+
+    // Loads the triangles `number` of the fans, relative to the origins (x0, y0). `t` holds those of the
+    // number before: the triangles of a fan have its centre in common, and each begins at the corner where
+    // the last one ended.
+    __attribute__((always_inline)) void load_triangles(const Block &block, const Batch &batch, int number,
+                                                       const vd &x0, const vd &y0, Triangles &t) const {
+        bool same_center = number > 0, joined = number > 0;
+        for (int lane = 0; lane < WD; ++lane) {
+            const int64_t face = batch.first[lane] + std::min(number, batch.count[lane] - 1);
+            int32_t corner[3];
+            for (int j = 0; j < 3; ++j) corner[j] = fans_.slot(mesh_.faces[3 * face + j]) - block.base;
+            same_center &= corner[0] == t.slot[0][lane];
+            joined &= corner[1] == t.slot[2][lane];
+            for (int j = 0; j < 3; ++j) t.slot[j][lane] = corner[j];
+        }
+        if (!same_center) load_corners(block, x0, y0, 0, t);
+        if (joined) {
+            t.x[1] = t.x[2], t.y[1] = t.y[2], t.w[1] = t.w[2], t.a[1] = t.a[2];
+        } else {
+            load_corners(block, x0, y0, 1, t);
+        }
+        load_corners(block, x0, y0, 2, t);
+        t.alpha_sum = t.a[0] + t.a[1] + t.a[2];
+        t.u[0] = t.x[1] - t.x[0], t.u[1] = t.y[1] - t.y[0], t.u[2] = batch.k * (t.w[1] - t.w[0]);
+        t.v[0] = t.x[2] - t.x[0], t.v[1] = t.y[2] - t.y[0], t.v[2] = batch.k * (t.w[2] - t.w[0]);
+        cross(t.u, t.v, t.n);
+        t.area = root(t.n[0] * t.n[0] + t.n[1] * t.n[1] + t.n[2] * t.n[2]);
+        if (number >= batch.least)
+            for (int lane = 0; lane < WD; ++lane)
+                if (number >= batch.count[lane]) t.area[lane] = 0;
+    }
+    __attribute__((always_inline)) static void load_corners(const Block &block, const vd &x0, const vd &y0,
+                                                            int j, Triangles &t) {
+        vd fields[4];
+        gather(block, t.slot[j], fields);
+        t.x[j] = fields[0] - x0, t.y[j] = fields[1] - y0, t.w[j] = fields[2], t.a[j] = fields[3];
+    }
+
+    // Means, covariances and A of the fans of a batch.
+    void solve_transforms(const Block &block, Batch &batch) const {
+        int32_t origin[WD];
+        for (int lane = 0; lane < WD; ++lane)
+            origin[lane] = fans_.slot(mesh_.faces[3 * (int64_t)batch.first[lane]]) - block.base;
+        vd origins[4];
+        gather(block, origin, origins);
+        const vd &x0 = origins[0], &y0 = origins[1], &w0 = origins[2];
+        batch.k = depth_scale_ / w0;
+        vd mass = {}, sx = {}, sy = {}, xx = {}, xy = {}, yy = {}, nearest = w0;
+        Triangles t;
+        for (int number = 0; number < batch.most; ++number) {
+            load_triangles(block, batch, number, x0, y0, t);
             // Q = (x, y), B = (bx, by), and the sum of (a + 2 a_i) q_i q_i^T.
-            const Double8 x = t.x[0] + t.x[1] + t.x[2], y = t.y[0] + t.y[1] + t.y[2];
-            Double8 bx = {}, by = {}, txx = {}, txy = {}, tyy = {};
+            const vd x = t.x[0] + t.x[1] + t.x[2], y = t.y[0] + t.y[1] + t.y[2];
+            vd bx = {}, by = {}, txx = {}, txy = {}, tyy = {};
             for (int j = 0; j < 3; ++j) {
-                const Double8 weight = t.alpha_sum + 2 * t.a[j];
+                const vd weight = t.alpha_sum + 2 * t.a[j];
                 bx += t.a[j] * t.x[j];
                 by += t.a[j] * t.y[j];
                 txx += weight * t.x[j] * t.x[j];
                 txy += weight * t.x[j] * t.y[j];
                 tyy += weight * t.y[j] * t.y[j];
+                nearest = t.w[j] < nearest ? t.w[j] : nearest;
             }
             mass += 20 * t.alpha_sum * t.area;
             sx += 5 * t.area * (t.alpha_sum * x + bx);
@@ -196,152 +338,138 @@ class FanFilter {
             xy += t.area * (txy + t.alpha_sum * x * y + bx * y + by * x);
             yy += t.area * (tyy + y * (t.alpha_sum * y + 2 * by));
         }
-        fan.inverse_mass = total(mass);
-        fan.x = total(sx);
-        fan.y = total(sy);
-        fan.m[0] = total(xx);
-        fan.m[1] = total(xy);
-        fan.m[2] = total(yy);
-        fan.x0 = origin.x;
-        fan.y0 = origin.y;
-        fan.active = visible;
-    }
-
-    // Mean, covariance and A of a fan. The square root of a 2 x 2 matrix B with determinant d^2 is
-    // (B + d I) / sqrt(tr B + 2 d).
-    void solve_transform(Fan &fan) const {
-        const bool has_mass = fan.inverse_mass > 0;
-        fan.inverse_mass = 1 / fan.inverse_mass;
-        const double x = fan.x * fan.inverse_mass, y = fan.y * fan.inverse_mass;
-        fan.x = fan.x0 + x;
-        fan.y = fan.y0 + y;
-        fan.m[0] = fan.m[0] * fan.inverse_mass - x * x;
-        fan.m[1] = fan.m[1] * fan.inverse_mass - x * y;
-        fan.m[2] = fan.m[2] * fan.inverse_mass - y * y;
-        const Inverse inverse = inverse_covariance(fan);
-        // B = I + s M^-1.
-        const double s = variance_, b[3] = {1 + s * inverse.m[0], s * inverse.m[1], 1 + s * inverse.m[2]},
-                     d = std::sqrt(1 + s * (inverse.m[0] + inverse.m[2]) + s * s * inverse.determinant),
-                     scale = 1 / std::sqrt(b[0] + b[2] + 2 * d);
-        fan.a[0] = (b[0] + d) * scale;
-        fan.a[1] = b[1] * scale;
-        fan.a[2] = (b[2] + d) * scale;
+        batch.inverse_mass = 1 / mass;
+        const vd x = sx * batch.inverse_mass, y = sy * batch.inverse_mass;
+        batch.x = x0 + x;
+        batch.y = y0 + y;
+        batch.m[0] = xx * batch.inverse_mass - x * x;
+        batch.m[1] = xy * batch.inverse_mass - x * y;
+        batch.m[2] = yy * batch.inverse_mass - y * y;
+        // B = I + s M^-1. The square root of a 2 x 2 matrix B with determinant d^2 is
+        // (B + d I) / sqrt(tr B + 2 d).
+        const double s = variance_, least = MIN_VARIANCE * s;
+        const vd mxx = batch.m[0] + least, mxy = batch.m[1], myy = batch.m[2] + least,
+                 determinant = 1 / (mxx * myy - mxy * mxy);
+        batch.inverse[0] = myy * determinant;
+        batch.inverse[1] = -mxy * determinant;
+        batch.inverse[2] = mxx * determinant;
+        const vd bxx = 1 + s * batch.inverse[0], byy = 1 + s * batch.inverse[2],
+                 d = root(1 + s * (batch.inverse[0] + batch.inverse[2]) + s * s * determinant),
+                 scale = 1 / root(bxx + byy + 2 * d);
+        batch.a[0] = (bxx + d) * scale;
+        batch.a[1] = s * batch.inverse[1] * scale;
+        batch.a[2] = (byy + d) * scale;
         constexpr double MAX_TRANSFORM = 1e30;
-        fan.active = fan.active & has_mass & (inverse.determinant > 0) &
-                     (fan.a[0] + std::fabs(fan.a[1]) + fan.a[2] < MAX_TRANSFORM);
+        for (int lane = 0; lane < WD; ++lane)
+            batch.active[lane] =
+                (nearest[lane] > 0) & (mass[lane] > 0) & (determinant[lane] > 0) &
+                (batch.a[0][lane] + std::fabs(batch.a[1][lane]) + batch.a[2][lane] < MAX_TRANSFORM);
     }
 
-    // Inverse of the covariance with MIN_VARIANCE added.
-    struct Inverse {
-        double m[3], determinant;  // xx, xy, yy
-    };
-    Inverse inverse_covariance(const Fan &fan) const {
-        const double least = MIN_VARIANCE * variance_, xx = fan.m[0] + least, xy = fan.m[1],
-                     yy = fan.m[2] + least, determinant = 1 / (xx * yy - xy * xy);
-        return {{yy * determinant, -xy * determinant, xx * determinant}, determinant};
+    // Writes the filtered vertices of the fan in a lane.
+    void filter(const Batch &batch, int lane, const Block &block) {
+        const int32_t fan = batch.fan[lane], end = fans_.slots[fan + 1];
+        double x0 = 0, y0 = 0, a[3] = {1, 0, 1};
+        if (batch.active[lane]) {
+            x0 = batch.x[lane], y0 = batch.y[lane];
+            for (int i = 0; i < 3; ++i) a[i] = batch.a[i][lane];
+        }
+        for (int32_t slot = fans_.slots[fan]; slot < end; ++slot) {
+            const Vertex &p = block.vertices[slot - block.base];
+            const double x = p.x - x0, y = p.y - y0;
+            filtered_[fans_.vertex(slot)] = {x0 + (a[0] * x + a[1] * y), y0 + (a[1] * x + a[2] * y), p.w};
+        }
     }
 
-    // Writes the filtered vertices of a fan; false if another fan owns one of them.
-    bool transform_vertices(int32_t fan_index) {
-        const Fan &fan = fans_[fan_index];
-        bool owned = true;
-        for_each_corner(fan_index, [&](int32_t v) {
-            const Projected p = unfiltered_[v];
-            if (owner_[v] != fan_index) {
-                owned = false;
-            } else if (!fan.active) {
-                filtered_[v] = p;
-            } else {
-                const double x = p.x - fan.x, y = p.y - fan.y;
-                filtered_[v] = {fan.x + (fan.a[0] * x + fan.a[1] * y), fan.y + (fan.a[1] * x + fan.a[2] * y),
-                                p.w};
-            }
-        });
-        return owned;
-    }
-
-    void backward_fan(int32_t fan_index, const float *grad, int32_t *index,
-                      std::vector<FanVertexGradient> &buffer, const MsVertexGradients &out) const {
-        const Fan &fan = fans_[fan_index];
-        const size_t max_vertices = 3 * (size_t)(starts_[fan_index + 1] - starts_[fan_index]);
-        if (buffer.size() < max_vertices) buffer.resize(max_vertices);
-        FanVertexGradient *vertices = buffer.data();
-        int count = 0;
+    bool has_gradient(int32_t fan, const float *grad) const {
         bool any = false;
-        for_each_corner(fan_index, [&](int32_t v) {
-            if (index[v] != fan_index) return;
-            index[v] = -1 - count;
-            vertices[count++].vertex = v;
-            const float *g = grad + 3 * (int64_t)v;
+        for (int32_t slot = fans_.slots[fan]; slot < fans_.slots[fan + 1]; ++slot) {
+            const float *g = grad + 3 * (int64_t)fans_.vertex(slot);
             any |= (g[0] != 0) | (g[1] != 0) | (g[2] != 0);
-        });
-        if (!any) return;
-        if (!fan.active) {
-            for (int i = 0; i < count; ++i) {
-                const float *g = grad + 3 * (int64_t)vertices[i].vertex;
-                add_position(vertices[i].vertex, g[0], g[1], g[2], out);
-            }
-            return;
         }
-        backward_density(fan_index, backward_positions(fan, grad, vertices, count), index, vertices);
-        for (int i = 0; i < count; ++i) {
-            const FanVertexGradient &g = vertices[i];
-            const Projected &p = unfiltered_[g.vertex];
-            add_position(g.vertex, g.x * projection_.fx * p.w, g.y * projection_.fy * p.w,
-                         g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w, out);
-            out.colors[4 * (int64_t)g.vertex + 3] += (float)g.alpha;
+        return any;
+    }
+
+    void backward_batch(const Batch &batch, const float *grad, Block &block,
+                        const MsVertexGradients &out) const {
+        const DensityGradient density = backward_positions(batch, grad, block);
+        backward_density(batch, density, block);
+        for (int lane = 0; lane < batch.size; ++lane) {
+            const int32_t fan = batch.fan[lane];
+            for (int32_t slot = fans_.slots[fan]; slot < fans_.slots[fan + 1]; ++slot) {
+                const int32_t v = fans_.vertex(slot), i = slot - block.base;
+                if (!batch.active[lane]) {
+                    const float *g = grad + 3 * (int64_t)v;
+                    add_position(v, g[0], g[1], g[2], out);
+                    continue;
+                }
+                const VertexGradient &g = block.gradients[i];
+                const Vertex &p = block.vertices[i];
+                add_position(v, g.x * projection_.fx * p.w, g.y * projection_.fy * p.w,
+                             g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w, out);
+                out.colors[4 * (int64_t)v + 3] += (float)g.alpha;
+            }
         }
     }
 
-    // The gradients of the vertices for constant A and c. Returns the gradient of the density through A and
-    // c.
-    DensityGradient backward_positions(const Fan &fan, const float *grad, FanVertexGradient *vertices,
-                                       int count) const {
-        const double *a = fan.a, unit_x = 1 / projection_.fx, unit_y = 1 / projection_.fy;
-        double g[3] = {0, 0, 0};  // gradient of A, symmetric
+    // The gradients of the vertices for constant A and c. Returns the gradients of the densities through A
+    // and c.
+    DensityGradient backward_positions(const Batch &batch, const float *grad, Block &block) const {
+        const double unit_x = 1 / projection_.fx, unit_y = 1 / projection_.fy;
+        vd g[3] = {};  // gradient of A, symmetric
         DensityGradient density{};
-        for (int i = 0; i < count; ++i) {
-            FanVertexGradient &to = vertices[i];
-            const Projected &p = unfiltered_[to.vertex], &q = filtered_[to.vertex];
-            const float *t = grad + 3 * (int64_t)to.vertex;
-            const double z = 1 / p.w, x = t[0] * unit_x * z, y = t[1] * unit_y * z, dx = p.x - fan.x,
-                         dy = p.y - fan.y;
-            g[0] += x * dx;
-            g[1] += 0.5 * (x * dy + y * dx);
-            g[2] += y * dy;
-            to.x = a[0] * x + a[1] * y;
-            to.y = a[1] * x + a[2] * y;
-            to.z = t[2] + (x * (q.x - projection_.cx) + y * (q.y - projection_.cy)) * p.w;
-            density.c[0] += x - to.x;
-            density.c[1] += y - to.y;
-            to.alpha = 0;
+        for (int lane = 0; lane < batch.size; ++lane) {
+            if (!batch.active[lane]) continue;
+            const double x0 = batch.x[lane], y0 = batch.y[lane],
+                         a[3] = {batch.a[0][lane], batch.a[1][lane], batch.a[2][lane]};
+            double sum[3] = {0, 0, 0}, c[2] = {0, 0};
+            const int32_t fan = batch.fan[lane];
+            for (int32_t slot = fans_.slots[fan]; slot < fans_.slots[fan + 1]; ++slot) {
+                const int32_t v = fans_.vertex(slot), i = slot - block.base;
+                const float *from = grad + 3 * (int64_t)v;
+                VertexGradient &to = block.gradients[i];
+                to = {0, 0, 0, 0};
+                const Vertex &p = block.vertices[i];
+                if (!(p.w > 0)) continue;  // of no face
+                const Projected &q = filtered_[v];
+                const double z = 1 / p.w, x = from[0] * unit_x * z, y = from[1] * unit_y * z, dx = p.x - x0,
+                             dy = p.y - y0;
+                sum[0] += x * dx;
+                sum[1] += 0.5 * (x * dy + y * dx);
+                sum[2] += y * dy;
+                to.x = a[0] * x + a[1] * y;
+                to.y = a[1] * x + a[2] * y;
+                to.z = from[2] + (x * (q.x - projection_.cx) + y * (q.y - projection_.cy)) * p.w;
+                c[0] += x - to.x;
+                c[1] += y - to.y;
+            }
+            for (int i = 0; i < 3; ++i) g[i][lane] = sum[i];
+            for (int i = 0; i < 2; ++i) density.c[i][lane] = c[i];
         }
         // A A = I + s M^-1. The Sylvester equation A X + X A = g has the solution
         // X = (det A g + adj A g adj A) / (2 tr A det A), and h = -s M^-1 X M^-1.
-        const double det = a[0] * a[2] - a[1] * a[1], scale = 1 / (2 * (a[0] + a[2]) * det),
-                     adjugate[3] = {a[2], -a[1], a[0]};
-        double x[3], product[3];
+        const vd *a = batch.a, det = a[0] * a[2] - a[1] * a[1], scale = 1 / (2 * (a[0] + a[2]) * det),
+                 adjugate[3] = {a[2], -a[1], a[0]};
+        vd x[3], product[3];
         congruence(adjugate, g, product);
         for (int i = 0; i < 3; ++i) x[i] = (det * g[i] + product[i]) * scale;
-        const Inverse inverse = inverse_covariance(fan);
-        congruence(inverse.m, x, density.h);
-        for (double &h : density.h) h *= -variance_;
-        density.level = density.h[0] * fan.m[0] + 2 * density.h[1] * fan.m[1] + density.h[2] * fan.m[2];
+        congruence(batch.inverse, x, density.h);
+        for (vd &h : density.h) h *= -variance_;
+        density.level = density.h[0] * batch.m[0] + 2 * density.h[1] * batch.m[1] + density.h[2] * batch.m[2];
         return density;
     }
 
-    // Adds the gradients through the density, whose moments determine A and c: the derivatives of the
+    // Adds the gradients through the densities, whose moments determine A and c: the derivatives of the
     // integrals in the header with respect to opacities, positions and areas.
-    void backward_density(int32_t fan_index, const DensityGradient &density, const int32_t *index,
-                          FanVertexGradient *vertices) const {
-        const Fan &fan = fans_[fan_index];
-        const double *h = density.h, *c = density.c;
-        const int64_t first = starts_[fan_index], end = starts_[fan_index + 1];
-        double grad_k = 0;
-        Batch t;
-        for (int64_t i = first; i < end; i += BATCH) {
-            load_batch(i, end, fan.x, fan.y, fan.k, t);
-            Double8 hx[3], hy[3], quadratic[3], linear[3];  // h q_j, q_j^T h q_j, c . q_j
+    void backward_density(const Batch &batch, const DensityGradient &density, Block &block) const {
+        const vd *h = density.h, *c = density.c;
+        vd grad_k = {};
+        int32_t origin[WD];
+        Triangles t;
+        for (int number = 0; number < batch.most; ++number) {
+            load_triangles(block, batch, number, batch.x, batch.y, t);
+            if (number == 0) std::copy(t.slot[0], t.slot[0] + WD, origin);
+            vd hx[3], hy[3], quadratic[3], linear[3];  // h q_j, q_j^T h q_j, c . q_j
             for (int j = 0; j < 3; ++j) {
                 hx[j] = h[0] * t.x[j] + h[1] * t.y[j];
                 hy[j] = h[1] * t.x[j] + h[2] * t.y[j];
@@ -349,34 +477,33 @@ class FanFilter {
                 linear[j] = c[0] * t.x[j] + c[1] * t.y[j];
             }
             // Q, h Q, Q^T h Q, the sums of the above, h B.
-            const Double8 qx = t.x[0] + t.x[1] + t.x[2], qy = t.y[0] + t.y[1] + t.y[2],
-                          hqx = hx[0] + hx[1] + hx[2], hqy = hy[0] + hy[1] + hy[2], qhq = qx * hqx + qy * hqy,
-                          quadratics = quadratic[0] + quadratic[1] + quadratic[2],
-                          linears = linear[0] + linear[1] + linear[2];
-            const Double8 hbx = t.a[0] * hx[0] + t.a[1] * hx[1] + t.a[2] * hx[2],
-                          hby = t.a[0] * hy[0] + t.a[1] * hy[1] + t.a[2] * hy[2];
-            const Double8 scale = t.area * fan.inverse_mass;
-            Double8 integral = {}, grad[3][3],
-                    grad_alpha[3];  // integral: over the triangle, without the scale
+            const vd qx = t.x[0] + t.x[1] + t.x[2], qy = t.y[0] + t.y[1] + t.y[2],
+                     hqx = hx[0] + hx[1] + hx[2], hqy = hy[0] + hy[1] + hy[2], qhq = qx * hqx + qy * hqy,
+                     quadratics = quadratic[0] + quadratic[1] + quadratic[2],
+                     linears = linear[0] + linear[1] + linear[2];
+            const vd hbx = t.a[0] * hx[0] + t.a[1] * hx[1] + t.a[2] * hx[2],
+                     hby = t.a[0] * hy[0] + t.a[1] * hy[1] + t.a[2] * hy[2];
+            const vd scale = t.area * batch.inverse_mass;
+            vd integral = {}, grad[3][3],
+               grad_alpha[3];  // integral: over the triangle, without the scale
             for (int j = 0; j < 3; ++j) {
-                const Double8 by_alpha = qhq + 2 * (t.x[j] * hqx + t.y[j] * hqy) + quadratics +
-                                         2 * quadratic[j] + 5 * (linears + linear[j]) - 20 * density.level;
+                const vd by_alpha = qhq + 2 * (t.x[j] * hqx + t.y[j] * hqy) + quadratics + 2 * quadratic[j] +
+                                    5 * (linears + linear[j]) - 20 * density.level;
                 grad_alpha[j] = scale * by_alpha;
                 integral += t.a[j] * by_alpha;
-                const Double8 by_hq = 2 * (t.alpha_sum + t.a[j]), by_h = 2 * (t.alpha_sum + 2 * t.a[j]),
-                              by_c = 5 * (t.alpha_sum + t.a[j]);
+                const vd by_hq = 2 * (t.alpha_sum + t.a[j]), by_h = 2 * (t.alpha_sum + 2 * t.a[j]),
+                         by_c = 5 * (t.alpha_sum + t.a[j]);
                 grad[j][0] = scale * (by_hq * hqx + 2 * hbx + by_h * hx[j] + by_c * c[0]);
                 grad[j][1] = scale * (by_hq * hqy + 2 * hby + by_h * hy[j] + by_c * c[1]);
-                grad[j][2] = Double8{};
+                grad[j][2] = vd{};
             }
-            add_area_gradient(t, integral * fan.inverse_mass, grad);
+            add_area_gradient(t, integral * batch.inverse_mass, grad);
             for (int j = 0; j < 3; ++j) {
-                const Double8 along = grad[j][2] * t.w[j], depth = fan.k * along * t.w[j];
-                grad_k += total(along);
-                const int32_t *vertex = mesh_.faces + 3 * i + j;
-                for (int lane = 0; lane < t.size; ++lane) {
-                    MS_ASSERT(index[vertex[3 * lane]] < 0);
-                    FanVertexGradient &sum = vertices[-1 - index[vertex[3 * lane]]];
+                const vd along = grad[j][2] * t.w[j], depth = batch.k * along * t.w[j];
+                grad_k += along;
+                for (int lane = 0; lane < batch.size; ++lane) {
+                    if (number >= batch.count[lane] || !batch.active[lane]) continue;
+                    VertexGradient &sum = block.gradients[t.slot[j][lane]];
                     sum.x += grad[j][0][lane];
                     sum.y += grad[j][1][lane];
                     sum.z -= depth[lane];
@@ -384,17 +511,18 @@ class FanFilter {
                 }
             }
         }
-        vertices[0].z +=
-            grad_k * fan.k * unfiltered_[vertices[0].vertex].w;  // k is proportional to its depth
+        for (int lane = 0; lane < batch.size; ++lane)  // k is proportional to the depth of the first vertex
+            if (batch.active[lane])
+                block.gradients[origin[lane]].z +=
+                    grad_k[lane] * batch.k[lane] * block.vertices[origin[lane]].w;
     }
 
-    // Adds the gradients of the corners through the areas of the triangles, whose gradients are
-    // `grad_area`.
-    static void add_area_gradient(const Batch &t, const Double8 &grad_area, Double8 grad[3][3]) {
-        Double8 grad_n[3], grad_u[3], grad_v[3];
-        Double8 area = t.area;
-        for (int lane = 0; lane < BATCH; ++lane) area[lane] = area[lane] > 0 ? area[lane] : 1;  // n is 0, too
-        for (int j = 0; j < 3; ++j) grad_n[j] = grad_area / area * t.n[j];
+    // Adds the gradients of the corners through the areas of the triangles, whose gradients are `grad_area`.
+    static void add_area_gradient(const Triangles &t, const vd &grad_area, vd grad[3][3]) {
+        vd grad_n[3], grad_u[3], grad_v[3];
+        vd scale = grad_area / t.area;
+        for (int lane = 0; lane < WD; ++lane) scale[lane] = t.area[lane] > 0 ? scale[lane] : 0;
+        for (int j = 0; j < 3; ++j) grad_n[j] = scale * t.n[j];
         cross(t.v, grad_n, grad_u);
         cross(grad_n, t.u, grad_v);
         for (int j = 0; j < 3; ++j) {
@@ -411,34 +539,12 @@ class FanFilter {
             out.vertices[3 * (int64_t)v + j] += (float)(m[j] * x + m[4 + j] * y + m[8 + j] * z);
     }
 
-    static double total(const Double8 &lanes) {
-        double a[BATCH];
-        std::memcpy(a, &lanes, sizeof a);
-        return ((a[0] + a[4]) + (a[2] + a[6])) + ((a[1] + a[5]) + (a[3] + a[7]));
-    }
-    static void cross(const Double8 a[3], const Double8 b[3], Double8 out[3]) {
-        out[0] = a[1] * b[2] - a[2] * b[1];
-        out[1] = a[2] * b[0] - a[0] * b[2];
-        out[2] = a[0] * b[1] - a[1] * b[0];
-    }
-    // a b a for symmetric 2 x 2 matrices xx, xy, yy.
-    static void congruence(const double a[3], const double b[3], double out[3]) {
-        const double p = a[0] * b[0] + a[1] * b[1], q = a[0] * b[1] + a[1] * b[2],
-                     r = a[1] * b[0] + a[2] * b[1], t = a[1] * b[1] + a[2] * b[2];
-        out[0] = p * a[0] + q * a[1];
-        out[1] = p * a[1] + q * a[2];
-        out[2] = r * a[1] + t * a[2];
-    }
-
     const MsMesh mesh_;
     const Projection projection_;
     const double variance_;     // square samples
     const double depth_scale_;  // k of a fan at depth 1
-    const PooledVector<Projected> unfiltered_;
+    const FanVertices fans_;
     PooledVector<Projected> filtered_;
-    PooledVector<int32_t> owner_;  // fan of each vertex
-    std::vector<int32_t> starts_;  // fan i has the faces [starts_[i], starts_[i + 1])
-    PooledVector<Fan> fans_;
 };
 
 }  // namespace ms

@@ -70,17 +70,15 @@ struct Scene {
         : mesh(mesh), grid(grid), projection(camera, grid.samples), filtered(mesh.filter_px2 > 0) {
         MS_ASSERT(mesh.vertex_count >= 0 && mesh.face_count >= 0 && mesh.face_count <= INT32_MAX);
         MS_ASSERT(!filtered || mesh.face_splat);
-        if (!known_filter) {
+        if (filtered && !known_filter) {
+            filter = std::make_unique<FanFilter>(mesh, projection, grid.samples, threads);
+            known_filter = filter.get();
+        } else if (!filtered) {
             projected_.resize(mesh.vertex_count);
             parallel_blocks(threads, mesh.vertex_count, 1 << 16, [&](int64_t begin, int64_t end, int) {
                 for (int64_t i = begin; i < end; ++i)
                     projected_[i] = projection.project(projection.to_camera(mesh.vertices + 3 * i));
             });
-            if (filtered) {
-                filter = std::make_unique<FanFilter>(mesh, projection, grid.samples, std::move(projected_),
-                                                     threads);
-                known_filter = filter.get();
-            }
         }
         vertices = known_filter ? known_filter->filtered() : projected_.data();
         if (!with_items) return;
@@ -113,6 +111,13 @@ struct Scene {
         constexpr int MAX_FAN = 64, MAX_STRIP = 16;
         const int32_t *f = mesh.faces;
         group_start.reserve(mesh.face_count / 6 + 2);
+        if (filter) {
+            const std::vector<int32_t> &fans = filter->first_faces();
+            for (size_t fan = 0; fan + 1 < fans.size(); ++fan)
+                for (int32_t i = fans[fan]; i < fans[fan + 1]; i += MAX_FAN) group_start.push_back(i);
+            group_start.push_back((int32_t)mesh.face_count);
+            return;
+        }
         for (int64_t i = 0; i < mesh.face_count; ++i, f += 3) {
             for (int k = 0; k < 3; ++k) MS_ASSERT(f[k] >= 0 && f[k] < mesh.vertex_count);
             bool joins = false;
