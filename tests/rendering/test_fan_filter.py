@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_rendering_variants import VIEWS, assert_image, in_another_process, scaled
 
-from meshsplats import SplatMesh, convert
+from meshsplats import Camera, SplatMesh, convert
 from meshsplats._core import library
 from meshsplats.rendering import reference, render
 from meshsplats.rendering.backward import TapedRendering
@@ -181,6 +181,23 @@ def test_order_of_the_splats():
         assert a.tobytes() == b.tobytes()
 
 
+@pytest.mark.parametrize("unused", [1, 1000], ids=["a few", "many"])
+def test_vertices_of_no_face(unused):
+    """They change nothing, wherever they are: behind the camera, too, or at infinity."""
+    mesh, view = diamond((20, 18), (2.0, 3.0)), plain_camera()
+    for place in ((0, 0, -1), (40, 36, 2), (0, 0, 3e38)):
+        more = replace(
+            mesh,
+            vertices=np.vstack([np.tile(np.array(place, np.float32), (unused, 1)), mesh.vertices]),
+            colors=np.vstack([np.ones((unused, 4), np.float32), mesh.colors]),
+            faces=mesh.faces + unused,
+        )
+        assert_same_bits(render(mesh, view, filter_px2=1.0), render(more, view, filter_px2=1.0))
+        for a, b in zip(back(mesh, view=view), back(more, view=view), strict=True):
+            assert a.tobytes() == b[unused:].tobytes()
+            assert not b[:unused].any()
+
+
 def test_no_filter_changes_no_bit():
     mesh = fans(4, 60)
     plain = replace(mesh, filter_px2=0)
@@ -324,12 +341,16 @@ def test_gradients_by_finite_differences():
 
 
 def many() -> SplatMesh:
-    """More than one thread's share."""
-    return fans(0, 5_000, "crossed", sizes=(0.005, 0.1))
+    """More than one thread's share, of fans with different numbers of triangles."""
+    mesh = fans(0, 5_000, "crossed", sizes=(0.005, 0.1))
+    kept = np.random.default_rng(0).random(len(mesh.faces)) < 0.8
+    return replace(mesh, faces=mesh.faces[kept], face_splat=mesh.face_splat[kept])
 
 
-def back(mesh: SplatMesh, threads: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    view = camera(70, 50)
+def back(
+    mesh: SplatMesh, threads: int | None = None, view: Camera | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    view = view or camera(70, 50)
     image = TapedRendering(
         mesh.vertices,
         mesh.faces,

@@ -16,7 +16,6 @@
 #pragma once
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <stdexcept>
 
@@ -30,15 +29,16 @@ struct SharedVertices : std::runtime_error {
     SharedVertices() : std::runtime_error("two splats share a vertex") {}
 };
 
-// The vertices of each fan, as one list of slots in the order of the fans: fan i has the faces
+// The vertices of all fans in one list, fan by fan. A slot is a position in this list: fan i has the faces
 // [faces[i], faces[i + 1]) and the slots [slots[i], slots[i + 1]). Where the vertices of each fan follow
-// those of the fan before, as conversion makes them, a slot is a vertex, and slots may include vertices of no
-// face.
+// those of the fan before, as conversion makes them, the list is that of the vertices itself; it may then
+// include a few vertices of no face.
 class FanVertices {
   public:
     std::vector<int32_t> faces, slots;
 
     explicit FanVertices(const MsMesh &mesh) {
+        MS_ASSERT(mesh.face_splat && mesh.vertex_count <= INT32_MAX);
         faces.reserve(mesh.face_count / 6 + 2);
         slots.reserve(faces.capacity());
         if (!list_in_order(mesh)) list_in_any_order(mesh);
@@ -48,30 +48,33 @@ class FanVertices {
     int32_t vertex(int32_t slot) const { return vertex_of_slot_.empty() ? slot : vertex_of_slot_[slot]; }
 
   private:
-    // False if a fan has a vertex below the last one of the fans before.
+    // False if a fan has a vertex below the last one of the fans before, or if many vertices are of no face.
     bool list_in_order(const MsMesh &mesh) {
-        int32_t end = 0;  // vertices up to here are of the fans before
+        constexpr int64_t MAX_VERTICES = 12;  // of a fan, for each of its triangles
+        int64_t end = 0;                      // vertices up to here are of the fans before
         bool in_order = true;
         for (int64_t i = 0; i < mesh.face_count;) {
             faces.push_back((int32_t)i);
-            slots.push_back(end);
-            int32_t least = INT32_MAX, most = end - 1;
+            slots.push_back((int32_t)end);
+            int32_t least = INT32_MAX, most = -1;
             const int32_t splat = mesh.face_splat[i];
             for (; i < mesh.face_count && mesh.face_splat[i] == splat; ++i) {
                 const int32_t *f = mesh.faces + 3 * i;
+                for (int k = 0; k < 3; ++k) MS_ASSERT(f[k] >= 0 && f[k] < mesh.vertex_count);
                 least = std::min(least, std::min(f[0], std::min(f[1], f[2])));
                 most = std::max(most, std::max(f[0], std::max(f[1], f[2])));
             }
-            in_order &= least >= end;
-            end = most + 1;
+            in_order &= (least >= end) & (most - end < MAX_VERTICES * (i - faces.back()));
+            end = (int64_t)most + 1;
         }
         faces.push_back((int32_t)mesh.face_count);
-        slots.push_back(end);
+        slots.push_back((int32_t)end);
         return in_order;
     }
     void list_in_any_order(const MsMesh &mesh) {
         slots.clear();
         slot_of_vertex_.assign(mesh.vertex_count, -1);
+        vertex_of_slot_.reserve(std::min(mesh.vertex_count, 3 * mesh.face_count));
         for (int32_t fan = 0; fan < fan_count(); ++fan) {
             const int32_t first = (int32_t)vertex_of_slot_.size();
             slots.push_back(first);
@@ -102,12 +105,12 @@ class FanFilter {
           depth_scale_(DEPTH_SHARE * std::sqrt(projection.fx * projection.fy)),
           fans_(mesh),
           filtered_(mesh.vertex_count) {
-        MS_ASSERT(mesh.face_splat && variance_ > 0);
-        for_blocks(threads, [&](int32_t begin, int32_t end, Block &block) {
-            project(begin, end, block);
-            for (int32_t fan = begin; fan < end; ++fan) block.order.push_back(fan);
-            for_batches(block, [&](const Batch &batch) {
-                for (int lane = 0; lane < batch.size; ++lane) filter(batch, lane, block);
+        MS_ASSERT(variance_ > 0);
+        for_blocks(threads, [&](int32_t begin, int32_t end, Workspace &work) {
+            project(begin, end, work);
+            for (int32_t fan = begin; fan < end; ++fan) work.order.push_back(fan);
+            for_batches(work, [&](const FanBatch &batch) {
+                for (int lane = 0; lane < batch.size; ++lane) filter(batch, lane, work);
             });
         });
     }
@@ -121,13 +124,13 @@ class FanFilter {
     // Backward pass. Adds to `out` the gradients of positions in world space and of opacities. `grad` holds
     // those of the filtered vertices in camera space, (vertex_count, 3).
     void backward(const float *grad, const MsVertexGradients &out, int threads) const {
-        for_blocks(threads, [&](int32_t begin, int32_t end, Block &block) {
+        for_blocks(threads, [&](int32_t begin, int32_t end, Workspace &work) {
             for (int32_t fan = begin; fan < end; ++fan)
-                if (has_gradient(fan, grad)) block.order.push_back(fan);
-            if (block.order.empty()) return;
-            project(begin, end, block);
-            block.gradients.resize(block.vertices.size());
-            for_batches(block, [&](const Batch &batch) { backward_batch(batch, grad, block, out); });
+                if (has_gradient(fan, grad)) work.order.push_back(fan);
+            if (work.order.empty()) return;
+            project(begin, end, work);
+            work.gradients.resize(work.vertices.size());
+            for_batches(work, [&](const FanBatch &batch) { backward_batch(batch, grad, work, out); });
         });
     }
 
@@ -135,8 +138,6 @@ class FanFilter {
     static constexpr double MIN_VARIANCE = 1e-4;  // added to M, as a share of the filter's variance
     static constexpr double DEPTH_SHARE = 0.1;
     static constexpr double OPACITY_BIAS = 1e-6;  // added to opacities: transparent fans need moments, too
-
-    // Fans are processed WD at a time, one in each lane. No lane depends on its neighbours.
 
     struct VertexGradient {
         double x, y;  // of the position in samples
@@ -147,30 +148,32 @@ class FanFilter {
     struct Vertex {
         double x, y, w, a;
     };
-    // The working memory of a thread: consecutive fans, and the vertices in their slots from `base` on.
-    struct Block {
+    // The memory in which a thread processes a block of consecutive fans: their vertices, from the slot
+    // `base` on. Aligned, as its neighbours are of other threads.
+    struct alignas(64) Workspace {
         int32_t base;
         PooledVector<Vertex> vertices;
         PooledVector<VertexGradient> gradients;
-        std::vector<int32_t> order, sorted, bins;  // fans to process
+        std::vector<int32_t> order;  // fans to process
     };
-    struct Batch {
+    // Fans that are processed together, one in each lane. No lane depends on its neighbours.
+    struct FanBatch {
         int size;  // lanes in use; the others repeat the last fan
         int32_t fan[WD];
-        int32_t first[WD];    // first triangles
-        int32_t count[WD];    // numbers of triangles
-        int32_t least, most;  // of the counts
-        vd inverse_mass;      // 1 / (60 integral of opacity over doubled areas)
-        vd x, y;              // mean c
-        vd m[3];              // covariance M: xx, xy, yy
-        vd inverse[3];        // of M with MIN_VARIANCE added
-        vd k;                 // scale of depths: that of the fan's first vertex
-        vd a[3];              // A: xx, xy, yy
-        bool active[WD];      // false: the fan stays as it is
+        int32_t first[WD];     // first triangles
+        int32_t count[WD];     // numbers of triangles
+        int32_t fewest, most;  // of the counts
+        vd inverse_mass;       // 1 / (60 integral of opacity over doubled areas)
+        vd x, y;               // mean c
+        vd m[3];               // covariance M: xx, xy, yy
+        vd inverse[3];         // of M with MIN_VARIANCE added
+        vd k;                  // scale of depths: that of the fan's first vertex
+        vd a[3];               // A: xx, xy, yy
+        bool active[WD];       // false: the fan stays as it is
     };
-    // The triangles of one number in all fans of a batch.
+    // Triangle `index` of each fan of a batch.
     struct Triangles {
-        int32_t slot[3][WD];        // corners, in the block
+        int32_t slot[3][WD] = {};   // corners, less the workspace's base
         vd x[3], y[3], w[3], a[3];  // corners: position relative to an origin, 1 / depth, opacity
         vd alpha_sum;               // over the corners
         vd u[3], v[3], n[3];        // edges 0 to 1 and 0 to 2 in (x, y, k / z), and their cross product
@@ -181,73 +184,58 @@ class FanFilter {
         vd h[3], c[2], level;
     };
 
-    // Calls body(begin, end, block) with an empty order for blocks of fans.
+    // Calls body(begin, end, work) with an empty order for blocks of fans.
     template <class Body>
     void for_blocks(int threads, Body body) const {
-        std::vector<Block> blocks(threads);
+        std::vector<Workspace> workspaces(threads);
         parallel_blocks(threads, fans_.fan_count(), 1 << 6, [&](int64_t begin, int64_t end, int thread) {
-            blocks[thread].order.clear();
-            body((int32_t)begin, (int32_t)end, blocks[thread]);
+            workspaces[thread].order.clear();
+            body((int32_t)begin, (int32_t)end, workspaces[thread]);
         });
     }
 
-    void project(int32_t begin, int32_t end, Block &block) const {
-        block.base = fans_.slots[begin];
-        const size_t count = fans_.slots[end] - block.base;
-        block.vertices.resize(count);
+    void project(int32_t begin, int32_t end, Workspace &work) const {
+        work.base = fans_.slots[begin];
+        const size_t count = fans_.slots[end] - work.base;
+        work.vertices.resize(count);
         const Projection projection = projection_;
         for (size_t i = 0; i < count; ++i) {
-            const int64_t v = fans_.vertex(block.base + (int32_t)i);
+            const int64_t v = fans_.vertex(work.base + (int32_t)i);
             const Projected p = projection.project(projection.to_camera(mesh_.vertices + 3 * v));
-            block.vertices[i] = {p.x, p.y, p.w, mesh_.colors[4 * v + 3] + OPACITY_BIAS};
+            work.vertices[i] = {p.x, p.y, p.w, mesh_.colors[4 * v + 3] + OPACITY_BIAS};
         }
     }
 
-    // Calls body(batch) for all fans of block.order, those with equally many triangles together, and with
-    // their transforms.
+    // Calls body(batch) for all fans of work.order, with their transforms. Fans are sorted by the number of
+    // their triangles, as a batch takes as long as its largest fan.
     template <class Body>
-    __attribute__((always_inline)) void for_batches(Block &block, Body body) const {
-        sort_by_count(block);
-        const int count = (int)block.order.size();
-        Batch batch;
+    __attribute__((always_inline)) void for_batches(Workspace &work, Body body) const {
+        const auto triangles = [&](int32_t fan) { return fans_.faces[fan + 1] - fans_.faces[fan]; };
+        const auto smaller = [&](int32_t a, int32_t b) { return triangles(a) < triangles(b); };
+        if (!std::is_sorted(work.order.begin(), work.order.end(), smaller))
+            std::sort(work.order.begin(), work.order.end(), smaller);
+        const int count = (int)work.order.size();
+        FanBatch batch;
         for (int i = 0; i < count; i += WD) {
             batch.size = std::min(WD, count - i);
-            batch.least = INT32_MAX, batch.most = 0;
+            batch.fewest = INT32_MAX, batch.most = 0;
             for (int lane = 0; lane < WD; ++lane) {
-                const int32_t fan = block.order[i + std::min(lane, batch.size - 1)];
+                const int32_t fan = work.order[i + std::min(lane, batch.size - 1)];
                 batch.fan[lane] = fan;
                 batch.first[lane] = fans_.faces[fan];
-                batch.count[lane] = fans_.faces[fan + 1] - fans_.faces[fan];
-                batch.least = std::min(batch.least, batch.count[lane]);
+                batch.count[lane] = triangles(fan);
+                batch.fewest = std::min(batch.fewest, batch.count[lane]);
                 batch.most = std::max(batch.most, batch.count[lane]);
             }
-            solve_transforms(block, batch);
+            solve_transforms(work, batch);
             body(batch);
         }
     }
 
-    // A stable counting sort of block.order, which is not empty; large fans share the last bin.
-    void sort_by_count(Block &block) const {
-        constexpr int BINS = 128;
-        const auto bin = [&](int32_t fan) {
-            return std::min(fans_.faces[fan + 1] - fans_.faces[fan], BINS - 1);
-        };
-        const int first_bin = bin(block.order[0]);
-        bool sorted = true;
-        for (int32_t fan : block.order) sorted &= bin(fan) == first_bin;
-        if (sorted) return;
-        block.bins.assign(BINS + 1, 0);
-        for (int32_t fan : block.order) ++block.bins[bin(fan) + 1];
-        for (int i = 0; i < BINS; ++i) block.bins[i + 1] += block.bins[i];
-        block.sorted.resize(block.order.size());
-        for (int32_t fan : block.order) block.sorted[block.bins[bin(fan)]++] = fan;
-        block.order.swap(block.sorted);
-    }
-
     // The vertices with the indices i, by field.
-    static void gather(const Block &block, const int32_t *i, vd fields[4]) {
+    static void gather(const Workspace &work, const int32_t *i, vd fields[4]) {
         const double *rows[WD];
-        for (int lane = 0; lane < WD; ++lane) rows[lane] = &block.vertices[i[lane]].x;
+        for (int lane = 0; lane < WD; ++lane) rows[lane] = &work.vertices[i[lane]].x;
         transpose(rows, fields);
     }
     static vd root(const vd &a) {
@@ -269,56 +257,56 @@ class FanFilter {
         out[2] = r * a[1] + t * a[2];
     }
 
-    // Loads the triangles `number` of the fans, relative to the origins (x0, y0). `t` holds those of the
-    // number before: the triangles of a fan have its centre in common, and each begins at the corner where
-    // the last one ended.
-    __attribute__((always_inline)) void load_triangles(const Block &block, const Batch &batch, int number,
-                                                       const vd &x0, const vd &y0, Triangles &t) const {
-        bool same_center = number > 0, joined = number > 0;
+    // Loads triangle `index` of each fan, relative to the origins (x0, y0). `t` holds the triangles before:
+    // most share the fan's centre with them and begin at the corner where they end; other corners are loaded.
+    __attribute__((always_inline)) void load_triangles(const Workspace &work, const FanBatch &batch,
+                                                       int index, const vd &x0, const vd &y0,
+                                                       Triangles &t) const {
+        bool same_center = index > 0, joined = index > 0;
         for (int lane = 0; lane < WD; ++lane) {
-            const int64_t face = batch.first[lane] + std::min(number, batch.count[lane] - 1);
+            const int64_t face = batch.first[lane] + std::min(index, batch.count[lane] - 1);
             int32_t corner[3];
-            for (int j = 0; j < 3; ++j) corner[j] = fans_.slot(mesh_.faces[3 * face + j]) - block.base;
+            for (int j = 0; j < 3; ++j) corner[j] = fans_.slot(mesh_.faces[3 * face + j]) - work.base;
             same_center &= corner[0] == t.slot[0][lane];
             joined &= corner[1] == t.slot[2][lane];
             for (int j = 0; j < 3; ++j) t.slot[j][lane] = corner[j];
         }
-        if (!same_center) load_corners(block, x0, y0, 0, t);
+        if (!same_center) load_corners(work, x0, y0, 0, t);
         if (joined) {
             t.x[1] = t.x[2], t.y[1] = t.y[2], t.w[1] = t.w[2], t.a[1] = t.a[2];
         } else {
-            load_corners(block, x0, y0, 1, t);
+            load_corners(work, x0, y0, 1, t);
         }
-        load_corners(block, x0, y0, 2, t);
+        load_corners(work, x0, y0, 2, t);
         t.alpha_sum = t.a[0] + t.a[1] + t.a[2];
         t.u[0] = t.x[1] - t.x[0], t.u[1] = t.y[1] - t.y[0], t.u[2] = batch.k * (t.w[1] - t.w[0]);
         t.v[0] = t.x[2] - t.x[0], t.v[1] = t.y[2] - t.y[0], t.v[2] = batch.k * (t.w[2] - t.w[0]);
         cross(t.u, t.v, t.n);
         t.area = root(t.n[0] * t.n[0] + t.n[1] * t.n[1] + t.n[2] * t.n[2]);
-        if (number >= batch.least)
+        if (index >= batch.fewest)
             for (int lane = 0; lane < WD; ++lane)
-                if (number >= batch.count[lane]) t.area[lane] = 0;
+                if (index >= batch.count[lane]) t.area[lane] = 0;
     }
-    __attribute__((always_inline)) static void load_corners(const Block &block, const vd &x0, const vd &y0,
+    __attribute__((always_inline)) static void load_corners(const Workspace &work, const vd &x0, const vd &y0,
                                                             int j, Triangles &t) {
         vd fields[4];
-        gather(block, t.slot[j], fields);
+        gather(work, t.slot[j], fields);
         t.x[j] = fields[0] - x0, t.y[j] = fields[1] - y0, t.w[j] = fields[2], t.a[j] = fields[3];
     }
 
     // Means, covariances and A of the fans of a batch.
-    void solve_transforms(const Block &block, Batch &batch) const {
+    void solve_transforms(const Workspace &work, FanBatch &batch) const {
         int32_t origin[WD];
         for (int lane = 0; lane < WD; ++lane)
-            origin[lane] = fans_.slot(mesh_.faces[3 * (int64_t)batch.first[lane]]) - block.base;
+            origin[lane] = fans_.slot(mesh_.faces[3 * (int64_t)batch.first[lane]]) - work.base;
         vd origins[4];
-        gather(block, origin, origins);
+        gather(work, origin, origins);
         const vd &x0 = origins[0], &y0 = origins[1], &w0 = origins[2];
         batch.k = depth_scale_ / w0;
         vd mass = {}, sx = {}, sy = {}, xx = {}, xy = {}, yy = {}, nearest = w0;
         Triangles t;
-        for (int number = 0; number < batch.most; ++number) {
-            load_triangles(block, batch, number, x0, y0, t);
+        for (int index = 0; index < batch.most; ++index) {
+            load_triangles(work, batch, index, x0, y0, t);
             // Q = (x, y), B = (bx, by), and the sum of (a + 2 a_i) q_i q_i^T.
             const vd x = t.x[0] + t.x[1] + t.x[2], y = t.y[0] + t.y[1] + t.y[2];
             vd bx = {}, by = {}, txx = {}, txy = {}, tyy = {};
@@ -367,7 +355,7 @@ class FanFilter {
     }
 
     // Writes the filtered vertices of the fan in a lane.
-    void filter(const Batch &batch, int lane, const Block &block) {
+    void filter(const FanBatch &batch, int lane, const Workspace &work) {
         const int32_t fan = batch.fan[lane], end = fans_.slots[fan + 1];
         double x0 = 0, y0 = 0, a[3] = {1, 0, 1};
         if (batch.active[lane]) {
@@ -375,7 +363,7 @@ class FanFilter {
             for (int i = 0; i < 3; ++i) a[i] = batch.a[i][lane];
         }
         for (int32_t slot = fans_.slots[fan]; slot < end; ++slot) {
-            const Vertex &p = block.vertices[slot - block.base];
+            const Vertex &p = work.vertices[slot - work.base];
             const double x = p.x - x0, y = p.y - y0;
             filtered_[fans_.vertex(slot)] = {x0 + (a[0] * x + a[1] * y), y0 + (a[1] * x + a[2] * y), p.w};
         }
@@ -390,21 +378,22 @@ class FanFilter {
         return any;
     }
 
-    void backward_batch(const Batch &batch, const float *grad, Block &block,
+    void backward_batch(const FanBatch &batch, const float *grad, Workspace &work,
                         const MsVertexGradients &out) const {
-        const DensityGradient density = backward_positions(batch, grad, block);
-        backward_density(batch, density, block);
+        const DensityGradient density = backward_positions(batch, grad, work);
+        backward_density(batch, density, work);
         for (int lane = 0; lane < batch.size; ++lane) {
             const int32_t fan = batch.fan[lane];
             for (int32_t slot = fans_.slots[fan]; slot < fans_.slots[fan + 1]; ++slot) {
-                const int32_t v = fans_.vertex(slot), i = slot - block.base;
+                const int32_t v = fans_.vertex(slot), i = slot - work.base;
                 if (!batch.active[lane]) {
                     const float *g = grad + 3 * (int64_t)v;
                     add_position(v, g[0], g[1], g[2], out);
                     continue;
                 }
-                const VertexGradient &g = block.gradients[i];
-                const Vertex &p = block.vertices[i];
+                const VertexGradient &g = work.gradients[i];
+                const Vertex &p = work.vertices[i];
+                if (!(p.w > 0)) continue;  // of no face
                 add_position(v, g.x * projection_.fx * p.w, g.y * projection_.fy * p.w,
                              g.z - (g.x * (p.x - projection_.cx) + g.y * (p.y - projection_.cy)) * p.w, out);
                 out.colors[4 * (int64_t)v + 3] += (float)g.alpha;
@@ -414,7 +403,7 @@ class FanFilter {
 
     // The gradients of the vertices for constant A and c. Returns the gradients of the densities through A
     // and c.
-    DensityGradient backward_positions(const Batch &batch, const float *grad, Block &block) const {
+    DensityGradient backward_positions(const FanBatch &batch, const float *grad, Workspace &work) const {
         const double unit_x = 1 / projection_.fx, unit_y = 1 / projection_.fy;
         vd g[3] = {};  // gradient of A, symmetric
         DensityGradient density{};
@@ -425,11 +414,11 @@ class FanFilter {
             double sum[3] = {0, 0, 0}, c[2] = {0, 0};
             const int32_t fan = batch.fan[lane];
             for (int32_t slot = fans_.slots[fan]; slot < fans_.slots[fan + 1]; ++slot) {
-                const int32_t v = fans_.vertex(slot), i = slot - block.base;
+                const int32_t v = fans_.vertex(slot), i = slot - work.base;
                 const float *from = grad + 3 * (int64_t)v;
-                VertexGradient &to = block.gradients[i];
+                VertexGradient &to = work.gradients[i];
                 to = {0, 0, 0, 0};
-                const Vertex &p = block.vertices[i];
+                const Vertex &p = work.vertices[i];
                 if (!(p.w > 0)) continue;  // of no face
                 const Projected &q = filtered_[v];
                 const double z = 1 / p.w, x = from[0] * unit_x * z, y = from[1] * unit_y * z, dx = p.x - x0,
@@ -460,15 +449,15 @@ class FanFilter {
     }
 
     // Adds the gradients through the densities, whose moments determine A and c: the derivatives of the
-    // integrals in the header with respect to opacities, positions and areas.
-    void backward_density(const Batch &batch, const DensityGradient &density, Block &block) const {
+    // integrals at the top of this file with respect to opacities, positions and areas.
+    void backward_density(const FanBatch &batch, const DensityGradient &density, Workspace &work) const {
         const vd *h = density.h, *c = density.c;
         vd grad_k = {};
         int32_t origin[WD];
         Triangles t;
-        for (int number = 0; number < batch.most; ++number) {
-            load_triangles(block, batch, number, batch.x, batch.y, t);
-            if (number == 0) std::copy(t.slot[0], t.slot[0] + WD, origin);
+        for (int index = 0; index < batch.most; ++index) {
+            load_triangles(work, batch, index, batch.x, batch.y, t);
+            if (index == 0) std::copy(t.slot[0], t.slot[0] + WD, origin);
             vd hx[3], hy[3], quadratic[3], linear[3];  // h q_j, q_j^T h q_j, c . q_j
             for (int j = 0; j < 3; ++j) {
                 hx[j] = h[0] * t.x[j] + h[1] * t.y[j];
@@ -500,10 +489,10 @@ class FanFilter {
             add_area_gradient(t, integral * batch.inverse_mass, grad);
             for (int j = 0; j < 3; ++j) {
                 const vd along = grad[j][2] * t.w[j], depth = batch.k * along * t.w[j];
-                grad_k += along;
+                grad_k += along;  // 0 in the lanes of fans that have no such triangle, as their area is
                 for (int lane = 0; lane < batch.size; ++lane) {
-                    if (number >= batch.count[lane] || !batch.active[lane]) continue;
-                    VertexGradient &sum = block.gradients[t.slot[j][lane]];
+                    if (index >= batch.count[lane] || !batch.active[lane]) continue;
+                    VertexGradient &sum = work.gradients[t.slot[j][lane]];
                     sum.x += grad[j][0][lane];
                     sum.y += grad[j][1][lane];
                     sum.z -= depth[lane];
@@ -513,8 +502,8 @@ class FanFilter {
         }
         for (int lane = 0; lane < batch.size; ++lane)  // k is proportional to the depth of the first vertex
             if (batch.active[lane])
-                block.gradients[origin[lane]].z +=
-                    grad_k[lane] * batch.k[lane] * block.vertices[origin[lane]].w;
+                work.gradients[origin[lane]].z +=
+                    grad_k[lane] * batch.k[lane] * work.vertices[origin[lane]].w;
     }
 
     // Adds the gradients of the corners through the areas of the triangles, whose gradients are `grad_area`.

@@ -114,7 +114,8 @@ struct Scene {
         if (filter) {
             const std::vector<int32_t> &fans = filter->first_faces();
             for (size_t fan = 0; fan + 1 < fans.size(); ++fan)
-                for (int32_t i = fans[fan]; i < fans[fan + 1]; i += MAX_FAN) group_start.push_back(i);
+                for (int64_t i = fans[fan]; i < fans[fan + 1]; i += MAX_FAN)
+                    group_start.push_back((int32_t)i);
             group_start.push_back((int32_t)mesh.face_count);
             return;
         }
