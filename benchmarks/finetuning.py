@@ -31,7 +31,7 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
-from meshsplats.finetuning.config import is_long
+from meshsplats.finetuning.config import worthwhile_zooms
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,10 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
         source = options.data / scene.splats
         target = TargetOptions(sh_degree=options.sh_degree, held_out=1, look=options.look)
         count = worthwhile_views(config)
-        long = is_long(config, count)
-        data = target.make(cloud, source, (1, 1, 1), options.threads, count, preset, long)
+        zooms = worthwhile_zooms(
+            config, target.look_for(preset), preset == "default" and cloud.kernel == "3dgs"
+        )
+        data = target.make(cloud, source, (1, 1, 1), options.threads, count, preset, zooms)
         cameras = ms.load_cameras(options.data / scene.cameras)
         views = splat_views(cloud, cameras, look=options.look, sh_degree=options.sh_degree)
         judged = ms.Dataset((), views, look=options.look)

@@ -26,7 +26,7 @@ import meshsplats as ms
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import RunOptions, make_config, starting_mesh, worthwhile_views
-from meshsplats.finetuning.config import is_long
+from meshsplats.finetuning.config import worthwhile_zooms
 
 SIZES = {"200": (200, 1), "400": (400, 1), "800": (800, 1), "1600": (1600, 1), "near": (800, 2)}
 SAMPLES = {"area": 2, "splats": 1}
@@ -96,8 +96,8 @@ def tune(
     if zooms is None:
         target = TargetOptions(look=look)  # type: ignore[arg-type]
         views = worthwhile_views(config)
-        long = is_long(config, views)
-        data = target.make(cloud, Path("splats.ply"), (1, 1, 1), options.threads, views, long=long)
+        zooms = worthwhile_zooms(config, look, cloud.kernel == "3dgs")
+        data = target.make(cloud, Path("splats.ply"), (1, 1, 1), options.threads, views, zooms=zooms)
     else:
         count = worthwhile_views(config)
         data = ms.splat_dataset(cloud, train=count, look=look, zooms=zooms, threads=options.threads)

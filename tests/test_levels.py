@@ -15,8 +15,12 @@ from meshsplats.levels import Level, level_targets, likeness, make_level, plan_l
 
 
 def test_plan():
-    assert plan_levels(1000, 3) == [Level(1000, 800), Level(250, 400), Level(62, 200)]
-    assert plan_levels(1000, 3, factor=2, width=100) == [Level(1000, 100), Level(500, 71), Level(250, 50)]
+    assert plan_levels(1000, 3) == [Level(1000, 800, 1000), Level(250, 400, 1000), Level(62, 200, 1000)]
+    assert plan_levels(1000, 3, factor=2, width=100) == [
+        Level(1000, 100, 1000),
+        Level(500, 71, 1000),
+        Level(250, 50, 1000),
+    ]
     with pytest.raises(ValueError, match=r"9 levels are too many for 1000 splats .* at most 5 fit"):
         plan_levels(1000, 9)
     with pytest.raises(ValueError, match="the last would have 62 splats and 12 pixels; at most 2 fit"):
@@ -45,7 +49,7 @@ def test_tuning_makes_a_level_better():
     from meshsplats.finetuning import make_config
 
     cloud = make_scene(600)
-    level = Level(150, 40)
+    level = Level(150, 40, 600)
     config = make_config("default", steps=60)
     targets = level_targets(cloud, level, config, sh_degree=0)
     plain, tuned = make_level(cloud, level, targets), make_level(cloud, level, targets, config)
@@ -60,10 +64,31 @@ def test_all_levels_have_the_triangles_of_a_splat_of_the_finest(monkeypatch):
 
     monkeypatch.setattr(initial, "MANY_TRIANGLES", 6000)
     cloud = make_scene(600)
-    level = Level(150, 40)
+    level = Level(150, 40, 600)
     config = make_config("default", steps=1)
     mesh = make_level(cloud, level, level_targets(cloud, level, config, sh_degree=0), config)
     assert 9 * mesh.splat_count < len(mesh.faces) <= 10 * 150
+
+
+def test_the_finest_level_counts_the_splats_it_may_have(monkeypatch):
+    """Not those of the whole cloud."""
+    from meshsplats.finetuning import initial, make_config
+
+    monkeypatch.setattr(initial, "MANY_TRIANGLES", 1500)
+    cloud = make_scene(600)
+    (level,) = plan_levels(150, 1, width=40)
+    config = make_config("default", steps=1)
+    mesh = make_level(cloud, level, level_targets(cloud, level, config, sh_degree=0), config)
+    assert 9 * mesh.splat_count < len(mesh.faces) <= 10 * 150
+
+
+def test_every_sixth_view_is_a_window():
+    from meshsplats.finetuning import make_config
+
+    cloud, level = make_scene(200), Level(200, 40, 200)
+    targets = level_targets(cloud, level, make_config("default", steps=10), sh_degree=0)
+    focal = np.array([view.camera.fx for view in targets.train])
+    assert np.mean(focal > 1.5 * np.median(focal)) == 33 / 200
 
 
 @pytest.fixture

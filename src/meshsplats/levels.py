@@ -22,6 +22,7 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
+from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starting_sides
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -41,6 +42,8 @@ class Level:
     """Maximum number of splats."""
     width: int
     """Side in pixels of the square images, which the subject just fills, that the level is made for."""
+    finest: int
+    """Maximum number of splats of the finest level of the chain."""
 
 
 def plan_levels(splats: int, count: int, *, factor: int = 4, width: int = 800) -> list[Level]:
@@ -53,7 +56,7 @@ def plan_levels(splats: int, count: int, *, factor: int = 4, width: int = 800) -
     """
     if count < 1 or factor < 2 or splats < 1:
         raise ValueError(f"there must be a splat, a level and a factor of 2, got {splats}, {count}, {factor}")
-    levels = [Level(splats // factor**i, round(width / math.sqrt(factor**i))) for i in range(count)]
+    levels = [Level(splats // factor**i, round(width / math.sqrt(factor**i)), splats) for i in range(count)]
     if levels[-1].splats < 1 or levels[-1].width < SMALLEST:
         fit = sum(level.splats >= 1 and level.width >= SMALLEST for level in levels)
         raise ValueError(
@@ -68,10 +71,12 @@ def level_targets(
 ) -> Dataset:
     """Training and held-out images of ``cloud`` in the size of ``level``.
 
-    Their number suits a run with ``config`` (``worthwhile_views``). ``options`` are those of
-    ``splat_dataset``.
+    Their number suits a run with ``config`` (``worthwhile_views``), which sees some of them as windows
+    (``worthwhile_zooms``). ``options`` are those of ``splat_dataset``.
     """
     train = worthwhile_views(config) if config is not None else 1
+    if config is not None:
+        options = {"zooms": worthwhile_zooms(config, "area"), **options}
     return splat_dataset(cloud, train=train, width=level.width, **options)
 
 
@@ -96,7 +101,7 @@ def make_level(
         cameras = [view.camera for view in targets.test]
         return convert(cloud, options, cameras=cameras, up=up, max_splats=level.splats)
     cameras = [view.camera for view in targets.train]
-    options = options or ConversionOptions(sides=starting_sides(len(cloud), config, len(cameras)))
+    options = options or ConversionOptions(sides=starting_sides(level.finest, config, len(cameras)))
     mesh = starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
     return finetune(mesh, targets, config, run=run, on_progress=on_progress)
 

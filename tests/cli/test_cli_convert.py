@@ -18,6 +18,7 @@ from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main, toml
 from meshsplats.conversion import convert, simplify
+from meshsplats.evaluation.comparison import compare
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.gltf.document import GltfDocument
@@ -105,6 +106,22 @@ def test_json(splats, tmp_path, capsys):
     assert (result["input"], result["preview"]) == (str(splats), None)
     assert (result["warnings"], result["meshsplats"]) == ([], meshsplats.__version__)
     assert not (tmp_path / "mesh.npz.preview.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "look"),
+    [([], "area"), (["--look", "splats"], "splats"), (["--footprint", "filter"], "splats")],
+)
+def test_fidelity_is_that_of_the_look_that_was_chosen(splats, tmp_path, capsys, options, look):
+    out = tmp_path / "mesh.npz"
+    assert run(splats, "-o", out, "--fidelity", "2", "--no-preview", *options) == 0
+    printed = capsys.readouterr().out
+    assert f"2 views, look {look}" in printed
+    assert (f"--look {look}" in printed) == (look != "area")
+    cloud, mesh = load_gaussians(splats), load_mesh(out)
+    views = orbit(mesh, 2, elevation=15, width=400, height=400)
+    wanted = np.mean([view.psnr for view in compare(cloud, mesh, views, look=look).views])
+    assert f"{wanted:.2f} dB" in printed
 
 
 def test_up(splats, tmp_path):

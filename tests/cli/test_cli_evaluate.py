@@ -68,7 +68,9 @@ def test_against_the_splats_own_pictures(scene, tmp_path, capsys):
     assert sorted(p.name for p in (out / "crops").iterdir()) == ["view_0000.png", "view_0002.png"]
     with Image.open(out / "strips" / "view_0000.png") as image:
         assert image.width == 8 + 5 * 48  # truth, three methods, error
-    assert "| splats | mesh |" in (out / "table.md").read_text()
+    table = (out / "table.md").read_text()
+    assert "| splats | mesh |" in table
+    assert "Ground truth: splats as means over each pixel's area; meshes with 1 x 1 samples" in table
 
 
 def test_what_degree_0_shows_of_splats_with_more_is_scored_beside_a_mesh(scene, tmp_path, capsys):
@@ -114,7 +116,11 @@ def test_against_photographs(scene, tmp_path, capsys):
     out = tmp_path / "out"
     options = ("--data", data, "--splats", scene / "scene.ply", "--test-every", "2", "--background", "0,0,1")
     assert run(scene / "mesh.npz", "-o", out, *options) == 0
-    assert "splats_sh0" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "splats_sh0" in printed
+    note = "Ground truth: photographs; meshes with 2 x 2 samples per pixel."
+    assert note in printed
+    assert note in (out / "table.md").read_text()
     results = json.loads((out / "results.json").read_text())
     assert set(results) == {"mesh", "splats_sh0", "splats"}
     dataset = load_dataset(data, test_every=2, background=(0, 0, 1))

@@ -63,6 +63,7 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     result = json.loads(printed.out)
     assert result["steps"] == 12
     assert result["held_out_psnr"]["after"] > result["held_out_psnr"]["before"]
+    assert (result["look"], result["samples"]) == ("area", 2)
     assert "memory: about" in printed.err
     assert "step 6/12, loss" in printed.err
     mesh = load_mesh(out)
@@ -71,6 +72,7 @@ def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == names
     config = toml.load(tmp_path / "tuned.npz.config.toml")
     assert config["resolved"] == without_none(make_config(steps=12).to_dict())
+    assert config["result"] == {"look": "area", "samples": 2}
     assert config["options"]["width"] == 32
     # Nothing is overwritten, and an older run is not lost.
     assert run(splats, "-o", out, *SMALL, "--steps", "12") == 3
@@ -120,6 +122,29 @@ def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys, o
     assert run("scene.ply", "-o", "tuned.npz", "--views", "4", "--steps", "2", *options) == 0
     printed, scored = printed_score(capsys.readouterr().out, capsys)
     assert printed == pytest.approx(scored, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "options", "filtered"),
+    [
+        ("3dgs", [], True),
+        ("3dgs", ["--footprint", "none"], False),
+        ("antialiased", [], False),
+        ("3dgs", ["--preset", "paper"], False),
+    ],
+)
+def test_only_a_mesh_with_a_filter_learns_viewers_images_of_several_sizes(
+    kernel, options, filtered, tmp_path, capsys, monkeypatch
+):
+    made = []
+    monkeypatch.setattr(Finetune, "next_steps", lambda self, files, config, plan: made.append(plan) or [])
+    save_gaussians(replace(make_scene(200), kernel=kernel), tmp_path / "scene.ply")
+    options = ["--look", "splats", *options, "--steps", "1", "--views", "6", "--width", "32"]
+    assert run(tmp_path / "scene.ply", "-o", tmp_path / "tuned.npz", *options) == 0
+    assert "(look splats, 1 x 1 samples)" in capsys.readouterr().out
+    assert (load_mesh(tmp_path / "tuned.npz").filter_px2 > 0) == filtered
+    focal = np.array([view.camera.fx for view in made[0].dataset.train])
+    assert (focal.max() > 1.5 * focal.min()) == filtered
 
 
 def test_a_part_learns_from_its_own_pictures(splats, tmp_path, capsys):

@@ -403,7 +403,7 @@ class TestLimits:
 
     def test_max_splats_is_what_simplify_makes(self):
         mesh = convert(self.cloud, max_splats=500, footprint="none", min_opacity=0)
-        same = convert(simplify(self.cloud, 500, low_pass=0), footprint="none", min_opacity=0)
+        same = convert(simplify(self.cloud, 500), footprint="none", min_opacity=0)
         np.testing.assert_array_equal(mesh.vertices, same.vertices)
         np.testing.assert_array_equal(mesh.colors, same.colors)
         np.testing.assert_array_equal(mesh.face_splat, same.face_splat)

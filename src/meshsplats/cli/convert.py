@@ -89,7 +89,7 @@ class Convert(Command):
     """
 
     COMMON = (
-        *("input", "output", "formats", "preset", "cameras", "data", "up", "lit"),
+        *("input", "output", "formats", "preset", "look", "cameras", "data", "up", "lit"),
         *("alpha", "as_splats", "max_splats", "max_triangles", "crop", "json", "force"),
     )
     EXCLUSIVE = (("cameras", "data"),)
@@ -438,8 +438,9 @@ class Convert(Command):
         views = [camera.within(400) for camera in subsample(cameras, self.fidelity)] or orbit(
             mesh, self.fidelity, elevation=15, width=400, height=400
         )
-        mean = compare(cloud, mesh, views).to_dict()["mean"]
-        return {"views": len(views), "psnr": mean["psnr"], "ssim": mean["ssim"]}
+        look = self._look
+        mean = compare(cloud, mesh, views, look=look).to_dict()["mean"]
+        return {"views": len(views), "look": look, "psnr": mean["psnr"], "ssim": mean["ssim"]}
 
     def _save_again(self, job: Job) -> dict[str, Any]:
         """The mesh of ``job`` in another format."""
@@ -519,6 +520,11 @@ class Convert(Command):
         files = ", ".join(f"{path.name} ({size_of(path)})" for path in job.outputs)
         print(f"{job.shown}: {sizes}: {files}", flush=True)
 
+    @property
+    def _look(self) -> Literal["area", "splats"]:
+        """The look that the conversion is for."""
+        return "splats" if self.conversion.footprint == "filter" else self.conversion.look or "area"
+
     def _next(self, cameras: Sequence[Camera] | None) -> str:
         """The command that compares the mesh with the splats in its cameras, or one that renders it if only a
         part of them was converted."""
@@ -526,6 +532,7 @@ class Convert(Command):
         if self.conversion.crop is not None or source == "-":
             return command_line(["meshsplats", "render", self.output, "-o", f"{folder}-images"])
         words: list[str | Path] = ["meshsplats", "compare", source, self.output]
+        words += ["--look", self._look] if self._look != "area" else []
         if self.data is not None:
             words += ["--data", self.data]
         elif cameras:
@@ -563,4 +570,5 @@ def _counts(result: dict[str, Any]) -> str:
         return sizes
     psnr = "equal" if fidelity["psnr"] is None else f"{fidelity['psnr']:.2f} dB"
     views = plural(fidelity["views"], "view")
-    return f"{sizes}; {psnr}, SSIM {fidelity['ssim']:.4f} against the splats, {views}"
+    scores = f"{psnr}, SSIM {fidelity['ssim']:.4f} against the splats"
+    return f"{sizes}; {scores}, {views}, look {fidelity['look']}"

@@ -72,7 +72,7 @@ class Evaluate(Command):
 
     COMMON = (
         *("mesh", "output", "data", "splats", "before", "cameras", "downscale", "test_every"),
-        *("background", "samples", "lpips", "fit_exposure", "threads", "json", "force"),
+        *("look", "background", "samples", "lpips", "fit_exposure", "threads", "json", "force"),
     )
     EXCLUSIVE = (("data", "cameras"),)
     CONFIGURABLE = True
@@ -372,11 +372,14 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def _notes(reports: Sequence[Report]) -> list[str]:
-    """Notes under the table: the scenes' backgrounds."""
-    backgrounds = [(report.scene, report.about["background_description"]) for report in reports]
-    if len(backgrounds) == 1:
-        return [f"Background: {backgrounds[0][1]}."]
-    return [f"Background of {scene}: {text}." for scene, text in backgrounds]
+    """Notes under the table: the ground truth, the samples and the background of each scene."""
+    notes = []
+    for report in reports:
+        about, scene = report.about, "" if len(reports) == 1 else f"{report.scene}: "
+        samples = f"meshes with {about['samples']} x {about['samples']} samples per pixel"
+        notes.append(f"{scene}Ground truth: {about['ground_truth']}; {samples}.")
+        notes.append(f"{scene}Background: {about['background_description']}.")
+    return notes
 
 
 def _print_table(reports: Sequence[Report]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -48,7 +49,8 @@ from meshsplats.finetuning import (
     worthwhile_views,
 )
 from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.config import is_long
+from meshsplats.finetuning.config import worthwhile_zooms
+from meshsplats.finetuning.initial import starts_with_filter
 from meshsplats.finetuning.ranks import is_started_by_torchrun
 from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores
 from meshsplats.finetuning.step import samples_of
@@ -77,8 +79,8 @@ class Finetune(TrainingCommand):
     """
 
     COMMON = (
-        *("input", "output", "preset", "opacity", "minutes", "steps", "data", "downscale", "cameras"),
-        *("width", "max_triangles", "threads", "device", "resume", "force"),
+        *("input", "output", "preset", "opacity", "minutes", "steps", "data", "cameras"),
+        *("look", "max_triangles", "threads", "device", "resume", "force"),
     )
 
     RANKS = True
@@ -155,7 +157,7 @@ class Finetune(TrainingCommand):
             self.threads,
             views,
             self.preset,
-            self.cell_splats is None and is_long(begun, self.target.views or views),
+            self._zooms(config, scene),
         )
         return scene, dataset
 
@@ -222,6 +224,15 @@ class Finetune(TrainingCommand):
         words += ["--samples", samples_of(dataset.train[0], config)]
         words += ["-o", f"{folder}-evaluation"]
         return [f"next: {command_line(words)}"]
+
+    def _zooms(self, config: FinetuneConfig, scene: GaussianCloud | SplatMesh) -> Sequence[int]:
+        """Zooms of the training views of a ``scene`` of splats."""
+        look = self.target.look_for(self.preset)
+        if look == "area" and self.cell_splats is not None:
+            return (1,)
+        options = replace(self.conversion, look=look)
+        filtered = isinstance(scene, GaussianCloud) and starts_with_filter(scene, options)
+        return worthwhile_zooms(config, look, filtered and self._start_preset == "default")
 
     @property
     def _start_preset(self) -> str:

@@ -37,7 +37,8 @@ from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_config
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.levels import Level, level_targets, likeness, make_level, plan_levels
+from meshsplats.levels import SAMPLES, Level, level_targets, likeness, make_level, plan_levels
+from meshsplats.rendering.looks import GROUND_TRUTHS
 
 TABLE = "levels.json"
 MINUTES = 2.0
@@ -112,7 +113,14 @@ class Levels(Command):
                     return 128 + (stop.signal or signal.SIGINT)
                 write_json(done, row)
             rows.append(json.loads(done.read_text(encoding="utf-8")))
-        table = {"source": str(self.input), "splats": len(cloud), "factor": self.factor, "levels": rows}
+        table = {
+            "source": str(self.input),
+            "splats": len(cloud),
+            "factor": self.factor,
+            "look": "area",
+            "samples": SAMPLES,
+            "levels": rows,
+        }
         self._finish(folder, table)
         if self.json:
             print(json.dumps(table | {"folder": str(self.output)}, indent=1))
@@ -230,4 +238,7 @@ class Levels(Command):
                 f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{size:>10}"
                 f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
             )
+        print(
+            f"dB: look area, {GROUND_TRUTHS['area']}; the mesh with {SAMPLES} x {SAMPLES} samples per pixel"
+        )
         print(f"{self.output}/: {TABLE} has this table")

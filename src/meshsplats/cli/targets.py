@@ -15,7 +15,7 @@ from meshsplats.cli.common import Count, File, Folder, Text, cameras_beside, par
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset
-from meshsplats.finetuning.config import FEWEST_VIEWS, LONG_ZOOMS
+from meshsplats.finetuning.config import FEWEST_VIEWS
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -42,7 +42,7 @@ class TargetOptions:
     """Without --data: side of the images in pixels."""
     distance: tuple[float, float] = (0.9, 1.1)
     """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
-    sphere with 90 % of the splats' opacity just fits the image. The mesh looks best from there."""
+    sphere with 90 % of the splats' opacity just fits the image."""
     placement: Literal["auto", "object", "surrounded", "inside"] = "auto"
     """Without --data: cameras all around an object, above the ground around an object in its surroundings, or
     inside a room."""
@@ -54,10 +54,8 @@ class TargetOptions:
     look: Annotated[
         Literal["area", "splats"] | None, tyro.conf.arg(metavar="{area,splats}", help_behavior_hint="")
     ] = None
-    """Without --data: kind of images. area: means over each pixel's area, right at every size in programs
-    that take several samples per pixel: Blender, MSAA, ray tracers. splats: those of a 3DGS viewer; the mesh
-    is then rendered with the viewer's filter here, and needs 'meshsplats bake' for other programs. Default:
-    area; with --preset paper and published: splats, without the filter."""
+    """Images of splats. area: means over pixels, right at every size (with several samples: Blender, MSAA).
+    splats: as in a 3DGS viewer, for this renderer. Default: area; of the other presets: splats."""
     sh_degree: Count = None
     """Without --data: render the splats with spherical harmonics up to this degree. Default: all that are
     stored."""
@@ -82,6 +80,9 @@ class TargetOptions:
     def _is_set(self, name: str) -> bool:
         return getattr(self, name) != next(f.default for f in fields(self) if f.name == name)
 
+    def look_for(self, preset: str) -> Literal["area", "splats"]:
+        return self.look or ("area" if preset == "default" else "splats")
+
     @property
     def cache_bytes(self) -> int:
         return int(self.cache * 1e9)
@@ -94,10 +95,10 @@ class TargetOptions:
         threads: int | None,
         worthwhile: int = FEWEST_VIEWS,
         preset: str = "default",
-        long: bool = False,
+        zooms: Sequence[int] = (1,),
     ) -> Dataset:
-        """The data set: by default with ``worthwhile`` views, and with the look of the ``preset``; ``long``:
-        for a long run."""
+        """The data set: by default with ``worthwhile`` views, and with the look of the ``preset``. ``zooms``:
+        of images of splats."""
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
@@ -120,10 +121,6 @@ class TargetOptions:
             cameras: list[Camera] | None = load_cameras(self.cameras)
         else:
             cameras = None if any(map(self._is_set, PLACING)) else cameras_beside(source)
-        look = self.look or ("area" if preset == "default" else "splats")
-        zooms: Sequence[int] | None = None if preset == "default" else (1,)
-        if long and look == "area":
-            zooms = LONG_ZOOMS
         return splat_dataset(
             scene,
             placement=self.placement,
@@ -133,7 +130,7 @@ class TargetOptions:
             width=self.width,
             distance=self.distance,
             up=None if self.up is None else parse_up(self.up),
-            look=look,
+            look=self.look_for(preset),
             zooms=zooms,
             sh_degree=self.sh_degree,
             background=background,

@@ -201,7 +201,7 @@ class TrainingCommand(Command):
     minutes: Number = None
     """Length of the run: time for the whole command."""
     resume: bool = False
-    """Continue an interrupted run of the same command; with --force also one that has ended, for longer."""
+    """Continue an interrupted run; with --force also one that has ended, for longer."""
     target: TargetOptions = field(default_factory=TargetOptions)
     tuning: TuningOptions = field(default_factory=TuningOptions)
     report_every: int = 100
@@ -289,11 +289,12 @@ class TrainingCommand(Command):
         except OtherRunError as error:
             raise self._naming_options(error, files) from None
         save_mesh(trained.saved, files.mesh, alpha=trained.alpha)
-        result = None if plan.background is None else plan.background.to_dict()
-        write_configuration(files.config, self._name, self, result)
+        scored = self._scored(config, plan.dataset)
+        background = {} if plan.background is None else plan.background.to_dict()
+        write_configuration(files.config, self._name, self, scored | background)
         self.save_more(files, plan, trained)
         draw_preview(trained.shown, files.preview, self.preview_camera(plan))
-        self._print_result(files, time.perf_counter() - start, earlier, trained)
+        self._print_result(files, time.perf_counter() - start, earlier, trained, scored)
         if not self.json:
             for line in self.next_steps(files, config, plan):
                 print(line)
@@ -381,10 +382,22 @@ class TrainingCommand(Command):
         )
         return OtherRunError(f"{error}. Options that differ: {changes}")
 
+    def _scored(self, config: FinetuneConfig, dataset: Dataset) -> dict[str, Any]:
+        """What the scores of a run compare: the look of the targets, and the samples of the mesh."""
+        from meshsplats.finetuning.step import samples_of
+
+        return {"look": dataset.look, "samples": samples_of((dataset.test or dataset.train)[0], config)}
+
     def _print_result(
-        self, files: RunFiles, seconds: float, earlier: Checkpoint | None, trained: Trained
+        self,
+        files: RunFiles,
+        seconds: float,
+        earlier: Checkpoint | None,
+        trained: Trained,
+        scored: Mapping[str, Any],
     ) -> None:
-        """Prints the result of a run of ``seconds``, after those of the ``earlier`` part."""
+        """Prints the result of a run of ``seconds``, after those of the ``earlier`` part. ``scored``: see
+        ``_scored``."""
         from meshsplats.finetuning.journal import Journal
 
         lines = Journal(files.folder).metrics()
@@ -403,6 +416,7 @@ class TrainingCommand(Command):
                 "seconds_since_resumed": None if earlier is None else round(seconds, 2),
                 **trained.counts,
                 "held_out_psnr": held_out,
+                **scored,
                 "run": str(files.folder),
             }
             print(json.dumps(result, indent=1))
@@ -411,6 +425,8 @@ class TrainingCommand(Command):
         quality = f"; held out: {scores[0]:.2f} -> {scores[-1]:.2f} dB" if scores else ""
         if len(scores) == 1:
             quality = f"; held out: {scores[0]:.2f} dB"
+        if scores:
+            quality += f" (look {scored['look']}, {scored['samples']} x {scored['samples']} samples)"
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
         print(f"preview: {files.preview}; metrics: {files.folder}/metrics.jsonl")
 

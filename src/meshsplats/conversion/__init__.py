@@ -103,12 +103,11 @@ def convert(
     if len(rows) < len(cloud):
         part = part.select(rows)
     chosen, count = within_limits(given, chosen, len(part))
-    whole = _ViewedSplats(part, chosen, cameras, direction)
-    viewed = whole
+    whole = part
     if chosen.budget == "merge" and count < len(part):
-        viewed = _ViewedSplats(simplify(part, count, low_pass=whole.low_pass), chosen, cameras, direction)
-        rows, cloud = np.arange(count, dtype=np.int32), viewed.cloud
-    part = viewed.cloud
+        cloud = part = simplify(part, count, cameras=cameras)
+        rows = np.arange(count, dtype=np.int32)
+    viewed = _ViewedSplats(part, chosen, cameras, direction)
 
     fans = Fans.of(part, chosen, viewed.pixel)
     keep = fans.areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(part), bool)
@@ -134,7 +133,7 @@ def convert(
     mesh = assembled(fans, keep)
     if chosen.detail == "cameras":
         wanted: Look = "splats" if chosen.footprint == "filter" else chosen.look or "area"
-        shown = visibility(mesh, cloud.means, whole.cloud, cameras or (), wanted)
+        shown = visibility(mesh, cloud.means, whole, cameras or (), wanted)
         visible = keep & ~shown.hidden[rows]
         keep = visible if visible.any() else keep
         budget = len(mesh.faces) if chosen.max_triangles is None else chosen.max_triangles
@@ -230,15 +229,11 @@ class _ViewedSplats:
         cameras: Sequence[Camera] | None,
         up: np.ndarray,
     ) -> None:
-        self.cloud = cloud
         self.coverage = None
         if cameras and "cameras" in (options.footprint, options.colors):
             self.coverage = CameraCoverage(cloud.means, cameras)
         self.pixel = pixel_sizes(cloud, options, self.coverage, up)
         """(n,) scene units, or None: no low-pass filter."""
-        px2 = _filter_px2(cloud, options)
-        self.low_pass: float | np.ndarray = 0.0 if self.pixel is None else np.sqrt(px2) * self.pixel
-        """Standard deviation of the filter, scene units."""
 
 
 def _filter_px2(cloud: GaussianCloud, options: ConversionOptions) -> float:

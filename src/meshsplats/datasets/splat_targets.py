@@ -35,8 +35,7 @@ SURROUNDED_ELEVATIONS = (3.0, 60.0)
 hard to match that such views make the others worse."""
 INSIDE_ELEVATIONS = (-35.0, 35.0)
 DISTANCES = (0.9, 1.1)
-"""Multiples of the distance at which the subject just fits. Without the filter of splats, a mesh cannot be
-right at every size: the wider this range, the larger the error at each."""
+"""Multiples of the distance at which the subject just fits."""
 SURROUNDINGS_SHARE = 0.01
 """A subject has surroundings if more than this share of the opacity lies beyond it."""
 STANDS = 12

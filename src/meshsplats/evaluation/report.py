@@ -15,7 +15,7 @@ from meshsplats.datasets.views import Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.looks import Look, draw_splats, image_of, mesh_samples
+from meshsplats.rendering.looks import GROUND_TRUTHS, Look, draw_splats, image_of, mesh_samples
 
 if TYPE_CHECKING:
     from meshsplats.evaluation.lpips import Lpips
@@ -226,6 +226,7 @@ def evaluate(
         "views": len(views),
         "held_out": bool(dataset.test),
         "look": dataset.look,
+        "ground_truth": GROUND_TRUTHS[dataset.look] if _targets_are_splats(dataset) else "photographs",
         "samples": samples,
         "triangles": counts if len(counts) > 1 else next(iter(counts.values()), None),
         "splats": None if splats is None else len(splats),

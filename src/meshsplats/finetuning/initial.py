@@ -60,8 +60,7 @@ def starting_mesh(
         return convert(cloud, replace(chosen, look=None), preset="paper", cameras=cameras, up=up)
     if chosen.mode is None and chosen.flat_below is None:
         chosen = replace(chosen, mode="flat")
-    no_footprint = chosen.footprint is None and chosen.footprint_px2 is None
-    if chosen.look == "splats" and cloud.kernel == "3dgs" and no_footprint:
+    if starts_with_filter(cloud, chosen):
         chosen = replace(chosen, footprint="filter")
     if chosen.detail is None and chosen.mode == "flat" and chosen.rings in (None, 1):
         chosen = replace(chosen, detail="cameras")
@@ -69,6 +68,13 @@ def starting_mesh(
             splats = max(1, min(len(cloud), chosen.max_splats or len(cloud)))
             chosen = replace(chosen, sides=starting_sides(splats, config, len(cameras)))
     return convert(cloud, chosen, cameras=cameras, up=up)
+
+
+def starts_with_filter(cloud: GaussianCloud, options: ConversionOptions) -> bool:
+    """Whether ``starting_mesh`` (preset 'default') makes a mesh that is drawn with the filter of 3DGS."""
+    if options.footprint is not None or options.footprint_px2 is not None:
+        return options.footprint == "filter"
+    return options.look == "splats" and cloud.kernel == "3dgs"
 
 
 def starting_sides(splats: int, config: FinetuneConfig | None, views: int) -> int:

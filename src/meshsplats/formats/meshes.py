@@ -96,9 +96,10 @@ def save_mesh(
       primvars. They need the extra ``usd``.
     - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
 
-    All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning. All but `.obj` keep
-    ``filter_px2``, but other programs render without a low-pass filter: writing a mesh with one as `.glb`,
-    USD or `.obj` gives a DataWarning; ``bake_filter`` makes the filter part of the triangles.
+    All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning. All but `.obj`, and
+    `.glb` with 'hybrid' or compression, keep ``filter_px2``, but other programs render without a low-pass
+    filter: writing a mesh with one as `.glb`, USD or `.obj` gives a DataWarning; ``bake_filter`` makes the
+    filter part of the triangles.
 
     An older file at ``path`` is replaced at the end; an error leaves it as it was.
 

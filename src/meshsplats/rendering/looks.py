@@ -19,6 +19,12 @@ Look = Literal["area", "splats"]
 splats: as a 3DGS viewer draws them, with its filter of 0.3 px^2 at the size of the image: wider in small
 images, narrower in large ones."""
 
+GROUND_TRUTHS: dict[Look, str] = {
+    "area": "splats as means over each pixel's area",
+    "splats": "splats as a 3DGS viewer renders them at this size",
+}
+"""The looks in words."""
+
 AREA = 4
 """The mean over a pixel's area is taken from an image this many times as large."""
 
