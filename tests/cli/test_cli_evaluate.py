@@ -120,6 +120,7 @@ def test_against_photographs(scene, tmp_path, capsys):
     assert "splats_sh0" in printed
     note = "Ground truth: photographs; meshes with 2 x 2 samples per pixel."
     assert note in printed
+    assert "Splats: as a 3DGS viewer renders them at this size." in printed
     assert note in (out / "table.md").read_text()
     results = json.loads((out / "results.json").read_text())
     assert set(results) == {"mesh", "splats_sh0", "splats"}

@@ -57,6 +57,7 @@ from meshsplats.evaluation.strips import (
 )
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.looks import GROUND_TRUTHS
 
 RESULTS, PER_VIEW, REPORT, TABLE = "results.json", "per_view.json", "report.json", "table.md"
 Files = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")]
@@ -378,6 +379,8 @@ def _notes(reports: Sequence[Report]) -> list[str]:
         about, scene = report.about, "" if len(reports) == 1 else f"{report.scene}: "
         samples = f"meshes with {about['samples']} x {about['samples']} samples per pixel"
         notes.append(f"{scene}Ground truth: {about['ground_truth']}; {samples}.")
+        if about["splats"] is not None and about["ground_truth"] not in GROUND_TRUTHS.values():
+            notes.append(f"{scene}Splats: {GROUND_TRUTHS['splats'].removeprefix('splats ')}.")
         notes.append(f"{scene}Background: {about['background_description']}.")
     return notes
 
