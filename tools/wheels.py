@@ -40,7 +40,7 @@ PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
 MAX_BYTES = 1_200_000
 """Of a wheel."""
 SMALLER = [
-    *("-mllvm", "-inline-threshold=60"),
+    *("-mllvm", "-inline-threshold=45"),
     *("-mllvm", "-unroll-runtime=false"),
     *("-mllvm", "-unroll-allow-partial=false"),
 ]
@@ -215,7 +215,7 @@ def small_zip(files: dict[str, bytes], executable: set[str], moment: time.struct
 @functools.cache
 def zopfli_deflated(content: bytes) -> bytes:
     """The deflate stream alone: without zlib's header of 2 bytes and its checksum of 4."""
-    return zopfli.zlib.compress(content)[2:-4]
+    return zopfli.zlib.compress(content, blocksplittingmax=0)[2:-4]  # 0: any number of blocks
 
 
 def _record_hash(content: bytes) -> str:

@@ -209,12 +209,16 @@ class FanFilter {
     // Calls body(batch) for all fans of work.order, with their transforms. Fans are sorted by the number of
     // their triangles, as a batch takes as long as its largest fan.
     template <class Body>
-    __attribute__((always_inline)) void for_batches(Workspace &work, Body body) const {
+    void for_batches(Workspace &work, Body body) const {
         const auto triangles = [&](int32_t fan) { return fans_.faces[fan + 1] - fans_.faces[fan]; };
-        const auto smaller = [&](int32_t a, int32_t b) { return triangles(a) < triangles(b); };
-        if (!std::is_sorted(work.order.begin(), work.order.end(), smaller))
-            std::sort(work.order.begin(), work.order.end(), smaller);
         const int count = (int)work.order.size();
+        for (int i = 1; i < count; ++i) {  // insertion sort: there are few, and most are in order
+            const int32_t fan = work.order[i];
+            int to = i;
+            for (; to > 0 && triangles(work.order[to - 1]) > triangles(fan); --to)
+                work.order[to] = work.order[to - 1];
+            work.order[to] = fan;
+        }
         FanBatch batch;
         for (int i = 0; i < count; i += WD) {
             batch.size = std::min(WD, count - i);
@@ -259,9 +263,8 @@ class FanFilter {
 
     // Loads triangle `index` of each fan, relative to the origins (x0, y0). `t` holds the triangles before:
     // most share the fan's centre with them and begin at the corner where they end; other corners are loaded.
-    __attribute__((always_inline)) void load_triangles(const Workspace &work, const FanBatch &batch,
-                                                       int index, const vd &x0, const vd &y0,
-                                                       Triangles &t) const {
+    void load_triangles(const Workspace &work, const FanBatch &batch, int index, const vd &x0, const vd &y0,
+                        Triangles &t) const {
         bool same_center = index > 0, joined = index > 0;
         for (int lane = 0; lane < WD; ++lane) {
             const int64_t face = batch.first[lane] + std::min(index, batch.count[lane] - 1);
@@ -287,8 +290,7 @@ class FanFilter {
             for (int lane = 0; lane < WD; ++lane)
                 if (index >= batch.count[lane]) t.area[lane] = 0;
     }
-    __attribute__((always_inline)) static void load_corners(const Workspace &work, const vd &x0, const vd &y0,
-                                                            int j, Triangles &t) {
+    static void load_corners(const Workspace &work, const vd &x0, const vd &y0, int j, Triangles &t) {
         vd fields[4];
         gather(work, t.slot[j], fields);
         t.x[j] = fields[0] - x0, t.y[j] = fields[1] - y0, t.w[j] = fields[2], t.a[j] = fields[3];
