@@ -30,14 +30,7 @@ from meshsplats.rendering.backward import TapedRendering
 MODES = ("flat", "crossed", "3d")
 STARS = {"detail": "cameras", "sides": 60, "cameras": [camera()]}
 """Splats of many triangles: stars where they are thick, three rings where they are not."""
-SHAPES = [
-    ("flat", {}),
-    ("flat", {"sides": 3}),
-    ("flat", {"rings": 3}),
-    ("crossed", {}),
-    ("3d", {}),
-    ("flat", STARS),
-]
+SHAPES = [("flat", {}), ("flat", {"sides": 3}), ("flat", {"rings": 3}), ("crossed", {}), ("3d", {})]
 
 
 def fans(
@@ -117,9 +110,11 @@ def covariance(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.einsum("n,ni,nj->ij", weights, points - mean, points - mean)
 
 
-@pytest.mark.parametrize(("mode", "options"), SHAPES)
+@pytest.mark.parametrize(
+    ("mode", "options", "tolerance"), [*((*shape, 0.02) for shape in SHAPES), ("flat", STARS, 0.025)]
+)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_the_covariance_on_the_image_grows_by_the_filter(mode, options, seed):
+def test_the_covariance_on_the_image_grows_by_the_filter(mode, options, tolerance, seed):
     """For all patterns, in all positions: what is drawn of one splat has its mean and its covariance + s.
     Faint, for opacities of layers to add up; far, for perspective to be small."""
     cloud = splats(seed, 1, degree=0, sizes=(0.4, 1.2), opacity=0.01)
@@ -131,7 +126,7 @@ def test_the_covariance_on_the_image_grows_by_the_filter(mode, options, seed):
         for s in (4.0, 60.0):
             moved, after = covariance(render(mesh, view, samples=samples, filter_px2=s).alpha)
             np.testing.assert_allclose(moved, mean, atol=0.1)
-            np.testing.assert_allclose(after, before + s * np.eye(2), atol=0.025 * (s + before.max()))
+            np.testing.assert_allclose(after, before + s * np.eye(2), atol=tolerance * (s + before.max()))
 
 
 # What must not change it
@@ -192,7 +187,7 @@ def test_order_of_the_splats():
 
 @pytest.mark.parametrize("unused", [1, 1000], ids=["a few", "many"])
 def test_vertices_of_no_face(unused):
-    """They change nothing, wherever they are: behind the camera, too, or at infinity."""
+    """They change nothing, wherever they are: behind the camera, too, or far away."""
     mesh, view = diamond((20, 18), (2.0, 3.0)), plain_camera()
     for place in ((0, 0, -1), (40, 36, 2), (0, 0, 3e38)):
         more = replace(
@@ -277,7 +272,7 @@ def test_hostile(view):
 # Against float64
 
 
-@pytest.mark.parametrize(("mode", "options"), SHAPES)
+@pytest.mark.parametrize(("mode", "options"), [*SHAPES, ("flat", STARS)])
 def test_equal_to_the_reference(mode, options):
     mesh, view = fans(1, 25, mode, **options), camera()
     assert_mesh_is_exact(mesh, view, depth=True, normals=True)

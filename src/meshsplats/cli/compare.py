@@ -29,7 +29,7 @@ from meshsplats.cli.records import CAMERAS, CONFIGURATION, write_configuration, 
 from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.comparison import Comparison, compare_views
 from meshsplats.formats.sniff import identify
-from meshsplats.rendering.looks import GROUND_TRUTHS, mesh_samples
+from meshsplats.rendering.looks import comparison_in_words, mesh_samples
 
 RESULTS = "results.json"
 
@@ -138,10 +138,7 @@ class Compare(Command):
             print(json.dumps(result, indent=1, allow_nan=False))
             return
         _print_table(comparison)
-        print(
-            f"look {self.look}: {GROUND_TRUTHS[self.look]}; the mesh with {samples} x {samples} samples per"
-            " pixel"
-        )
+        print(comparison_in_words(self.look, samples))
         print(f"{len(cloud):,} splats against {len(mesh.faces):,} triangles, {result['seconds']:.1f} s")
         print(f"background: {background.describe()}")
         print(f"strips splats | mesh | error x {self.amplify:g}: {self.output}/")

@@ -38,7 +38,7 @@ from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.levels import SAMPLES, Level, level_targets, likeness, make_level, plan_levels
-from meshsplats.rendering.looks import GROUND_TRUTHS
+from meshsplats.rendering.looks import comparison_in_words
 
 TABLE = "levels.json"
 MINUTES = 2.0
@@ -238,7 +238,5 @@ class Levels(Command):
                 f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{size:>10}"
                 f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
             )
-        print(
-            f"dB: look area, {GROUND_TRUTHS['area']}; the mesh with {SAMPLES} x {SAMPLES} samples per pixel"
-        )
+        print(comparison_in_words("area", SAMPLES))
         print(f"{self.output}/: {TABLE} has this table")

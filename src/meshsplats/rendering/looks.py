@@ -38,6 +38,11 @@ def check_look(look: str) -> None:
         raise ValueError(f"look must be {' or '.join(get_args(Look))}, got {look!r}")
 
 
+def comparison_in_words(look: Look, samples: int) -> str:
+    """What a score of a mesh compares."""
+    return f"look {look}: {GROUND_TRUTHS[look]}; the mesh with {samples} x {samples} samples per pixel"
+
+
 def mesh_samples(look: Look, mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
     """Side of the grid of samples in each pixel for comparing ``mesh`` with images of that ``look`` from
     ``cameras``: 1 for 'splats', ``needed_samples`` for 'area'."""
