@@ -15,6 +15,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.framing import front_axes, guess_up, scene_bounds, weighted_quantile
 from meshsplats.cameras.trajectories import dome, look_around, look_at, orbit
+from meshsplats.datasets.splat_targets import inside_cameras, outside_cameras
 from meshsplats.errors import FileFormatError
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -188,6 +189,24 @@ def test_guess_up():
     sides = [(0, -1, 0), (0, 1, 0), (1, 0, 0), (-1, 0, 0)] * 2 + [(1, 0, 0)]
     rolled = [look_at((0, 0, -5), (0, 0, 0), up=side) for side in sides]
     np.testing.assert_array_equal(guess_up(None, rolled), (0, -1, 0))
+
+
+def test_cameras_placed_upright_tell_up_exactly():
+    """Whatever their number and heights: the mean of their own up directions leans by degrees."""
+    cloud = make_cloud(ball(200))
+    for number in (5, 8, 40, 41, 200):
+        for placed in outside_cameras(cloud, number), inside_cameras(cloud, number):
+            np.testing.assert_allclose(guess_up(None, placed), (0, -1, 0), atol=1e-9)
+    down = [look_at((np.sin(a), -2, np.cos(a)), (0, 0, 0), up=(0, -1, 0)) for a in (0.0, 0.6, 1.3)]
+    np.testing.assert_allclose(guess_up(None, down), (0, -1, 0), atol=1e-9)
+
+
+def test_cameras_of_one_direction_or_rolled_ones_tell_up_by_their_mean():
+    same = [look_at((0.1 * i, -1, -5), (0.1 * i, 0, 0), up=(0, -1, 0)) for i in range(3)]
+    np.testing.assert_allclose(guess_up(None, same), same[0].up, atol=1e-9)
+    # Half of them hold the camera upright, half on its side: no direction is level for all.
+    turns = [look_at((0, 0, -5), (0, 0, 0), up=up) for up in ((0, -1, 0), (1, 0, 0))]
+    np.testing.assert_allclose(guess_up(None, turns), (0.5**0.5, -(0.5**0.5), 0), atol=1e-9)
 
 
 def test_weighted_quantile_by_hand():

@@ -196,6 +196,17 @@ def test_the_turn_of_a_z_up_mesh_is_the_customary_one():
     np.testing.assert_allclose(v + 2 * np.cross(q, np.cross(q, v) + w * v), [1, 3, -2], atol=1e-12)
 
 
+@pytest.mark.parametrize("up", [(0.02, -0.99, -0.04), (-0.02, -0.99, 0.04), (0.03, -0.99, 0), (0, -1, 1e-9)])
+def test_the_turn_of_a_nearly_upright_capture_is_nearly_the_half_turn(up):
+    """Its x axis stays right, where the shortest rotation has any axis: meshes of one scene would differ by
+    any angle around the vertical."""
+    x, y, z, w = up_quaternion(np.array(up))
+    q, tilt = np.array([x, y, z]), np.hypot(up[0], up[2])
+    for v, half_turned in ((1.0, 0, 0), (1.0, 0, 0)), ((0, 0, 1.0), (0, 0, -1.0)):
+        turned = np.array(v) + 2 * np.cross(q, np.cross(q, v) + w * np.array(v))
+        assert np.linalg.norm(turned - half_turned) <= 1.5 * tilt + 1e-9
+
+
 def test_vertex_normals_weigh_by_area_and_never_vanish():
     # A triangle of area 2 facing +z and one of area 1 facing +x meet in vertex 0; vertex 5 has a sliver only.
     vertices = [[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 1, 0], [0, 0, 2], [9, 9, 9]]

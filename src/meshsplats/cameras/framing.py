@@ -32,6 +32,14 @@ COVERED = 0.995
 MARGIN = 1.08
 """Distance of the cameras as a multiple of the one at which the subject just fits."""
 
+LEVEL_SPREAD = 0.03
+"""Least mean square of the second principal component of the directions to the right of cameras, for these
+to tell what is level: cameras that look the same way within some 20 degrees do not."""
+LEVEL_ROLL = 0.2
+"""Greatest mean square of what stands out of that plane, as a share of the former: people roll cameras."""
+LEVEL_AGREES = 0.3
+"""Least cosine between that direction and the cameras' mean up direction."""
+
 Framable = GaussianCloud | SplatMesh | np.ndarray
 """Whatever cameras can be placed around: splats, a mesh, or points (n, 3)."""
 
@@ -112,18 +120,33 @@ def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np
 def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = None) -> np.ndarray:
     """(3,) float64 unit direction that points up in the world frame.
 
-    The mean up direction of ``cameras`` if there are any and they agree (people hold cameras upright); else
-    the ``up`` of a mesh; else ``DEFAULT_UP``, as in scenes trained from COLMAP cameras. The points themselves
-    do not count: they cannot distinguish an upright vase from a hanging lamp.
+    That of ``cameras`` if there are any and they agree (people hold cameras upright); else the ``up`` of a
+    mesh; else ``DEFAULT_UP``, as in scenes trained from COLMAP cameras. The points themselves do not count:
+    they cannot distinguish an upright vase from a hanging lamp.
     """
     if cameras:
-        mean = np.mean([-camera.world_to_camera[1, :3] for camera in cameras], axis=0)
+        rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
+        mean = -rotations[:, 1].mean(axis=0)
         length = float(np.linalg.norm(mean))
         if length > 0.2:  # up directions all around a sphere cancel out
-            return mean / length
+            level = _across(rotations[:, 0])
+            if level is None or abs(level @ mean) < LEVEL_AGREES * length:
+                return mean / length
+            return level if level @ mean > 0 else -level
     if isinstance(scene, SplatMesh):
         return scene.up.astype(np.float64)
     return np.array(DEFAULT_UP)
+
+
+def _across(rights: np.ndarray) -> np.ndarray | None:
+    """(3,) unit direction across the horizontal axes of images, (k, 3); None if they do not tell it.
+
+    Cameras that look up or down tilt their own up direction, but not the axis to their right: that of an
+    upright camera is level. So this is exact for upright cameras, whose mean up direction is not.
+    """
+    values, axes = np.linalg.eigh(rights.T @ rights / len(rights))
+    told = values[1] >= LEVEL_SPREAD and values[0] <= LEVEL_ROLL * values[1]
+    return axes[:, 0] if told else None
 
 
 def unit_up(up: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -280,17 +280,18 @@ def _semantic(name: str, taken: dict[str, int]) -> str:
 
 
 def up_quaternion(up: np.ndarray) -> list[float]:
-    """Unit quaternion x, y, z, w of the shortest rotation that takes the unit vector ``up`` to +y.
+    """Unit quaternion x, y, z, w of a rotation that takes the unit vector ``up`` to +y: the shortest one, for
+    directions below the horizon after a half turn about x.
 
-    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is the half turn about x: x
-    stays right, and a camera that looked along +z looks along -z, as glTF's do.
+    For ``up`` = -y (splats of COLMAP cameras: x right, y down, z forward) it is that half turn: x stays
+    right, and a camera that looked along +z looks along -z, as glTF's do. Directions near -y differ little
+    from it, where the shortest rotation could have any axis.
     """
     x, y, z = (float(u) for u in np.asarray(up, np.float64) / np.linalg.norm(np.asarray(up, np.float64)))
-    if y < -1 + 1e-9:
-        return [1.0, 0.0, 0.0, 0.0]
-    # up x (0, 1, 0) = (-z, 0, x); half-angle form of the shortest rotation between unit vectors.
-    q = np.array([-z, 0.0, x, 1 + y])
-    return [float(c) for c in q / np.linalg.norm(q)]
+    # up x (0, 1, 0) = (-z, 0, x); half-angle form of the shortest rotation between unit vectors. After the
+    # half turn, (x, y, z) is (x, -y, -z), and (a, b, c, w) (1, 0, 0, 0) = (w, c, -b, -a).
+    q = np.array([-z, 0.0, x, 1 + y]) if y >= 0 else np.array([1 - y, x, 0.0, -z])
+    return [float(c) + 0.0 for c in q / np.linalg.norm(q)]  # no negative zeros
 
 
 def linear_colors(mesh: SplatMesh, color_type: ColorType) -> np.ndarray:
