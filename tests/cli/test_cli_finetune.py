@@ -268,7 +268,7 @@ def test_a_run_is_made_longer(splats, tmp_path, capsys, monkeypatch):
     third = json.loads(capsys.readouterr().out)
     assert (third["steps"], third["triangles"]) == (7, second["triangles"])
     assert run(*arguments, "--steps", "6", "--force") == 0
-    assert json.loads(capsys.readouterr().out)["triangles"] > 2 * third["triangles"]
+    assert json.loads(capsys.readouterr().out)["triangles"] > 1.9 * third["triangles"]
 
 
 def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):

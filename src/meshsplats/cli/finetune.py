@@ -27,6 +27,7 @@ from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
     Plan,
     RunFiles,
+    Setup,
     ShowProgress,
     Trained,
     TrainingCommand,
@@ -48,9 +49,11 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
+from meshsplats.finetuning.baseline import Baseline, converted, measure_baseline
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
+from meshsplats.finetuning.pace import StartRecord, measure_pace, worthwhile_steps
 from meshsplats.finetuning.ranks import is_started_by_torchrun
 from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores
 from meshsplats.finetuning.step import samples_of
@@ -68,6 +71,16 @@ else:
         without=("look",),  # that of the targets
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
+
+
+SETUP_SHARE = 0.2
+"""Largest share of the time, of a run with a length in minutes, before its first step."""
+BASELINE_SHARE = 0.05
+"""Share of it in which the conversion is scored, and the result afterwards."""
+SAVE_SECONDS = 2e-6
+"""Time to write a triangle and to draw it in the preview, with some to spare."""
+TIMED_SPLATS = 100_000
+"""Clouds from this size on are merged where the time demands it."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +125,7 @@ class Finetune(TrainingCommand):
             raise UsageError("--cluster is for the cells of --cell-splats")
         super().check()
 
-    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
+    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         scene, dataset = self._inputs(config, earlier)
         background = None
         if self.target.data is not None:
@@ -126,19 +139,103 @@ class Finetune(TrainingCommand):
             return self._plan_of_cells(config, scene, dataset, background)
         # Photographs are few: what more triangles for them are worth was not measured.
         begun = as_begun(config, earlier) if self.target.data is None else None
-        mesh = scene if isinstance(scene, SplatMesh) else self._converted(scene, dataset, begun)
+        baseline, record = None, StartRecord()
+        mesh = scene
+        if isinstance(scene, GaussianCloud):
+            record = self._recorded(scene, dataset, config, earlier, setup)
+            mesh = self._start(scene, dataset, begun, record, setup)
+            baseline = self._baseline(scene, dataset, config, setup)
+        assert isinstance(mesh, SplatMesh)
         summary = f"{len(mesh.faces):,} triangles"
         if isinstance(scene, GaussianCloud) and (mesh.splat_count or 0) < len(scene):
             summary += f" of {mesh.splat_count:,} splats, {len(scene):,} before"
+        reserve = (0 if baseline is None else baseline.seconds) + SAVE_SECONDS * len(mesh.faces)
 
         def optimise(run: RunOptions, show: ShowProgress) -> Trained:
+            record.save(self.files().folder)
             tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
+            sizes = None if baseline is None else baseline.compare(tuned, config, self.threads)
+            if sizes is not None and sizes.loses:
+                assert isinstance(scene, GaussianCloud)
+                tuned = self._conversion(scene, dataset, config)
+                self._log_scores(tuned, dataset, config)
             count = len(tuned.faces)
-            glb = self.output.suffix.lower() == ".glb"
+            glb = self.output.suffix.lower() == ".glb" and not (sizes is not None and sizes.loses)
             alpha: Literal["hybrid"] | None = "hybrid" if config.soft_share and glb else None
-            return Trained(tuned, tuned, {"triangles": count}, f"{count:,} triangles", alpha)
+            return Trained(tuned, tuned, {"triangles": count}, f"{count:,} triangles", alpha, sizes)
 
-        return Plan(mesh, dataset, summary, background, optimise)
+        return Plan(mesh, dataset, summary, background, optimise, reserve)
+
+    def _recorded(
+        self,
+        cloud: GaussianCloud,
+        dataset: Dataset,
+        config: FinetuneConfig,
+        earlier: Checkpoint | None,
+        setup: Setup,
+    ) -> StartRecord:
+        """What the time leaves of the start; of a resumed run, what it left then."""
+        if earlier is not None:
+            return StartRecord.load(self.files().folder)
+        limited = self.conversion.max_splats is not None or self.conversion.max_triangles is not None
+        if setup.seconds is None or limited or self._start_preset != "default" or len(cloud) < TIMED_SPLATS:
+            return StartRecord()
+        setup.phase("timing steps")
+        pace = measure_pace(cloud, dataset, config, self._start_options(dataset), self.threads)
+        left = (1 - SETUP_SHARE) * setup.seconds - setup.spent
+        count = pace.splats(len(cloud), worthwhile_steps(config), left)
+        return StartRecord(max_splats=count if count < len(cloud) else None)
+
+    def _start(
+        self,
+        cloud: GaussianCloud,
+        dataset: Dataset,
+        config: FinetuneConfig | None,
+        record: StartRecord,
+        setup: Setup,
+    ) -> SplatMesh:
+        """The starting mesh. ``record`` notes the images that there was time for."""
+        options = self._start_options(dataset)
+        if record.max_splats is not None:
+            options = replace(options, max_splats=record.max_splats)
+            setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
+        else:
+            setup.phase(f"converting {len(cloud):,} splats")
+        goes_on = setup.observer("choosing numbers of triangles", SETUP_SHARE)
+        recorded, record.images = record.images, 0
+
+        def on_image(done: int, total: int) -> bool:
+            record.images = done
+            time_left = goes_on(done, total)
+            return time_left if recorded is None else done < recorded
+
+        cameras = [view.camera for view in dataset.train]
+        return starting_mesh(
+            cloud,
+            cameras,
+            options,
+            preset=self._start_preset,
+            config=config,
+            threads=self.threads,
+            on_image=on_image,
+        )
+
+    def _start_options(self, dataset: Dataset) -> ConversionOptions:
+        return replace(self.conversion, crop=None, look=dataset.look)  # cropped already
+
+    def _conversion(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig) -> SplatMesh:
+        return converted(cloud, config, self._start_options(dataset))
+
+    def _baseline(
+        self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig, setup: Setup
+    ) -> Baseline | None:
+        """The conversion's scores, for images of splats and the preset 'default'; None for others."""
+        if self.target.data is not None or self._start_preset != "default":
+            return None
+        setup.phase("scoring the conversion")
+        mesh = self._conversion(cloud, dataset, config)
+        most = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
+        return measure_baseline(mesh, cloud, dataset, config, threads=self.threads, seconds=most)
 
     def _inputs(
         self, config: FinetuneConfig, earlier: Checkpoint | None
@@ -169,7 +266,6 @@ class Finetune(TrainingCommand):
         background: Background | None,
     ) -> Plan:
         from meshsplats.finetuning.cells import CellOptions, CellScene, check_for_cells, finetune_cells
-        from meshsplats.finetuning.journal import Journal
 
         if is_started_by_torchrun():
             raise UsageError("--cell-splats is for --cluster, not for torchrun")
@@ -186,17 +282,24 @@ class Finetune(TrainingCommand):
                 shared = Shared(partial(_cell_scene, command, color))
                 shared.hold(CellScene(scene, dataset))
                 mesh = finetune_cells(shared, config, options, run, workers=workers, on_progress=show).mesh()
-            if dataset.test:
-                views = subsample(dataset.test, SCORED_VIEWS)
-                journal = Journal(self.files().folder)
-                decibels, similarity = held_out_scores(mesh, views, config, self.threads)
-                last = max((line["step"] for line in journal.metrics()), default=0)
-                journal.log_metrics(last, psnr=decibels, ssim=similarity, triangles=len(mesh.faces))
+            self._log_scores(mesh, dataset, config)
             triangles = len(mesh.faces)
             return Trained(mesh, mesh, {"triangles": triangles, "cells": count}, f"{triangles:,} triangles")
 
         summary = f"{len(scene):,} splats in {plural(count, 'cell')}"
         return Plan(None, dataset, summary, background, optimise)
+
+    def _log_scores(self, mesh: SplatMesh, dataset: Dataset, config: FinetuneConfig) -> None:
+        """Logs the scores of ``mesh``, which is not that of the last step, on the held-out views."""
+        from meshsplats.finetuning.journal import Journal
+
+        if not dataset.test:
+            return
+        views = subsample(dataset.test, SCORED_VIEWS)
+        journal = Journal(self.files().folder)
+        decibels, similarity = held_out_scores(mesh, views, config, self.threads)
+        last = max((line["step"] for line in journal.metrics()), default=0)
+        journal.log_metrics(last, psnr=decibels, ssim=similarity, triangles=len(mesh.faces))
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         if self.target.data is None and plan.dataset.test:
@@ -237,11 +340,6 @@ class Finetune(TrainingCommand):
     @property
     def _start_preset(self) -> str:
         return self.preset if self.start == "same" else self.start
-
-    def _converted(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig | None) -> SplatMesh:
-        cameras = [view.camera for view in dataset.train]
-        options = replace(self.conversion, crop=None, look=dataset.look)  # cropped already
-        return starting_mesh(cloud, cameras, options, preset=self._start_preset, config=config)
 
 
 def _cell_scene(command: Finetune, background: tuple[float, float, float] | None) -> CellScene:

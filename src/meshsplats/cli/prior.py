@@ -16,6 +16,7 @@ from meshsplats.cli.messages import UsageError, quoted
 from meshsplats.cli.training import (
     Plan,
     RunFiles,
+    Setup,
     ShowProgress,
     Trained,
     TrainingCommand,
@@ -105,7 +106,7 @@ class Prior(TrainingCommand):
             raise UsageError("--spacing has no effect with one layer; give --layers")
         super().check()
 
-    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
+    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         from meshsplats.formats.base_meshes import load_base
 
         wants_texture = self.laying.colors in ("auto", "texture")

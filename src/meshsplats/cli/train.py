@@ -15,6 +15,7 @@ from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.training import (
     Plan,
     RunFiles,
+    Setup,
     ShowProgress,
     Trained,
     TrainingCommand,
@@ -102,7 +103,7 @@ class Train(TrainingCommand):
             check_outputs([self.as_splats], self.force, inputs=self.inputs)
         super().check()
 
-    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
+    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         from meshsplats.datasets.points import load_points
         from meshsplats.training.reconstruction import bare_photographs, find_cameras
 

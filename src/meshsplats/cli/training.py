@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
 import tyro
 
@@ -42,6 +42,7 @@ from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
+from meshsplats.finetuning.baseline import SizeScores
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
 from meshsplats.finetuning.config import LENGTHS, with_changes
 from meshsplats.finetuning.ranks import Ranks, joined_ranks
@@ -60,6 +61,25 @@ _CHANGEABLE = {
 }
 """Options that may change when a run is resumed."""
 ShowProgress = Callable[[Progress], None]
+
+
+class Display(Protocol):
+    """Shows a set-up and the steps after it."""
+
+    def phase(self, text: str, share: float | None = None) -> None:
+        """Shows what begins, or how much of it is done, 0 to 1."""
+
+    def __call__(self, progress: Progress) -> None: ...
+
+
+class Silent:
+    """Shows nothing."""
+
+    def phase(self, text: str, share: float | None = None) -> None:
+        pass
+
+    def __call__(self, progress: Progress) -> None:
+        pass
 
 
 def tuning_options(default_of: Callable[[str], str]) -> type[FinetuneConfig]:
@@ -164,6 +184,8 @@ class Trained:
     """Sizes, in words."""
     alpha: Literal["hybrid"] | None = None
     """As in ``save_mesh``."""
+    sizes: SizeScores | None = None
+    """The conversion of splats against the tuned mesh."""
 
 
 @dataclass(frozen=True)
@@ -177,8 +199,38 @@ class Plan:
     background: Background | None
     """That of photographs; None without them."""
     optimise: Callable[[RunOptions, ShowProgress], Trained]
+    reserve: float = 0.0
+    """Seconds that ``optimise`` and the command need after the last step."""
     needed: int | None = None
     """Estimated memory in bytes, which is there; None: that of fine-tuning ``mesh``, if there is one."""
+
+
+class Setup:
+    """What a command does before its first step: shown in phases, and with an eye on the clock."""
+
+    def __init__(self, show: Display, start: float, minutes: float | None) -> None:
+        self._show, self._start = show, start
+        self.seconds = None if minutes is None else 60 * minutes
+        """Time for the whole command; None: not limited."""
+
+    def phase(self, text: str) -> None:
+        """Shows what begins now."""
+        self._show.phase(text)
+
+    @property
+    def spent(self) -> float:
+        """Seconds since the command began."""
+        return time.perf_counter() - self._start
+
+    def observer(self, text: str, share: float) -> Callable[[int, int], bool]:
+        """For images of a set-up (``convert``): shows their number, and ends them after this ``share`` of the
+        command's time."""
+
+        def on_image(done: int, total: int) -> bool:
+            self._show.phase(text, done / total)
+            return self.seconds is None or self.spent < share * self.seconds
+
+        return on_image
 
 
 @dataclass(frozen=True)
@@ -243,7 +295,7 @@ class TrainingCommand(Command):
                 raise UsageError("--device gpu has no gradients for --opacity cutoff")
             open_device()
 
-    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None) -> Plan:
+    def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         """Reads the input and prepares the optimisation. ``earlier``: checkpoint of a resumed run."""
         raise NotImplementedError
 
@@ -274,16 +326,15 @@ class TrainingCommand(Command):
         files = self.files()
         files.check(self.inputs, resume=self.resume, force=self.force)
         earlier = self._earlier(files)
-        plan = self.plan(config, earlier)
-        print_plan(plan, self.target.cache_bytes)
-        options = self._run_options(files, start, ranks)
         try:
-            with (
-                files.claimed(self.inputs, resume=self.resume, force=self.force),
-                progress_display() as show,
-            ):
-                self._record_start(files)
-                trained = plan.optimise(options, show)
+            with progress_display() as show:
+                setup = Setup(show, start, config.minutes)
+                setup.phase(f"reading {self.input.name}")
+                plan = self.plan(config, earlier, setup)
+                print_plan(plan, self.target.cache_bytes)
+                with files.claimed(self.inputs, resume=self.resume, force=self.force):
+                    self._record_start(files)
+                    trained = plan.optimise(self._run_options(files, start, ranks, plan.reserve), show)
         except Interrupted as stop:
             return self.report_interrupt(stop, files)
         except OtherRunError as error:
@@ -305,9 +356,10 @@ class TrainingCommand(Command):
         self.check()
         files = self.files()
         with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere), redirect_stdout(nowhere):
-            plan = self.plan(config, self._earlier(files))
+            begun = time.perf_counter()
+            plan = self.plan(config, self._earlier(files), Setup(Silent(), begun, config.minutes))
             try:
-                plan.optimise(self._run_options(files, time.perf_counter(), ranks), lambda progress: None)
+                plan.optimise(self._run_options(files, begun, ranks, plan.reserve), Silent())
             except Interrupted as stop:
                 return 128 + stop.signal
         return 0
@@ -348,8 +400,9 @@ class TrainingCommand(Command):
         whole = self.resume and not files.in_cells
         return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if whole else None
 
-    def _run_options(self, files: RunFiles, start: float, ranks: Ranks) -> RunOptions:
-        """Of a run whose command started at ``start`` by the performance counter."""
+    def _run_options(self, files: RunFiles, start: float, ranks: Ranks, reserve: float) -> RunOptions:
+        """Of a run whose command started at ``start`` by the performance counter, and needs ``reserve``
+        seconds afterwards."""
         return RunOptions(
             folder=files.folder,
             resume=self.resume,
@@ -358,6 +411,7 @@ class TrainingCommand(Command):
             threads=self.threads,
             device=self.device,
             spent=time.perf_counter() - start,
+            reserve=reserve,
             cache_bytes=self.target.cache_bytes,
             ranks=ranks,
         )
@@ -417,6 +471,7 @@ class TrainingCommand(Command):
                 **trained.counts,
                 "held_out_psnr": held_out,
                 **scored,
+                **_sizes_record(trained.sizes),
                 "run": str(files.folder),
             }
             print(json.dumps(result, indent=1))
@@ -428,7 +483,32 @@ class TrainingCommand(Command):
         if scores:
             quality += f" (look {scored['look']}, {scored['samples']} x {scored['samples']} samples)"
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
+        for line in _sizes_in_words(trained.sizes, steps):
+            print(line)
         print(f"preview: {files.preview}; metrics: {files.folder}/metrics.jsonl")
+
+
+def _sizes_record(sizes: SizeScores | None) -> dict[str, Any]:
+    """For JSON."""
+    if sizes is None:
+        return {}
+    rounded = {
+        name: {str(width): round(value, 3) for width, value in scores.items()}
+        for name, scores in (("converted", sizes.converted), ("tuned", sizes.tuned))
+    }
+    return {"psnr_by_width": rounded, "written": "converted" if sizes.loses else "tuned"}
+
+
+def _sizes_in_words(sizes: SizeScores | None, steps: int) -> Iterator[str]:
+    """At each image width, the conversion against the tuned mesh; and which one was written, if not that."""
+    if sizes is None:
+        return
+    pairs = (f"{width} px {old:.1f} -> {sizes.tuned[width]:.1f}" for width, old in sizes.converted.items())
+    yield f"converted -> tuned, dB: {', '.join(pairs)}"
+    if sizes.loses:
+        where = " and ".join(str(width) for width in sizes.worse_at)
+        yield f"the conversion is written: after {plural(steps, 'step')}, the mesh was worse at {where} px;"
+        yield "  more --minutes help, or fewer triangles (--max-splats); --resume --force continues this run"
 
 
 def default_background(config: FinetuneConfig) -> tuple[float, float, float]:
@@ -487,8 +567,8 @@ def _in_words(value: Any) -> str:
 
 
 @contextmanager
-def progress_display() -> Iterator[ShowProgress]:
-    """A function that shows a ``Progress``: as a bar where stderr is a terminal, else one line per score."""
+def progress_display() -> Iterator[Display]:
+    """Shows a run: as a bar where stderr is a terminal, else a line for each phase and score."""
     if not sys.stderr.isatty():
         yield _Lines()
         return
@@ -503,18 +583,31 @@ def progress_display() -> Iterator[ShowProgress]:
 
 class _InBar:
     def __init__(self, bar: Bar) -> None:
-        self._bar, self._task = bar, bar.add_task("fine-tuning", total=1.0, text="")
+        self._bar, self._task = bar, bar.add_task("", total=None, text="")
         self._loss: float | None = None
+
+    def phase(self, text: str, share: float | None = None) -> None:
+        total = None if share is None else 1.0
+        self._bar.update(self._task, description=text, total=total, completed=share or 0.0)
 
     def __call__(self, progress: Progress) -> None:
         if progress.loss is not None:  # smoothed: it differs from view to view
             self._loss = progress.loss if self._loss is None else 0.95 * self._loss + 0.05 * progress.loss
-        self._bar.update(self._task, completed=progress.fraction, text=_text(progress, self._loss))
+        text = _text(progress, self._loss)
+        self._bar.update(
+            self._task, description="fine-tuning", total=1.0, completed=progress.fraction, text=text
+        )
 
 
 class _Lines:
     def __init__(self) -> None:
         self._last: float | None = None
+        self._phase = ""
+
+    def phase(self, text: str, share: float | None = None) -> None:
+        if text != self._phase:
+            self._phase = text
+            say(text)
 
     def __call__(self, progress: Progress) -> None:
         if progress.held_out != self._last:

@@ -13,7 +13,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.conversion.baking import bake_filter
 from meshsplats.conversion.budget import within_limits
-from meshsplats.conversion.detail import FIRST_STAR, LEVELS, choose_levels, visibility
+from meshsplats.conversion.detail import FIRST_STAR, LEVELS, OnImage, choose_levels, visibility
 from meshsplats.conversion.fans import Shape, build, pattern
 from meshsplats.conversion.footprint import DRAWN_PX2, FILTER_PX2, CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.merging import simplify
@@ -59,6 +59,8 @@ def convert(
     preset: Preset = "default",
     cameras: Sequence[Camera] | None = None,
     up: Sequence[float] | np.ndarray | None = None,
+    threads: int | None = None,
+    on_image: OnImage | None = None,
     **changes: Unpack[ConversionChanges],
 ) -> SplatMesh:
     """Turns every splat into one or more fans of translucent triangles around its centre.
@@ -78,6 +80,9 @@ def convert(
             (``footprint``), the mean colour if asked for (``colors``) and what is up. Without them, images
             of the whole subject are assumed.
         up: direction that points up, world frame; that of the cameras by default, else (0, -1, 0).
+        threads: maximum number of threads for the images of ``detail='cameras'``; all processors by default.
+        on_image: called after each of these images, with how many are rendered and how many there will be;
+            if it returns False, those so far have to do, but at least 6.
         changes: fields of ``ConversionOptions``, which says what they mean, in place of those of
             ``options``: ``convert(cloud, max_triangles=500_000)``.
 
@@ -133,7 +138,9 @@ def convert(
     mesh = assembled(fans, keep)
     if chosen.detail == "cameras":
         wanted: Look = "splats" if chosen.footprint == "filter" else chosen.look or "area"
-        shown = visibility(mesh, cloud.means, whole, cameras or (), wanted)
+        shown = visibility(
+            mesh, cloud.means, whole, cameras or (), wanted, threads=threads, on_image=on_image
+        )
         visible = keep & ~shown.hidden[rows]
         keep = visible if visible.any() else keep
         budget = len(mesh.faces) if chosen.max_triangles is None else chosen.max_triangles

@@ -6,7 +6,7 @@ Most of the difference to the ground truth lies on the few splats that cover mor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +52,14 @@ MIN_VIEWS = 4
 """Only splats inside the frustum of at least this many cameras can count as hidden."""
 
 
+FEWEST_IMAGES = 6
+"""That are rendered, however little time there is."""
+
+OnImage = Callable[[int, int], bool]
+"""Called after each image, with how many are rendered and how many there will be; returns whether to go
+on."""
+
+
 class Visibility(NamedTuple):
     """Visible pixels and error of n splats in images of a mesh."""
 
@@ -69,7 +77,14 @@ class Visibility(NamedTuple):
 
 
 def visibility(
-    mesh: SplatMesh, means: np.ndarray, cloud: GaussianCloud, cameras: Sequence[Camera], look: Look
+    mesh: SplatMesh,
+    means: np.ndarray,
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera],
+    look: Look,
+    *,
+    threads: int | None = None,
+    on_image: OnImage | None = None,
 ) -> Visibility:
     """How visible each splat is to ``cameras``, and how large its error.
 
@@ -77,6 +92,7 @@ def visibility(
         mesh: triangles of the splats; its ``face_splat`` are rows of ``means``.
         means: (n, 3) float32 centres of the splats.
         cloud: the splats that the ground truth is rendered from, in that ``look``.
+        on_image: may end this early, after ``FEWEST_IMAGES`` images.
     """
     assert mesh.face_splat is not None
     n = len(means)
@@ -86,12 +102,16 @@ def visibility(
     samples = 1 if look == "splats" else AREA_SAMPLES
     fewest, most = IMAGES
     chosen = subsample(cameras, min(max(len(cameras) // 8, fewest), most))
-    for own in chosen:
+    done = 0
+    # Evenly spread, wherever this ends: every third camera, then those after them.
+    for own in (camera for first in range(3) for camera in chosen[first::3]):
         camera = own.within(SIDE)
         values = np.zeros((len(owner), 2), np.float32)
-        rendering = TapedRendering.of(mesh, camera, values, background=(0, 0, 0), samples=samples)
+        rendering = TapedRendering.of(
+            mesh, camera, values, background=(0, 0, 0), samples=samples, threads=threads
+        )
         # Colours over black and alpha: then no background hides a difference.
-        target = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples)
+        target = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples, threads=threads)
         square = np.square(rendering.color - target.color).sum(axis=2)
         square += np.square(rendering.alpha - target.alpha)
         sums = rendering.scatter_to_vertices(np.stack([np.ones_like(square), square], axis=2))
@@ -99,8 +119,11 @@ def visibility(
         pixels += own_pixels * np.bincount(owner, sums[:, 0], n)
         error += own_pixels * np.bincount(owner, sums[:, 1], n)
         views += camera.sees(means)
+        done += 1
+        if on_image is not None and not on_image(done, len(chosen)) and done >= FEWEST_IMAGES:
+            break
     hidden = (pixels < HIDDEN * views) & (views >= MIN_VIEWS)
-    return Visibility(pixels / len(chosen), error / len(chosen), hidden)
+    return Visibility(pixels / done, error / done, hidden)
 
 
 def choose_levels(need: np.ndarray, budget: int) -> np.ndarray:

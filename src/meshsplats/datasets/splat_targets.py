@@ -144,9 +144,9 @@ def splat_dataset(
     zooms = ZOOMS[look] if zooms is None else zooms
     if not zooms or min(zooms) < 1:
         raise ValueError(f"zooms must be whole numbers from 1 on, got {zooms!r}")
-    centers = _window_centers(cloud)
+    centers = window_centers(cloud)
     learned_from = [
-        _window(camera, zooms[i % len(zooms)], i, centers) for i, camera in enumerate(placed[first:])
+        window_of_image(camera, zooms[i % len(zooms)], i, centers) for i, camera in enumerate(placed[first:])
     ]
     quick = TRAINING_SAMPLES if look == "area" else None
     held_out, learned = (
@@ -302,7 +302,7 @@ def _free_places(cloud: GaussianCloud, axes: np.ndarray, count: int) -> tuple[np
     return tried[chosen], clearance[chosen]
 
 
-def _window_centers(cloud: GaussianCloud) -> np.ndarray:
+def window_centers(cloud: GaussianCloud) -> np.ndarray:
     """(WINDOW_CENTERS, 3): means of splats, evenly spread over the opacity in the order of the file."""
     opacity = np.cumsum(cloud.opacities, dtype=np.float64)
     shares = (np.arange(WINDOW_CENTERS) + 0.5) / WINDOW_CENTERS
@@ -310,7 +310,7 @@ def _window_centers(cloud: GaussianCloud) -> np.ndarray:
     return cloud.means[np.minimum(chosen, len(cloud) - 1)]
 
 
-def _window(camera: Camera, zoom: int, number: int, centers: np.ndarray) -> Camera:
+def window_of_image(camera: Camera, zoom: int, number: int, centers: np.ndarray) -> Camera:
     """As large an image, cut out of that of ``camera`` drawn ``zoom`` times as large, around one of
     ``centers``, scene points (k, 3), that ``camera`` sees; ``number`` spreads such windows over them."""
     if zoom == 1:

@@ -64,6 +64,15 @@ MIN_PREVIEWS = 4
 SCORED_VIEWS = 8
 """Maximum number of held-out views that are scored during a run."""
 
+REPORT_SHARE = 0.02
+"""Share of a run with a length in minutes that scoring them once may take; fewer are scored where it would be
+more, but at least ``FEWEST_SCORED``."""
+
+FEWEST_SCORED = 2
+
+CHECKPOINT_SHARE = 0.05
+"""Largest share of the time that checkpoints take."""
+
 
 @dataclass(frozen=True)
 class RunOptions:
@@ -86,6 +95,8 @@ class RunOptions:
     """Where images are rendered, and gradients computed: 'cpu' or 'gpu'. Opacity 'cutoff' needs 'cpu'."""
     spent: float = 0.0
     """Seconds already used, which count if the length is given in minutes."""
+    reserve: float = 0.0
+    """Seconds that the caller needs afterwards, which count likewise."""
     cache_bytes: int = CACHE_BYTES
     """Limit of the data set's image cache, for the memory estimate."""
     ranks: Ranks = ALONE
@@ -297,7 +308,7 @@ class TrainingLoop:
         if self.config.minutes is None:
             return None
         total = 60 * self.config.minutes
-        reserve = 1.5 * (self.report_cost + self.save_cost) + self.step_cost
+        reserve = 1.5 * (self.report_cost + self.save_cost) + self.step_cost + self.options.reserve
         return max(total - (reserve + min(0.01 * total, WRAP_UP_SECONDS)), 0)
 
     @property
@@ -331,7 +342,7 @@ class TrainingLoop:
                     self._report()
                 if self._passed_quarter() or self._due(self.options.preview_every, before):
                     self._save_preview()
-                if time.perf_counter() - self.save_time >= self.options.checkpoint_seconds:
+                if time.perf_counter() - self.save_time >= self._checkpoint_interval:
                     self._save_checkpoint()
                 self._notify()
             if not self.options.resume or self.step > self.first_step:
@@ -341,6 +352,11 @@ class TrainingLoop:
             if signals.received is not None:
                 raise Interrupted(self.step, signals.received)
         return self.result()
+
+    @property
+    def _checkpoint_interval(self) -> float:
+        """Seconds between two checkpoints: more where writing one takes long."""
+        return max(self.options.checkpoint_seconds, self.save_cost / CHECKPOINT_SHARE)
 
     def result(self) -> SplatMesh:
         """The current mesh, cut if it is made for a cutoff."""
@@ -433,9 +449,8 @@ class TrainingLoop:
         loss = float(np.mean(self.losses)) if self.losses else None
         mean_ssim = None
         if self.scored_views:
-            self.held_out, mean_ssim = held_out_scores(
-                self.result(), self.scored_views, self.config, self.options.threads, self.options.device
-            )
+            self._limit_scored_views()
+            self.held_out, mean_ssim = self._score(self.scored_views)
         if self.journal is not None:
             self.journal.log_metrics(
                 self.step,
@@ -447,6 +462,20 @@ class TrainingLoop:
             )
         self.losses.clear()
         self.report_cost = time.perf_counter() - start
+
+    def _limit_scored_views(self) -> None:
+        """Leaves as many views to be scored as there is time for; all reports have the same."""
+        if self.config.minutes is None or self.step > self.first_step or len(self.scored_views) < 2:
+            return
+        start = time.perf_counter()
+        self._score(self.scored_views[:1])
+        cost = time.perf_counter() - start
+        count = int(REPORT_SHARE * 60 * self.config.minutes / cost) if cost > 0 else SCORED_VIEWS
+        self.scored_views = subsample(self.scored_views, max(count, FEWEST_SCORED))
+
+    def _score(self, views: Sequence[View]) -> tuple[float, float]:
+        options = self.options
+        return held_out_scores(self.result(), views, self.config, options.threads, options.device)
 
     def _passed_quarter(self) -> bool:
         quarter = int(MIN_PREVIEWS * self.fraction)

@@ -1,0 +1,153 @@
+"""The conversion as the baseline of a fine-tuning: which of the two is nearer to the splats, at every size.
+
+A short run on a large cloud can end below its conversion, above all in images larger than those that it was
+trained on. Both are compared in the same images, of several sizes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from meshsplats._arrays import subsample
+from meshsplats.conversion import ConversionOptions, convert
+from meshsplats.datasets.splat_targets import RenderedSplats, splat_views, window_centers, window_of_image
+from meshsplats.datasets.views import Dataset, View
+from meshsplats.evaluation.metrics import psnr
+from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.initial import starts_with_filter
+from meshsplats.finetuning.step import samples_of
+from meshsplats.formats.cutting import cut_mesh
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.looks import image_of
+
+ZOOMS = (0.5, 1, 2, 4)
+"""Image sizes, as multiples of those of the training views: for 400 pixels, 200 to 1600. Of the larger images
+windows of the views' size are compared, which also show what they would from as much nearer."""
+VIEWS = 3
+"""Views of each size."""
+SAMPLES = 2
+"""Samples along each side of a pixel of the splats, for the look 'area'."""
+TOLERANCE = 0.05
+"""Differences in dB that do not count."""
+
+
+@dataclass(frozen=True)
+class SizeScores:
+    """Mean PSNR in dB of a conversion, and of the same splats tuned, by image width in pixels."""
+
+    converted: Mapping[int, float]
+    tuned: Mapping[int, float]
+
+    @property
+    def worse_at(self) -> list[int]:
+        """Image widths at which the tuned mesh is below the conversion."""
+        return [width for width, own in self.converted.items() if self.tuned[width] < own - TOLERANCE]
+
+    @property
+    def loses(self) -> bool:
+        """Whether it is, anywhere."""
+        return bool(self.worse_at)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """The conversion's scores, and the views that they come from."""
+
+    views: Mapping[int, Sequence[View]]
+    """By image width in pixels."""
+    scores: Mapping[int, float]
+    """Mean PSNR of the conversion in dB, by image width."""
+    seconds: float
+    """Time that scoring it took, without rendering the splats."""
+
+    def compare(self, mesh: SplatMesh, config: FinetuneConfig, threads: int | None = None) -> SizeScores:
+        """Scores ``mesh`` likewise."""
+        return SizeScores(self.scores, _scores(mesh, self.views, config, threads))
+
+
+def converted(
+    cloud: GaussianCloud,
+    config: FinetuneConfig,
+    options: ConversionOptions,
+    up: np.ndarray | None = None,
+) -> SplatMesh:
+    """What ``convert`` makes of ``cloud`` with these ``options``, and with the look and opacity of a run with
+    ``config``: with the filter of 3DGS where the run has it, cut where its triangles are opaque."""
+    if starts_with_filter(cloud, options):
+        options = replace(options, footprint="filter")
+    if options.detail == "cameras":
+        options = replace(options, detail=None)
+    mesh = convert(cloud, options, up=up)
+    return cut_mesh(mesh, config.cutoff) if config.opacity == "cutoff" else mesh
+
+
+def measure_baseline(
+    mesh: SplatMesh,
+    cloud: GaussianCloud,
+    dataset: Dataset,
+    config: FinetuneConfig,
+    *,
+    threads: int | None = None,
+    seconds: float | None = None,
+) -> Baseline:
+    """Scores ``mesh``, the conversion of ``cloud``, in held-out views of ``dataset``, which are images of
+    ``cloud``; in training views if none are held out. Of each size ``VIEWS``, or as few as take
+    ``seconds``."""
+    views = _views(cloud, dataset, threads)
+    used: dict[int, Sequence[View]] = dict.fromkeys(views, ())
+    start, spent = time.perf_counter(), 0.0
+    scores: dict[int, list[float]] = {width: [] for width in views}
+    for place in range(min(len(same) for same in views.values())):
+        if place and seconds is not None and (time.perf_counter() - start) * (place + 1) / place > seconds:
+            break
+        for width, same in views.items():
+            same[place].load()
+            began = time.perf_counter()
+            scores[width].append(_psnr(mesh, same[place], config, threads))
+            spent += time.perf_counter() - began
+            used[width] = same[: place + 1]
+    means = {width: float(np.mean(found)) for width, found in scores.items()}
+    return Baseline(used, means, spent)
+
+
+def _views(cloud: GaussianCloud, dataset: Dataset, threads: int | None) -> dict[int, Sequence[View]]:
+    source = (dataset.test or dataset.train)[0]
+    assert isinstance(source.source, RenderedSplats)
+    cameras = [view.camera for view in subsample(dataset.test or dataset.train, VIEWS)]
+    centers = window_centers(cloud)
+    found: dict[int, Sequence[View]] = {}
+    for zoom in ZOOMS:
+        if zoom <= 1:
+            seen = [camera.scaled(zoom) for camera in cameras]
+        else:
+            seen = [window_of_image(camera, int(zoom), i, centers) for i, camera in enumerate(cameras)]
+        found[round(zoom * cameras[0].width)] = splat_views(
+            cloud,
+            seen,
+            look=source.source.look,
+            sh_degree=source.source.sh_degree,
+            background=source.background,
+            samples=SAMPLES if source.source.look == "area" else None,
+            threads=threads,
+        )
+    return found
+
+
+def _scores(
+    mesh: SplatMesh, views: Mapping[int, Sequence[View]], config: FinetuneConfig, threads: int | None
+) -> dict[int, float]:
+    return {
+        width: float(np.mean([_psnr(mesh, view, config, threads) for view in same]))
+        for width, same in views.items()
+    }
+
+
+def _psnr(mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None) -> float:
+    samples = samples_of(view, config)
+    image, _ = image_of(mesh, view.camera, view.background, samples=samples, threads=threads)
+    return min(psnr(np.clip(image, 0, 1), np.clip(view.image, 0, 1)), 200.0)
