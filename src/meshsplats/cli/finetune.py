@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -49,11 +49,18 @@ from meshsplats.finetuning import (
     starting_mesh,
     worthwhile_views,
 )
-from meshsplats.finetuning.baseline import Baseline, converted, measure_baseline
+from meshsplats.finetuning.baseline import SHARES, SizeScores, converted, measure_baseline, partly
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
-from meshsplats.finetuning.pace import StartRecord, measure_pace, worthwhile_steps
+from meshsplats.finetuning.pace import (
+    BRIEF_ZOOMS,
+    StartRecord,
+    is_brief,
+    measure_pace,
+    of_brief_run,
+    worthwhile_steps,
+)
 from meshsplats.finetuning.ranks import is_started_by_torchrun
 from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores
 from meshsplats.finetuning.step import samples_of
@@ -126,7 +133,8 @@ class Finetune(TrainingCommand):
         super().check()
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
-        scene, dataset = self._inputs(config, earlier)
+        scene = self._scene()
+        dataset = self._targets(scene, config, earlier)
         background = None
         if self.target.data is not None:
             whole = self.conversion.crop is None
@@ -137,82 +145,126 @@ class Finetune(TrainingCommand):
             )
         if self.cell_splats is not None:
             return self._plan_of_cells(config, scene, dataset, background)
-        # Photographs are few: what more triangles for them are worth was not measured.
-        begun = as_begun(config, earlier) if self.target.data is None else None
-        baseline, record = None, StartRecord()
+        if isinstance(scene, GaussianCloud) and self.target.data is None and self._start_preset == "default":
+            return self._plan_on_splats(config, scene, dataset, earlier, setup)
         mesh = scene
         if isinstance(scene, GaussianCloud):
-            record = self._recorded(scene, dataset, config, earlier, setup)
-            mesh = self._start(scene, dataset, begun, record, setup)
-            baseline = self._baseline(scene, dataset, config, setup)
+            # Photographs are few: what more triangles for them are worth was not measured.
+            begun = as_begun(config, earlier) if self.target.data is None else None
+            setup.phase(f"converting {len(scene):,} splats")
+            mesh = self._start(scene, dataset, begun)
         assert isinstance(mesh, SplatMesh)
-        summary = f"{len(mesh.faces):,} triangles"
-        if isinstance(scene, GaussianCloud) and (mesh.splat_count or 0) < len(scene):
-            summary += f" of {mesh.splat_count:,} splats, {len(scene):,} before"
-        reserve = (0 if baseline is None else baseline.seconds) + SAVE_SECONDS * len(mesh.faces)
+        start = mesh
 
         def optimise(run: RunOptions, show: ShowProgress) -> Trained:
-            record.save(self.files().folder)
-            tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
-            sizes = None if baseline is None else baseline.compare(tuned, config, self.threads)
-            if sizes is not None and sizes.loses:
-                assert isinstance(scene, GaussianCloud)
-                tuned = self._conversion(scene, dataset, config)
-                self._log_scores(tuned, dataset, config)
-            count = len(tuned.faces)
-            glb = self.output.suffix.lower() == ".glb" and not (sizes is not None and sizes.loses)
-            alpha: Literal["hybrid"] | None = "hybrid" if config.soft_share and glb else None
-            return Trained(tuned, tuned, {"triangles": count}, f"{count:,} triangles", alpha, sizes)
+            return self._trained(finetune(start, dataset, config, run=run, on_progress=show), config)
 
-        return Plan(mesh, dataset, summary, background, optimise, reserve)
+        reserve = SAVE_SECONDS * len(mesh.faces)
+        return Plan(mesh, dataset, _summary(mesh, scene), background, optimise, reserve)
 
-    def _recorded(
+    def _plan_on_splats(
         self,
+        config: FinetuneConfig,
         cloud: GaussianCloud,
         dataset: Dataset,
-        config: FinetuneConfig,
         earlier: Checkpoint | None,
         setup: Setup,
+    ) -> Plan:
+        """On images of the splats: as much as there is time for, and never below the conversion."""
+        if earlier is None:
+            record = self._timed(cloud, dataset, config, setup)
+        else:
+            record = StartRecord.load(self.files().folder)
+        if record.brief_steps is not None:
+            given = {name for name, value in asdict(self.tuning).items() if value is not None}
+            config = of_brief_run(config, record.brief_steps, given)
+            dataset = self._targets(cloud, config, earlier, BRIEF_ZOOMS)
+        setup.phase(f"converting {len(cloud):,} splats")
+        conversion = self._conversion(cloud, dataset, config)
+        setup.phase("scoring the conversion")
+        most = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
+        baseline = measure_baseline(conversion, cloud, dataset, config, threads=self.threads, seconds=most)
+        if record.brief_steps is not None and record.max_splats is None:
+            mesh = conversion
+        elif record.brief_steps is not None:
+            setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
+            mesh = self._conversion(cloud, dataset, config, record.max_splats)
+        else:
+            mesh = self._start(cloud, dataset, as_begun(config, earlier), record, setup)
+        scorings = 1 if record.brief_steps is None else 1 + len(SHARES)
+        reserve = scorings * baseline.seconds + SAVE_SECONDS * len(mesh.faces)
+
+        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
+            if not run.ranks.index:
+                record.save(self.files().folder)
+            tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
+            sizes = baseline.compare(tuned, config, self.threads)
+            if not sizes.loses:
+                return self._trained(tuned, config, sizes)
+            for share in SHARES if record.brief_steps is not None else ():
+                less = partly(mesh, tuned, share)
+                if less is not None and not (found := baseline.compare(less, config, self.threads)).loses:
+                    self._log_scores(less, dataset, config)
+                    return self._trained(less, config, found)
+            converted = self._conversion(cloud, dataset, config)
+            self._log_scores(converted, dataset, config)
+            return self._trained(converted, config, sizes)
+
+        return Plan(mesh, dataset, _summary(mesh, cloud), None, optimise, reserve)
+
+    def _trained(self, mesh: SplatMesh, config: FinetuneConfig, sizes: SizeScores | None = None) -> Trained:
+        count = len(mesh.faces)
+        hybrid = config.soft_share and self.output.suffix.lower() == ".glb" and not (sizes and sizes.loses)
+        alpha: Literal["hybrid"] | None = "hybrid" if hybrid else None
+        return Trained(mesh, mesh, {"triangles": count}, f"{count:,} triangles", alpha, sizes)
+
+    def _timed(
+        self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig, setup: Setup
     ) -> StartRecord:
-        """What the time leaves of the start; of a resumed run, what it left then."""
-        if earlier is not None:
-            return StartRecord.load(self.files().folder)
-        limited = self.conversion.max_splats is not None or self.conversion.max_triangles is not None
-        if setup.seconds is None or limited or self._start_preset != "default" or len(cloud) < TIMED_SPLATS:
-            return StartRecord()
-        setup.phase("timing steps")
-        pace = measure_pace(cloud, dataset, config, self._start_options(dataset), self.threads)
-        left = (1 - SETUP_SHARE) * setup.seconds - setup.spent
-        count = pace.splats(len(cloud), worthwhile_steps(config), left)
-        return StartRecord(max_splats=count if count < len(cloud) else None)
+        """What the time leaves of the start, by the speed of this machine."""
+        chosen, pixels = self.conversion, dataset.train[0].camera.width * dataset.train[0].camera.height
+        limited = chosen.max_splats is not None or chosen.max_triangles is not None
+        own = any(value is not None for value in (chosen.mode, chosen.detail, chosen.sides, chosen.rings))
+        may_be_brief = config.opacity == "blended" and dataset.look == "area" and not limited and not own
+        steps: float | None = config.total_steps(len(dataset.train))
+        count = len(cloud)
+        if setup.seconds is not None and not limited and count >= TIMED_SPLATS:
+            setup.phase("timing steps")
+            pace = measure_pace(cloud, dataset, config, self._start_options(dataset), self.threads)
+            left = (1 - SETUP_SHARE) * setup.seconds
+            count = pace.splats(count, worthwhile_steps(config), left)
+            steps = pace.steps(count, left)
+        brief = may_be_brief and steps is not None and is_brief(count, pixels, steps)
+        return StartRecord(
+            max_splats=count if count < len(cloud) else None,
+            brief_steps=max(1, round(steps)) if brief and steps is not None else None,
+        )
 
     def _start(
         self,
         cloud: GaussianCloud,
         dataset: Dataset,
         config: FinetuneConfig | None,
-        record: StartRecord,
-        setup: Setup,
+        record: StartRecord | None = None,
+        setup: Setup | None = None,
     ) -> SplatMesh:
         """The starting mesh. ``record`` notes the images that there was time for."""
         options = self._start_options(dataset)
-        if record.max_splats is not None:
-            options = replace(options, max_splats=record.max_splats)
-            setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
-        else:
-            setup.phase(f"converting {len(cloud):,} splats")
-        goes_on = setup.observer("choosing numbers of triangles", SETUP_SHARE)
-        recorded, record.images = record.images, 0
+        on_image = None
+        if record is not None and setup is not None:
+            if record.max_splats is not None:
+                options = replace(options, max_splats=record.max_splats)
+                setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
+            goes_on = setup.observer("choosing numbers of triangles", SETUP_SHARE)
+            recorded = record.images
 
-        def on_image(done: int, total: int) -> bool:
-            record.images = done
-            time_left = goes_on(done, total)
-            return time_left if recorded is None else done < recorded
+            def on_image(done: int, total: int) -> bool:
+                record.images = done
+                return goes_on(done, total) if recorded is None else done < recorded
 
-        cameras = [view.camera for view in dataset.train]
         return starting_mesh(
             cloud,
-            cameras,
+            [view.camera for view in dataset.train],
             options,
             preset=self._start_preset,
             config=config,
@@ -223,40 +275,35 @@ class Finetune(TrainingCommand):
     def _start_options(self, dataset: Dataset) -> ConversionOptions:
         return replace(self.conversion, crop=None, look=dataset.look)  # cropped already
 
-    def _conversion(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig) -> SplatMesh:
-        return converted(cloud, config, self._start_options(dataset))
+    def _conversion(
+        self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig, splats: int | None = None
+    ) -> SplatMesh:
+        options = self._start_options(dataset)
+        return converted(cloud, config, options if splats is None else replace(options, max_splats=splats))
 
-    def _baseline(
-        self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig, setup: Setup
-    ) -> Baseline | None:
-        """The conversion's scores, for images of splats and the preset 'default'; None for others."""
-        if self.target.data is not None or self._start_preset != "default":
-            return None
-        setup.phase("scoring the conversion")
-        mesh = self._conversion(cloud, dataset, config)
-        most = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
-        return measure_baseline(mesh, cloud, dataset, config, threads=self.threads, seconds=most)
-
-    def _inputs(
-        self, config: FinetuneConfig, earlier: Checkpoint | None
-    ) -> tuple[GaussianCloud | SplatMesh, Dataset]:
-        """The scene and its targets."""
+    def _scene(self) -> GaussianCloud | SplatMesh:
         scene = load_scene(self.input, self.reading)
         if isinstance(scene, GaussianCloud) and self.conversion.crop is not None:
             # Cropped splats must not be in the targets; other selections leave gaps that the rest fills.
             scene = choose_splats(scene, crop=self.conversion.crop)
-        begun = as_begun(config, earlier)
-        views = worthwhile_views(begun)
-        dataset = self.target.make(
+        return scene
+
+    def _targets(
+        self,
+        scene: GaussianCloud | SplatMesh,
+        config: FinetuneConfig,
+        earlier: Checkpoint | None,
+        zooms: Sequence[int] | None = None,
+    ) -> Dataset:
+        return self.target.make(
             scene,
             self.input,
             default_background(config),
             self.threads,
-            views,
+            worthwhile_views(as_begun(config, earlier)),
             self.preset,
-            self._zooms(config, scene),
+            self._zooms(config, scene) if zooms is None else zooms,
         )
-        return scene, dataset
 
     def _plan_of_cells(
         self,
@@ -342,12 +389,20 @@ class Finetune(TrainingCommand):
         return self.preset if self.start == "same" else self.start
 
 
+def _summary(mesh: SplatMesh, scene: GaussianCloud | SplatMesh) -> str:
+    text = f"{len(mesh.faces):,} triangles"
+    if isinstance(scene, GaussianCloud) and (mesh.splat_count or 0) < len(scene):
+        text += f" of {mesh.splat_count:,} splats, {len(scene):,} before"
+    return text
+
+
 def _cell_scene(command: Finetune, background: tuple[float, float, float] | None) -> CellScene:
     """The scene of a run in cells, in one of its processes; ``background`` of photographs."""
     from meshsplats.finetuning.cells import CellScene
 
-    scene, dataset = command._inputs(command.configured(), None)
+    scene = command._scene()
     assert isinstance(scene, GaussianCloud)
+    dataset = command._targets(scene, command.configured(), None)
     return CellScene(scene, dataset if background is None else dataset.over(background))
 
 

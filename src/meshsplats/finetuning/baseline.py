@@ -32,6 +32,9 @@ VIEWS = 3
 """Views of each size."""
 SAMPLES = 2
 """Samples along each side of a pixel of the splats, for the look 'area'."""
+SHARES = (0.5, 0.25)
+"""Where a mesh that began as its conversion ended below it at some size, it is moved by these shares of its way
+only: noise falls faster than what was gained."""
 TOLERANCE = 0.05
 """Differences in dB that do not count."""
 
@@ -84,6 +87,16 @@ def converted(
         options = replace(options, detail=None)
     mesh = convert(cloud, options, up=up)
     return cut_mesh(mesh, config.cutoff) if config.opacity == "cutoff" else mesh
+
+
+def partly(start: SplatMesh, tuned: SplatMesh, share: float) -> SplatMesh | None:
+    """``start`` moved by this ``share`` of the way to ``tuned``, in positions and colours; None if they differ
+    in their triangles."""
+    if start.colors.shape != tuned.colors.shape or not np.array_equal(start.faces, tuned.faces):
+        return None
+    vertices = start.vertices + np.float32(share) * (tuned.vertices - start.vertices)
+    colors = start.colors + np.float32(share) * (tuned.colors - start.colors)
+    return replace(tuned, vertices=vertices, colors=colors)
 
 
 def measure_baseline(

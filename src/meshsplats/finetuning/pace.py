@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -16,17 +17,26 @@ import numpy as np
 from meshsplats._files.atomic import write_text
 from meshsplats._json import read_json
 from meshsplats.conversion import ConversionOptions, convert, simplify
+from meshsplats.datasets.splat_targets import ZOOMS
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
-from meshsplats.finetuning.config import FinetuneConfig
+from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.gaussians import GaussianCloud
 
-FEWEST_STEPS = {"blended": 60, "cutoff": 150}
-"""Steps that a run should have, by opacity."""
-STEPS_A_MINUTE = {"blended": 12, "cutoff": 30}
+FEWEST_STEPS = {"blended": 12, "cutoff": 150}
+"""Steps that a run should have, by opacity. Blended meshes of few steps begin as their conversion."""
+STEPS_A_MINUTE = {"blended": 6, "cutoff": 30}
 """The same for each minute, in runs where this is more."""
+BRIEF_STEPS = 150
+"""See ``is_brief``."""
+BRIEF_RATES = {"position_rate": 0.005, "color_rate": 0.008}
+"""Learning rates of brief runs..."""
+BRIEF_RATE_STEPS = 100
+"""... of at least so many steps; in proportion to the steps in shorter ones."""
+BRIEF_ZOOMS = ZOOMS["splats"]
+"""Zooms of their training views."""
 TRIAL_SPLATS = 50_000
 """Splats of the mesh whose steps are timed: every k-th of a larger cloud."""
 FEWEST_SPLATS = 20_000
@@ -45,6 +55,10 @@ class Pace:
     """Of one step, for each splat."""
     merging: float
     """Of merging, for each splat that there was."""
+
+    def steps(self, count: int, seconds: float) -> float:
+        """Steps of a mesh of ``count`` splats for which there is time, at least 1."""
+        return max(seconds / (self.target + self.step * count), 1.0)
 
     def splats(self, count: int, steps: float, seconds: float) -> int:
         """How many of ``count`` splats can take part in this number of steps: all, or those that are left
@@ -69,6 +83,8 @@ class StartRecord:
     """To which the splats were merged; None: all of them, or as the options say."""
     images: int | None = None
     """In which the visibility of splats was measured; None: all."""
+    brief_steps: int | None = None
+    """Expected steps of a brief run (``is_brief``); None: it is not brief."""
 
     @classmethod
     def load(cls, folder: Path) -> StartRecord:
@@ -77,11 +93,10 @@ class StartRecord:
         if not path.is_file():
             return cls()
         found = read_json(path, RECORD_BYTES)
-        names = [f.name for f in fields(cls)]
-        values = {name: found.get(name) for name in names} if isinstance(found, dict) else {"": 0}
-        if any(type(v) is not int or v < 1 for v in values.values() if v is not None):
+        counts = [found.get(f.name) for f in fields(cls)] if isinstance(found, dict) else [0]
+        if any(type(count) is not int or count < 1 for count in counts if count is not None):
             raise FileFormatError(f"{path}: not the record of a run's start")
-        return cls(**values)
+        return cls(*counts)
 
     def save(self, folder: Path) -> None:
         """Writes it into ``folder``, which exists."""
@@ -92,6 +107,22 @@ def worthwhile_steps(config: FinetuneConfig) -> float:
     """Steps that a run of this length, in minutes, should have at least."""
     each = STEPS_A_MINUTE[config.opacity] * (config.minutes or 0)
     return max(FEWEST_STEPS[config.opacity], each)
+
+
+def is_brief(splats: int, pixels: int, steps: float) -> bool:
+    """Whether a run of ``steps`` on images of ``pixels`` is brief for this number of splats.
+
+    Where they are dense in the images, their triangles are smaller than pixels: what a step learns of them is
+    mostly noise, which only many steps average out, while the conversion is right to the last pixel.
+    """
+    return splats > pixels and steps < BRIEF_STEPS * splats / pixels
+
+
+def of_brief_run(config: FinetuneConfig, steps: float, given: Collection[str]) -> FinetuneConfig:
+    """``config`` with the learning rates of a brief run of ``steps``, but for those that are ``given``."""
+    share = min(1.0, steps / BRIEF_RATE_STEPS)
+    changes = {name: rate * share for name, rate in BRIEF_RATES.items() if name not in given}
+    return with_changes(config, **changes)  # type: ignore[arg-type]
 
 
 def measure_pace(
