@@ -53,11 +53,13 @@ from meshsplats.finetuning.baseline import SHARES, SizeScores, converted, measur
 from meshsplats.finetuning.checkpoint import Checkpoint
 from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
+from meshsplats.finetuning.memory import available_memory
 from meshsplats.finetuning.pace import (
     BRIEF_ZOOMS,
     StartRecord,
     is_brief,
     measure_pace,
+    most_splats,
     of_brief_run,
     worthwhile_steps,
 )
@@ -86,8 +88,8 @@ BASELINE_SHARE = 0.05
 """Share of it in which the conversion is scored, and the result afterwards."""
 SAVE_SECONDS = 2e-6
 """Time to write a triangle and to draw it in the preview, with some to spare."""
-TIMED_SPLATS = 100_000
-"""Clouds from this size on are merged where the time demands it."""
+TIMED_SPLATS = 10_000
+"""Steps are timed for clouds from this size on."""
 
 
 @dataclass(frozen=True)
@@ -180,18 +182,17 @@ class Finetune(TrainingCommand):
             config = of_brief_run(config, record.brief_steps, given)
             dataset = self._targets(cloud, config, earlier, BRIEF_ZOOMS)
         setup.phase(f"converting {len(cloud):,} splats")
-        conversion = self._conversion(cloud, dataset, config)
+        # Too many splats to fine-tune are too many to score.
+        most = record.max_splats if config.opacity == "blended" else None
+        conversion = self._conversion(cloud, dataset, config, most)
         setup.phase("scoring the conversion")
-        most = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
-        baseline = measure_baseline(conversion, cloud, dataset, config, threads=self.threads, seconds=most)
-        if record.brief_steps is not None and record.max_splats is None:
+        seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
+        baseline = measure_baseline(conversion, cloud, dataset, config, threads=self.threads, seconds=seconds)
+        if record.brief_steps is not None:
             mesh = conversion
-        elif record.brief_steps is not None:
-            setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
-            mesh = self._conversion(cloud, dataset, config, record.max_splats)
         else:
             mesh = self._start(cloud, dataset, as_begun(config, earlier), record, setup)
-        scorings = 1 if record.brief_steps is None else 1 + len(SHARES)
+        scorings = 1 if record.brief_steps is None else 2
         reserve = scorings * baseline.seconds + SAVE_SECONDS * len(mesh.faces)
 
         def optimise(run: RunOptions, show: ShowProgress) -> Trained:
@@ -206,7 +207,7 @@ class Finetune(TrainingCommand):
                 if less is not None and not (found := baseline.compare(less, config, self.threads)).loses:
                     self._log_scores(less, dataset, config)
                     return self._trained(less, config, found)
-            converted = self._conversion(cloud, dataset, config)
+            converted = self._conversion(cloud, dataset, config, most)
             self._log_scores(converted, dataset, config)
             return self._trained(converted, config, sizes)
 
@@ -225,20 +226,29 @@ class Finetune(TrainingCommand):
         chosen, pixels = self.conversion, dataset.train[0].camera.width * dataset.train[0].camera.height
         limited = chosen.max_splats is not None or chosen.max_triangles is not None
         own = any(value is not None for value in (chosen.mode, chosen.detail, chosen.sides, chosen.rings))
-        may_be_brief = config.opacity == "blended" and dataset.look == "area" and not limited and not own
+        may_be_brief = config.opacity == "blended" and dataset.look == "area" and not own
         steps: float | None = config.total_steps(len(dataset.train))
-        count = len(cloud)
-        if setup.seconds is not None and not limited and count >= TIMED_SPLATS:
+        count, timed = len(cloud), setup.seconds is not None and len(cloud) >= TIMED_SPLATS
+        if not limited:
+            count = min(count, most_splats(available_memory()) or count)
+        if timed:
             setup.phase("timing steps")
             pace = measure_pace(cloud, dataset, config, self._start_options(dataset), self.threads)
-            left = (1 - SETUP_SHARE) * setup.seconds
-            count = pace.splats(count, worthwhile_steps(config), left)
-            steps = pace.steps(count, left)
-        brief = may_be_brief and steps is not None and is_brief(count, pixels, steps)
+            left = (1 - SETUP_SHARE) * (setup.seconds or 0)
+            if config.opacity == "cutoff" and not limited:
+                count = min(pace.splats(count, worthwhile_steps(config), left), count)
+            steps = pace.steps(self._limited(count), left)
+        brief = may_be_brief and steps is not None and is_brief(self._limited(count), pixels, steps, timed)
         return StartRecord(
             max_splats=count if count < len(cloud) else None,
             brief_steps=max(1, round(steps)) if brief and steps is not None else None,
         )
+
+    def _limited(self, splats: int) -> int:
+        """How many of them the options leave."""
+        chosen = self.conversion
+        by_triangles = None if chosen.max_triangles is None else max(chosen.max_triangles // 8, 1)
+        return min(splats, chosen.max_splats or splats, by_triangles or splats)
 
     def _start(
         self,

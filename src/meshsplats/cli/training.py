@@ -505,7 +505,9 @@ def _sizes_in_words(sizes: SizeScores | None, steps: int) -> Iterator[str]:
         return
     pairs = (f"{width} px {old:.1f} -> {sizes.tuned[width]:.1f}" for width, old in sizes.converted.items())
     yield f"converted -> tuned, dB: {', '.join(pairs)}"
-    if sizes.loses:
+    if not steps:
+        yield "there was no time for a step: this is the mesh at the start; more --minutes help"
+    elif sizes.loses:
         where = " and ".join(str(width) for width in sizes.worse_at)
         yield f"the conversion is written: after {plural(steps, 'step')}, the mesh was worse at {where} px;"
         yield "  more --minutes help, or fewer triangles (--max-splats); --resume --force continues this run"

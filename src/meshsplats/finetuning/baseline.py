@@ -33,8 +33,8 @@ VIEWS = 3
 SAMPLES = 2
 """Samples along each side of a pixel of the splats, for the look 'area'."""
 SHARES = (0.5, 0.25)
-"""Where a mesh that began as its conversion ended below it at some size, it is moved by these shares of its way
-only: noise falls faster than what was gained."""
+"""Where a mesh that began as its conversion ended below it at some size, it is moved by these shares of its
+way only: noise falls faster than what was gained."""
 TOLERANCE = 0.05
 """Differences in dB that do not count."""
 
@@ -90,8 +90,8 @@ def converted(
 
 
 def partly(start: SplatMesh, tuned: SplatMesh, share: float) -> SplatMesh | None:
-    """``start`` moved by this ``share`` of the way to ``tuned``, in positions and colours; None if they differ
-    in their triangles."""
+    """``start`` moved by this ``share`` of the way to ``tuned``, in positions and colours; None if they
+    differ in their triangles."""
     if start.colors.shape != tuned.colors.shape or not np.array_equal(start.faces, tuned.faces):
         return None
     vertices = start.vertices + np.float32(share) * (tuned.vertices - start.vertices)

@@ -1,7 +1,7 @@
-"""How many splats a run of given length has time for, by the measured speed of this machine.
+"""What a run of given length has time for, by the measured speed of this machine.
 
-Merging costs detail, few steps leave noise. With too few steps for its triangles, a mesh is worse than one of
-fewer triangles, in short runs even worse than its conversion.
+With few steps for its triangles, a mesh is worse than its conversion, unless it begins as such and takes
+small steps. Opaque meshes need many steps: they begin with fewer splats, merged.
 """
 
 from __future__ import annotations
@@ -25,16 +25,22 @@ from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.gaussians import GaussianCloud
 
-FEWEST_STEPS = {"blended": 12, "cutoff": 150}
-"""Steps that a run should have, by opacity. Blended meshes of few steps begin as their conversion."""
-STEPS_A_MINUTE = {"blended": 6, "cutoff": 30}
+FEWEST_STEPS = 150
+"""Steps that a run for opaque triangles should have."""
+STEPS_A_MINUTE = 30
 """The same for each minute, in runs where this is more."""
-BRIEF_STEPS = 150
-"""See ``is_brief``."""
+BRIEF_STEPS, DENSE_STEPS = 100, 150
+"""Runs of fewer steps are brief, or of fewer than ``DENSE_STEPS`` for each splat a pixel."""
+SPLAT_BYTES = 2000
+"""Memory of fine-tuning the triangles that ``convert`` makes of a splat."""
+MEMORY_SHARE = 0.5
+"""Share of the memory that is there which they may take."""
 BRIEF_RATES = {"position_rate": 0.005, "color_rate": 0.008}
-"""Learning rates of brief runs..."""
+"""Learning rates of brief runs. A logo of 0.3 million furry splats, a minute: 24.0/33.0/35.5/30.2/34.9 dB at
+200, 400, 800, 1600 pixels and near, converted 23.7/32.1/35.1/30.2/33.8, and with the rates of other runs
+24.0/32.7/34.3/29.6/34.2. They hold..."""
 BRIEF_RATE_STEPS = 100
-"""... of at least so many steps; in proportion to the steps in shorter ones."""
+"""... for so many steps; shorter runs have rates in proportion."""
 BRIEF_ZOOMS = ZOOMS["splats"]
 """Zooms of their training views."""
 TRIAL_SPLATS = 50_000
@@ -104,18 +110,25 @@ class StartRecord:
 
 
 def worthwhile_steps(config: FinetuneConfig) -> float:
-    """Steps that a run of this length, in minutes, should have at least."""
-    each = STEPS_A_MINUTE[config.opacity] * (config.minutes or 0)
-    return max(FEWEST_STEPS[config.opacity], each)
+    """Steps that a run for opaque triangles of this length, in minutes, should have at least."""
+    return max(FEWEST_STEPS, STEPS_A_MINUTE * (config.minutes or 0))
 
 
-def is_brief(splats: int, pixels: int, steps: float) -> bool:
-    """Whether a run of ``steps`` on images of ``pixels`` is brief for this number of splats.
+def most_splats(available: int | None) -> int | None:
+    """For how many splats there is memory, of ``available`` bytes; None: unknown."""
+    return None if available is None else max(int(MEMORY_SHARE * available / SPLAT_BYTES), FEWEST_SPLATS)
 
-    Where they are dense in the images, their triangles are smaller than pixels: what a step learns of them is
-    mostly noise, which only many steps average out, while the conversion is right to the last pixel.
+
+def is_brief(splats: int, pixels: int, steps: float, timed: bool) -> bool:
+    """Whether a run of ``steps`` on images of ``pixels`` is brief for this number of splats; ``timed``: that
+    is what its time leaves, not what was asked for.
+
+    Where splats are dense in the images, their triangles are smaller than pixels: what a step learns of them
+    is mostly noise, which only many steps average out, while the conversion is right to the last pixel.
     """
-    return splats > pixels and steps < BRIEF_STEPS * splats / pixels
+    if splats > pixels:
+        return steps < DENSE_STEPS * splats / pixels
+    return timed and steps < BRIEF_STEPS
 
 
 def of_brief_run(config: FinetuneConfig, steps: float, given: Collection[str]) -> FinetuneConfig:
