@@ -27,7 +27,7 @@ from meshsplats.cli import main, toml
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, save_mesh
+from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, load_mesh, save_mesh
 from meshsplats.images.writing import save_animation, save_array, save_image
 from meshsplats.mesh import SplatMesh
 
@@ -294,15 +294,50 @@ def test_what_a_kill_leaves_goes_with_the_next_file(tmp_path, monkeypatch):
 
 
 @posix
-@pytest.mark.parametrize("arguments", [["--help"], ["info", "scene.ply"], ["info", "scene.ply", "--json"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["convert", "--help"],
+        ["doctor"],
+        ["info", "scene.ply"],
+        ["info", "scene.ply", "--json"],
+        ["convert", "scene.ply", "-o", "a.npz", "--no-sidecar"],
+        ["convert", "scene.ply", "-o", "out", "--formats", "npz", "--no-sidecar", "--json"],
+        ["clean", "scene.ply", "-o", "clean.ply", "--min-opacity", "0.001"],
+        ["simplify", "scene.ply", "-o", "few.ply", "--share", "0.5", "--no-preview"],
+        ["render", "scene.ply", "-o", "images", "--orbit", "2", "--width", "16", "--json"],
+    ],
+)
 def test_a_reader_that_goes_away(tmp_path, arguments):
+    """As of any program that SIGPIPE ends: no message, and the code is not that of a wrong input."""
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "wb") as pipe:
-        done = subprocess.run([*COMMAND, *arguments], cwd=tmp_path, stdout=pipe, stderr=subprocess.PIPE)
-    assert done.stderr == b""
-    assert done.returncode == 1
+    for streams in ({"stderr": subprocess.PIPE}, {"stderr": subprocess.STDOUT}):
+        reading, writing = os.pipe()
+        os.close(reading)
+        with os.fdopen(writing, "wb") as pipe:
+            done = subprocess.run(
+                [*COMMAND, *arguments, *["--force"] * ("-o" in arguments)],
+                cwd=tmp_path,
+                stdout=pipe,
+                **streams,
+            )
+        assert not done.stderr
+        assert done.returncode == 141
+
+
+@posix
+@pytest.mark.parametrize("closed", [">&-", "2>&-"])
+def test_streams_that_are_closed(tmp_path, closed):
+    """Messages go nowhere, never to the other stream or into a file that took its number."""
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    for arguments, code in (["convert scene.ply -o a.npz --force", 0], ["info none.ply", 1], ["--help", 0]):
+        line = f'"{sys.executable}" -m meshsplats {arguments} {closed}'
+        done = subprocess.run(["sh", "-c", line], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == code, done.stderr
+        assert "Traceback" not in done.stderr
+        assert "none.ply" not in done.stdout
+    assert len(load_mesh(tmp_path / "a.npz").faces) == 320
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
