@@ -71,7 +71,16 @@ def parse(command: type[C], prog: str, words: Sequence[str]) -> C:
     Raises:
         SystemExit: after --help (0), or for words that are not understood (2), which has been printed.
         UsageError: for a configuration file that is wrong.
+        ValueError: --threads is below 1.
     """
+    made = _parsed(command, prog, words)
+    option = options_of(command).get("threads")
+    if option is not None and (count := option.value(made)) is not None and count < 1:
+        raise ValueError(f"--threads must be at least 1, got {count}")  # before the work: images come last
+    return made
+
+
+def _parsed(command: type[C], prog: str, words: Sequence[str]) -> C:
     words, file = _without_config(words)
     if any(word in words for word in ("-h", "--help", "--help-all")):
         _print_help(command, prog, everything="--help-all" in words)
