@@ -10,10 +10,10 @@ from meshsplats.cli.common import check_mesh_suffix, check_outputs
 from meshsplats.cli.messages import UsageError, shown_path
 from meshsplats.cli.records import CONFIGURATION, PREVIEW, beside
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.gaussians import splat_file, subject_name
+from meshsplats.formats.gaussians import SPLAT_SUFFIXES, files_named, splat_file, subject_name
 from meshsplats.formats.meshes import MESH_SUFFIXES
 
-INPUT_SUFFIXES = (*MESH_SUFFIXES, ".splat", ".spz", ".sog", ".gltf")
+INPUT_SUFFIXES = (*MESH_SUFFIXES, *SPLAT_SUFFIXES)
 """Names of inputs in a folder."""
 
 
@@ -103,12 +103,12 @@ def _is_splats(folder: Path) -> bool:
 def _inside(folder: Path) -> list[Path]:
     if _is_splats(folder):
         return [folder]
-    found = [
+    models = [
         path
-        for path in sorted(folder.iterdir())
-        if not path.name.startswith(".")
-        and (_is_splats(path) if path.is_dir() else path.suffix.lower() in INPUT_SUFFIXES)
+        for path in folder.iterdir()
+        if path.is_dir() and not path.name.startswith(".") and _is_splats(path)
     ]
+    found = sorted([*models, *files_named(folder, INPUT_SUFFIXES)])
     if not found:
         splat_file(folder)  # says what is wrong
     return found

@@ -16,7 +16,7 @@ from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.splats import read_splat_gltf
 from meshsplats.formats.ply.compressed_splats import read_compressed_ply
 from meshsplats.formats.ply.splats import read_float_ply, write_float_blocks, write_float_ply
-from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats
+from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats, identify
 from meshsplats.formats.splats._cloud_builder import SplatReader
 from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
@@ -25,8 +25,11 @@ from meshsplats.formats.splats.streamed_sog import read_streamed_sog, streamed_p
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 Axes = Literal["auto", "y-down", "y-up"]
-_SUFFIXES = (".ply", ".gz", ".splat", ".spz", ".sog", ".glb", ".gltf")
-"""Names of splat files in a folder."""
+SPLAT_SUFFIXES = (".ply", ".ply.gz", ".splat", ".spz", ".sog", ".glb", ".gltf")
+"""How the names of splat files end, wherever names decide: which files of a folder are read."""
+_MODEL_FILES = ("point_cloud.ply", "point_cloud.ply.gz")
+"""Names of the splats in a model folder; the first that is there counts."""
+_DOUBLE_SUFFIXES = (".compressed.ply", ".compressed.ply.gz", ".ply.gz")
 
 
 def load_gaussians(
@@ -162,7 +165,7 @@ def stream_gaussians(
 
     Args:
         path: a file or folder as for ``load_gaussians``; several of them; or a folder of splat files, which
-            are read in the order of their names.
+            are read in the order of their names; meshes among them are left out.
         block: about this many splats at a time.
         strict, axes: as for ``load_gaussians``.
 
@@ -188,14 +191,26 @@ def _splat_files(path: Path) -> list[Path]:
     except FileFormatError:
         if not path.is_dir():
             raise
-        found = [
-            part
-            for part in sorted(path.iterdir())
-            if part.is_file() and part.suffix.lower() in _SUFFIXES and splat_format(part) is not None
-        ]
+        found = [part for part in files_named(path, SPLAT_SUFFIXES) if not _is_mesh(part)]
         if not found:
             raise
         return found
+
+
+def files_named(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """The files of ``folder`` whose names end in one of ``suffixes``, by name; hidden ones are left out."""
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.name.lower().endswith(tuple(suffixes)) and not path.name.startswith(".") and path.is_file()
+    )
+
+
+def _is_mesh(path: Path) -> bool:
+    try:
+        return identify(path) == "mesh"
+    except FileFormatError:  # broken, or a download that failed: its reader says so
+        return False
 
 
 def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
@@ -269,7 +284,7 @@ def save_gaussian_blocks(
 def subject_name(path: Path) -> str:
     """A name for the contents of ``path``: the file's without its suffix, or the folder's where all such
     files have one name (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
-    if path.name in ("point_cloud.ply", "meta.json", "lod-meta.json"):
+    if path.name in (*_MODEL_FILES, "meta.json", "lod-meta.json"):
         folder = path.absolute().parent
         if re.fullmatch(r"iteration_[0-9]+", folder.name):
             folder = folder.parent
@@ -279,10 +294,13 @@ def subject_name(path: Path) -> str:
     if path.is_dir():
         return path.absolute().name or "scene"
     name = path.name
-    for suffix in (".compressed.ply", path.suffix):
-        if suffix and name.lower().endswith(suffix.lower()) and len(name) > len(suffix):
-            return name[: -len(suffix)]
-    return name
+    suffixes = [end for end in (*_DOUBLE_SUFFIXES, path.suffix) if end and name.lower().endswith(end.lower())]
+    longest = max(map(len, suffixes), default=0)
+    return name[: len(name) - longest] or name
+
+
+def _model_file(folder: Path) -> Path | None:
+    return next((folder / name for name in _MODEL_FILES if (folder / name).is_file()), None)
 
 
 def splat_file(path: Path) -> Path:
@@ -300,13 +318,14 @@ def splat_file(path: Path) -> Path:
     for folder in (path / "point_cloud", path):
         iterations = [
             (int(match[1]), found)
-            for found in folder.glob("iteration_*/point_cloud.ply")
-            if (match := re.fullmatch(r"iteration_([0-9]{1,15})", found.parent.name)) and found.is_file()
+            for place in folder.glob("iteration_*")
+            if (match := re.fullmatch(r"iteration_([0-9]{1,15})", place.name))
+            and (found := _model_file(place))
         ]
         if iterations:
             return max(iterations)[1]
-        if (folder / "point_cloud.ply").is_file():
-            return folder / "point_cloud.ply"
+        if found := _model_file(folder):
+            return found
     if (path / "tileset.json").is_file():
         raise FileFormatError(f"{path}: a tileset, not splats; render and info take it")
     photographs = [n for n in ("transforms.json", "transforms_train.json", "sparse") if (path / n).exists()]
