@@ -23,9 +23,9 @@ from meshsplats.cli.messages import OK, UsageError, flag, say
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
-INVOCATION = ("cluster", "executable", "force", "json", "resume")
+INVOCATION = ("cluster", "executable", "force", "json", "resume", "skip_existing")
 """Options for the command line only: a configuration file from a stranger must neither overwrite files nor
-run programs, here or on a cluster, and --json and --resume belong to a single call."""
+run programs, here or on a cluster, and --json, --resume and --skip-existing belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """Tables and keys of a configuration file. Only ``options`` is read."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tyro
 
+from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli.arguments import Command, as_cli_options
@@ -91,12 +92,13 @@ class Clean(Command):
             raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
         found = find(scene, rules)
         left = remove(scene, found)
-        if not self.preview_only:
-            if isinstance(left, SplatMesh):
-                save_mesh(left, self.output)
-            else:
-                save_gaussians(left, self.output)
-        _draw(scene, left, found, preview, self.threads)
+        with together():
+            if not self.preview_only:
+                if isinstance(left, SplatMesh):
+                    save_mesh(left, self.output)
+                else:
+                    save_gaussians(left, self.output)
+            _draw(scene, left, found, preview, self.threads)
         self._print_result(rules, found, left, preview, time.perf_counter() - start)
 
     def _print_result(

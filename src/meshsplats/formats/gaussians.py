@@ -281,21 +281,22 @@ def save_gaussian_blocks(
     write_float_blocks(blocks, target, count, (degree + 1) ** 2, kernel, flat=kernel == "2dgs")
 
 
-def subject_name(path: Path) -> str:
+def subject_name(path: Path, *, ending: bool = False) -> str:
     """A name for the contents of ``path``: the file's without its suffix, or the folder's where all such
-    files have one name (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
+    files have one name (``point_cloud.ply`` of a model, ``meta.json`` of SOG). With its ``ending``, if that
+    is asked for."""
     if path.name in (*_MODEL_FILES, "meta.json", "lod-meta.json"):
         folder = path.absolute().parent
         if re.fullmatch(r"iteration_[0-9]+", folder.name):
             folder = folder.parent
         if folder.name == "point_cloud":
             folder = folder.parent
-        return folder.name or path.stem
+        return (folder.name or path.stem) + ("".join(path.suffixes) if ending else "")
     if path.is_dir():
         return path.absolute().name or "scene"
     name = path.name
     suffixes = [end for end in (*_DOUBLE_SUFFIXES, path.suffix) if end and name.lower().endswith(end.lower())]
-    longest = max(map(len, suffixes), default=0)
+    longest = 0 if ending else max(map(len, suffixes), default=0)
     return name[: len(name) - longest] or name
 
 
