@@ -2,7 +2,8 @@
 
 The usual way through the package is ``load_gaussians`` -> ``convert`` -> ``finetune`` -> ``save_mesh``, with
 ``render`` and ``compare`` to look at the result. Names are loaded when first used, so that ``import
-meshsplats`` stays quick and needs NumPy alone.
+meshsplats`` stays quick. All of them load with NumPy alone; a function that needs an extra says so when it is
+called.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.prior import MeshPrior, load_prior, train_prior
     from meshsplats.prior.bind import bind
     from meshsplats.rendering import Rendering, render, render_splats
-    from meshsplats.rendering.autograd import rasterize as rasterize
+    from meshsplats.rendering.autograd import rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
     from meshsplats.tiles.building import TileOptions, build_tiles
@@ -111,7 +112,6 @@ _HOME = {
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
-# All but ``rasterize``, which needs torch: a star import must not.
 __all__ = [
     "BaseMesh",
     "Camera",
@@ -167,6 +167,7 @@ __all__ = [
     "open_workers",
     "orbit",
     "psnr",
+    "rasterize",
     "render",
     "render_splats",
     "render_tiles",
@@ -198,4 +199,4 @@ if not TYPE_CHECKING:  # a checker would take any name for one that this finds
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return list(__all__)

@@ -10,6 +10,7 @@ from typing import BinaryIO, Literal, get_args
 
 import numpy as np
 
+from meshsplats._kinds import described, each, need, need_path, require_path
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
 from meshsplats.formats._validation import Budget
@@ -63,6 +64,7 @@ def load_gaussians(
             says what is wrong and where.
         MissingDependencyError: SPZ 4 without Zstandard.
     """
+    need_path(path=path)
     _check_axes(axes)
     found = splat_file(Path(path))
     content = Content(found)
@@ -123,6 +125,11 @@ class SplatStream:
         axes: Axes = "auto",
     ) -> None:
         _check_axes(axes)
+        if isinstance(paths, (str, os.PathLike)):
+            what = described(paths)
+            raise TypeError(f"paths must be a list of paths, got {what}: stream_gaussians(path) opens one")
+        for i, path in enumerate(paths):
+            require_path(f"paths[{i}]", path)
         if isinstance(block, bool) or not isinstance(block, (int, np.integer)) or block < 1:
             raise ValueError(f"block must be a number of splats, at least 1, got {block!r}")
         self.paths = tuple(Path(path) for path in paths)
@@ -177,7 +184,12 @@ def stream_gaussians(
         FileNotFoundError: there is no such file.
         FileFormatError: a folder without splats.
     """
-    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    if isinstance(path, (str, os.PathLike)) or not isinstance(path, Sequence):
+        need_path(path=path)
+        path = [path]
+    given = list(path)
+    for i, one in enumerate(given):
+        require_path(f"path[{i}]", one)
     if not given:
         raise ValueError("name at least one splat file")
     files = [file for one in given for file in _splat_files(Path(one))]
@@ -243,6 +255,8 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     Raises:
         ValueError: the suffix is not .ply, or the cloud has no splats.
     """
+    need(GaussianCloud, cloud=cloud, instead={"SplatMesh": "save_mesh writes meshes"})
+    need_path(path=path)
     target = Path(path)
     if target.suffix.lower() != ".ply":
         raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
@@ -273,6 +287,8 @@ def save_gaussian_blocks(
     Raises:
         ValueError: the suffix is not .ply, a count or degree out of range, or blocks of another count.
     """
+    blocks = each(GaussianCloud, "blocks", blocks)
+    need_path(path=path)
     target = Path(path)
     if target.suffix.lower() != ".ply":
         raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
