@@ -87,6 +87,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
             {"cloud": "cloud", "cameras": "optional cameras", "options": "options"},
         ),
         ("cut_mesh", {"mesh": MESH}, {"mesh": "mesh"}),
+        ("gaussians_to_tensors", {}, {"cloud": "cloud"}),
         ("dome", {"scene": CLOUD}, {"scene": "scene"}),
         ("orbit", {"scene": CLOUD}, {"scene": "scene"}),
         ("look_around", {"scene": CLOUD}, {"scene": "scene"}),
@@ -148,6 +149,7 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, str]]] 
 ELSEWHERE = {
     *("GaussianCloud", "SplatMesh", "Camera", "BaseMesh", "Dataset", "SplatStream", "View"),  # tested below
     *("convert_blocks", "save_gaussian_blocks", "save_mesh_blocks", "rasterize", "open_workers"),
+    "gaussians_from_tensors",  # tests/formats/test_tensors.py
     *("ConversionOptions", "FinetuneConfig", "TrainConfig", "TileOptions", "PageOptions"),  # plain values
     *("make_config", "train_config"),
     *("Comparison", "Interrupted", "Progress", "Rendering", "Report", "Workers"),  # results

@@ -48,6 +48,7 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         stream_gaussians,
     )
     from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
+    from meshsplats.formats.tensors import gaussians_from_tensors, gaussians_to_tensors
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.images.writing import save_image
     from meshsplats.mesh import SplatMesh
@@ -95,6 +96,7 @@ _HOME = {
         *("SplatStream", "load_gaussians", "save_gaussian_blocks", "save_gaussians", "stream_gaussians"),
     ),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
+    "meshsplats.formats.tensors": ("gaussians_from_tensors", "gaussians_to_tensors"),
     "meshsplats.gaussians": ("GaussianCloud",),
     "meshsplats.images.writing": ("save_image",),
     "meshsplats.mesh": ("SplatMesh",),
@@ -152,6 +154,8 @@ __all__ = [
     "evaluate",
     "find_background",
     "finetune",
+    "gaussians_from_tensors",
+    "gaussians_to_tensors",
     "load_base",
     "load_cameras",
     "load_dataset",
