@@ -15,11 +15,23 @@ import pytest
 
 import meshsplats
 from meshsplats.conversion.options import ConversionChanges, ConversionOptions
-from meshsplats.errors import MissingDependencyError
 from meshsplats.finetuning.config import FinetuneChanges, FinetuneConfig
 
 ROOT = Path(__file__).parents[1]
-NEEDS_TORCH = {"rasterize"}
+EXTRAS = (
+    "torch",
+    "PIL",
+    "tyro",
+    "rich",
+    "wgpu",
+    "pxr",
+    "bpy",
+    "zstandard",
+    "pycolmap",
+    "pymeshlab",
+    "distributed",
+)
+"""Modules of the extras, and of the command line."""
 
 
 def names_for_checkers() -> set[str]:
@@ -31,23 +43,58 @@ def names_for_checkers() -> set[str]:
 
 def test_checkers_and_python_see_the_same_names():
     assert names_for_checkers() == set(meshsplats._MODULES)
-    assert set(meshsplats.__all__) == set(meshsplats._MODULES) - NEEDS_TORCH | {"__version__"}
+    assert set(meshsplats.__all__) == set(meshsplats._MODULES) | {"__version__"}
     assert meshsplats.__all__ == sorted(meshsplats.__all__)
-    assert set(dir(meshsplats)) >= set(meshsplats._MODULES)
+    assert dir(meshsplats) == meshsplats.__all__
 
 
 def test_every_public_name_is_there_with_its_documentation():
     for name in sorted(meshsplats._MODULES):
-        try:
-            value = getattr(meshsplats, name)
-        except MissingDependencyError:
-            assert name in NEEDS_TORCH
-            continue
+        value = getattr(meshsplats, name)
         assert inspect.getdoc(value), name
         if inspect.isfunction(value):
             assert value.__name__ == name
             for parameter in inspect.signature(value).parameters.values():
                 assert parameter.annotation is not parameter.empty, f"{name}: {parameter}"
+
+
+def alone(code: str) -> str:
+    """What Python prints for ``code`` where only NumPy is installed."""
+    block = f"import sys; sys.modules.update(dict.fromkeys({EXTRAS}))\nimport meshsplats as ms\n"
+    done = subprocess.run([sys.executable, "-c", block + code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_looking_around_needs_no_extra():
+    """For ``help``, editors and doctest."""
+    shown = alone(
+        "import doctest, inspect, pydoc\n"
+        "members = dict(inspect.getmembers(ms))\n"
+        "assert set(members) == set(ms.__all__) and all(hasattr(ms, name) for name in ms.__all__)\n"
+        "print(doctest.testmod(ms).failed)\n"
+        "print(inspect.signature(ms.rasterize))\n"
+        "from meshsplats import *\n"
+        "print(rasterize.__doc__.splitlines()[0])\n"
+        "print(pydoc.plain(pydoc.render_doc(ms)))\n"
+    )
+    failed, signature, doc, *page = shown.splitlines()
+    assert failed == "0"
+    assert "cameras: 'Camera | Sequence[Camera]'" in signature
+    assert doc == "The images that ``render`` gives, differentiable once."
+    for name in ("rasterize", "convert", "GaussianCloud"):
+        assert any(re.search(rf"^    (class )?{name}\(", line) for line in page), name
+
+
+def test_what_needs_torch_says_so_when_it_is_called():
+    shown = alone(
+        "from meshsplats import rasterize\n"
+        "try:\n"
+        "    rasterize(None, None, None, [])\n"
+        "except ms.MissingDependencyError as error:\n"
+        "    print(error)\n"
+    )
+    assert shown.startswith("rasterize needs torch; the build for processors will do: pip install torch")
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ NAVIGATION = {
 REFERENCE = {
     "Splats and meshes": [
         *("GaussianCloud", "SplatMesh", "load_gaussians", "save_gaussians", "load_mesh", "save_mesh"),
+        *("gaussians_from_tensors", "gaussians_to_tensors"),
         *("convert", "ConversionOptions", "simplify", "bake_filter", "cut_mesh"),
     ],
     "Cameras and images": [

@@ -2,7 +2,8 @@
 
 The usual way through the package is ``load_gaussians`` -> ``convert`` -> ``finetune`` -> ``save_mesh``, with
 ``render`` and ``compare`` to look at the result. Names are loaded when first used, so that ``import
-meshsplats`` stays quick and needs NumPy alone.
+meshsplats`` stays quick. All of them load with NumPy alone; a function that needs an extra says so when it is
+called.
 """
 
 from __future__ import annotations
@@ -47,13 +48,14 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
         stream_gaussians,
     )
     from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
+    from meshsplats.formats.tensors import gaussians_from_tensors, gaussians_to_tensors
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.images.writing import save_image
     from meshsplats.mesh import SplatMesh
     from meshsplats.prior import MeshPrior, load_prior, train_prior
     from meshsplats.prior.bind import bind
     from meshsplats.rendering import Rendering, render, render_splats
-    from meshsplats.rendering.autograd import rasterize as rasterize
+    from meshsplats.rendering.autograd import rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
     from meshsplats.tiles.building import TileOptions, build_tiles
@@ -94,6 +96,7 @@ _HOME = {
         *("SplatStream", "load_gaussians", "save_gaussian_blocks", "save_gaussians", "stream_gaussians"),
     ),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
+    "meshsplats.formats.tensors": ("gaussians_from_tensors", "gaussians_to_tensors"),
     "meshsplats.gaussians": ("GaussianCloud",),
     "meshsplats.images.writing": ("save_image",),
     "meshsplats.mesh": ("SplatMesh",),
@@ -111,7 +114,6 @@ _HOME = {
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
-# All but ``rasterize``, which needs torch: a star import must not.
 __all__ = [
     "BaseMesh",
     "Camera",
@@ -152,6 +154,8 @@ __all__ = [
     "evaluate",
     "find_background",
     "finetune",
+    "gaussians_from_tensors",
+    "gaussians_to_tensors",
     "load_base",
     "load_cameras",
     "load_dataset",
@@ -167,6 +171,7 @@ __all__ = [
     "open_workers",
     "orbit",
     "psnr",
+    "rasterize",
     "render",
     "render_splats",
     "render_tiles",
@@ -198,4 +203,4 @@ if not TYPE_CHECKING:  # a checker would take any name for one that this finds
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_MODULES})
+    return list(__all__)

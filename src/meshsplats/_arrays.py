@@ -44,9 +44,15 @@ def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[in
     An array that already is one is returned itself, after one pass over its values where they are floats.
     Raises TypeError if the values are not numbers, ValueError if the shape differs or a value is not finite.
     """
-    given = np.asarray(value)
+    try:
+        given = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        # Ragged lists; tensors with gradients, or on a GPU.
+        way = f"; {name}.detach().cpu().numpy() is an array" if hasattr(value, "detach") else ""
+        raise TypeError(f"{name} must hold numbers, got a {type(value).__name__}: {error}{way}") from None
     if given.dtype.kind not in "fiub":
-        raise TypeError(f"{name} must hold numbers, got dtype {given.dtype}")
+        what = f"a {type(value).__name__}" if given.ndim == 0 else f"dtype {given.dtype}"
+        raise TypeError(f"{name} must hold numbers, got {what}")
     if given.ndim != len(shape) or any(
         s is not None and s != g for s, g in zip(shape, given.shape, strict=True)
     ):

@@ -243,7 +243,7 @@ def test_a_configuration_neither_overwrites_nor_names_programs(splats, capsys, o
         file.write(f"[options]\n{option} = true")
     name = "blender" if option == "executable" else "finetune"
     assert main([name, splats, "-o", "a.png", "--config", "run.toml"]) == 2
-    assert f"--{option} is for the command line only" in capsys.readouterr().err
+    assert f"{flag(option)} is for the command line only" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import os
@@ -16,6 +17,7 @@ from _splats import few_splats
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main, toml
+from meshsplats.cli.batch import jobs
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians, subject_name
@@ -91,7 +93,11 @@ def test_several_files_and_their_records(scans, tmp_path, capsys):
     [
         (["scans", "-o", "out.glb"], 2, "need a folder: -o out, say"),
         (["scans/a.ply", "-o", "out.glb", "--formats", "npz"], 2, "need a folder"),
-        (["scans/a.ply", "scans/../scans/a.ply", "-o", "out"], 2, f"would both become {Path('out/a.glb')}"),
+        (
+            ["scans/a.ply", "scans/../scans/a.ply", "-o", "out"],
+            2,
+            f"would both become {Path('out/a.ply.glb')}",
+        ),
         (["-o", "out"], 2, "give a splat file, a mesh or a folder"),
         (["scans/empty", "-o", "out"], 1, "a folder without splats"),
         (["scans/none.ply", "scans/a.ply", "-o", "no/out"], 1, "no"),
@@ -108,6 +114,119 @@ def test_mistakes_are_reported_first(scans, tmp_path, capsys, arguments, code, w
     assert run(*arguments) == code
     assert words in " ".join(capsys.readouterr().err.split())
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_inputs_of_one_name_keep_their_endings(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    os.makedirs("scans/same")
+    cloud = few_splats()
+    save_gaussians(cloud, "one.ply")
+    one = Path("one.ply").read_bytes()
+    names = ("same.ply", "same.compressed.ply", "same.ply.gz", "same.ply.ply", "Same.splat.ply", "other.ply")
+    for name in names:
+        Path("scans", name).write_bytes(gzip.compress(one) if name.endswith(".gz") else one)
+    Path("scans/same/point_cloud.ply").write_bytes(one)
+    stems = ["same", *(n for n in names if n.lower() < "same.s" and n != "other.ply"), "Same.splat", "other"]
+    for name in ("out", "again"):  # and again: the names do not depend on what is there
+        assert run("scans", "-o", name, "--no-sidecar") == 0
+        assert run("scans", "-o", name, "--no-sidecar", "--skip-existing") == 0
+        assert capsys.readouterr().out.endswith(f"0 of 7 converted, 7 kept: {name}/\n")
+        assert sorted(os.listdir(name)) == sorted(f"{stem}.glb" for stem in stems)
+    assert run("scans/same.ply", "-o", "alone", "--formats", "glb", "--no-sidecar") == 0
+    assert os.listdir("alone") == ["same.glb"]
+
+
+def test_names_do_not_depend_on_the_case_of_letters(tmp_path):
+    paths = [tmp_path / name for name in ("Same.ply", "same.sog", "a.spz")]
+    made = jobs(paths, tmp_path, ["glb"], preview=False, sidecars=False)
+    assert [job.outputs[0].name for job in made] == ["Same.ply.glb", "same.sog.glb", "a.glb"]
+
+
+def test_results_in_the_folder_of_the_inputs_are_no_inputs(scans):
+    os.remove("scans/broken.ply")
+    save_mesh(convert(few_splats()), "scans/mesh.npz")
+    for skip in ([], ["--skip-existing"]):
+        assert run("scans", "-o", "scans", "--formats", "glb", *skip) == 0
+        found = sorted(path.name for path in Path("scans").glob("*.glb"))
+        assert found == ["a.glb", "b.glb", "chair.glb", "mesh.glb"]
+    assert run("scans", "-o", "scans", "--formats", "glb") == 3
+    # A file that is named is an input, whatever it is.
+    assert run("scans/mesh.npz", "scans/mesh.glb", "-o", "scans", "--formats", "ply") == 0
+    assert {"mesh.npz.ply", "mesh.glb.ply"} <= set(os.listdir("scans"))
+
+
+def test_a_folder_that_was_interrupted(scans, tmp_path, capsys):
+    os.remove("scans/broken.ply")
+    assert run("scans", "-o", "out") == 0
+    first = {path.name: path.stat().st_mtime_ns for path in Path("out").iterdir()}
+    gone = {"b.glb", "b.glb.config.toml", "b.glb.preview.png", "chair.glb.preview.png"}
+    for name in gone:
+        os.remove(Path("out", name))
+    capsys.readouterr()
+    assert run("scans", "-o", "out", "--skip-existing", "--json") == 0
+    printed = lines(capsys.readouterr().out)
+    assert [line["skipped"] for line in printed] == [True, False, False]
+    assert [line.get("splats") for line in printed] == [None, 30, 20]
+    assert all(line["outputs"][0]["bytes"] and line["preview"] and not line["warnings"] for line in printed)
+    again = {path.name: path.stat().st_mtime_ns for path in Path("out").iterdir()}
+    assert again.keys() == first.keys()
+    assert {name for name in again if again[name] != first[name]} == gone
+    assert run("scans", "-o", "out", "--skip-existing") == 0
+    assert capsys.readouterr().out.endswith("0 of 3 converted, 3 kept: out/\n")
+    assert run("scans", "-o", "out", "--skip-existing", "--force") == 2
+    assert "not both" in capsys.readouterr().err
+
+
+def test_what_is_kept_but_may_be_wrong_is_named(scans, capsys):
+    assert run("scans/a.ply", "-o", "a.glb", "--max-splats", "30") == 0
+    before = Path("a.glb").read_bytes()
+    capsys.readouterr()
+    assert run("scans/a.ply", "-o", "a.glb", "--skip-existing") == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("a.glb (")
+    assert out.endswith("): kept\n")
+    assert "a.glb: kept, though made with other options: --max-splats was 30 and is not given" in err
+    os.utime("a.glb", (1, 1))
+    assert run("scans/a.ply", "-o", "a.glb", "--max-splats", "30", "--skip-existing", "--json") == 0
+    (warning,) = lines(capsys.readouterr().out)[0]["warnings"]
+    assert warning == "a.glb: kept, though older than its input; --force makes it anew"
+    # Its preview, if that is missing, would be one of another mesh.
+    os.remove("a.glb.preview.png")
+    assert run("scans/a.ply", "-o", "a.glb", "--max-splats", "30") == 3
+    assert "exists already (and 1 more), older than its input; --force" in capsys.readouterr().err
+    assert run("scans/a.ply", "-o", "a.glb", "--skip-existing", "--json") == 0
+    assert lines(capsys.readouterr().out)[0]["preview"] is None
+    assert not os.path.exists("a.glb.preview.png")
+    assert Path("a.glb").read_bytes() == before
+
+
+def test_a_further_format_beside_what_is_there(scans, capsys):
+    options = ["-o", "out", "--no-sidecar", "--json"]
+    assert run("scans/a.ply", *options, "--formats", "glb") == 0
+    stamp = os.stat("out/a.glb").st_mtime_ns
+    assert run("scans/a.ply", *options, "--formats", "glb", "npz") == 3
+    assert "--skip-existing makes only the meshes that are missing" in capsys.readouterr().err
+    assert run("scans/a.ply", *options, "--formats", "glb", "npz", "--skip-existing") == 0
+    assert sorted(os.listdir("out")) == ["a.glb", "a.npz"]
+    assert os.stat("out/a.glb").st_mtime_ns == stamp
+
+
+@pytest.mark.parametrize("skip", [[], ["--skip-existing"]])
+def test_records_of_another_run_stay(scans, capsys, skip):
+    """Where the mesh itself is gone, they are all that is left of it."""
+    assert run("scans/a.ply", "-o", "a.glb", "--max-splats", "30") == 0
+    os.remove("a.glb")
+    left = {name: Path(name).read_bytes() for name in ("a.glb.config.toml", "a.glb.preview.png")}
+    assert run("scans/a.ply", "-o", "a.glb", *skip) == 3
+    assert "made with other options: --max-splats was 30 and is not given" in capsys.readouterr().err
+    os.remove("a.glb.config.toml")
+    assert run("scans/a.ply", "-o", "a.glb", *skip) == 3
+    assert "a.glb.preview.png: the output exists already" in capsys.readouterr().err
+    assert Path("a.glb.preview.png").read_bytes() == left["a.glb.preview.png"]
+    Path("a.glb.config.toml").write_bytes(left["a.glb.config.toml"])
+    assert run("scans/a.ply", "-o", "a.glb", "--max-splats", "30", *skip) == 0
+    assert os.path.exists("a.glb")
+    assert Path("a.glb.preview.png").read_bytes() == left["a.glb.preview.png"]
 
 
 def test_a_folder_of_failures_leaves_no_folder(scans, capsys):
@@ -187,6 +306,10 @@ def test_standard_input(scans, tmp_path, monkeypatch, capsys):
     printed = lines(capsys.readouterr().out)[0]
     assert (printed["input"], printed["splats"]) == ("-", 40)
     assert toml.load(tmp_path / "a.npz.config.toml")["options"]["input"] == ["-"]
+    # What was piped then is not known now.
+    monkeypatch.setattr(sys, "stdin", _Piped(content))
+    assert run("-", "-o", "a.npz", "--skip-existing", "--json") == 0
+    assert "another standard input" in lines(capsys.readouterr().out)[0]["warnings"][0]
     monkeypatch.setattr(sys, "stdin", _Piped(content[:300]))
     assert run("-", "-o", "b.npz", "--json") == 1
     out, err = capsys.readouterr()
@@ -208,6 +331,9 @@ def test_standard_input(scans, tmp_path, monkeypatch, capsys):
         ("a.ply", "a"),
         ("a.b.spz", "a.b"),
         ("garden.compressed.ply", "garden"),
+        ("garden.ply.gz", "garden"),
+        ("Garden.COMPRESSED.PLY.GZ", "Garden"),
+        ("chair/point_cloud/iteration_7/point_cloud.ply.gz", "chair"),
         ("chair/point_cloud/iteration_30000/point_cloud.ply", "chair"),
         ("chair/point_cloud.ply", "chair"),
         ("room/meta.json", "room"),

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshsplats._cells import Cells
+from meshsplats._core import library
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
@@ -205,6 +206,28 @@ def test_the_command_says_what_goes_and_draws_it(file, tmp_path, capsys):
     third = image.shape[1] // 3
     assert red[:, third : 2 * third].sum() > 50
     assert red[:, :third].sum() == red[:, 2 * third :].sum() == 0
+
+
+@pytest.mark.parametrize("kind", ["splats", "mesh"])
+def test_the_command_keeps_to_its_threads(file, tmp_path, monkeypatch, kind):
+    """Without the option, images ask for the number of processors."""
+    if kind == "mesh":
+        save_mesh(convert(scene()[0]), tmp_path / "scene.ply")
+    asked = []
+    monkeypatch.setattr(library, "processors", lambda: asked.append(1) or 1)
+    assert main(["clean", str(file), "-o", str(tmp_path / "clean.ply"), "--threads", "1"]) == 0
+    assert not asked
+    assert main(["clean", str(file), "-o", str(tmp_path / "clean.ply"), "--force"]) == 0
+    assert asked
+
+
+@pytest.mark.parametrize("command", ["clean", "simplify", "render"])
+def test_threads_are_checked_before_the_work(file, tmp_path, capsys, command):
+    more = ["--share", "0.5"] if command == "simplify" else []
+    output = str(tmp_path / "out.ply")
+    assert main([command, str(file), "-o", output, "--threads", "0", *more]) == 1
+    assert capsys.readouterr().err == "meshsplats: error: --threads must be at least 1, got 0\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
 
 
 def test_the_command_on_a_mesh_in_json(tmp_path, capsys):

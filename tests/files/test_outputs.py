@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 import warnings
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -21,13 +22,20 @@ import pytest
 from _splats import few_splats
 
 from meshsplats._files import atomic
-from meshsplats._files.atomic import atomic_path, promises_kept, refuse_existing, temporary_beside
-from meshsplats._files.locks import locked
+from meshsplats._files.atomic import (
+    atomic_path,
+    promises_kept,
+    refuse_existing,
+    temporary_beside,
+    together,
+    write_bytes,
+)
+from meshsplats._files.locks import lock_of, locked
 from meshsplats.cli import main, toml
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians
-from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, save_mesh
+from meshsplats.formats.meshes import MESH_SUFFIXES, expected_bytes, load_mesh, save_mesh
 from meshsplats.images.writing import save_animation, save_array, save_image
 from meshsplats.mesh import SplatMesh
 
@@ -232,6 +240,101 @@ def test_two_processes_one_output(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
+_HANGING_PREVIEW = """
+import sys, time, meshsplats.cli.{0}
+def hang(*_, **__):
+    print("drawing", flush=True)
+    time.sleep(60)
+meshsplats.cli.{0}.{1} = hang
+sys.exit(meshsplats.cli.main(sys.argv[1:]))
+"""
+
+
+def killed_in_the_preview(folder: Path, *arguments: str, function: str = "draw_preview") -> None:
+    """Runs a command there that is killed when its result is written and its preview is not."""
+    code = _HANGING_PREVIEW.format(arguments[0], function)
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], cwd=folder, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "drawing\n"
+        process.kill()
+
+
+@posix
+@pytest.mark.parametrize("option", [[], ["--skip-existing"]])
+def test_a_kill_before_the_preview_costs_the_preview_only(tmp_path, capsys, option):
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    killed_in_the_preview(tmp_path, "convert", "scene.ply", "-o", "mesh.glb")
+    made = {"mesh.glb", "mesh.glb.config.toml"}
+    assert {name for name in os.listdir(tmp_path) if name.startswith("mesh")} == made
+    stamp = (tmp_path / "mesh.glb").stat().st_mtime_ns
+    arguments = ["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.glb")]
+    assert main([*arguments, "--max-splats", "30"]) == 3  # another command
+    assert "with other options: --max-splats was not given and is 30" in capsys.readouterr().err
+    assert main([*arguments, *option]) == 0
+    assert set(os.listdir(tmp_path)) == made | {"scene.ply", "mesh.glb.preview.png"}
+    assert (tmp_path / "mesh.glb").stat().st_mtime_ns == stamp
+    assert main(arguments) == 3  # complete
+
+
+@posix
+def test_a_kill_before_the_preview_leaves_nothing_of_quick_commands(tmp_path, monkeypatch):
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    killed_in_the_preview(tmp_path, "clean", "scene.ply", "-o", "out.ply", function="_draw")
+    killed_in_the_preview(tmp_path, "simplify", "scene.ply", "-o", "out.ply", "--share", "0.5")
+    assert [name for name in os.listdir(tmp_path) if not name.startswith(".")] == ["scene.ply"]
+    monkeypatch.setattr(atomic, "_swept", set())
+    assert main(["clean", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "out.ply")]) == 0
+    assert not _temporaries(tmp_path)
+
+
+@posix
+def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, capsys):
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    code = _HANGING_PREVIEW.format("convert", "draw_preview")
+    arguments = ["convert", str(tmp_path / "scene.ply"), "-o", str(tmp_path / "mesh.glb")]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        for option in ([], ["--skip-existing"]):
+            assert main([*arguments, *option]) == 3
+            assert "another process is writing this output" in capsys.readouterr().err
+        process.kill()
+    assert main(arguments) == 0
+    assert not _temporaries(tmp_path)
+
+
+def test_files_that_belong_together_appear_together(tmp_path):
+    (tmp_path / "b").write_bytes(b"old")
+    with suppress(KeyboardInterrupt), together():
+        write_bytes(tmp_path / "a", b"1")
+        write_bytes(tmp_path / "b", b"2")
+        raise KeyboardInterrupt
+    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+    with promises_kept():
+        refuse_existing([tmp_path / "a"], False)
+        with together():
+            write_bytes(tmp_path / "a", b"1")
+            with together():
+                write_bytes(tmp_path / "b", b"2")
+            assert not (tmp_path / "a").exists()
+            assert (tmp_path / "b").read_bytes() == b"old"
+        assert ((tmp_path / "a").read_bytes(), (tmp_path / "b").read_bytes()) == (b"1", b"2")
+        refuse_existing([tmp_path / "c", tmp_path / "d"], False)
+        written = together()
+        written.__enter__()
+        write_bytes(tmp_path / "c", b"ours")
+        write_bytes(tmp_path / "d", b"ours")
+        (tmp_path / "c").write_bytes(b"theirs")
+        with pytest.raises(FileExistsError, match="another process"):
+            written.__exit__(None, None, None)
+    assert (tmp_path / "c").read_bytes() == b"theirs"
+    assert sorted(os.listdir(tmp_path)) == ["a", "b", "c"]
+
+
 def _temporaries(folder: Path) -> list[str]:
     return [name for name in os.listdir(folder) if name.startswith(".")]
 
@@ -293,16 +396,60 @@ def test_what_a_kill_leaves_goes_with_the_next_file(tmp_path, monkeypatch):
     assert sorted(_temporaries(tmp_path)) == sorted(left)
 
 
+def test_locks_of_killed_processes_go_with_the_next_file(tmp_path, monkeypatch):
+    held, left = (lock_of(tmp_path / name) for name in ("a.glb", "b.glb"))
+    left.touch()
+    with locked(held):
+        monkeypatch.setattr(atomic, "_swept", set())
+        write_bytes(tmp_path / "c.glb", b"")
+        assert sorted(os.listdir(tmp_path)) == sorted([held.name, "c.glb"])
+
+
 @posix
-@pytest.mark.parametrize("arguments", [["--help"], ["info", "scene.ply"], ["info", "scene.ply", "--json"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["convert", "--help"],
+        ["doctor"],
+        ["info", "scene.ply"],
+        ["info", "scene.ply", "--json"],
+        ["convert", "scene.ply", "-o", "a.npz", "--no-sidecar"],
+        ["convert", "scene.ply", "-o", "out", "--formats", "npz", "--no-sidecar", "--json"],
+        ["clean", "scene.ply", "-o", "clean.ply", "--min-opacity", "0.001"],
+        ["simplify", "scene.ply", "-o", "few.ply", "--share", "0.5", "--no-preview"],
+        ["render", "scene.ply", "-o", "images", "--orbit", "2", "--width", "16", "--json"],
+    ],
+)
 def test_a_reader_that_goes_away(tmp_path, arguments):
+    """As of any program that SIGPIPE ends: no message, and the code is not that of a wrong input."""
     save_gaussians(few_splats(), tmp_path / "scene.ply")
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "wb") as pipe:
-        done = subprocess.run([*COMMAND, *arguments], cwd=tmp_path, stdout=pipe, stderr=subprocess.PIPE)
-    assert done.stderr == b""
-    assert done.returncode == 1
+    for streams in ({"stderr": subprocess.PIPE}, {"stderr": subprocess.STDOUT}):
+        reading, writing = os.pipe()
+        os.close(reading)
+        with os.fdopen(writing, "wb") as pipe:
+            done = subprocess.run(
+                [*COMMAND, *arguments, *["--force"] * ("-o" in arguments)],
+                cwd=tmp_path,
+                stdout=pipe,
+                **streams,
+            )
+        assert not done.stderr
+        assert done.returncode == 141
+
+
+@posix
+@pytest.mark.parametrize("closed", [">&-", "2>&-"])
+def test_streams_that_are_closed(tmp_path, closed):
+    """Messages go nowhere, never to the other stream or into a file that took its number."""
+    save_gaussians(few_splats(), tmp_path / "scene.ply")
+    for arguments, code in (["convert scene.ply -o a.npz --force", 0], ["info none.ply", 1], ["--help", 0]):
+        line = f'"{sys.executable}" -m meshsplats {arguments} {closed}'
+        done = subprocess.run(["sh", "-c", line], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == code, done.stderr
+        assert "Traceback" not in done.stderr
+        assert "none.ply" not in done.stdout
+    assert len(load_mesh(tmp_path / "a.npz").faces) == 320
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full on this system")
@@ -323,7 +470,7 @@ def test_standard_output_that_is_full(tmp_path):
 @posix
 def test_locks_end_with_their_process(tmp_path):
     path = tmp_path / "lock"
-    code = "import sys, time; from pathlib import Path; from meshsplats._files.locks import locked\n"
+    code = "import sys, time; from pathlib import Path; from meshsplats._files.locks import lock_of, locked\n"
     code += "with locked(Path(sys.argv[1])) as ours: print(ours, flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "True\n"

@@ -30,8 +30,13 @@ from meshsplats import (
     save_gaussians,
     stream_gaussians,
 )
+from meshsplats.cli.batch import sources
+from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
+from meshsplats.evaluation.benchmarks import find_input
 from meshsplats.formats import _validation
+from meshsplats.formats.gaussians import splat_file, subject_name
+from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.ply import compressed_splats, table
 from meshsplats.formats.splats import dot_splat as dot_splat_module
 from meshsplats.formats.splats import sog as sog_module
@@ -123,6 +128,46 @@ def test_a_streamed_scene_comes_part_by_part(tmp_path, small_chunks):
     blocks = list(stream_gaussians(tmp_path, block=100))
     assert len(blocks) >= 4
     assert_same(blocks, cloud)
+
+
+@pytest.mark.parametrize("name", [*FILES, "LOUD.PLY.GZ"])
+def test_what_is_read_when_named_is_found_in_a_folder(tmp_path, name):
+    """By everything that takes folders."""
+    if name == "LOUD.PLY.GZ":
+        gzipped(tmp_path / name)
+    else:
+        FILES[name](tmp_path / name)
+    for other in (".hidden.ply", "notes.txt.gz", "notes.txt"):
+        (tmp_path / other).write_bytes(gzip.compress(b"no splats"))
+    assert sources([tmp_path]) == [tmp_path / name]
+    assert stream_gaussians(tmp_path).paths == (tmp_path / name,)
+    if name.islower():
+        stem = name.partition(".")[0]
+        assert find_input(tmp_path, stem) == tmp_path / name
+
+
+def test_meshes_in_a_folder_are_no_splats_and_broken_files_are_not_passed_over(tmp_path):
+    write_ply(tmp_path / "a.ply", [splat_table(VALUES)])
+    mesh = convert(load_gaussians(tmp_path / "a.ply"))
+    for name in ("a.glb", "b.ply"):
+        save_mesh(mesh, tmp_path / name)
+    assert stream_gaussians(tmp_path).paths == (tmp_path / "a.ply",)
+    for name, content in (("c.ply", b""), ("d.spz", b"version https://git-lfs"), ("e.glb", b"glTF")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(FileFormatError, match=name):
+            list(stream_gaussians(tmp_path))
+        (tmp_path / name).unlink()
+
+
+def test_a_model_may_be_gzipped(tmp_path):
+    for step in (7, 30):
+        folder = tmp_path / "chair" / "point_cloud" / f"iteration_{step}"
+        folder.mkdir(parents=True)
+        gzipped(folder / "point_cloud.ply.gz")
+    assert splat_file(tmp_path / "chair") == folder / "point_cloud.ply.gz"
+    assert subject_name(splat_file(tmp_path / "chair")) == "chair"
+    assert sources([tmp_path]) == [tmp_path / "chair"]
+    assert len(load_gaussians(tmp_path / "chair")) == 600
 
 
 def test_several_files_and_folders(tmp_path):

@@ -13,7 +13,10 @@ import sys
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+
+from meshsplats._files.locks import LOCK, locked
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of a full disk, an exhausted quota or a limit on file sizes."""
@@ -24,6 +27,8 @@ _swept: set[Path] = set()
 """Folders that this process has searched for leftovers."""
 _promised: set[Path] | None = None
 """Outputs that must still be free when they are written; see ``promises_kept``."""
+_waiting: list[_Finished] | None = None
+"""Finished files that wait for others; see ``together``."""
 
 
 @contextmanager
@@ -96,12 +101,11 @@ def atomic_path(
         yield temporary
         if mode is not None:
             os.chmod(temporary, stat.S_IMODE(mode))
-        if new or promised:
-            _place_new(temporary, target, shown)
-            if _promised is not None:
-                _promised.discard(target)  # ours: it may be replaced from now on
+        finished = _Finished(temporary, target, shown, new or promised)
+        if _waiting is None:
+            finished.place()
         else:
-            os.replace(temporary, target)
+            _waiting.append(finished)
     except BaseException as error:
         written = 0
         with suppress(OSError):
@@ -112,6 +116,31 @@ def atomic_path(
         if number is None:
             raise
         raise OSError(number, _no_room(number, folder, needs, written), shown) from None
+
+
+@contextmanager
+def together() -> Iterator[None]:
+    """Files that are finished within the block appear at its end, one right after the other; none of them if
+    the block raises.
+
+    So a process that is killed leaves all or nothing of a result in several files, but for the moment of the
+    last renames. Within the block, the files are not yet at their paths.
+    """
+    global _waiting
+    if _waiting is not None:  # part of a larger block
+        yield
+        return
+    _waiting = []
+    try:
+        yield
+        while _waiting:
+            _waiting[0].place()
+            del _waiting[0]
+    finally:
+        for finished in _waiting:
+            with suppress(OSError):
+                finished.temporary.unlink()
+        _waiting = None
 
 
 def temporary_beside(path: str | os.PathLike[str]) -> Path:
@@ -169,6 +198,26 @@ def promises_kept() -> Iterator[None]:
         yield
     finally:
         _promised = before
+
+
+@dataclass(frozen=True)
+class _Finished:
+    """A file that is complete, under its temporary name."""
+
+    temporary: Path
+    target: Path
+    shown: str
+    new: bool
+    """Whether ``target`` must not exist."""
+
+    def place(self) -> None:
+        """Gives the file its name. FileExistsError if it is taken and must not be."""
+        if not self.new:
+            os.replace(self.temporary, self.target)
+            return
+        _place_new(self.temporary, self.target, self.shown)
+        if _promised is not None:
+            _promised.discard(self.target)  # ours: it may be replaced from now on
 
 
 def _place_new(temporary: Path, target: Path, shown: str) -> None:
@@ -239,7 +288,7 @@ def _machine() -> int:
 
 
 def _sweep(folder: Path) -> None:
-    """Removes the temporary files of killed processes from ``folder``, once for each folder."""
+    """Removes the temporary files and locks of killed processes from ``folder``, once for each folder."""
     if folder in _swept or sys.platform == "win32":  # os.kill(.., 0) ends processes on Windows
         return
     _swept.add(folder)
@@ -249,6 +298,9 @@ def _sweep(folder: Path) -> None:
             if match and int(match[2], 16) == _machine() and not _alive(int(match[1], 16)):
                 with suppress(OSError):
                     os.unlink(entry.path)
+            elif LOCK.fullmatch(entry.name):
+                with suppress(OSError), locked(Path(entry.path)):
+                    pass  # removes it, unless a process holds it
 
 
 def _alive(process: int) -> bool:

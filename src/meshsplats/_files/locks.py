@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+LOCK = re.compile(r"\..*\.[0-9a-f]{8}\.lock")
+"""Names of locks on outputs: see ``lock_of``."""
+
+
+def lock_of(output: Path) -> Path:
+    """The hidden file whose lock the process holds that writes ``output``."""
+    return output.with_name(f".{output.stem[:32]}.{zlib.crc32(os.fsencode(output.name)):08x}.lock")
 
 
 def try_lock(path: Path) -> int | None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from meshsplats._files.atomic import write_text
 from meshsplats._json import read_json
+from meshsplats._kinds import need_all, need_path
 from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
 
@@ -30,6 +31,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
     format, and OSError if it cannot be opened.
     """
+    need_path(path=path)
     path = Path(path)
     if path.is_dir():
         path = path / "cameras.json"
@@ -51,6 +53,8 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
 def save_cameras(cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:
     """Writes the JSON list that ``load_cameras`` reads, to the last digit; replaces a file of that name."""
+    need_all(Camera, cameras=cameras)
+    need_path(path=path)
     entries = [
         {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
         | {"world_to_camera": camera.world_to_camera.tolist()}

@@ -9,6 +9,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
+from meshsplats._kinds import need_array
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -60,6 +61,20 @@ class Bounds:
     """(k,) float64 reach of each point: two standard deviations of a splat's middle axis, else 0."""
 
 
+def need_scene(scene: Framable) -> None:
+    """TypeError unless ``scene`` is one."""
+    if isinstance(scene, (GaussianCloud, SplatMesh)):
+        return
+    instead = {
+        "path": "load_gaussians(path) or load_mesh(path) reads the scene first",
+        "MeshPrior": "prior.mesh is its mesh",
+        "BaseMesh": "base.vertices are points",
+        "Dataset": "its cameras are there already, [view.camera for view in dataset.views]",
+        "Tileset": "tiles_mesh makes a mesh of it",
+    }
+    need_array(scene=scene, instead=instead, wanted="splats, a mesh or points (n, 3)")
+
+
 def weighted_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
     """Smallest of ``values`` (k,) at which the sorted ``weights`` add up to ``q`` (0 to 1) of their sum."""
     order = np.argsort(values)  # equal values may stand in any order
@@ -77,6 +92,7 @@ def scene_bounds(scene: Framable) -> Bounds:
     elif isinstance(scene, SplatMesh):
         points, weights = scene.vertices, scene.colors[:, 3]
     else:
+        need_scene(scene)
         points = np.asarray(scene, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise ValueError(f"points must be finite and of shape (n, 3), got {points.shape}")

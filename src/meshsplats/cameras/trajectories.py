@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._geometry import direction
+from meshsplats._kinds import need_array
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import (
     DEFAULT_UP,
@@ -16,6 +17,7 @@ from meshsplats.cameras.framing import (
     front_axes,
     guess_up,
     middle,
+    need_scene,
     scene_bounds,
     unit_up,
 )
@@ -50,6 +52,7 @@ def look_at(
 
     Raises ValueError if the two points coincide or are not finite, and for a value out of range.
     """
+    need_array(center=center, target=target, up=up)
     if not 1 <= fov <= 170:
         raise ValueError(f"fov must lie between 1 and 170 degrees, got {fov}")
     center = np.asarray(center, np.float64)
@@ -100,6 +103,7 @@ def orbit(
 
     Raises ValueError for an empty scene or a value out of range.
     """
+    need_scene(scene)
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     angles = [(azimuth + 360 * i / count, elevation) for i in range(count)]
@@ -128,6 +132,7 @@ def dome(
 
     The other arguments are those of ``orbit``.
     """
+    need_scene(scene)
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     golden = 180 * (3 - 5**0.5)
@@ -155,6 +160,7 @@ def look_around(
 
     The other arguments are those of ``orbit``.
     """
+    need_scene(scene)
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}")
     bounds = scene_bounds(scene)

@@ -18,14 +18,15 @@ from contextlib import contextmanager
 from meshsplats.cli.messages import (
     DISK_FULL,
     ENDINGS,
-    FAILED,
     OK,
+    UNREAD,
     USAGE,
     Terminated,
     UsageError,
     close_output,
     exit_code,
     one_line,
+    open_missing_streams,
     print_json_error,
     read_from_standard_input,
     say,
@@ -62,9 +63,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns the exit code: 0, 1 for an error in the input, 2 for wrong usage, 3 for an output that exists
     already, 4 for a full disk, 5 for a library, program or memory that is missing, 130 for Ctrl-C, 143 for
-    SIGTERM. With ``--json``, an error is printed as JSON too: ``{"error": {"kind", "code", "message", "path",
-    "type"}}``.
+    SIGTERM, 141 where nobody reads standard output any more (``| head``). With ``--json``, an error is
+    printed as JSON too: ``{"error": {"kind", "code", "message", "path", "type"}}``.
     """
+    open_missing_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     name = arguments[0] if arguments else ""
     debug, as_json = "--debug" in arguments, "--json" in arguments
@@ -83,8 +85,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         say(f"{ENDINGS.get(number, 'ended')}; no file was left half-written")
         return 128 + number
     except BrokenPipeError:
-        close_output()  # its reader has gone, `| head` say
-        return FAILED
+        close_output()
+        return UNREAD
     except (UsageError, ValueError, OSError, ImportError, MemoryError, DeviceError, ClusterError) as error:
         if debug:
             raise
@@ -217,7 +219,7 @@ def _overview() -> str:
         "  meshsplats --version\n"
         "  --debug                     with any command: the full traceback of an error\n\n"
         "exit codes: 0 done, 1 wrong input, 2 wrong usage, 3 the output exists, 4 no space, 5 something is\n"
-        "missing (a library, a program, memory)\n\n"
+        "missing (a library, a program, memory); 128 + n ended by signal n, 141 by `| head`\n\n"
         "start with:\n"
         "  meshsplats convert scene.ply -o scene.glb"
     )

@@ -23,9 +23,9 @@ from meshsplats.cli.messages import OK, UsageError, flag, say
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
-INVOCATION = ("cluster", "executable", "force", "json", "resume")
+INVOCATION = ("cluster", "executable", "force", "json", "resume", "skip_existing")
 """Options for the command line only: a configuration file from a stranger must neither overwrite files nor
-run programs, here or on a cluster, and --json and --resume belong to a single call."""
+run programs, here or on a cluster, and --json, --resume and --skip-existing belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """Tables and keys of a configuration file. Only ``options`` is read."""
 _MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
@@ -71,7 +71,16 @@ def parse(command: type[C], prog: str, words: Sequence[str]) -> C:
     Raises:
         SystemExit: after --help (0), or for words that are not understood (2), which has been printed.
         UsageError: for a configuration file that is wrong.
+        ValueError: --threads is below 1.
     """
+    made = _parsed(command, prog, words)
+    option = options_of(command).get("threads")
+    if option is not None and (count := option.value(made)) is not None and count < 1:
+        raise ValueError(f"--threads must be at least 1, got {count}")  # before the work: images come last
+    return made
+
+
+def _parsed(command: type[C], prog: str, words: Sequence[str]) -> C:
     words, file = _without_config(words)
     if any(word in words for word in ("-h", "--help", "--help-all")):
         _print_help(command, prog, everything="--help-all" in words)

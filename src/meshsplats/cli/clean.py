@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tyro
 
+from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
+    Count,
     Output,
     SplatOptions,
     check_mesh_suffix,
@@ -67,6 +69,8 @@ class Clean(Command):
     preview_only: bool = False
     """Print and draw what would be removed, but write no result."""
     reading: SplatOptions = field(default_factory=SplatOptions)
+    threads: Count = None
+    """Maximum number of threads. Default: all processors."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -88,12 +92,13 @@ class Clean(Command):
             raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
         found = find(scene, rules)
         left = remove(scene, found)
-        if not self.preview_only:
-            if isinstance(left, SplatMesh):
-                save_mesh(left, self.output)
-            else:
-                save_gaussians(left, self.output)
-        _draw(scene, left, found, preview)
+        with together():
+            if not self.preview_only:
+                if isinstance(left, SplatMesh):
+                    save_mesh(left, self.output)
+                else:
+                    save_gaussians(left, self.output)
+            _draw(scene, left, found, preview, self.threads)
         self._print_result(rules, found, left, preview, time.perf_counter() - start)
 
     def _print_result(
@@ -138,25 +143,30 @@ class Clean(Command):
 
 
 def _draw(
-    scene: GaussianCloud | SplatMesh, left: GaussianCloud | SplatMesh, found: Findings, path: Path
+    scene: GaussianCloud | SplatMesh,
+    left: GaussianCloud | SplatMesh,
+    found: Findings,
+    path: Path,
+    threads: int | None,
 ) -> None:
     """Saves the strip of three images: two that show the whole, one that shows the rest."""
     from meshsplats.images.writing import save_image, strip
 
     lens: dict[str, Any] = {"azimuth": 30, "width": _SIDE, "height": _SIDE}
     whole, rest = orbit(scene, 1, **lens)[0], orbit(left, 1, **lens)[0]
-    images = [_image(scene, whole), _image(_marked(scene, found), whole), _image(left, rest)]
+    shown = ((scene, whole), (_marked(scene, found), whole), (left, rest))
+    images = [_image(part, camera, threads) for part, camera in shown]
     save_image(path, strip(images, ("before", "removed", "after")))
 
 
-def _image(scene: GaussianCloud | SplatMesh, camera: Camera) -> np.ndarray:
+def _image(scene: GaussianCloud | SplatMesh, camera: Camera, threads: int | None) -> np.ndarray:
     from meshsplats.rendering import render_splats
     from meshsplats.rendering.looks import image_of
 
     white: Sequence[float] = (1.0, 1.0, 1.0)
     if isinstance(scene, SplatMesh):
-        return np.clip(image_of(scene, camera, white, samples=2)[0], 0, 1)
-    return np.clip(render_splats(scene, camera, background=white).color, 0, 1)
+        return np.clip(image_of(scene, camera, white, samples=2, threads=threads)[0], 0, 1)
+    return np.clip(render_splats(scene, camera, background=white, threads=threads).color, 0, 1)
 
 
 def _marked(scene: GaussianCloud | SplatMesh, found: Findings) -> GaussianCloud | SplatMesh:

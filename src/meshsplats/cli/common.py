@@ -396,7 +396,7 @@ def check_outputs(
     """
     from meshsplats._files.atomic import refuse_existing
 
-    read = [_file_of(source) for source in inputs if source.exists()]
+    read = [file_of(source) for source in inputs if source.exists()]
     for path in paths:
         if path.exists() and any(path.samefile(source) for source in read):
             raise UsageError(f"{path} is read by this command: give another name for the output")
@@ -412,7 +412,7 @@ def check_outputs(
             raise PermissionError(errno.EACCES, "no permission to write in this folder", str(above))
 
 
-def _file_of(source: Path) -> Path:
+def file_of(source: Path) -> Path:
     """The file that is read where ``source`` is a folder."""
     from meshsplats.formats.gaussians import splat_file
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,12 +16,13 @@ import numpy as np
 import tyro
 
 from meshsplats._arrays import subsample
+from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli.arguments import Command, as_cli_options
-from meshsplats.cli.batch import Job, check_file, check_folder, is_batch, jobs, sources
+from meshsplats.cli.batch import Job, check_file, check_folder, is_batch, jobs, sources, without_results
 from meshsplats.cli.common import (
     Count,
     File,
@@ -49,11 +52,11 @@ from meshsplats.cli.messages import (
     say,
     shown_path,
 )
-from meshsplats.cli.records import write_configuration
+from meshsplats.cli.records import CONFIGURATION, beside, changes_since, write_configuration
 from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, checked_cutoff
@@ -62,9 +65,11 @@ _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect with --as-splats."""
 _FOR_SPLATS = (
     *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
-    *("conversion", "reading", "json", "force"),
+    *("conversion", "reading", "json", "force", "skip_existing"),
 )
 """Options of the command that have one."""
+_IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
+"""Options that do not change the mesh."""
 _GLB_ALPHA = ("mask", "hybrid")
 """Values of --alpha that only .glb files have."""
 
@@ -150,6 +155,9 @@ class Convert(Command):
     """Print the results as JSON, a line for each input, errors too."""
     force: bool = False
     """Overwrite existing outputs."""
+    skip_existing: bool = False
+    """Keep the meshes that are there, and make those that are missing. Says which of them are older than
+    their input or were made with other options."""
 
     def execute(self) -> int:
         if not self.input:
@@ -160,6 +168,8 @@ class Convert(Command):
         self._check(formats or [self.output.suffix.lower()[1:]])
         found = sources(self.input)
         preview = not (self.no_preview or self.stream)
+        if formats:
+            found = without_results(found, self.input, self.output, formats)
         todo = jobs(found, self.output, formats, preview=preview, sidecars=not self.no_sidecar)
         cameras = self._cameras()
         if not folder:
@@ -192,6 +202,8 @@ class Convert(Command):
 
     def _check(self, kinds: Sequence[str]) -> None:
         """UsageError or ValueError for options that contradict each other or have no effect."""
+        if self.force and self.skip_existing:
+            raise UsageError("give --force or --skip-existing, not both")
         if self.fidelity is not None and self.fidelity < 1:
             raise ValueError(f"--fidelity must be a number of views, at least 1, got {self.fidelity}")
         if self.stream:
@@ -249,10 +261,12 @@ class Convert(Command):
     def _convert_all(self, todo: Sequence[Job], cameras: list[Camera] | None) -> int:
         """Does every job, also after failures; a full disk ends them. Returns the exit code: that of the
         failures if they are all of one kind."""
-        codes = []
+        codes, skipped = [], 0
         for job in track(todo, "converting", len(todo)):
             try:
-                self._print_line(self._convert(job, cameras), job)
+                result = self._convert(job, cameras)
+                skipped += result["skipped"]
+                self._print_line(result, job)
             except BrokenPipeError:
                 raise
             except (UsageError, ValueError, OSError, ImportError, MemoryError) as error:
@@ -262,36 +276,56 @@ class Convert(Command):
                     print(json.dumps({"input": job.shown, "error": error_record(error)}), flush=True)
                 if codes[-1] == NO_SPACE:
                     break
-        if not self.json:
-            left = len(todo) - len(codes) if NO_SPACE not in codes else None
-            if left is not None:
-                print(f"{left} of {len(todo)} converted: {self.output}/")
+        if not self.json and NO_SPACE not in codes:
+            made = len(todo) - len(codes) - skipped
+            kept = f", {skipped} kept" if skipped else ""
+            print(f"{made} of {len(todo)} converted{kept}: {self.output}/")
         return OK if not codes else codes[-1] if len(set(codes)) == 1 or codes[-1] == NO_SPACE else FAILED
 
     def _convert(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """Does ``job``; its result, for JSON."""
         import meshsplats
 
-        job.check(self.force)
-        with warnings_kept() as warned:
-            kind = identify(job.source)
-            if kind == "cameras" or (kind == "mesh" and self.as_splats):
-                raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
-            if self.stream and kind == "mesh":
-                raise FileFormatError(f"{job.source}: a mesh; --stream is for splats")
-            if self.stream:
-                result = self._stream_splats(job) if self.as_splats else self._stream_mesh(job, cameras)
-            elif self.as_splats:
-                result = self._save_splats(job, cameras)
-            elif kind == "mesh":
-                result = self._save_again(job)
-            else:
-                result = self._save_mesh(job, cameras)
+        with warnings_kept() as warned, job.claimed(self.force):
+            plan = job.plan(
+                force=self.force, skip_existing=self.skip_existing, changes=partial(self._changes, job)
+            )
+            for mesh in plan.kept:
+                if remark := mesh.remark:
+                    warnings.warn(remark, DataWarning, stacklevel=1)
+            result = {} if plan.finished else self._made(plan.job, cameras)
+        outputs = [{"path": str(path), "bytes": path.stat().st_size} for path in job.outputs]
+        image = job.preview if job.preview and job.preview.exists() else None
+        base = {"input": job.shown, "outputs": outputs, "preview": str(image) if image else None}
+        more = {"skipped": plan.finished, "warnings": warned, "meshsplats": meshsplats.__version__}
+        return base | result | more
+
+    def _changes(self, job: Job, index: int) -> str | None:
+        """How the record beside an output of ``job`` differs from the options of now: see ``Job.plan``."""
+        path = job.outputs[index]
+        return changes_since(beside(path, CONFIGURATION), "convert", self._alone(job, path), _IDLE)
+
+    def _made(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
+        """Writes the outputs of ``job``."""
+        kind = identify(job.source)
+        if kind == "cameras" or (kind == "mesh" and self.as_splats):
+            raise FileFormatError(f"{job.source}: not splats; convert needs splats or a mesh")
+        if self.stream and kind == "mesh":
+            raise FileFormatError(f"{job.source}: a mesh; --stream is for splats")
+        if self.stream:
+            return self._stream_splats(job) if self.as_splats else self._stream_mesh(job, cameras)
+        if self.as_splats:
+            return self._save_splats(job, cameras)
+        return self._save_again(job) if kind == "mesh" else self._save_mesh(job, cameras)
+
+    @contextmanager
+    def _recorded(self, job: Job) -> Iterator[None]:
+        """The files that are written within the block appear together with their configurations: a mesh
+        without one cannot be told from a stranger's. The preview, which takes longer, comes later."""
+        with together():
             for path, config in zip(job.outputs, job.configs, strict=False):
                 write_configuration(config, "convert", self._alone(job, path))
-        outputs = [{"path": str(path), "bytes": path.stat().st_size} for path in job.outputs]
-        base = {"input": job.shown, "outputs": outputs, "preview": str(job.preview) if job.preview else None}
-        return base | result | {"warnings": warned, "meshsplats": meshsplats.__version__}
+            yield
 
     def _save_mesh(self, job: Job, cameras: list[Camera] | None) -> dict[str, Any]:
         """The splats of ``job`` as a mesh."""
@@ -345,8 +379,8 @@ class Convert(Command):
         up = None if self.up is None else parse_up(self.up)
         source = _Counted(self.reading.stream(job.source))
         parts = convert_blocks(source, self.conversion, preset=self.preset, cameras=cameras, up=up)
-        (path,) = job.outputs
-        vertices, triangles, converted = save_mesh_blocks(parts, path)
+        with self._recorded(job):
+            vertices, triangles, converted = save_mesh_blocks(parts, job.outputs[0])
         return {
             "splats": source.count,
             "converted": converted,
@@ -373,8 +407,8 @@ class Convert(Command):
             raise ValueError(f"{job.source}: none of the {source.count:,} splats is left")
         kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
         kept = (block.select(worth_drawing(block, self.conversion)) for block in source)
-        (path,) = job.outputs
-        save_gaussian_blocks(kept, path, count, degree=degree, kernel=kernel)
+        with self._recorded(job):
+            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel)
         seconds = round(time.perf_counter() - start, 4)
         return {"read": source.count, "written": count, "seconds": seconds}
 
@@ -413,17 +447,18 @@ class Convert(Command):
     def _write(self, mesh: SplatMesh, job: Job) -> None:
         from meshsplats.formats.meshes import save_mesh
 
-        for path in job.outputs:
-            glb = path.suffix.lower() == ".glb"
-            save_mesh(
-                mesh,
-                path,
-                lit=True if self.lit and (glb or path.suffix.lower().startswith(".usd")) else None,
-                color_type=self.color_type if glb and self.color_type != "uint16" else None,
-                alpha=self.alpha if glb and self.alpha in _GLB_ALPHA else None,  # 'opaque' is cut already
-                cutoff=self.cutoff if glb and self.alpha == "mask" else None,
-                compression=self.compression if glb and self.compression != "none" else None,
-            )
+        with self._recorded(job):
+            for path in job.outputs:
+                glb = path.suffix.lower() == ".glb"
+                save_mesh(
+                    mesh,
+                    path,
+                    lit=True if self.lit and (glb or path.suffix.lower().startswith(".usd")) else None,
+                    color_type=self.color_type if glb and self.color_type != "uint16" else None,
+                    alpha=self.alpha if glb and self.alpha in _GLB_ALPHA else None,  # 'opaque' is cut already
+                    cutoff=self.cutoff if glb and self.alpha == "mask" else None,
+                    compression=self.compression if glb and self.compression != "none" else None,
+                )
 
     def _fidelity(
         self, cloud: GaussianCloud, mesh: SplatMesh, cameras: Sequence[Camera]
@@ -486,7 +521,9 @@ class Convert(Command):
         )
         if merging and count is not None:
             kept = simplify(kept, count, cameras=cameras_beside(job.source) if cameras is None else cameras)
-        save_gaussians(kept, job.outputs[0])
+        with self._recorded(job):
+            for path in job.outputs:
+                save_gaussians(kept, path)
         seconds = time.perf_counter() - start
         if job.preview:
             draw_preview(kept, job.preview)
@@ -496,6 +533,9 @@ class Convert(Command):
         """Prints the result of a single input."""
         if self.json:
             print(json.dumps(result))
+            return
+        if result["skipped"]:
+            print(f"{self.output} ({size_of(self.output)}): kept")
             return
         if "written" in result:
             print(f"{result['written']:,} of {result['read']:,} splats in {result['seconds']:.2f} s")
@@ -516,7 +556,10 @@ class Convert(Command):
         if self.json:
             print(json.dumps(result), flush=True)
             return
-        sizes = f"{result['written']:,} splats" if "written" in result else _counts(result)
+        if result["skipped"]:
+            sizes = "kept"
+        else:
+            sizes = f"{result['written']:,} splats" if "written" in result else _counts(result)
         files = ", ".join(f"{path.name} ({size_of(path)})" for path in job.outputs)
         print(f"{job.shown}: {sizes}: {files}", flush=True)
 

@@ -10,6 +10,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any
 
 from meshsplats.errors import ClusterError, DeviceError
@@ -19,6 +20,8 @@ DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 OK, FAILED, USAGE, EXISTS, NO_SPACE, LACKING = 0, 1, 2, 3, 4, 5
 """Exit codes. FAILED: the input, or a path that was named, is wrong. LACKING: a library, a program, a GPU or
 memory is missing. Ended by signal n: 128 + n."""
+UNREAD = 128 + 13
+"""Exit code where the reader of standard output has gone, `| head` say: of programs which SIGPIPE ends."""
 KINDS = {FAILED: "input", USAGE: "usage", EXISTS: "exists", NO_SPACE: "space", LACKING: "missing"}
 """Names of the exit codes in JSON."""
 ENDINGS = {signal.SIGINT: "interrupted"} | {
@@ -74,6 +77,14 @@ def close_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def open_missing_streams() -> None:
+    """Opens standard output and error where the process began without them (``>&-``), lest a result file take
+    their numbers and get the messages."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
+
+
 def read_from_standard_input(path: str | None) -> None:
     """Messages name the file at ``path`` "standard input" until the next command."""
     global _standard_input
@@ -117,8 +128,9 @@ def quoted(word: str) -> str:
 
 
 def say(text: str) -> None:
-    """Prints a line on standard error."""
-    print(f"meshsplats: {text}", file=sys.stderr, flush=True)
+    """Prints a line on standard error, if anybody reads it."""
+    with suppress(OSError):
+        print(f"meshsplats: {text}", file=sys.stderr, flush=True)
 
 
 def flag(name: str) -> str:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import os
+from collections.abc import Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from meshsplats.cli import toml
 from meshsplats.cli.arguments import INVOCATION, Command, options_of, relative_to
-from meshsplats.cli.messages import UsageError, shown_path
+from meshsplats.cli.messages import UsageError, flag, shown_path
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
@@ -58,6 +60,36 @@ def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | No
         return dict(record["options"]) if name in (None, record["command"]) else None
     except (OSError, UsageError, ValueError, KeyError, TypeError):
         return None
+
+
+def changes_since(path: Path, name: str, command: Command, idle: Collection[str] = ()) -> str | None:
+    """How ``command`` differs from the one recorded at ``path``, in words: empty if it does not, None without
+    a record of a command ``name``. ``idle``: options that do not change the result."""
+    before = recorded_options(path, name)
+    if before is None:
+        return None
+    today = configuration(name, command, path.parent)
+    now = {key: value for key, value in today["options"].items() if value is not None}
+    same = partial(_same, path.parent)
+    changed = [key for key in sorted({*now, *before} - set(idle)) if not same(before.get(key), now.get(key))]
+    found = [f"{flag(key)} was {_shown(before.get(key))} and is {_shown(now.get(key))}" for key in changed]
+    version = toml.load(path).get("version")
+    if version != today["version"]:
+        found.append(f"MeshSplats was {version} and is {today['version']}")
+    return ", ".join(found)
+
+
+def _same(folder: Path, a: Any, b: Any) -> bool:
+    """Whether two recorded values are equal, as paths from ``folder``, too: one may be absolute."""
+    if isinstance(a, list) and isinstance(b, list):
+        return len(a) == len(b) and all(_same(folder, x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, str) and isinstance(b, str):
+        return a == b or os.path.realpath(folder / a) == os.path.realpath(folder / b)
+    return bool(a == b)
+
+
+def _shown(value: Any) -> str:
+    return "not given" if value is None else json.dumps(value)
 
 
 def write_json(path: Path, content: Any) -> None:

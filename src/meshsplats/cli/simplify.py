@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli.arguments import Command
@@ -82,10 +83,11 @@ class Simplify(Command):
         assert count is not None
         kept = simplify(cloud, count, cameras=cameras, threads=self.threads)
         seconds = time.perf_counter() - start
-        save_gaussians(kept, self.output)
-        write_configuration(config, "simplify", self)
-        if not self.no_preview:
-            draw_preview(kept, preview)
+        with together():
+            save_gaussians(kept, self.output)
+            write_configuration(config, "simplify", self)
+            if not self.no_preview:
+                draw_preview(kept, preview)
         if self.json:
             result = {
                 "splats": str(self.output),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, unit_up
 from meshsplats.conversion.baking import bake_filter
@@ -97,6 +98,9 @@ def convert(
         TypeError: an option that does not exist.
         ValueError: an option out of range, options that contradict each other, or no splat left to convert.
     """
+    need(GaussianCloud, cloud=cloud)
+    need(ConversionOptions, options=options, optional=True)
+    need_all(Camera, cameras=cameras, optional=True)
     given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
     filter_px2 = filter_of(cloud.kernel, chosen)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks
@@ -56,6 +57,8 @@ def bake_filter(
         ValueError: both of cameras and pixel, cameras that see nothing of the mesh, a mesh without
             ``face_splat``, or splats that share vertices.
     """
+    need(SplatMesh, mesh=mesh)
+    need_all(Camera, cameras=cameras, optional=True)
     variance = checked_filter(mesh.filter_px2 if filter_px2 is None else filter_px2, mesh.face_splat)
     if cameras and pixel is not None:
         raise ValueError("give bake_filter cameras or the size of a pixel, not both")

@@ -20,6 +20,7 @@ import numpy as np
 
 from meshsplats._core.library import pointer, processors, run
 from meshsplats._geometry import quaternions_of
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import CameraCoverage, pixel_sizes, widen
@@ -114,6 +115,8 @@ def simplify(
         ValueError: ``count`` or ``low_pass`` out of range.
         MemoryError: the work does not fit; it takes about 600 bytes a splat.
     """
+    need(GaussianCloud, cloud=cloud)
+    need_all(Camera, cameras=cameras, optional=True)
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
         raise ValueError(f"count must be a whole number of splats, at least 1, got {count!r}")
     return cloud if count >= len(cloud) else merge(cloud, count, low_pass, cameras, threads).cloud

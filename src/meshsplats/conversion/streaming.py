@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from meshsplats._kinds import each, need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import SAMPLE, guess_up, unit_up
 from meshsplats.cameras.trajectories import orbit
@@ -190,6 +191,9 @@ def convert_blocks(
         ValueError: as ``convert``; and for what needs all splats at once: limits that splats are merged or
             dropped for, ``detail='cameras'`` and ``footprint='density'``.
     """
+    source = each(GaussianCloud, "source", source, again=True)
+    need(ConversionOptions, options=options, optional=True)
+    need_all(Camera, cameras=cameras, optional=True)
     given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
     refuse_whole(chosen)

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from meshsplats._kinds import need_path
 from meshsplats.datasets.colmap import find_model, read_model
 from meshsplats.datasets.image_files import Album, Frame, Taken, split
 from meshsplats.datasets.transforms import read_transforms
@@ -254,6 +255,7 @@ def load_dataset(
     Warns with a DataWarning if images or masks are missing: views without an image are left out, all pixels
     of those without a mask count.
     """
+    need_path(path=path)
     for option, value, least, most in (("downscale", downscale, 1, 64), ("test_every", test_every, 0, 10**9)):
         if int(value) != value or not least <= value <= most:
             raise ValueError(f"{option} must be a whole number from {least} to {most}, got {value}")

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._kinds import need_path
 from meshsplats.datasets.folder import find_layout
 from meshsplats.datasets.image_files import inside
 from meshsplats.datasets.transforms import points_file
@@ -51,6 +52,7 @@ def load_points(path: str | os.PathLike[str]) -> ScenePoints | None:
 
     Raises FileFormatError for broken files, which names file and record.
     """
+    need_path(path=path)
     layout = find_layout(Path(path))
     if layout is None:
         return None

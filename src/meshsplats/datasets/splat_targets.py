@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.framing import (
     SAMPLE,
@@ -110,6 +111,8 @@ def splat_dataset(
 
     Raises ValueError for an empty cloud or an option out of its range.
     """
+    need(GaussianCloud, cloud=cloud)
+    need_all(Camera, cameras=cameras, optional=True)
     if len(cloud) == 0:
         raise ValueError("the scene is empty: there is nothing to make images of")
     if placement not in ("auto", "object", "surrounded", "inside"):

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.rendering.looks import Look
 
@@ -31,6 +32,8 @@ class ViewImage:
     """(h, w) bool, True where pixels count; None: all of them."""
 
     def __post_init__(self) -> None:
+        need(np.ndarray, color=self.color)
+        need(np.ndarray, alpha=self.alpha, mask=self.mask, optional=True)
         shape = self.color.shape
         if len(shape) != 3 or shape[2] != 3 or self.color.dtype not in (np.uint8, np.float16, np.float32):
             raise ValueError(
@@ -128,6 +131,7 @@ class Dataset:
     """Look of the images (``rendering.looks``); photographs are means over each pixel's area."""
 
     def __post_init__(self) -> None:
+        need_all(View, train=self.train, test=self.test)
         object.__setattr__(self, "train", tuple(self.train))
         object.__setattr__(self, "test", tuple(self.test))
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats._kinds import described, need, require
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.views import WHITE, Dataset, View
 from meshsplats.errors import DataWarning
@@ -101,6 +102,13 @@ def find_background(
         The background with its reason and the scores. A DataWarning names each scene that loses more than
         ``WARNING_GAIN`` dB by it.
     """
+    need(Dataset, dataset=dataset)
+    if not isinstance(scenes, Mapping):
+        what = described(scenes)
+        raise TypeError(f"scenes must be a dict of splats and meshes by name, got {what}: {{'mesh': mesh}}")
+    for name, scene in scenes.items():
+        if not isinstance(scene, SplatMesh):
+            require(GaussianCloud, f"scenes[{name!r}]", scene)
     views = subsample(dataset.train or dataset.views, MAX_VIEWS)
     chosen = given if given is not None else named
     reason: Reason = "given" if given is not None else "model folder"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
@@ -131,6 +132,9 @@ def compare(
 
     Raises ValueError without cameras.
     """
+    need(GaussianCloud, cloud=cloud)
+    need(SplatMesh, mesh=mesh)
+    need_all(Camera, cameras=cameras)
     if not cameras:
         raise ValueError("cameras must hold at least one camera")
     views = compare_views(

@@ -6,6 +6,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from meshsplats._kinds import need_array
+
 SsimConvention = Literal["3dgs", "valid", "reflect"]
 
 WINDOW = 11
@@ -87,6 +89,7 @@ def ssim(a: np.ndarray, b: np.ndarray, *, convention: SsimConvention = "3dgs") -
 
 def checked_images(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two images of one shape as arrays; raises the errors of :func:`psnr`."""
+    need_array(a=a, b=b)
     a, b = np.asarray(a), np.asarray(b)
     for image in (a, b):
         if image.dtype.kind != "f":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import numpy as np
 
+from meshsplats._kinds import need
 from meshsplats.camera import Camera
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset, View
@@ -181,6 +182,11 @@ def evaluate(
         ValueError: nothing to score, no view, a view whose mask excludes all pixels, a mesh with the name of
             another method.
     """
+    if not (isinstance(mesh, Mapping) and all(isinstance(one, SplatMesh) for one in mesh.values())):
+        need(SplatMesh, mesh=mesh, optional=True, instead={"dict": "one by the name of each method"})
+    need(Dataset, dataset=dataset)
+    need(SplatMesh, before=before, optional=True)
+    need(GaussianCloud, splats=splats, optional=True)
     meshes = {} if mesh is None else {"mesh": mesh} if isinstance(mesh, SplatMesh) else dict(mesh)
     views = dataset.test or dataset.views
     if samples is None:

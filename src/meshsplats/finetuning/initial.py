@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.conversion.detail import OnImage
@@ -65,6 +66,10 @@ def starting_mesh(
     ``look='splats'`` each splat has 8 triangles on average, and the mesh is to be drawn with the filter of
     3DGS (``footprint='filter'``), where the splats' kernel has it.
     """
+    need(GaussianCloud, cloud=cloud)
+    need_all(Camera, cameras=cameras)
+    need(ConversionOptions, options=options, optional=True)
+    need(FinetuneConfig, config=config, optional=True)
     chosen = make_options(options, **changes)
     how: dict[str, Any] = {"cameras": cameras, "up": up, "threads": threads, "on_image": on_image}
     if preset != "default":

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
+from meshsplats._kinds import need, need_path
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import masked_ssim
@@ -104,6 +105,9 @@ class RunOptions:
     of a run that is resumed is at the same path on all."""
 
     def __post_init__(self) -> None:
+        if self.folder is not None:
+            need_path(folder=self.folder)
+            object.__setattr__(self, "folder", Path(self.folder))
         for name in ("report_every", "preview_every"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must be a number of steps, >= 0, got {getattr(self, name)}")
@@ -177,6 +181,10 @@ def finetune(
             a run that starts, nothing was written. Or the GPU failed, or did not finish an image.
         Interrupted: SIGINT or SIGTERM arrived; a checkpoint is in the folder, if there is one.
     """
+    need(SplatMesh, mesh=mesh)
+    need(Dataset, dataset=dataset)
+    need(FinetuneConfig, config=config, optional=True)
+    need(RunOptions, run=run, optional=True)
     config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()
     if not dataset.train:
         raise ValueError("the data set has no training views")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from meshsplats._kinds import need_path
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
 from meshsplats.formats.gltf.textures import gltf_textures
@@ -38,6 +39,7 @@ def load_base(
         FileFormatError: as ``load_mesh``, for a mesh prior, and for broken images and materials.
         ValueError: ``texture`` is given, but the mesh has no texture coordinates.
     """
+    need_path(path=path)
     source = Path(path)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

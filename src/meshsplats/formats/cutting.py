@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from meshsplats._kinds import need
 from meshsplats.mesh import SplatMesh, checked_cutoff
 
 CUTOFF = 0.2
@@ -33,6 +34,7 @@ def cut_mesh(mesh: SplatMesh, cutoff: float = CUTOFF) -> SplatMesh:
     Raises:
         ValueError: ``cutoff`` is out of its range, or the mesh has a filter.
     """
+    need(SplatMesh, mesh=mesh)
     level = np.float32(checked_cutoff(cutoff))
     if mesh.filter_px2:
         raise ValueError(

@@ -10,13 +10,14 @@ from typing import BinaryIO, Literal, get_args
 
 import numpy as np
 
+from meshsplats._kinds import described, each, need, need_path, require_path
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.splats import read_splat_gltf
 from meshsplats.formats.ply.compressed_splats import read_compressed_ply
 from meshsplats.formats.ply.splats import read_float_ply, write_float_blocks, write_float_ply
-from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats
+from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats, identify
 from meshsplats.formats.splats._cloud_builder import SplatReader
 from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
@@ -25,8 +26,11 @@ from meshsplats.formats.splats.streamed_sog import read_streamed_sog, streamed_p
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 Axes = Literal["auto", "y-down", "y-up"]
-_SUFFIXES = (".ply", ".gz", ".splat", ".spz", ".sog", ".glb", ".gltf")
-"""Names of splat files in a folder."""
+SPLAT_SUFFIXES = (".ply", ".ply.gz", ".splat", ".spz", ".sog", ".glb", ".gltf")
+"""How the names of splat files end, wherever names decide: which files of a folder are read."""
+_MODEL_FILES = ("point_cloud.ply", "point_cloud.ply.gz")
+"""Names of the splats in a model folder; the first that is there counts."""
+_DOUBLE_SUFFIXES = (".compressed.ply", ".compressed.ply.gz", ".ply.gz")
 
 
 def load_gaussians(
@@ -60,6 +64,7 @@ def load_gaussians(
             says what is wrong and where.
         MissingDependencyError: SPZ 4 without Zstandard.
     """
+    need_path(path=path)
     _check_axes(axes)
     found = splat_file(Path(path))
     content = Content(found)
@@ -120,6 +125,11 @@ class SplatStream:
         axes: Axes = "auto",
     ) -> None:
         _check_axes(axes)
+        if isinstance(paths, (str, os.PathLike)):
+            what = described(paths)
+            raise TypeError(f"paths must be a list of paths, got {what}: stream_gaussians(path) opens one")
+        for i, path in enumerate(paths):
+            require_path(f"paths[{i}]", path)
         if isinstance(block, bool) or not isinstance(block, (int, np.integer)) or block < 1:
             raise ValueError(f"block must be a number of splats, at least 1, got {block!r}")
         self.paths = tuple(Path(path) for path in paths)
@@ -162,7 +172,7 @@ def stream_gaussians(
 
     Args:
         path: a file or folder as for ``load_gaussians``; several of them; or a folder of splat files, which
-            are read in the order of their names.
+            are read in the order of their names; meshes among them are left out.
         block: about this many splats at a time.
         strict, axes: as for ``load_gaussians``.
 
@@ -174,7 +184,12 @@ def stream_gaussians(
         FileNotFoundError: there is no such file.
         FileFormatError: a folder without splats.
     """
-    given = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+    if isinstance(path, (str, os.PathLike)) or not isinstance(path, Sequence):
+        need_path(path=path)
+        path = [path]
+    given = list(path)
+    for i, one in enumerate(given):
+        require_path(f"path[{i}]", one)
     if not given:
         raise ValueError("name at least one splat file")
     files = [file for one in given for file in _splat_files(Path(one))]
@@ -188,14 +203,26 @@ def _splat_files(path: Path) -> list[Path]:
     except FileFormatError:
         if not path.is_dir():
             raise
-        found = [
-            part
-            for part in sorted(path.iterdir())
-            if part.is_file() and part.suffix.lower() in _SUFFIXES and splat_format(part) is not None
-        ]
+        found = [part for part in files_named(path, SPLAT_SUFFIXES) if not _is_mesh(part)]
         if not found:
             raise
         return found
+
+
+def files_named(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """The files of ``folder`` whose names end in one of ``suffixes``, by name; hidden ones are left out."""
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.name.lower().endswith(tuple(suffixes)) and not path.name.startswith(".") and path.is_file()
+    )
+
+
+def _is_mesh(path: Path) -> bool:
+    try:
+        return identify(path) == "mesh"
+    except FileFormatError:  # broken, or a download that failed: its reader says so
+        return False
 
 
 def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
@@ -228,6 +255,8 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     Raises:
         ValueError: the suffix is not .ply, or the cloud has no splats.
     """
+    need(GaussianCloud, cloud=cloud, instead={"SplatMesh": "save_mesh writes meshes"})
+    need_path(path=path)
     target = Path(path)
     if target.suffix.lower() != ".ply":
         raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
@@ -258,6 +287,8 @@ def save_gaussian_blocks(
     Raises:
         ValueError: the suffix is not .ply, a count or degree out of range, or blocks of another count.
     """
+    blocks = each(GaussianCloud, "blocks", blocks)
+    need_path(path=path)
     target = Path(path)
     if target.suffix.lower() != ".ply":
         raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
@@ -266,23 +297,27 @@ def save_gaussian_blocks(
     write_float_blocks(blocks, target, count, (degree + 1) ** 2, kernel, flat=kernel == "2dgs")
 
 
-def subject_name(path: Path) -> str:
+def subject_name(path: Path, *, ending: bool = False) -> str:
     """A name for the contents of ``path``: the file's without its suffix, or the folder's where all such
-    files have one name (``point_cloud.ply`` of a model, ``meta.json`` of SOG)."""
-    if path.name in ("point_cloud.ply", "meta.json", "lod-meta.json"):
+    files have one name (``point_cloud.ply`` of a model, ``meta.json`` of SOG). With its ``ending``, if that
+    is asked for."""
+    if path.name in (*_MODEL_FILES, "meta.json", "lod-meta.json"):
         folder = path.absolute().parent
         if re.fullmatch(r"iteration_[0-9]+", folder.name):
             folder = folder.parent
         if folder.name == "point_cloud":
             folder = folder.parent
-        return folder.name or path.stem
+        return (folder.name or path.stem) + ("".join(path.suffixes) if ending else "")
     if path.is_dir():
         return path.absolute().name or "scene"
     name = path.name
-    for suffix in (".compressed.ply", path.suffix):
-        if suffix and name.lower().endswith(suffix.lower()) and len(name) > len(suffix):
-            return name[: -len(suffix)]
-    return name
+    suffixes = [end for end in (*_DOUBLE_SUFFIXES, path.suffix) if end and name.lower().endswith(end.lower())]
+    longest = 0 if ending else max(map(len, suffixes), default=0)
+    return name[: len(name) - longest] or name
+
+
+def _model_file(folder: Path) -> Path | None:
+    return next((folder / name for name in _MODEL_FILES if (folder / name).is_file()), None)
 
 
 def splat_file(path: Path) -> Path:
@@ -300,13 +335,14 @@ def splat_file(path: Path) -> Path:
     for folder in (path / "point_cloud", path):
         iterations = [
             (int(match[1]), found)
-            for found in folder.glob("iteration_*/point_cloud.ply")
-            if (match := re.fullmatch(r"iteration_([0-9]{1,15})", found.parent.name)) and found.is_file()
+            for place in folder.glob("iteration_*")
+            if (match := re.fullmatch(r"iteration_([0-9]{1,15})", place.name))
+            and (found := _model_file(place))
         ]
         if iterations:
             return max(iterations)[1]
-        if (folder / "point_cloud.ply").is_file():
-            return folder / "point_cloud.ply"
+        if found := _model_file(folder):
+            return found
     if (path / "tileset.json").is_file():
         raise FileFormatError(f"{path}: a tileset, not splats; render and info take it")
     photographs = [n for n in ("transforms.json", "transforms_train.json", "sparse") if (path / n).exists()]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import atomic_path
+from meshsplats._kinds import each, need, need_path
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
@@ -55,6 +56,7 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
             and where.
         MissingDependencyError: USD without the extra ``usd``.
     """
+    need_path(path=path)
     source = Path(path)
     content = Content(source)
     content.refuse_empty()
@@ -126,6 +128,10 @@ def save_mesh(
         MissingDependencyError: a package or program is missing.
         OSError: the file cannot be written.
     """
+    need(
+        SplatMesh, mesh=mesh, instead={"GaussianCloud": "save_gaussians writes splats, convert makes a mesh"}
+    )
+    need_path(path=path)
     target = Path(path)
     suffix = target.suffix.lower()
     writer = _WRITERS.get(suffix)
@@ -190,6 +196,8 @@ def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -
         ValueError: another suffix, no parts, or more than a mesh can number.
         OSError: the file cannot be written.
     """
+    need_path(path=path)
+    parts = each(SplatMesh, "parts", parts)
     target = Path(path)
     if target.suffix.lower() != ".ply":
         raise ValueError(f"parts of meshes are written as .ply, got {target.name!r}: for others, build tiles")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from meshsplats._files.atomic import write_bytes
+from meshsplats._kinds import need_array, need_path
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -64,6 +65,8 @@ def save_image(path: str | os.PathLike[str], image: np.ndarray) -> None:
     Raises:
         ValueError: the suffix or the shape is another, or a value is not finite.
     """
+    need_path(path=path, instead={"ndarray": "the path comes first, save_image(path, image)"})
+    need_array(image=image)
     write_bytes(path, encode_image(path, image))
 
 

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from meshsplats._kinds import need, need_all
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.binding import Binding
 from meshsplats.datasets.views import View
@@ -86,6 +87,8 @@ def bind(
         ValueError: a base without any face that has an area, options out of range, colours that the base does
             not have.
     """
+    need(BaseMesh, base=base)
+    need_all(View, views=views)
     if not 1 <= layers <= MAX_LAYERS:
         raise ValueError(f"layers must be a number from 1 to {MAX_LAYERS}, got {layers}")
     if spacing is not None and not np.isfinite(spacing):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats._kinds import need, need_path
 from meshsplats.base_mesh import BaseMesh
 from meshsplats.mesh import SplatMesh
 
@@ -31,6 +32,7 @@ class MeshPrior:
     """The splats in the pose of the base in ``mesh.binding``, with the base's normals as shading normals."""
 
     def __post_init__(self) -> None:
+        need(SplatMesh, mesh=self.mesh)
         if self.mesh.binding is None:
             raise ValueError(
                 "the mesh is bound to no base; bind() makes a mesh prior, which .npz and .glb files keep"
@@ -121,6 +123,7 @@ def load_prior(path: str | os.PathLike[str]) -> MeshPrior:
 
     Raises the errors of ``load_mesh``, and ValueError for a mesh that is bound to no base.
     """
+    need_path(path=path)
     from meshsplats.formats.meshes import load_mesh
 
     mesh = load_mesh(path)

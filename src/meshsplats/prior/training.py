@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from meshsplats._kinds import need
 from meshsplats.datasets.views import Dataset
 from meshsplats.prior.model import MeshPrior
 
@@ -57,6 +58,8 @@ def train_prior(
     Raises:
         The errors of ``finetune``.
     """
+    need(MeshPrior, prior=prior)
+    need(Dataset, dataset=dataset)
     from meshsplats.finetuning import finetune
 
     trained = finetune(prior.mesh, dataset, config or prior_config(), run=run, on_progress=on_progress)

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from meshsplats._core import library
+from meshsplats._kinds import need
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
@@ -113,6 +114,8 @@ def render(
         MissingDependencyError: no GPU, or no library for it.
         DeviceError: the GPU failed, or did not finish.
     """
+    need(SplatMesh, mesh=mesh, instead={"GaussianCloud": "render_splats draws splats, convert makes a mesh"})
+    need(Camera, camera=camera)
     check_device(device)
     keep = Pointers()
     options = checked_options(keep, camera, background, samples, threads)
@@ -236,6 +239,8 @@ def render_splats(
         ValueError: an option out of its range.
         MemoryError: the scene does not fit.
     """
+    need(GaussianCloud, cloud=cloud, instead={"SplatMesh": "render draws meshes"})
+    need(Camera, camera=camera)
     keep = Pointers()
     options = checked_options(keep, camera, background, samples, threads)
     if sh_degree is not None and sh_degree not in (0, 1, 2, 3):

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from meshsplats._kinds import need
 from meshsplats.camera import Camera
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.gaussians import GaussianCloud
@@ -74,6 +75,8 @@ def draw_splats(
 
     Raises ValueError for an option out of its range.
     """
+    need(GaussianCloud, cloud=cloud, instead={"SplatMesh": "render draws meshes"})
+    need(Camera, camera=camera)
     check_look(look)
     area = look == "area"
     return render_splats(

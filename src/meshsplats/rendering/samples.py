@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import weighted_quantile
 from meshsplats.mesh import SplatMesh, splat_starts
@@ -35,6 +36,8 @@ def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
     Fans are the triangles of one splat (``face_splat``); a mesh without them needs 2, one with a low-pass
     filter (``filter_px2``) 1.
     """
+    need(SplatMesh, mesh=mesh)
+    need_all(Camera, cameras=cameras)
     if mesh.filter_px2:
         return 1  # its filter is as wide as a pixel, as that of splats
     if mesh.face_splat is None or not len(mesh.faces):

@@ -19,6 +19,7 @@ import numpy as np
 
 from meshsplats._files.atomic import atomic_path, write_bytes, write_text
 from meshsplats._files.locks import locked
+from meshsplats._kinds import need, need_path
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import Fans
@@ -133,6 +134,10 @@ def build_tiles(
         OSError: a full disk; what is done stays, for ``resume``.
         ClusterError: the workers are lost; what is done stays.
     """
+    need(SplatStream, source=source)
+    need_path(folder=folder)
+    need(TileOptions, options=options, optional=True)
+    need(Workers, workers=workers, optional=True)
     chosen = options or TileOptions()
     conversion = chosen.resolved()
     target = Path(folder)

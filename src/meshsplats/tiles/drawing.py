@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import Rendering, render
@@ -121,6 +122,8 @@ def render_tiles(
         ValueError: an option out of its range.
         FileFormatError: a tile is broken.
     """
+    need(Tileset, tileset=tileset)
+    need(Camera, camera=camera)
     tiles, _ = choose_tiles(tileset, [camera], max_error=max_error)
     if sum(tile.triangles for tile in tiles) <= max_triangles:
         return render(join_tiles(tileset, tiles), camera, **options)
@@ -169,6 +172,8 @@ def tiles_mesh(
         ValueError: an option out of its range; no tile is in any of the images.
         FileFormatError: a tile is broken.
     """
+    need(Tileset, tileset=tileset)
+    need_all(Camera, cameras=cameras)
     tiles, worst = choose_tiles(tileset, cameras, max_error=max_error, most=max_triangles)
     if not tiles:
         raise ValueError(f"{tileset.path}: none of the cameras sees any of it")

@@ -21,6 +21,7 @@ import numpy as np
 from meshsplats import __version__
 from meshsplats._files.atomic import write_text
 from meshsplats._json import read_json
+from meshsplats._kinds import need_path
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.writer import up_quaternion
@@ -197,6 +198,7 @@ class Tileset:
     """
 
     def __init__(self, path: str | Path) -> None:
+        need_path(path=path)
         self.path = Path(path) / NAME if Path(path).is_dir() else Path(path)
         document = _load(self.path)
         note = _object(_object(document, "extras", self.path), "meshsplats", self.path)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._kinds import need
 from meshsplats.cameras.framing import guess_up
 from meshsplats.datasets.points import ScenePoints
 from meshsplats.datasets.reduced import opaque_views, reduced_views
@@ -87,6 +88,10 @@ def train(
 
     Warns with a DataWarning of photographs that do not fit the others.
     """
+    need(Dataset, dataset=dataset)
+    need(TrainConfig, config=config, optional=True)
+    need(ScenePoints, points=points, optional=True)
+    need(RunOptions, run=run, optional=True)
     began = time.perf_counter()
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:

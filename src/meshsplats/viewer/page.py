@@ -19,6 +19,7 @@ from importlib import resources
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
@@ -78,6 +79,10 @@ def make_page(
 
     Raises ValueError for a mesh without triangles.
     """
+    need(SplatMesh, mesh=mesh)
+    need(GaussianCloud, splats=splats, optional=True)
+    need_all(Camera, cameras=cameras)
+    need(PageOptions, options=options, optional=True)
     options = options or PageOptions()
     packed = quantise_mesh(mesh)
     views = list(subsample(cameras, MOST_CAMERAS))

@@ -20,6 +20,7 @@ import numpy as np
 
 from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats import _activation
 from meshsplats.formats.ply.header import Element, PlyHeader
 from meshsplats.formats.ply.table import CHUNK_BYTES, FloatTable
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
@@ -32,11 +33,6 @@ _RGB = ("red", "green", "blue")
 _FILTER = "filter_3D"
 _REST_COUNTS = {0: 1, 9: 4, 24: 9, 45: 16}
 """Coefficients per channel by the count of f_rest properties."""
-
-MIN_LOG_SCALE = float(np.log(np.finfo(np.float32).tiny))
-"""Stored for a scale of 0, whose logarithm is not finite: -87.3."""
-MIN_LOGIT, MAX_LOGIT = -30.0, 20.0
-"""Stored for opacities of 0 and 1; the float32 sigmoid of 20 is exactly 1."""
 
 
 class _Columns:
@@ -159,8 +155,8 @@ def _activate(
     """
     axes = log_scales.shape[1]
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        scales = np.exp(log_scales)
-        np.divide(1, 1 + np.exp(-logits), out=rows.opacities)
+        scales = _activation.activated_scales(log_scales)
+        _activation.activated_opacities(logits, out=rows.opacities)
         if filter_3d is not None:
             wide = np.hypot(scales, filter_3d[:, None])
             rows.opacities[:] *= np.prod(np.where(wide > 0, scales / wide, 1), axis=1)
@@ -231,12 +227,9 @@ def write_float_blocks(
                 rows[:, 6:9] = sh[:, 0]
                 rest = rows[:, 9 : at["opacity"]].reshape(len(sh), 3, k - 1)  # a view of the rows
                 rest[:, :, : sh.shape[1] - 1] = sh[:, 1:].transpose(0, 2, 1)
-                opacities = cloud.opacities[part].astype(np.float64)
-                with np.errstate(divide="ignore"):
-                    logits = np.log(opacities) - np.log1p(-opacities)
-                    logs = np.log(cloud.scales[part, : len(scale_names)])
-                rows[:, at["opacity"]] = np.clip(logits, MIN_LOGIT, MAX_LOGIT)
-                rows[:, at["scale_0"] : at["rot_0"]] = np.maximum(logs, MIN_LOG_SCALE)
+                rows[:, at["opacity"]] = _activation.logits(cloud.opacities[part])
+                scales = cloud.scales[part, : len(scale_names)]
+                rows[:, at["scale_0"] : at["rot_0"]] = _activation.log_scales(scales)
                 rows[:, at["rot_0"] : at["rot_0"] + 4] = cloud.quaternions[part]
                 file.write(rows.data)
             written += len(cloud)
