@@ -15,7 +15,7 @@ import pytest
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main, toml, view
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians
@@ -99,6 +99,57 @@ def test_a_crop_leaves_less(folder, tmp_path, capsys):
     assert 0 <= result["image_error_levels"] < 3
 
 
+def test_many_splats_are_merged_and_it_says_so(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(view, "TRIANGLES", 800)
+    page = tmp_path / "page.html"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 0
+    out, err = capsys.readouterr()
+    assert "800 triangles, 100 splats" in out
+    found = re.search(
+        r"200 splats were merged to 100: an image of them with 400 pixels has (\S+) dB against that of all;"
+        r" --max-triangles N or --whole keeps more",
+        err,
+    )
+    assert found is not None
+    assert 10 < float(found[1]) < 45
+    assert settings(page)["statistics"]["merged from"] == "200 splats"
+    for words, triangles in (["--whole"], 1600), (["--max-triangles", "1207"], 1200):
+        assert main(["view", str(folder / "scene.ply"), "-o", str(page), "--force", "--json", *words]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert (result["triangles"], result["splats"]) == (triangles, triangles // 8)
+        assert result.get("merged_from") == (200 if triangles < 1600 else None)
+        assert ("merged from" in settings(page)["statistics"]) == (triangles < 1600)
+
+
+def test_the_size_is_said_before_anything_is_packed(folder, tmp_path, monkeypatch, capsys):
+    def packed(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    page = tmp_path / "page.html"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 0
+    size = page.stat().st_size
+    capsys.readouterr()
+    monkeypatch.setattr("meshsplats.viewer.page.quantise_mesh", packed)
+    other = tmp_path / "other.html"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(other)]) != 0
+    assert not other.exists()
+    said = re.search(
+        r"other.html will have about (\S+) kB: 1,600 triangles, 200 splats", capsys.readouterr().err
+    )
+    assert said is not None
+    assert float(said[1]) * 1000 == pytest.approx(size, rel=0.05)
+
+
+def test_a_page_has_a_limit(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(view, "MOST_TRIANGLES", 1000)
+    for name, words in ("scene.ply", ["--whole"]), ("mesh.npz", []):
+        assert main(["view", str(folder / name), "-o", str(tmp_path / "p.html"), *words]) == 2
+        error = capsys.readouterr().err
+        assert "a page holds at most 1,000 triangles, and these would be 1,600" in error
+        assert "meshsplats tiles" in error
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -112,6 +163,10 @@ def test_a_crop_leaves_less(folder, tmp_path, capsys):
         (["scene.ply", "--cameras", "c.json", "--data", "d", "-o", "page.html"], "not both"),
         (["cameras.json", "-o", "page.html"], "expected splats or a mesh"),
         (["scene.ply", "-o", "nowhere/page.html"], "does not exist"),
+        (["scene.ply", "--max-triangles", "7", "-o", "page.html"], "--max-triangles must be from 8"),
+        (["scene.ply", "--max-triangles", "80", "--whole", "-o", "p.html"], "not both"),
+        (["mesh.npz", "--max-triangles", "800", "-o", "page.html"], "--max-triangles is for splats"),
+        (["mesh.npz", "--whole", "-o", "page.html"], "--whole is for splats"),
     ],
 )
 def test_wrong_usage_is_told_before_anything_is_written(

@@ -24,7 +24,7 @@ from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.viewer.quantise import QuantisedMesh, pack_splats, quantise_mesh
+from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, pack_splats, quantise_mesh
 from meshsplats.webgpu import device, kernels, renderer
 
 MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")
@@ -50,6 +50,8 @@ class PageOptions:
     """Display RGB, 0 to 1."""
     up: Sequence[float] | np.ndarray | None = None
     """(3,) direction that points up. None: by the cameras, else by the mesh."""
+    merged_from: int | None = None
+    """How many splats there were, if only some are in the page, merged."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def make_page(
         "extent": _extent(mesh),
         "cameras": [_described(camera) for camera in views],
         "statistics": {
+            **({} if options.merged_from is None else {"merged from": f"{options.merged_from:,} splats"}),
             "data": f"{packed.bytes_a_triangle:.1f} bytes a triangle",
             "position error": f"{packed.position_error:.2g}",
             "colour error": f"{packed.color_error:.2g} of 255",
@@ -108,6 +111,12 @@ def make_page(
     if splats is not None:
         blocks["splats"] = ("text/plain", _base64(pack_splats(splats)))
     return Page(_assembled(settings["title"], blocks), packed)
+
+
+def estimated_size(mesh: SplatMesh, splats: GaussianCloud | None = None) -> int:
+    """About how many bytes the page of ``mesh`` and ``splats`` will have; known in a fraction of a second."""
+    texts = [_read(name) for name in (*MODULES, "style.css", "index.html")]
+    return len(_json(_kernels(False))) + sum(map(len, texts)) + 4 * estimated_bytes(mesh, splats) // 3
 
 
 def _kernels(groups: bool) -> dict[str, object]:
