@@ -15,6 +15,7 @@ from _pages import cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa:
 from test_page import HOSTILE, block
 
 import meshsplats as ms
+from meshsplats.demo_scene import make_scene
 from meshsplats.viewer.page import PageOptions, _read, make_page
 from meshsplats.viewer.quantise import pack_splats, unpack_mesh
 
@@ -557,3 +558,67 @@ def test_the_page_decodes_what_python_decodes(browser, mesh, cloud):
 
 def test_levels_round_as_screenshots_do():
     assert levels(np.array([0.5, -1, 2])).tolist() == [128, 0, 255]
+
+
+# ---- Large scenes
+
+COUNTING = """
+window.drawn = [];
+for (const name of ['drawElements', 'drawArrays', 'drawArraysInstanced']) {
+  const before = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...words) {
+    before.apply(this, words);
+    window.drawn.push([name, name === 'drawElements' ? words[1] : words[2]]);
+    window.after?.();
+  };
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def large_page(browser, write_page):
+    """More triangles than one draw call takes."""
+    cloud = make_scene(40_000)
+    cameras = ms.orbit(cloud, 1, width=WIDTH, height=HEIGHT, elevation=20, distance=0.9)
+    mesh = ms.convert(cloud)
+    page = open_page(browser, write_page(mesh, "large", cameras=cameras), before=COUNTING)
+    page.run("document.body.classList.add('plain')")
+    page.still(PATIENCE)
+    yield page, mesh, cameras[0]
+    assert page.problems() == []
+    page.close()
+
+
+def drawn_at_rest(page: Page) -> list[list]:
+    page.run("document.querySelector('#home').click()")
+    page.wait("document.body.dataset.state === 'moving'")
+    page.run("window.drawn = []; 0")
+    page.still(PATIENCE)
+    return page.run("window.drawn")
+
+
+def test_many_triangles_are_drawn_in_parts_by_their_indices(large_page):
+    page, mesh, camera = large_page
+    counts = [count for name, count in drawn_at_rest(page) if name == "drawElements"]
+    part = 3 << 18
+    whole = 3 * len(mesh.faces)
+    assert counts[-2:] == [part, whole - part]
+    assert not any(name == "drawArraysInstanced" for name, _ in page.run("window.drawn"))
+    image = page.screenshot() / 255
+    assert ms.psnr(image, ms.render(mesh, camera, samples=2).color) > 26
+
+
+def test_a_movement_ends_the_drawing_of_what_is_no_longer_wanted(large_page):
+    page, mesh, _ = large_page
+    drawn_at_rest(page)
+    part, whole = 3 << 18, 3 * len(mesh.faces)
+    # Changes the view again after the first part of the image at rest, which is the second large one.
+    page.run(
+        "window.drawn = []; window.after = () => {"
+        f" if (drawn.filter(one => one[1] === {part}).length < 2) return;"
+        " delete window.after; document.querySelector('#home').click(); };"
+        " document.querySelector('#home').click()"
+    )
+    page.still(PATIENCE)
+    counts = [count for name, count in page.run("window.drawn") if name == "drawElements"]
+    assert counts == [part, whole - part, part, part, whole - part, part, whole - part]

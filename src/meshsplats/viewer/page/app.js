@@ -305,7 +305,7 @@ class App {
     const { options } = this, exact = this.#exactly();
     const passes = exact && options.content !== "splats" ? options.samples ** 2 : 1, pass = this.passes++;
     if (exact) await this.#drawExact(1, pass, options.samples);
-    if (pass === 0) this.#drawSorted(1, true, exact);
+    if (pass === 0) await this.#drawSorted(1, true, exact);
     if (this.dirty) return;
     this.finished = this.passes >= passes;
     this.#report(!this.finished ? "refining" : this.preparing ? "preparing" : "still", exact, passes, 1);
@@ -317,12 +317,12 @@ class App {
   async #draft(now) {
     const exact = this.#exactly() && (this.drafts.exact >= 0 || !this.sorted);
     const kind = exact ? "exact" : "sorted", scale = DRAFTS[Math.max(0, this.drafts[kind])];
-    if (!exact) this.#drawSorted(scale, false, false);
+    if (!exact) await this.#drawSorted(scale, false, false);
     let took = this.lastDraft === kind ? now - this.draftAt : 0;
     if (exact) {
       const begun = performance.now();
       await this.#drawExact(scale, 0, 1);
-      this.#drawSorted(scale, false, true);
+      await this.#drawSorted(scale, false, true);
       took = performance.now() - begun;
     }
     this.lastDraft = kind;
@@ -334,16 +334,18 @@ class App {
     this.#report("moving", exact, 1, scale);
   }
 
-  #drawSorted(scale, still, exact) {
+  async #drawSorted(scale, still, exact) {
     const { options } = this, meshToo = !exact, parts = [];
     const split = { mesh: 0, both: options.split, splats: 1 }[options.content];
     if (this.splats && split > 0) parts.push({ what: "splats", from: 0, to: split });
     if (meshToo && split < 1) parts.push({ what: "mesh", from: split, to: 1 });
+    const { style, background, gain } = options, stop = () => this.dirty;
+    if (parts.length && this.sorted) {
+      const drawn = await this.sorted.draw({ view: this.view, parts, style, still, scale, background, gain, stop });
+      if (!drawn) return;
+    }
     this.canvases.exact.style.visibility = exact && split < 1 ? "visible" : "hidden";
     this.canvases.sorted.style.visibility = parts.length ? "visible" : "hidden";
-    if (!parts.length) return;
-    const { style, background, gain } = options;
-    this.sorted?.draw({ view: this.view, parts, style, still, scale, background, gain });
   }
 
   // Sample `pass` of n x n in each pixel.
