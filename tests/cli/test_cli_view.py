@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import signal
@@ -20,6 +21,7 @@ from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
+from meshsplats.viewer.quantise import unpack_mesh
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +121,30 @@ def test_many_splats_are_merged_and_it_says_so(folder, tmp_path, monkeypatch, ca
         assert (result["triangles"], result["splats"]) == (triangles, triangles // 8)
         assert result.get("merged_from") == (200 if triangles < 1600 else None)
         assert ("merged from" in settings(page)["statistics"]) == (triangles < 1600)
+
+
+def test_large_meshes_get_a_coarse_level_of_their_splats(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(view, "COARSE_TRIANGLES", 400)
+    page = tmp_path / "page.html"
+
+    def made(name: str, *words: str) -> tuple[dict, str]:
+        line = ["view", str(folder / name), "-o", str(page), "--force", *words]
+        assert main(line) == 0
+        return settings(page)["triangles"], "".join(capsys.readouterr())
+
+    counts, printed = made("scene.ply")
+    assert counts == {"fine": 1600, "coarse": 400}
+    assert printed.count("1,600 triangles, a coarse level of 400, 200 splats") == 2  # before and after
+    assert made("scene.ply", "--without-splats")[0] == counts
+    assert made("mesh.npz", "--splats", str(folder / "scene.ply"))[0] == counts
+    packed = re.search(r'id="coarse">(.*?)</script>', page.read_text("utf-8"))
+    assert packed is not None
+    assert len(unpack_mesh(base64.b64decode(packed[1])).faces) == 400
+    for words in (["mesh.npz"], ["scene.ply", "--max-triangles", "400"]):
+        counts, printed = made(*words)
+        assert list(counts) == ["fine"]
+        assert "coarse level" not in printed
+        assert 'id="coarse"' not in page.read_text("utf-8")
 
 
 def test_the_size_is_said_before_anything_is_packed(folder, tmp_path, monkeypatch, capsys):

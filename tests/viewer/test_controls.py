@@ -622,3 +622,98 @@ def test_a_movement_ends_the_drawing_of_what_is_no_longer_wanted(large_page):
     page.still(PATIENCE)
     counts = [count for name, count in page.run("window.drawn") if name == "drawElements"]
     assert counts == [part, whole - part, part, part, whole - part, part, whole - part]
+
+
+@pytest.fixture(scope="module")
+def two_levels(write_page, mesh, cloud, cameras):
+    """The address of a page with a coarse level, and that level."""
+    coarse = ms.convert(ms.simplify(cloud, 60))
+    return write_page(mesh, "levels", splats=cloud, coarse=coarse, cameras=cameras), coarse
+
+
+LEVELS = """
+window.levels = [];
+new MutationObserver(() => {
+  const { level, state } = document.body.dataset, found = `${state} ${level}`;
+  if (level && levels.at(-1) !== found) levels.push(found);
+}).observe(document, { attributes: true, subtree: true, attributeFilter: ['data-level'] });
+"""
+
+
+def test_the_coarse_level_comes_first_and_moves_and_the_fine_one_rests(browser, two_levels, mesh, cameras):
+    address, coarse = two_levels
+    page = open_page(browser, address, cameras[0].width, cameras[0].height, before=COUNTING + LEVELS)
+    page.run("document.body.classList.add('plain')")
+    page.still(PATIENCE)
+    seen = page.run("levels")
+    assert seen[0] == "moving coarse"
+    assert "preparing coarse" in seen
+    assert seen[-1] == "still fine"
+    page.run("levels.length = drawn.length = 0; document.querySelector('#next').click()")
+    page.still(PATIENCE)
+    assert page.run("levels") == ["moving coarse", "still fine"]
+    counts = [count for name, count in page.run("drawn") if name == "drawElements"]
+    assert set(counts[:-1]) == {3 * len(coarse.faces)}
+    assert counts[-1] == 3 * len(mesh.faces)
+    rest = page.screenshot() / 255
+    fine, other = (ms.render(each, cameras[1], samples=2).color for each in (mesh, coarse))
+    assert ms.psnr(rest, fine) > 26 > ms.psnr(other, fine)
+    assert page.statistics()["triangles"] == f"{len(mesh.faces):,}"
+    assert page.problems() == []
+    page.close()
+
+
+def test_the_crop_box_crops_both_levels(browser, two_levels, mesh):
+    address, coarse = two_levels
+    page = open_page(browser, address, before=COUNTING)
+    page.run("drawn.length = 0; 0")
+    page.choose("#crop-x0", "100")
+    page.still(PATIENCE)
+    counts = [count for name, count in page.run("drawn") if name == "drawElements"]
+    assert 0 < counts[0] < 3 * len(coarse.faces)
+    assert len(coarse.faces) < counts[-1] < 3 * len(mesh.faces)
+    page.close()
+
+
+def test_a_phone_draws_the_coarse_level_and_unpacks_the_fine_one_when_asked(browser, two_levels, mesh):
+    address, coarse = two_levels
+    page = open_page(browser, address, 390, 844, mobile=True, ratio=2)
+    few, many = f"{len(coarse.faces):,}", f"{len(mesh.faces):,}"
+    assert page.run("document.body.dataset.level") == "coarse"
+    assert page.statistics()["triangles"] == few
+    assert page.run("document.querySelector('#mesh') !== null")  # still packed
+    assert page.run("[...document.querySelectorAll('#detail option')].map(o => o.textContent)") == [many, few]
+    page.choose("#detail", "fine")
+    page.wait("document.body.dataset.level === 'fine'", PATIENCE)
+    page.still(PATIENCE)
+    assert page.statistics()["triangles"] == many
+    assert page.run("document.querySelector('#mesh') === null")
+    page.choose("#detail", "coarse")
+    page.still(PATIENCE)
+    assert page.statistics()["triangles"] == few
+    assert page.problems() == []
+    page.close()
+
+
+@pytest.mark.parametrize(("width", "height", "mobile"), [(390, 844, False), (820, 1180, True)])
+def test_small_windows_and_tablets_are_no_phones(browser, two_levels, mesh, width, height, mobile):
+    page = open_page(browser, two_levels[0], width, height, mobile=mobile)
+    assert page.run("document.body.dataset.level") == "fine"
+    page.close()
+
+
+def test_a_page_without_a_coarse_level_has_no_choice_of_levels(browser, url):
+    page = open_page(browser, url, 390, 844, mobile=True)
+    assert page.run("document.querySelector('#detailLine').hidden")
+    assert page.run("document.body.dataset.level") == "fine"
+    page.close()
+
+
+def test_a_damaged_fine_level_leaves_the_coarse_one(browser, two_levels, tmp_path):
+    whole = Path(unquote(urlparse(two_levels[0]).path)).read_text(encoding="utf-8")
+    data = block(whole, "mesh")
+    file = tmp_path / "damaged.html"
+    file.write_text(whole.replace(data, data[:400] + "AAAA" + data[404:]), encoding="utf-8")
+    page = open_page(browser, file.as_uri())
+    assert page.run("document.body.dataset.level") == "coarse"
+    page.close()

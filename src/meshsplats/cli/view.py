@@ -46,6 +46,9 @@ SIDE = 400
 TRIANGLES = 4_000_000
 """Default of --max-triangles: more take seconds to sort and draw, and pages of more than 40 MB."""
 
+COARSE_TRIANGLES = 300_000
+"""Triangles of the coarse level, which any phone draws; meshes with more get one."""
+
 MOST_TRIANGLES = 20_000_000
 """Triangles of a page at most: browsers hold no more."""
 
@@ -75,10 +78,12 @@ class _Content:
     kept: int = 0
     """Splats of the mesh, where it was made of splats."""
     merging: _Merging | None = None
+    coarse: SplatMesh | None = None
 
     @property
     def summary(self) -> str:
         parts = [plural(len(self.mesh.faces), "triangle")]
+        parts += [] if self.coarse is None else [f"a coarse level of {len(self.coarse.faces):,}"]
         return ", ".join(parts if self.splats is None else [*parts, plural(len(self.splats), "splat")])
 
 
@@ -185,18 +190,17 @@ class View(Command):
         if isinstance(scene, SplatMesh):
             _check_size(len(scene.faces), "fine-tune it with --max-triangles, or make 'meshsplats tiles'")
             splats = None if self.splats is None else _degree_0(self.part.of(self.reading.load(self.splats)))
-            return _Content(scene, splats)
+            return _Content(scene, splats, coarse=_coarse(scene, splats))
         from meshsplats.conversion import convert
-        from meshsplats.conversion.budget import triangles_each
         from meshsplats.conversion.merging import simplify_in_blocks
-        from meshsplats.conversion.options import ConversionOptions
 
-        each = triangles_each(ConversionOptions().resolved("default", has_cameras=False))
+        each = _triangles_each()
         count = len(scene) if self.whole else max(1, (self.max_triangles or TRIANGLES) // each)
         _check_size(each * min(count, len(scene)), "leave --whole out, or make 'meshsplats tiles'")
         splats = simplify_in_blocks(scene, count)
         merging = None if splats is scene else _Merging(len(scene), _likeness(scene, splats, cameras))
-        return _Content(convert(splats), None if self.without_splats else splats, len(splats), merging)
+        mesh, shown = convert(splats), None if self.without_splats else splats
+        return _Content(mesh, shown, len(splats), merging, _coarse(mesh, splats))
 
     def _photographs(self) -> Dataset | None:
         if self.data is None:
@@ -222,7 +226,7 @@ class View(Command):
         if content.merging is not None:
             say(content.merging.sentence(content.kept))
         if self.output is not None:
-            size = in_words(estimated_size(content.mesh, content.splats))
+            size = in_words(estimated_size(content.mesh, content.splats, content.coarse))
             say(f"{self.output} will have about {size}: {content.summary}")
 
     def _page(self, content: _Content, photographs: Dataset | None, cameras: list[Camera]) -> Page:
@@ -243,7 +247,9 @@ class View(Command):
             up=None if self.up is None else parse_up(self.up),
             merged_from=None if content.merging is None else content.merging.splats,
         )
-        return make_page(content.mesh, splats=content.splats, cameras=cameras, options=options)
+        return make_page(
+            content.mesh, splats=content.splats, coarse=content.coarse, cameras=cameras, options=options
+        )
 
     def _measured(self, content: _Content, page: Page, cameras: list[Camera]) -> dict[str, Any]:
         """Sizes, and the errors that merging and quantisation make."""
@@ -257,6 +263,7 @@ class View(Command):
             merged = {"merged_from": content.merging.splats, "merging_psnr": round(content.merging.psnr, 2)}
         return {
             "triangles": len(mesh.faces),
+            "coarse_triangles": 0 if content.coarse is None else len(content.coarse.faces),
             "splats": 0 if content.splats is None else len(content.splats),
             **merged,
             "viewpoints": len(cameras),
@@ -305,6 +312,24 @@ def _degree_0(cloud: GaussianCloud) -> GaussianCloud:
     return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
 
 
+def _triangles_each() -> int:
+    """Triangles of a splat as converted by default."""
+    from meshsplats.conversion.budget import triangles_each
+    from meshsplats.conversion.options import ConversionOptions
+
+    return triangles_each(ConversionOptions().resolved("default", has_cameras=False))
+
+
+def _coarse(mesh: SplatMesh, splats: GaussianCloud | None) -> SplatMesh | None:
+    """The coarse level of a mesh with many triangles, made of its splats."""
+    if splats is None or len(mesh.faces) <= COARSE_TRIANGLES:
+        return None
+    from meshsplats.conversion import convert
+    from meshsplats.conversion.merging import simplify_in_blocks
+
+    return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // _triangles_each()), up=mesh.up)
+
+
 def _check_size(triangles: int, advice: str) -> None:
     if triangles > MOST_TRIANGLES:
         raise UsageError(
@@ -340,6 +365,7 @@ def _opened(url: str) -> bool:
 
 def _contents(result: dict[str, Any]) -> str:
     parts = [plural(result["triangles"], "triangle")]
+    parts += [f"a coarse level of {result['coarse_triangles']:,}"] if result["coarse_triangles"] else []
     parts += [plural(result["splats"], "splat")] if result["splats"] else []
     parts += [plural(result["viewpoints"], "viewpoint")] if result["viewpoints"] else []
     return ", ".join(parts)

@@ -121,33 +121,32 @@ function depthsOf(points, row, near, depths) {
 }
 
 export class SortedRenderer {
-  // Throws where there is no WebGL2.
-  constructor(canvas, mesh, splats) {
+  // levels: meshes by name; others may be added later. Throws where there is no WebGL2.
+  constructor(canvas, levels, splats) {
     const gl = canvas.getContext("webgl2", { alpha: true, antialias: false, premultipliedAlpha: true });
     if (!gl) throw new Error("this browser has no WebGL2");
-    Object.assign(this, { canvas, gl, mesh, splats, frames: new Map() });
+    Object.assign(this, { canvas, gl, levels, splats, triangles: {}, frames: new Map() });
     this.float = Boolean(gl.getExtension("EXT_color_buffer_float"));
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : gl.getParameter(gl.RENDERER);
     this.programs = { present: program(gl, PRESENT_VERTEX, PRESENT_FRAGMENT) };
-    this.triangles = null;
     this.cloud = null;
   }
 
-  #needMesh() {
-    if (this.triangles) return this.triangles;
-    const { gl, mesh } = this, { fans } = mesh, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
-    this.programs.mesh = program(gl, MESH_VERTEX, MESH_FRAGMENT);
+  #needMesh(level) {
+    if (this.triangles[level]) return this.triangles[level];
+    const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
+    this.programs.mesh ??= program(gl, MESH_VERTEX, MESH_FRAGMENT);
     const bytes = new Uint8Array(4 * V);
     for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
     const middles = fanMiddles(mesh), centers = fans.length - 1 === F ? middles : middlesOf(mesh, counting(F + 1));
-    this.triangles = {
+    this.triangles[level] = {
       ...indexedArray(gl, this.programs.mesh, mesh.vertices, bytes), centers, middles, fans, order: new Uint32Array(F),
       depths: new Float32Array(F), fanDepths: new Float32Array(fans.length - 1),
       fanOrder: new Uint32Array(fans.length - 1), count: 0,
     };
     this.crop(this.kept ?? null);
-    return this.triangles;
+    return this.triangles[level];
   }
 
   #needSplats() {
@@ -170,13 +169,12 @@ export class SortedRenderer {
     return this.cloud;
   }
 
-  // kept: {fans, triangles, splats}, lists of indices in ascending order; null: everything.
+  // kept: {splats, and by level {fans, triangles}}, lists of indices in ascending order; null: everything.
   crop(kept) {
     this.kept = kept;
-    if (this.triangles) {
-      const all = this.triangles;
-      all.fanItems = kept ? kept.fans : counting(all.fans.length - 1);
-      all.items = kept ? kept.triangles : counting(all.order.length);
+    for (const [level, all] of Object.entries(this.triangles)) {
+      all.fanItems = kept ? kept[level].fans : counting(all.fans.length - 1);
+      all.items = kept ? kept[level].triangles : counting(all.order.length);
     }
     if (this.cloud) {
       this.cloud.items = kept ? kept.splats : counting(this.splats.count);
@@ -186,12 +184,12 @@ export class SortedRenderer {
   // Draws parts [{what: "mesh" or "splats", from, to}] of the image's width, 0 to 1, and leaves the rest of the canvas
   // transparent. scale: size of the image in that of the canvas; still: triangles are sorted one by one, not fan by fan,
   // and the device may take its time, unless stop() says that the image is not wanted any more: then the canvas stays as it is, and the result is false.
-  async draw({ view, parts, style, still, scale, background, gain, stop }) {
+  async draw({ view, level, parts, style, still, scale, background, gain, stop }) {
     const { gl, canvas } = this, w = Math.max(1, Math.round(canvas.width * scale));
     const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h), images = [];
     gl.disable(gl.SCISSOR_TEST);
     for (const { what } of parts) {
-      images.push(what === "mesh" ? await this.#drawMesh(pinhole, style, still, stop) : this.#drawSplats(pinhole, scale));
+      images.push(what === "mesh" ? await this.#drawMesh(level, pinhole, style, still, stop) : this.#drawSplats(pinhole, scale));
       if (!images.at(-1)) return false;
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -207,7 +205,7 @@ export class SortedRenderer {
       bindTextures(gl, this.programs.present, { image: images[i] });
       gl.uniform3fv(at("background"), background);
       gl.uniform1f(at("gain"), gain);
-      gl.uniform1i(at("linear"), Number(what === "mesh" && this.mesh.blending === "linear"));
+      gl.uniform1i(at("linear"), Number(what === "mesh" && this.levels[level].blending === "linear"));
       gl.disable(gl.BLEND);
       gl.disable(gl.DEPTH_TEST);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -216,8 +214,8 @@ export class SortedRenderer {
     return true;
   }
 
-  async #drawMesh(pinhole, style, still, stop) {
-    const { gl } = this, all = this.#needMesh(), opaque = style === "opaque", wires = style === "wireframe";
+  async #drawMesh(level, pinhole, style, still, stop) {
+    const { gl } = this, all = this.#needMesh(level), opaque = style === "opaque", wires = style === "wireframe";
     if (!opaque) this.#sortMesh(all, pinhole, still);
     const list = opaque ? all.items : all.order.subarray(0, all.count);
     const frame = this.#frame(pinhole.width, pinhole.height, 4, opaque), corners = wires ? 6 : 3;
@@ -234,7 +232,7 @@ export class SortedRenderer {
       }
       gl.uniform1f(this.programs.mesh.at("solid"), SOLID[style]);
       gl.bindVertexArray(all.array);
-      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.mesh.faces, some, wires), gl.STREAM_DRAW);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.levels[level].faces, some, wires), gl.STREAM_DRAW);
       gl.drawElements(wires ? gl.LINES : gl.TRIANGLES, corners * some.length, gl.UNSIGNED_INT, 0);
       gl.bindVertexArray(null);
     }
