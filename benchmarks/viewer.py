@@ -7,8 +7,8 @@ A camera file for each splat file; its first camera is the view. `--chromium` op
 in a headless Chromium, with WebGPU and WebGL by SwiftShader (on processors: slow), and compares a screenshot
 of SIDE x SIDE pixels, one sample a pixel, with `render`.
 
-`--command` measures the command itself, in a process of its own, as for large files. `--chromium` then opens the
-page without WebGPU, as phones and servers do.
+`--command` measures the command itself, in a process of its own, as for large files. `--chromium` then opens
+the page without WebGPU.
 """
 
 from __future__ import annotations
@@ -40,9 +40,7 @@ def main() -> None:
     parser.add_argument("--chromium", type=int, metavar="SIDE")
     args = parser.parse_args()
     if args.command:
-        print(
-            "| file | splats | merged to | view of 400 px, dB | triangles | processor s | memory, GB | page, MB |"
-        )
+        print("| file | splats | merged to | 400 px, dB | triangles | processor s | memory, GB | page, MB |")
         print("|---|---|---|---|---|---|---|---|")
         for path in args.splats:
             by_command(path, args.chromium)
@@ -90,7 +88,8 @@ def by_command(path: Path, side: int | None) -> None:
         print(
             f"| {path.stem} | {found.get('merged_from', found['splats']):,} | {found['splats']:,}"
             f" | {found.get('merging_psnr', '-')} | {found['triangles']:,} + {found['coarse_triangles']:,}"
-            f" | {used.ru_utime + used.ru_stime:.1f} | {used.ru_maxrss / 1e6:.2f} | {found['bytes'] / 1e6:.1f} |",
+            f" | {used.ru_utime + used.ru_stime:.1f} | {used.ru_maxrss / 1e6:.2f}"
+            f" | {found['bytes'] / 1e6:.1f} |",
             flush=True,
         )
         if side:

@@ -252,7 +252,7 @@ class App {
     });
     const detail = element("detail");
     element("detailLine").hidden = !settings.triangles.coarse;
-    for (const { value, index } of detail.options) detail.options[index].textContent = number(settings.triangles[value] ?? 0);
+    for (const option of detail.options) option.textContent = `${number(settings.triangles[option.value] ?? 0)} triangles`;
     detail.value = options.detail;
     detail.addEventListener("change", () => {
       options.detail = detail.value;
