@@ -1,15 +1,22 @@
 """Pages of `meshsplats view`: size, errors of quantisation, time to the first picture, the image in Chromium.
 
     python benchmarks/viewer.py SPLATS [SPLATS ...] --cameras FILE [FILE ...] [--chromium SIDE]
+    python benchmarks/viewer.py SPLATS [SPLATS ...] --command [--chromium SIDE]
 
 A camera file for each splat file; its first camera is the view. `--chromium` opens each page from the disk
 in a headless Chromium, with WebGPU and WebGL by SwiftShader (on processors: slow), and compares a screenshot
 of SIDE x SIDE pixels, one sample a pixel, with `render`.
+
+`--command` measures the command itself, in a process of its own, as for large files. `--chromium` then opens
+the page without WebGPU.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -28,9 +35,18 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("splats", type=Path, nargs="+")
-    parser.add_argument("--cameras", type=Path, nargs="+", required=True)
+    parser.add_argument("--cameras", type=Path, nargs="+")
+    parser.add_argument("--command", action="store_true")
     parser.add_argument("--chromium", type=int, metavar="SIDE")
     args = parser.parse_args()
+    if args.command:
+        print("| file | splats | merged to | 400 px, dB | triangles | processor s | memory, GB | page, MB |")
+        print("|---|---|---|---|---|---|---|---|")
+        for path in args.splats:
+            by_command(path, args.chromium)
+        return
+    if args.cameras is None:
+        parser.error("give --cameras or --command")
     sides = " | ".join(f"{side} px: largest, pixels > 0.5, PSNR" for side in SIDES)
     print(f"| scene | triangles | bytes a triangle | page, MB | positions, radii | s | {sides} |")
     print("|---|---|---|---|---|---|" + "---|" * len(SIDES))
@@ -59,6 +75,58 @@ def main() -> None:
     if args.chromium:
         for name, mesh, camera, page in pages:
             in_chromium(name, mesh, camera.scaled(args.chromium / camera.width), page)
+
+
+def by_command(path: Path, side: int | None) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "page.html"
+        command = [sys.executable, "-m", "meshsplats", "view", str(path), "-o", str(file), "--json"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        found = json.loads(process.stdout.read())
+        _, _, used = os.wait4(process.pid, 0)
+        print(
+            f"| {path.stem} | {found.get('merged_from', found['splats']):,} | {found['splats']:,}"
+            f" | {found.get('merging_psnr', '-')} | {found['triangles']:,} + {found['coarse_triangles']:,}"
+            f" | {used.ru_utime + used.ru_stime:.1f} | {used.ru_maxrss / 1e6:.2f}"
+            f" | {found['bytes'] / 1e6:.1f} |",
+            flush=True,
+        )
+        if side:
+            without_webgpu(path.stem, file, side)
+
+
+def without_webgpu(name: str, file: Path, side: int) -> None:
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "viewer"))
+    from _browser import WEBGL, Browser
+
+    hidden = "Object.defineProperty(Navigator.prototype, 'gpu', { get: () => undefined });"
+    browser = Browser(WEBGL)
+    try:
+        shown = browser.page(file.as_uri(), side, side, before=hidden)
+        shown.wait("document.body.dataset.firstPicture", 600)
+        first = processor_seconds(browser.pid)
+        shown.still(3000)
+        found = shown.statistics()["triangles"]
+        print(
+            f"{name}, {side} x {side}, WebGL: first picture after {first:.1f} s of processor time of all"
+            f" processes, {found} triangles at rest after {processor_seconds(browser.pid):.1f} s",
+            flush=True,
+        )
+    finally:
+        browser.close()
+
+
+def processor_seconds(group: int) -> float:
+    """Of the living processes of a group; Linux."""
+    total = 0
+    for folder in Path("/proc").iterdir():
+        try:
+            words = (folder / "stat").read_text().rpartition(")")[2].split()
+        except (OSError, NotADirectoryError):
+            continue
+        total += int(words[11]) + int(words[12]) if int(words[2]) == group else 0
+    return total / os.sysconf("SC_CLK_TCK")
 
 
 def in_chromium(name: str, mesh: ms.SplatMesh, camera: ms.Camera, page: Page) -> None:

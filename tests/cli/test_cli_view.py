@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import signal
@@ -15,11 +16,12 @@ import pytest
 
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main, toml, view
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
+from meshsplats.viewer.quantise import unpack_mesh
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +101,81 @@ def test_a_crop_leaves_less(folder, tmp_path, capsys):
     assert 0 <= result["image_error_levels"] < 3
 
 
+def test_many_splats_are_merged_and_it_says_so(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(view, "TRIANGLES", 800)
+    page = tmp_path / "page.html"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 0
+    out, err = capsys.readouterr()
+    assert "800 triangles, 100 splats" in out
+    found = re.search(
+        r"200 splats were merged to 100: an image of them with 400 pixels has (\S+) dB against that of all;"
+        r" --max-triangles N or --whole keeps more",
+        err,
+    )
+    assert found is not None
+    assert 10 < float(found[1]) < 45
+    assert settings(page)["statistics"]["merged from"] == "200 splats"
+    for words, triangles in (["--whole"], 1600), (["--max-triangles", "1207"], 1200):
+        assert main(["view", str(folder / "scene.ply"), "-o", str(page), "--force", "--json", *words]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert (result["triangles"], result["splats"]) == (triangles, triangles // 8)
+        assert result.get("merged_from") == (200 if triangles < 1600 else None)
+        assert ("merged from" in settings(page)["statistics"]) == (triangles < 1600)
+
+
+def test_large_meshes_get_a_coarse_level_of_their_splats(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(view, "COARSE_TRIANGLES", 400)
+    page = tmp_path / "page.html"
+
+    def made(name: str, *words: str) -> tuple[dict, str]:
+        line = ["view", str(folder / name), "-o", str(page), "--force", *words]
+        assert main(line) == 0
+        return settings(page)["triangles"], "".join(capsys.readouterr())
+
+    counts, printed = made("scene.ply")
+    assert counts == {"fine": 1600, "coarse": 400}
+    assert printed.count("1,600 triangles, a coarse level of 400, 200 splats") == 2  # before and after
+    assert made("scene.ply", "--without-splats")[0] == counts
+    assert made("mesh.npz", "--splats", str(folder / "scene.ply"))[0] == counts
+    packed = re.search(r'id="coarse">(.*?)</script>', page.read_text("utf-8"))
+    assert packed is not None
+    assert len(unpack_mesh(base64.b64decode(packed[1])).faces) == 400
+    for words in (["mesh.npz"], ["scene.ply", "--max-triangles", "400"]):
+        counts, printed = made(*words)
+        assert list(counts) == ["fine"]
+        assert "coarse level" not in printed
+        assert 'id="coarse"' not in page.read_text("utf-8")
+
+
+def test_the_size_is_said_before_anything_is_packed(folder, tmp_path, monkeypatch, capsys):
+    def packed(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    page = tmp_path / "page.html"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(page)]) == 0
+    size = page.stat().st_size
+    capsys.readouterr()
+    monkeypatch.setattr("meshsplats.viewer.page.quantise_mesh", packed)
+    other = tmp_path / "other.html"
+    assert main(["view", str(folder / "scene.ply"), "-o", str(other)]) != 0
+    assert not other.exists()
+    said = re.search(
+        r"other.html will have about (\S+) kB: 1,600 triangles, 200 splats", capsys.readouterr().err
+    )
+    assert said is not None
+    assert float(said[1]) * 1000 == pytest.approx(size, rel=0.05)
+
+
+def test_a_page_has_a_limit(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(view, "MOST_TRIANGLES", 1000)
+    for name, words in ("scene.ply", ["--whole"]), ("mesh.npz", []):
+        assert main(["view", str(folder / name), "-o", str(tmp_path / "p.html"), *words]) == 2
+        error = capsys.readouterr().err
+        assert "a page holds at most 1,000 triangles, and these would be 1,600" in error
+        assert "meshsplats tiles" in error
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -112,6 +189,10 @@ def test_a_crop_leaves_less(folder, tmp_path, capsys):
         (["scene.ply", "--cameras", "c.json", "--data", "d", "-o", "page.html"], "not both"),
         (["cameras.json", "-o", "page.html"], "expected splats or a mesh"),
         (["scene.ply", "-o", "nowhere/page.html"], "does not exist"),
+        (["scene.ply", "--max-triangles", "7", "-o", "page.html"], "--max-triangles must be from 8"),
+        (["scene.ply", "--max-triangles", "80", "--whole", "-o", "p.html"], "not both"),
+        (["mesh.npz", "--max-triangles", "800", "-o", "page.html"], "--max-triangles is for splats"),
+        (["mesh.npz", "--whole", "-o", "page.html"], "--whole is for splats"),
     ],
 )
 def test_wrong_usage_is_told_before_anything_is_written(

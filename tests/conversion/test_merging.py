@@ -456,3 +456,56 @@ class TestLimits:
 def mesh_likeness(mesh, scene):
     truth = [render_splats(scene.cloud, c).color for c in scene.cameras]
     return np.mean([psnr(render(mesh, c).color, t) for c, t in zip(scene.cameras, truth, strict=True)])
+
+
+# ---- In blocks
+
+
+def test_blocks_leave_as_many_splats_and_as_good_an_image():
+    cloud = make_scene(6000)
+    camera = orbit(cloud, 1, width=120, height=120, elevation=20)[0]
+    image = render_splats(cloud, camera).color
+    at_once, blocks = simplify(cloud, 1500), merging.simplify_in_blocks(cloud, 1500, block=500)
+    assert len(blocks) == 1500
+    one, other = (psnr(render_splats(each, camera).color, image) for each in (at_once, blocks))
+    assert other > one - 0.5
+    assert one < 50  # the comparison is not one of a cloud with itself
+    assert not np.array_equal(np.sort(blocks.means[:, 0]), np.sort(at_once.means[:, 0]))
+
+
+def test_blocks_are_joined_to_merge_to_few_splats_around_the_same_centre():
+    cloud = random_cloud(1000)
+    blocks = merging.simplify_in_blocks(cloud, 10, block=100)  # fewer than each block keeps at first
+    assert len(blocks) == 10
+    assert blocks.kernel == cloud.kernel
+    low_pass = merging._usual_low_pass(cloud, None)
+    mean = np.average(cloud.means, axis=0, weights=masses(cloud, low_pass))
+    found = np.average(blocks.means, axis=0, weights=masses(blocks, float(np.median(low_pass))))
+    assert np.allclose(found, mean, atol=0.15)
+
+
+def test_a_cloud_of_one_block_is_simplified_as_a_whole():
+    cloud = random_cloud(300)
+    for block in (300, 1000):
+        assert np.array_equal(
+            merging.simplify_in_blocks(cloud, 40, block=block).means, simplify(cloud, 40).means
+        )
+    assert merging.simplify_in_blocks(cloud, 300, block=10) is cloud
+
+
+def test_blocks_hold_every_row_once_and_lie_apart():
+    means = np.random.default_rng(1).normal(size=(1000, 3)) * [1, 5, 1]
+    blocks = merging._blocks(means, np.arange(1000), 130)
+    assert max(map(len, blocks)) <= 130
+    assert np.array_equal(np.sort(np.concatenate(blocks)), np.arange(1000))
+    ranges = sorted((means[rows, 1].min(), means[rows, 1].max()) for rows in blocks)
+    assert np.mean([high - low for low, high in ranges]) < 0.5 * np.ptp(means[:, 1])
+
+
+def test_invisible_splats_earn_a_block_no_share():
+    cloud = random_cloud(1000)
+    cloud = replace(cloud, means=cloud.means * np.float32([9, 1, 1]))
+    left = cloud.means[:, 0] < np.median(cloud.means[:, 0])
+    faint = replace(cloud, opacities=np.where(left, 0.001, cloud.opacities).astype(np.float32))
+    kept = merging.simplify_in_blocks(faint, 200, block=500)
+    assert (kept.opacities >= 1 / 255).mean() > 0.95

@@ -15,6 +15,8 @@ from _pages import cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa:
 from test_page import HOSTILE, block
 
 import meshsplats as ms
+from meshsplats.conversion.cleaning import cropped
+from meshsplats.demo_scene import make_scene
 from meshsplats.viewer.page import PageOptions, _read, make_page
 from meshsplats.viewer.quantise import pack_splats, unpack_mesh
 
@@ -557,3 +559,169 @@ def test_the_page_decodes_what_python_decodes(browser, mesh, cloud):
 
 def test_levels_round_as_screenshots_do():
     assert levels(np.array([0.5, -1, 2])).tolist() == [128, 0, 255]
+
+
+# ---- Large scenes
+
+COUNTING = """
+window.drawn = [];
+for (const name of ['drawElements', 'drawArrays', 'drawArraysInstanced']) {
+  const before = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...words) {
+    before.apply(this, words);
+    window.drawn.push([name, name === 'drawElements' ? words[1] : words[2]]);
+    window.after?.();
+  };
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def large_page(browser, write_page):
+    """More triangles than one draw call takes."""
+    cloud = make_scene(40_000)
+    cameras = ms.orbit(cloud, 1, width=WIDTH, height=HEIGHT, elevation=20, distance=0.9)
+    mesh = ms.convert(cloud)
+    page = open_page(browser, write_page(mesh, "large", cameras=cameras), before=COUNTING)
+    page.run("document.body.classList.add('plain')")
+    page.still(PATIENCE)
+    yield page, mesh, cameras[0]
+    assert page.problems() == []
+    page.close()
+
+
+def drawn_at_rest(page: Page) -> list[list]:
+    page.run("document.querySelector('#home').click()")
+    page.wait("document.body.dataset.state === 'moving'")
+    page.run("window.drawn = []; 0")
+    page.still(PATIENCE)
+    return page.run("window.drawn")
+
+
+def test_many_triangles_are_drawn_in_parts_by_their_indices(large_page):
+    page, mesh, camera = large_page
+    counts = [count for name, count in drawn_at_rest(page) if name == "drawElements"]
+    part = 3 << 18
+    whole = 3 * len(mesh.faces)
+    assert counts[-2:] == [part, whole - part]
+    assert not any(name == "drawArraysInstanced" for name, _ in page.run("window.drawn"))
+    image = page.screenshot() / 255
+    assert ms.psnr(image, ms.render(mesh, camera, samples=2).color) > 26
+
+
+def test_a_movement_ends_the_drawing_of_what_is_no_longer_wanted(large_page):
+    page, mesh, _ = large_page
+    drawn_at_rest(page)
+    part, whole = 3 << 18, 3 * len(mesh.faces)
+    # Changes the view again after the first part of the image at rest, which is the second large one.
+    page.run(
+        "window.drawn = []; window.after = () => {"
+        f" if (drawn.filter(one => one[1] === {part}).length < 2) return;"
+        " delete window.after; document.querySelector('#home').click(); };"
+        " document.querySelector('#home').click()"
+    )
+    page.still(PATIENCE)
+    counts = [count for name, count in page.run("window.drawn") if name == "drawElements"]
+    assert counts == [part, whole - part, part, part, whole - part, part, whole - part]
+
+
+@pytest.fixture(scope="module")
+def two_levels(write_page, mesh, cloud, cameras):
+    """The address of a page with a coarse level, and that level."""
+    coarse = ms.convert(ms.simplify(cloud, 60))
+    return write_page(mesh, "levels", splats=cloud, coarse=coarse, cameras=cameras), coarse
+
+
+LEVELS = """
+window.levels = [];
+new MutationObserver(() => {
+  const { level, state } = document.body.dataset, found = `${state} ${level}`;
+  if (level && levels.at(-1) !== found) levels.push(found);
+}).observe(document, { attributes: true, subtree: true, attributeFilter: ['data-level'] });
+"""
+
+
+def test_the_coarse_level_comes_first_and_moves_and_the_fine_one_rests(browser, two_levels, mesh, cameras):
+    address, coarse = two_levels
+    page = open_page(browser, address, cameras[0].width, cameras[0].height, before=COUNTING + LEVELS)
+    page.run("document.body.classList.add('plain')")
+    page.still(PATIENCE)
+    seen = page.run("levels")
+    assert seen[0] == "moving coarse"
+    assert "preparing coarse" in seen
+    assert seen[-1] == "still fine"
+    page.run("levels.length = drawn.length = 0; document.querySelector('#next').click()")
+    page.still(PATIENCE)
+    assert page.run("levels") == ["moving coarse", "still fine"]
+    counts = [count for name, count in page.run("drawn") if name == "drawElements"]
+    assert set(counts[:-1]) == {3 * len(coarse.faces)}
+    assert counts[-1] == 3 * len(mesh.faces)
+    rest = page.screenshot() / 255
+    fine, other = (ms.render(each, cameras[1], samples=2).color for each in (mesh, coarse))
+    assert ms.psnr(rest, fine) > 26 > ms.psnr(other, fine)
+    assert page.statistics()["triangles"] == f"{len(mesh.faces):,}"
+    assert page.problems() == []
+    page.close()
+
+
+def test_the_crop_box_crops_both_levels(browser, two_levels, mesh):
+    address, coarse = two_levels
+    page = open_page(browser, address, before=COUNTING)
+    page.run("drawn.length = 0; 0")
+    page.choose("#crop-x0", "100")
+    page.still(PATIENCE)
+    counts = [count for name, count in page.run("drawn") if name == "drawElements"]
+    box = tuple(float(word) for word in page.text("#cropText").split()[1:])
+    few, many = (len(cropped(each, box).faces) for each in (coarse, mesh))
+    assert (counts[0], counts[-1]) == (3 * few, 3 * many)
+    assert 0 < few < len(coarse.faces)
+    page.close()
+
+
+def test_a_phone_draws_the_coarse_level_and_unpacks_the_fine_one_when_asked(browser, two_levels, mesh):
+    address, coarse = two_levels
+    page = open_page(browser, address, 390, 844, mobile=True, ratio=2)
+    few, many = f"{len(coarse.faces):,}", f"{len(mesh.faces):,}"
+    assert page.run("document.body.dataset.level") == "coarse"
+    assert page.statistics()["triangles"] == few
+    assert page.run("document.querySelector('#mesh') !== null")  # still packed
+    assert page.run("[...document.querySelectorAll('#detail option')].map(o => o.textContent)") == [
+        f"{many} triangles",
+        f"{few} triangles",
+    ]
+    page.choose("#detail", "fine")
+    page.wait("document.body.dataset.level === 'fine'", PATIENCE)
+    page.still(PATIENCE)
+    assert page.statistics()["triangles"] == many
+    assert page.run("document.querySelector('#mesh') === null")
+    page.choose("#detail", "coarse")
+    page.still(PATIENCE)
+    assert page.statistics()["triangles"] == few
+    assert page.problems() == []
+    page.close()
+
+
+@pytest.mark.parametrize(("width", "height", "mobile"), [(390, 844, False), (820, 1180, True)])
+def test_small_screens_and_tablets_are_no_phones(browser, two_levels, width, height, mobile):
+    screen = f"for (const [k, v] of [['width', {width}], ['height', {height}]])"
+    screen += " Object.defineProperty(Screen.prototype, k, { get: () => v });"
+    page = open_page(browser, two_levels[0], width, height, mobile=mobile, before=screen)
+    assert page.run("document.body.dataset.level") == "fine"
+    page.close()
+
+
+def test_a_page_without_a_coarse_level_has_no_choice_of_levels(browser, url):
+    page = open_page(browser, url, 390, 844, mobile=True)
+    assert page.run("document.querySelector('#detailLine').hidden")
+    assert page.run("document.body.dataset.level") == "fine"
+    page.close()
+
+
+def test_a_damaged_fine_level_leaves_the_coarse_one(browser, two_levels, tmp_path):
+    whole = Path(unquote(urlparse(two_levels[0]).path)).read_text(encoding="utf-8")
+    data = block(whole, "mesh")
+    file = tmp_path / "damaged.html"
+    file.write_text(whole.replace(data, data[:400] + "AAAA" + data[404:]), encoding="utf-8")
+    page = open_page(browser, file.as_uri())
+    assert page.run("document.body.dataset.level") == "coarse"
+    page.close()

@@ -14,6 +14,7 @@ from _pages import HEIGHT, WIDTH, cameras_fixture, cloud_fixture, levels, mesh_f
 import meshsplats as ms
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 from meshsplats.conversion.cleaning import cropped
+from meshsplats.demo_scene import make_scene
 from meshsplats.rendering.looks import image_of
 from meshsplats.viewer.page import _read
 from meshsplats.webgpu.renderer import DrawSettings, frame_uniform
@@ -22,8 +23,8 @@ PATIENCE = 400
 """Seconds for shaders that a busy processor compiles."""
 
 
-def open_page(browser: Browser, url: str) -> Page:
-    page = browser.page(url, WIDTH, HEIGHT)
+def open_page(browser: Browser, url: str, before: str = "") -> Page:
+    page = browser.page(url, WIDTH, HEIGHT, before=before)
     page.wait("document.body.dataset.state !== 'loading'", PATIENCE)
     page.run("document.body.classList.add('plain')")
     page.choose("#samples", "1")
@@ -129,7 +130,7 @@ def test_the_page_writes_the_uniform_of_the_python_host(browser, cameras):
     }
     arguments = (pinhole, counts, 4000, [180, 190, 250], 0.7, 60000)
     page = browser.page("about:blank#uniform", WIDTH, HEIGHT)
-    source = re.sub(r"^export ", "", _read("exact.js"), flags=re.MULTILINE)
+    source = re.sub(r"^export |^import .*$", "", _read("exact.js"), flags=re.MULTILINE)
     written = page.run(f"{source}; [...new Uint32Array(frameUniform(...{json.dumps(arguments)}).buffer)]")
     page.close()
     settings = DrawSettings(filter_px2=0.7, budget=60000)
@@ -171,5 +172,92 @@ def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud
     page = open_page(browser, write_page(odd, "odd", cameras=cameras))
     difference = np.abs(page.screenshot().astype(int) - expected)
     assert (difference > 1).any(axis=-1).mean() < 0.002
+    assert page.problems() == []
+    page.close()
+
+
+def limited(most: int) -> str:
+    """A script by which storage bindings have at most ``most`` bytes, and that notes the largest."""
+    return f"""
+    window.largest = 0;
+    const limits = Object.getOwnPropertyDescriptor(GPUAdapter.prototype, 'limits').get;
+    Object.defineProperty(GPUAdapter.prototype, 'limits', {{ get() {{
+      const own = limits.call(this);
+      return {{ maxBufferSize: own.maxBufferSize, maxStorageBufferBindingSize: {most} }};
+    }} }});
+    const request = GPUAdapter.prototype.requestDevice;
+    GPUAdapter.prototype.requestDevice = function () {{ return request.call(this); }};
+    const create = GPUDevice.prototype.createBuffer;
+    GPUDevice.prototype.createBuffer = function (what) {{
+      if (what.usage & GPUBufferUsage.STORAGE) window.largest = Math.max(window.largest, what.size);
+      return create.call(this, what);
+    }};
+    """
+
+
+def test_bindings_never_exceed_the_limit_of_the_device_and_the_image_is_the_same(
+    browser, write_page, mesh, cloud, cameras
+):
+    """The image is drawn in strips where samples and tile lists do not fit."""
+    address = write_page(mesh, "strips", cameras=cameras)
+    most = 16 * WIDTH * HEIGHT  # half of what the samples of the image take
+    assert 16 * len(mesh.vertices) < most
+    page = open_page(browser, address, before=limited(most))
+    assert page.run("document.querySelector('#message').hidden")
+    assert 0.5 * most < page.run("largest") <= most
+    assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
+    assert page.problems() == []
+    page.close()
+
+
+def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(browser, write_page, cameras):
+    many = ms.convert(make_scene(3000))
+    address = write_page(many, "parts", cameras=cameras)
+    most = 16 * WIDTH * HEIGHT
+    share = most / 16 / len(many.vertices)
+    assert share < 0.7
+    page = open_page(browser, address, before=limited(most))
+    said = re.search(
+        r"the exact image lacks the (\d+) % of the triangles that show least", page.text("#messageText")
+    )
+    assert said is not None
+    assert 1 - int(said[1]) / 100 == pytest.approx(share, abs=0.06)
+    assert page.run("largest") <= most
+    corners = many.vertices[many.faces]
+    areas = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    ) * many.colors[many.faces][..., 3].sum(axis=1)
+    shows = np.bincount(many.face_splat, areas)
+    order = np.argsort(-shows)
+    vertices = np.bincount(np.repeat(many.face_splat, 3)[np.unique(many.faces, return_index=True)[1]])
+    kept = np.zeros(len(shows), bool)
+    kept[order[np.cumsum(vertices[order]) <= most / 16]] = True
+    image = page.screenshot() / 255
+    expected = ms.render(many.keep_faces(kept[many.face_splat]), cameras[0]).color
+    assert ms.psnr(image, expected) > 30
+    assert ms.psnr(image, ms.render(many, cameras[0]).color) < 25
+    # The crop box works on that part.
+    page.choose("#crop-x0", "90")
+    page.still(PATIENCE)
+    assert page.text("#status").startswith("exact")
+    box = tuple(float(word) for word in page.text("#cropText").split()[1:])
+    part = cropped(many.keep_faces(kept[many.face_splat]), box)
+    assert ms.psnr(page.screenshot() / 255, ms.render(part, cameras[0]).color) > 30
+    assert ms.psnr(page.screenshot() / 255, ms.render(cropped(many, box), cameras[0]).color) < 25
+    assert page.problems() == []
+    page.close()
+
+
+def test_levels_in_the_exact_image(browser, write_page, mesh, cloud, cameras):
+    coarse = ms.convert(ms.simplify(cloud, 60))
+    page = open_page(browser, write_page(mesh, "exact-levels", coarse=coarse, cameras=cameras))
+    assert page.run("document.body.dataset.level") == "fine"
+    assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
+    page.choose("#detail", "coarse")
+    page.still(PATIENCE)
+    assert_within_one_level(page, ms.render(coarse, cameras[0]).color)
+    page.choose("#detail", "fine")
+    page.still(PATIENCE)
+    assert_within_one_level(page, ms.render(mesh, cameras[0]).color)
     assert page.problems() == []
     page.close()

@@ -15,7 +15,16 @@ from meshsplats.cameras.framing import scene_bounds
 from meshsplats.demo_scene import make_scene
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer import quantise
-from meshsplats.viewer.quantise import FINER, PRECISIONS, Precision, pack_mesh, quantise_mesh, unpack_mesh
+from meshsplats.viewer.quantise import (
+    FINER,
+    PRECISIONS,
+    Precision,
+    estimated_bytes,
+    pack_mesh,
+    pack_splats,
+    quantise_mesh,
+    unpack_mesh,
+)
 from meshsplats.viewer.streams import Packer, Unpacker
 
 
@@ -185,3 +194,14 @@ def test_damaged_data_is_refused():
 def test_the_same_mesh_gives_the_same_bytes():
     mesh = ms.convert(make_scene(200))
     assert quantise_mesh(mesh).data == quantise_mesh(mesh).data
+
+
+def test_the_size_is_estimated_from_a_part():
+    cloud = make_scene(40_000)
+    mesh = ms.convert(cloud)
+    size, beside = len(quantise_mesh(mesh).data), len(pack_splats(cloud))
+    assert estimated_bytes(mesh) == pytest.approx(size, rel=0.1)
+    assert estimated_bytes(mesh, cloud) == pytest.approx(size + beside, rel=0.1)
+    alone = replace(mesh, face_splat=None)
+    assert estimated_bytes(alone) == pytest.approx(len(quantise_mesh(alone).data), rel=0.1)
+    assert quantise._in_runs(np.arange(len(cloud))).mean() < 0.4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +16,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
+    Count,
     File,
     Folder,
     PartOptions,
@@ -40,7 +41,50 @@ if TYPE_CHECKING:
     from meshsplats.viewer.page import Page
 
 SIDE = 400
-"""Largest side of the image by which the error of quantisation is measured."""
+"""Largest side of the image by which the errors of merging and quantisation are measured."""
+
+TRIANGLES = 4_000_000
+"""Default of --max-triangles: more take seconds to sort and draw, and pages of more than 40 MB."""
+
+COARSE_TRIANGLES = 300_000
+"""Triangles of the coarse level, which any phone draws; meshes with more get one."""
+
+MOST_TRIANGLES = 20_000_000
+"""Triangles of a page at most: browsers hold no more."""
+
+
+@dataclass(frozen=True)
+class _Merging:
+    """Splats that were merged, as the page cannot hold all."""
+
+    splats: int
+    """How many there were."""
+    psnr: float
+    """dB between images of all splats and of those that are left, in one view."""
+
+    def sentence(self, kept: int) -> str:
+        return (
+            f"{self.splats:,} splats were merged to {kept:,}: an image of them with {SIDE} pixels has"
+            f" {self.psnr:.1f} dB against that of all; --max-triangles N or --whole keeps more"
+        )
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What a page shows."""
+
+    mesh: SplatMesh
+    splats: GaussianCloud | None
+    kept: int = 0
+    """Splats of the mesh, where it was made of splats."""
+    merging: _Merging | None = None
+    coarse: SplatMesh | None = None
+
+    @property
+    def summary(self) -> str:
+        parts = [plural(len(self.mesh.faces), "triangle")]
+        parts += [] if self.coarse is None else [f"a coarse level of {len(self.coarse.faces):,}"]
+        return ", ".join(parts if self.splats is None else [*parts, plural(len(self.splats), "splat")])
 
 
 @dataclass(frozen=True)
@@ -48,11 +92,11 @@ class View(Command):
     """Shows splats or a mesh in the browser, exactly, the splats beside it for comparison; or writes a page
     that anyone can open with a double click (-o scene.html).
 
-    Splats are converted to a mesh first, with default settings. Nothing leaves this machine: the browser gets
-    the scene from 127.0.0.1 until Ctrl-C.
+    Splats are converted to a mesh first, with default settings; very many are merged before. Nothing leaves
+    this machine: the browser gets the scene from 127.0.0.1 until Ctrl-C.
     """
 
-    EXCLUSIVE = (("cameras", "data"), ("splats", "without_splats"))
+    EXCLUSIVE = (("cameras", "data"), ("splats", "without_splats"), ("max_triangles", "whole"))
     CONFIGURABLE = True
 
     input: tyro.conf.Positional[Path]
@@ -65,6 +109,10 @@ class View(Command):
     """Splats to compare a mesh with. Default: the input, where that is splats."""
     without_splats: bool = False
     """Leave the splats out: the page is smaller."""
+    max_triangles: Count = None
+    """Splats are merged until their mesh has no more triangles. Default: 4,000,000."""
+    whole: bool = False
+    """Merge no splats, up to 20,000,000 triangles."""
     cameras: File = None
     """Viewpoints to choose from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model
     folder that has one. Default: those of the input, if it is a model folder."""
@@ -93,13 +141,14 @@ class View(Command):
             inputs = [path for path in (self.input, self.splats, self.cameras) if path is not None]
             outputs = [self.output, beside(self.output, CONFIGURATION)]
             check_outputs(outputs, self.force, inputs=inputs)
-        scene = self.part.of(load_scene(self.input, self.reading))
-        if isinstance(scene, GaussianCloud) and self.splats is not None:
-            raise UsageError(f"{shown_path(self.input)} is splats: --splats is for a mesh")
-        mesh, splats = self._content(scene)
+        scene = self._scene()
         photographs = self._photographs()
-        page, cameras = self._page(mesh, splats, photographs)
-        result = self._measured(mesh, splats, page, cameras)
+        cameras = self._cameras(photographs)
+        content = self._content(scene, cameras)
+        del scene  # large, and partly copied
+        self._announce(content)
+        page = self._page(content, photographs, cameras)
+        result = self._measured(content, page, cameras)
         if self.output is not None:
             self._write(page, result)
         else:
@@ -115,18 +164,43 @@ class View(Command):
         for first, second in self.EXCLUSIVE:
             if getattr(self, first) and getattr(self, second):
                 raise UsageError(f"give --{first} or --{second.replace('_', '-')}, not both")
+        if self.max_triangles is not None and not 8 <= self.max_triangles <= MOST_TRIANGLES:
+            raise UsageError(
+                f"--max-triangles must be from 8, one splat's, to {MOST_TRIANGLES:,},"
+                f" got {self.max_triangles}"
+            )
         if self.background is not None:
             parse_color(self.background)
         if self.up is not None:
             parse_up(self.up)
 
-    def _content(self, scene: GaussianCloud | SplatMesh) -> tuple[SplatMesh, GaussianCloud | None]:
-        """The mesh, and the splats to compare it with."""
+    def _scene(self) -> GaussianCloud | SplatMesh:
+        scene = self.part.of(load_scene(self.input, self.reading))
         if isinstance(scene, SplatMesh):
-            return scene, None if self.splats is None else self.part.of(self.reading.load(self.splats))
-        from meshsplats.conversion import convert
+            if self.max_triangles is not None or self.whole:
+                given = "--whole" if self.whole else "--max-triangles"
+                raise UsageError(f"{shown_path(self.input)} is a mesh: {given} is for splats")
+            return scene
+        if self.splats is not None:
+            raise UsageError(f"{shown_path(self.input)} is splats: --splats is for a mesh")
+        return _degree_0(scene)
 
-        return convert(scene), None if self.without_splats else scene
+    def _content(self, scene: GaussianCloud | SplatMesh, cameras: list[Camera]) -> _Content:
+        """What the page will show."""
+        if isinstance(scene, SplatMesh):
+            _check_size(len(scene.faces), "fine-tune it with --max-triangles, or make 'meshsplats tiles'")
+            splats = None if self.splats is None else _degree_0(self.part.of(self.reading.load(self.splats)))
+            return _Content(scene, splats, coarse=_coarse(scene, splats))
+        from meshsplats.conversion import convert
+        from meshsplats.conversion.merging import simplify_in_blocks
+
+        each = _triangles_each()
+        count = len(scene) if self.whole else max(1, (self.max_triangles or TRIANGLES) // each)
+        _check_size(each * min(count, len(scene)), "leave --whole out, or make 'meshsplats tiles'")
+        splats = simplify_in_blocks(scene, count)
+        merging = None if splats is scene else _Merging(len(scene), _likeness(scene, splats, cameras))
+        mesh, shown = convert(splats), None if self.without_splats else splats
+        return _Content(mesh, shown, len(splats), merging, _coarse(mesh, splats))
 
     def _photographs(self) -> Dataset | None:
         if self.data is None:
@@ -142,38 +216,56 @@ class View(Command):
             return load_cameras(self.cameras)
         return cameras_beside(self.input) or []
 
-    def _page(
-        self, mesh: SplatMesh, splats: GaussianCloud | None, photographs: Dataset | None
-    ) -> tuple[Page, list[Camera]]:
+    def _announce(self, content: _Content) -> None:
+        """Says what was merged, and how large the file will be, before the work of packing it."""
+        from meshsplats._files.atomic import in_words
+        from meshsplats.viewer.page import estimated_size
+
+        if self.json:
+            return  # the result has the same numbers
+        if content.merging is not None:
+            say(content.merging.sentence(content.kept))
+        if self.output is not None:
+            size = in_words(estimated_size(content.mesh, content.splats, content.coarse))
+            say(f"{self.output} will have about {size}: {content.summary}")
+
+    def _page(self, content: _Content, photographs: Dataset | None, cameras: list[Camera]) -> Page:
         from meshsplats.viewer.page import PageOptions, make_page
 
         background = chosen_background(
-            self.background, photographs, {"mesh": mesh}, self.input, None, whole=self.part.crop is None
+            self.background,
+            photographs,
+            {"mesh": content.mesh},
+            self.input,
+            None,
+            whole=self.part.crop is None,
         )
         name = shown_path(self.input)
         options = PageOptions(
             title=self.title or ("scene" if name == "-" else Path(name).resolve().stem),
             background=background.color,
             up=None if self.up is None else parse_up(self.up),
+            merged_from=None if content.merging is None else content.merging.splats,
         )
-        cameras = self._cameras(photographs)
-        return make_page(mesh, splats=splats, cameras=cameras, options=options), cameras
+        return make_page(
+            content.mesh, splats=content.splats, coarse=content.coarse, cameras=cameras, options=options
+        )
 
-    def _measured(
-        self, mesh: SplatMesh, splats: GaussianCloud | None, page: Page, cameras: list[Camera]
-    ) -> dict[str, Any]:
-        """Sizes, and the errors that quantisation makes."""
-        from meshsplats.cameras.trajectories import orbit
+    def _measured(self, content: _Content, page: Page, cameras: list[Camera]) -> dict[str, Any]:
+        """Sizes, and the errors that merging and quantisation make."""
         from meshsplats.rendering import render
 
-        camera = (
-            cameras[0].within(SIDE) if cameras else orbit(mesh, 1, azimuth=30, width=SIDE, height=SIDE)[0]
-        )
-        packed = page.mesh
+        mesh, packed = content.mesh, page.mesh
+        camera = _camera(mesh, cameras)
         images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
+        merged: dict[str, Any] = {}
+        if content.merging is not None:
+            merged = {"merged_from": content.merging.splats, "merging_psnr": round(content.merging.psnr, 2)}
         return {
             "triangles": len(mesh.faces),
-            "splats": 0 if splats is None else len(splats),
+            "coarse_triangles": 0 if content.coarse is None else len(content.coarse.faces),
+            "splats": 0 if content.splats is None else len(content.splats),
+            **merged,
             "viewpoints": len(cameras),
             "bytes": len(page.html.encode("utf-8")),
             "bytes_a_triangle": round(packed.bytes_a_triangle, 2),
@@ -215,6 +307,52 @@ class View(Command):
                 say("ended")
 
 
+def _degree_0(cloud: GaussianCloud) -> GaussianCloud:
+    """``cloud`` without the colours that a page does not show: up to three quarters of its memory."""
+    return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
+
+
+def _triangles_each() -> int:
+    """Triangles of a splat as converted by default."""
+    from meshsplats.conversion.budget import triangles_each
+    from meshsplats.conversion.options import ConversionOptions
+
+    return triangles_each(ConversionOptions().resolved("default", has_cameras=False))
+
+
+def _coarse(mesh: SplatMesh, splats: GaussianCloud | None) -> SplatMesh | None:
+    """The coarse level of a mesh with many triangles, made of its splats."""
+    if splats is None or len(mesh.faces) <= COARSE_TRIANGLES:
+        return None
+    from meshsplats.conversion import convert
+    from meshsplats.conversion.merging import simplify_in_blocks
+
+    return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // _triangles_each()), up=mesh.up)
+
+
+def _check_size(triangles: int, advice: str) -> None:
+    if triangles > MOST_TRIANGLES:
+        raise UsageError(
+            f"a page holds at most {MOST_TRIANGLES:,} triangles, and these would be {triangles:,}: {advice}"
+        )
+
+
+def _camera(scene: SplatMesh | GaussianCloud, cameras: list[Camera]) -> Camera:
+    """The view of the measurements."""
+    from meshsplats.cameras.trajectories import orbit
+
+    return cameras[0].within(SIDE) if cameras else orbit(scene, 1, azimuth=30, width=SIDE, height=SIDE)[0]
+
+
+def _likeness(cloud: GaussianCloud, merged: GaussianCloud, cameras: list[Camera]) -> float:
+    """dB between the images of two clouds."""
+    from meshsplats.evaluation.metrics import psnr
+    from meshsplats.rendering import render_splats
+
+    camera = _camera(cloud, cameras)
+    return psnr(*(render_splats(each, camera).color for each in (merged, cloud)))
+
+
 def _opened(url: str) -> bool:
     """Whether a browser with a window opens ``url``."""
     import webbrowser
@@ -227,6 +365,7 @@ def _opened(url: str) -> bool:
 
 def _contents(result: dict[str, Any]) -> str:
     parts = [plural(result["triangles"], "triangle")]
+    parts += [f"a coarse level of {result['coarse_triangles']:,}"] if result["coarse_triangles"] else []
     parts += [plural(result["splats"], "splat")] if result["splats"] else []
     parts += [plural(result["viewpoints"], "viewpoint")] if result["viewpoints"] else []
     return ", ".join(parts)

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import subsample
 from meshsplats._core.library import pointer, processors, run
 from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
@@ -45,6 +46,12 @@ FILTER_PX2 = 0.3
 
 MIN_OPACITY = 1 / 255
 """Opacity below which 3DGS draws nothing."""
+
+BLOCK = 1 << 16
+"""Splats that ``simplify_in_blocks`` merges at a time."""
+
+FEWEST_OF_BLOCK = 64
+"""Splats that it leaves of a block at least, before the blocks are joined."""
 
 
 class NearestStruct(ctypes.Structure):
@@ -120,6 +127,51 @@ def simplify(
     if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
         raise ValueError(f"count must be a whole number of splats, at least 1, got {count!r}")
     return cloud if count >= len(cloud) else merge(cloud, count, low_pass, cameras, threads).cloud
+
+
+def simplify_in_blocks(
+    cloud: GaussianCloud, count: int, *, block: int = BLOCK, threads: int | None = None
+) -> GaussianCloud:
+    """``simplify`` for large clouds: block by block of space, in half the time and little memory beside the
+    cloud's.
+
+    Blocks of at most ``block`` splats, cut at medians, keep equal shares of their visible splats, and pairs
+    across their borders are not merged: images are as good (benchmarks/RESULTS.md#the-viewer). Splats are
+    ordered by block.
+    """
+    if len(cloud) <= block or count >= len(cloud):
+        return simplify(cloud, count, threads=threads)
+    low_pass = _usual_low_pass(cloud, None)
+    blocks = _blocks(cloud.means, np.arange(len(cloud)), block)
+    visible = [int((cloud.opacities[rows] >= MIN_OPACITY).sum()) for rows in blocks]
+    most = max(count, FEWEST_OF_BLOCK * len(blocks))
+    ends = np.rint(np.cumsum(visible) / max(sum(visible), 1) * most).astype(np.int64)
+    shares = np.diff(ends, prepend=0)
+    parts = [
+        simplify(cloud.select(rows), int(share), low_pass=low_pass[rows], threads=threads)
+        for rows, share in zip(blocks, shares, strict=True)
+        if share
+    ]
+    joined = GaussianCloud(
+        np.concatenate([part.means for part in parts]),
+        np.concatenate([part.quaternions for part in parts]),
+        np.concatenate([part.scales for part in parts]),
+        np.concatenate([part.opacities for part in parts]),
+        np.concatenate([part.sh for part in parts]),
+        kernel=cloud.kernel,
+    )
+    return simplify(joined, count, threads=threads)
+
+
+def _blocks(means: np.ndarray, rows: np.ndarray, most: int) -> list[np.ndarray]:
+    """``rows`` of ``means`` (n, 3) in blocks of at most ``most``, each in ascending order."""
+    if len(rows) <= most:
+        return [np.sort(rows)]
+    points = means[rows]
+    axis = int(np.ptp(np.quantile(subsample(points, 10_000), (0.02, 0.98), axis=0), axis=0).argmax())
+    middle = len(rows) // 2
+    order = np.argpartition(points[:, axis], middle)
+    return _blocks(means, rows[order[:middle]], most) + _blocks(means, rows[order[middle:]], most)
 
 
 class Merged(NamedTuple):

@@ -25,7 +25,7 @@ from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.viewer.quantise import QuantisedMesh, pack_splats, quantise_mesh
+from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, pack_splats, quantise_mesh
 from meshsplats.webgpu import device, kernels, renderer
 
 MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")
@@ -51,6 +51,8 @@ class PageOptions:
     """Display RGB, 0 to 1."""
     up: Sequence[float] | np.ndarray | None = None
     """(3,) direction that points up. None: by the cameras, else by the mesh."""
+    merged_from: int | None = None
+    """How many splats there were, if only some are in the page, merged."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ def make_page(
     mesh: SplatMesh,
     *,
     splats: GaussianCloud | None = None,
+    coarse: SplatMesh | None = None,
     cameras: Sequence[Camera] = (),
     options: PageOptions | None = None,
 ) -> Page:
@@ -73,6 +76,7 @@ def make_page(
     Args:
         mesh: the triangles. Normals, attributes and bindings are left out.
         splats: shown beside the mesh or in its place, with colours of degree 0.
+        coarse: the same scene with few triangles: drawn first, while the view moves, and on phones.
         cameras: viewpoints to choose from. The first is where the page begins; without any, it begins before
             the subject.
         options: title, background, up.
@@ -98,7 +102,9 @@ def make_page(
         "radius": bounds.radius,
         "extent": _extent(mesh),
         "cameras": [_described(camera) for camera in views],
+        "triangles": {"fine": len(mesh.faces)} | ({} if coarse is None else {"coarse": len(coarse.faces)}),
         "statistics": {
+            **({} if options.merged_from is None else {"merged from": f"{options.merged_from:,} splats"}),
             "data": f"{packed.bytes_a_triangle:.1f} bytes a triangle",
             "position error": f"{packed.position_error:.2g}",
             "colour error": f"{packed.color_error:.2g} of 255",
@@ -110,9 +116,20 @@ def make_page(
         "kernels": ("application/json", _json(_kernels(groups))),
         "mesh": ("text/plain", _base64(packed.data)),
     }
+    if coarse is not None:
+        blocks["coarse"] = ("text/plain", _base64(quantise_mesh(coarse).data))
     if splats is not None:
         blocks["splats"] = ("text/plain", _base64(pack_splats(splats)))
     return Page(_assembled(settings["title"], blocks), packed)
+
+
+def estimated_size(
+    mesh: SplatMesh, splats: GaussianCloud | None = None, coarse: SplatMesh | None = None
+) -> int:
+    """About how many bytes the page of these will have; known in a fraction of a second."""
+    data = estimated_bytes(mesh, splats) + (0 if coarse is None else estimated_bytes(coarse))
+    texts = [_read(name) for name in (*MODULES, "style.css", "index.html")]
+    return len(_json(_kernels(False))) + sum(map(len, texts)) + 4 * data // 3
 
 
 def _kernels(groups: bool) -> dict[str, object]:

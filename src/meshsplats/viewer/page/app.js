@@ -17,13 +17,17 @@ const FLIGHT = 450; // milliseconds from one camera to the next
 const element = id => document.getElementById(id);
 const number = value => Math.round(value).toLocaleString("en");
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
+const PHONE = 600; // CSS pixels of the shorter side of a screen, below which a device with touch is a phone
 
 class App {
-  constructor(settings, mesh, splats) {
-    Object.assign(this, { settings, mesh, splats });
+  // levels: the meshes that are unpacked, "coarse" and "fine"; unpackFine() gives the fine one, once, where it is not.
+  constructor(settings, levels, splats, unpackFine) {
+    Object.assign(this, { settings, levels, splats, unpackFine });
     this.stage = element("stage");
     this.canvases = { exact: element("exact"), sorted: element("sorted") };
     this.options = { content: "mesh", style: "blended", renderer: "exact", samples: 2, split: 0.5, gain: 1 };
+    const phone = matchMedia("(pointer: coarse)").matches && Math.min(screen.width, screen.height) < PHONE;
+    this.options.detail = phone && levels.coarse ? "coarse" : "fine";
     this.view = this.#viewOf(0);
     this.camera = 0;
     this.flying = false;
@@ -35,21 +39,30 @@ class App {
     this.wake = () => {};
   }
 
-  // WebGL draws from the first moment on; WebGPU takes over when its shaders are compiled.
+  // The level of the image at rest, and its mesh.
+  get resting() { return this.options.detail === "fine" && this.levels.fine ? "fine" : this.levels.coarse ? "coarse" : "fine"; }
+
+  get mesh() { return this.levels[this.resting]; }
+
+  // WebGL draws from the first moment on, the coarse level if there is one; WebGPU takes over when its shaders are
+  // compiled.
   async start(kernels) {
     const problems = [];
     try {
-      this.sorted = new SortedRenderer(this.canvases.sorted, this.mesh, this.splats);
+      this.sorted = new SortedRenderer(this.canvases.sorted, this.levels, this.splats);
     } catch (error) {
       problems.push(error.message);
     }
     this.#connect();
     this.preparing = true;
     if (this.sorted) this.#begin();
+    await this.#refine();
+    this.preparing = true;
     try {
       const lost = reason => this.#fall(`The graphics device was lost (${reason}); triangles are drawn by WebGL now.`);
-      this.exact = await ExactRenderer.create(this.canvases.exact, this.mesh, kernels, lost);
-      if (this.kept) this.exact.crop(this.kept);
+      const exact = await ExactRenderer.create(this.canvases.exact, kernels, lost);
+      for (const level of Object.keys(this.levels)) this.#give(exact, level);
+      this.exact = exact;
     } catch (error) {
       problems.push(error.message);
     }
@@ -70,6 +83,34 @@ class App {
   #begin() {
     document.body.dataset.state = "moving";
     this.#loop();
+  }
+
+  // Unpacks the fine level where it is wanted.
+  async #refine() {
+    if (this.options.detail !== "fine" || !this.unpackFine) return;
+    const unpackFine = this.unpackFine;
+    this.unpackFine = null;
+    this.preparing = true;
+    if (this.sorted) await new Promise(resolve => { this.shown = resolve; }); // a picture first: unpacking blocks the page
+    try {
+      this.levels.fine = await unpackFine();
+      this.crop.again();
+      if (this.exact) this.#give(this.exact, "fine");
+    } catch (error) {
+      delete this.levels.fine;
+      this.say(`Only the coarse mesh is shown: ${error.message}`);
+    }
+    this.preparing = false;
+    this.changed();
+  }
+
+  #give(exact, level) {
+    exact.kept = this.kept;
+    const left = exact.add(level, this.levels[level]);
+    if (left) {
+      this.say(`WebGPU takes buffers of ${Math.round(exact.most / 2 ** 20)} MiB here: the exact image lacks the` +
+        ` ${(100 * left).toFixed(left < 0.1 ? 1 : 0)} % of the triangles that show least.`);
+    }
   }
 
   // From now on without the exact renderer.
@@ -209,7 +250,16 @@ class App {
       options.renderer = event.target.value;
       this.changed();
     });
-    this.crop = new CropBox(settings.extent, this.mesh, this.splats, kept => {
+    const detail = element("detail");
+    element("detailLine").hidden = !settings.triangles.coarse;
+    for (const option of detail.options) option.textContent = `${number(settings.triangles[option.value] ?? 0)} triangles`;
+    detail.value = options.detail;
+    detail.addEventListener("change", () => {
+      options.detail = detail.value;
+      this.changed();
+      this.#refine();
+    });
+    this.crop = new CropBox(settings.extent, this.levels, this.splats, kept => {
       this.kept = kept;
       this.cropped = true; // the renderers hear of it before the next frame, never within one
       this.changed();
@@ -304,26 +354,32 @@ class App {
     if (!quiet || this.finished) return;
     const { options } = this, exact = this.#exactly();
     const passes = exact && options.content !== "splats" ? options.samples ** 2 : 1, pass = this.passes++;
-    if (exact) await this.#drawExact(1, pass, options.samples);
-    if (pass === 0) this.#drawSorted(1, true, exact);
+    if (exact) await this.#drawExact(this.resting, 1, pass, options.samples);
+    if (pass === 0) await this.#drawSorted(this.resting, 1, true, exact);
     if (this.dirty) return;
     this.finished = this.passes >= passes;
-    this.#report(!this.finished ? "refining" : this.preparing ? "preparing" : "still", exact, passes, 1);
+    this.#report(!this.finished ? "refining" : this.preparing ? "preparing" : "still", exact, passes, 1, this.resting);
+    this.shown?.();
   }
 
-  #exactly() { return Boolean(this.exact) && this.options.renderer === "exact" && this.options.style === "blended"; }
+  #exactly() { return Boolean(this.exact?.levels[this.resting]) && this.options.renderer === "exact" && this.options.style === "blended"; }
 
   // A quick image while something changes: small enough to be fluid, by WebGL where WebGPU is too slow.
   async #draft(now) {
     const exact = this.#exactly() && (this.drafts.exact >= 0 || !this.sorted);
     const kind = exact ? "exact" : "sorted", scale = DRAFTS[Math.max(0, this.drafts[kind])];
-    if (!exact) this.#drawSorted(scale, false, false);
+    const level = this.levels.coarse && !(exact && this.swift) ? "coarse" : this.resting;
+    if (!exact) await this.#drawSorted(level, scale, false, false);
     let took = this.lastDraft === kind ? now - this.draftAt : 0;
     if (exact) {
       const begun = performance.now();
-      await this.#drawExact(scale, 0, 1);
-      this.#drawSorted(scale, false, true);
+      await this.#drawExact(level, scale, 0, 1);
+      await this.#drawSorted(level, scale, false, true);
       took = performance.now() - begun;
+      // The fine level too moves where the coarse one is so quick that it should; not again where it is slow.
+      const ratio = this.mesh.faces.length / this.levels[level].faces.length;
+      if (this.swift && took > SLOW) [this.swift, this.sluggish] = [false, true];
+      else if (scale === 1 && took * ratio < SLOW / 2) this.swift = !this.sluggish;
     }
     this.lastDraft = kind;
     this.draftAt = now;
@@ -331,29 +387,31 @@ class App {
     else if (took > SLOW && took < 1000) this.drafts[kind] = Math.max(0, this.drafts[kind] - 1);
     else if (took && took < QUICK) this.drafts[kind] = Math.min(DRAFTS.length - 1, this.drafts[kind] + 1);
     this.took = took;
-    this.#report("moving", exact, 1, scale);
+    this.#report("moving", exact, 1, scale, level);
   }
 
-  #drawSorted(scale, still, exact) {
+  async #drawSorted(level, scale, still, exact) {
     const { options } = this, meshToo = !exact, parts = [];
     const split = { mesh: 0, both: options.split, splats: 1 }[options.content];
     if (this.splats && split > 0) parts.push({ what: "splats", from: 0, to: split });
     if (meshToo && split < 1) parts.push({ what: "mesh", from: split, to: 1 });
+    const { style, background, gain } = options, stop = () => this.dirty;
+    if (parts.length && this.sorted) {
+      const drawn = await this.sorted.draw({ view: this.view, level, parts, style, still, scale, background, gain, stop });
+      if (!drawn) return;
+    }
     this.canvases.exact.style.visibility = exact && split < 1 ? "visible" : "hidden";
     this.canvases.sorted.style.visibility = parts.length ? "visible" : "hidden";
-    if (!parts.length) return;
-    const { style, background, gain } = options;
-    this.sorted?.draw({ view: this.view, parts, style, still, scale, background, gain });
   }
 
   // Sample `pass` of n x n in each pixel.
-  async #drawExact(scale, pass, n) {
+  async #drawExact(level, scale, pass, n) {
     if (this.options.content === "splats") return;
     const { width, height } = this.canvases.exact, { background, gain } = this.options;
     const w = Math.max(1, Math.round(width * scale)), h = Math.max(1, Math.round(height * scale));
     const begun = performance.now();
     const dx = (pass % n + 0.5) / n - 0.5, dy = (Math.floor(pass / n) + 0.5) / n - 0.5;
-    await this.exact.draw(this.view.pinhole(w, h, dx, dy), { first: pass === 0, background, gain, filterScale: scale });
+    await this.exact.draw(level, this.view.pinhole(w, h, dx, dy), { first: pass === 0, background, gain, filterScale: scale });
     this.exactTook = performance.now() - begun;
   }
 
@@ -367,7 +425,7 @@ class App {
 
   // ---- Status and statistics
 
-  #report(state, exact, passes, scale) {
+  #report(state, exact, passes, scale, level) {
     const { options } = this, only = options.content === "splats";
     const kind = only ? "splats" : exact ? "exact" : "sorted";
     const samples = exact && !only ? `, ${passes} sample${passes > 1 ? "s" : ""} per pixel` : "";
@@ -376,14 +434,15 @@ class App {
     element("status").textContent = kind + (wording[state] ?? size);
     element("samples").disabled = !this.#exactly();
     document.body.dataset.renderer = kind;
+    document.body.dataset.level = level;
     document.body.dataset.firstPicture ??= String(Math.round(performance.now())); // milliseconds after the request
     document.body.dataset.state = state;
     if (state === "moving" && !element("statistics").open) return;
     const { width, height } = this.canvases.sorted, { mesh, splats, view, settings } = this;
-    const shown = this.kept;
+    const shown = this.kept, triangles = number(mesh.faces.length / 3);
     const point = values => values.map(value => Number(value.toPrecision(4))).join(" ");
     const rows = {
-      triangles: shown ? `${number(shown.triangles.length)} of ${number(mesh.faces.length / 3)}` : number(mesh.faces.length / 3),
+      triangles: shown ? `${number(shown[this.resting].triangles.length)} of ${triangles}` : triangles,
       vertices: number(mesh.vertices.length / 3),
       ...(splats ? { splats: shown ? `${number(shown.splats.length)} of ${number(splats.count)}` : number(splats.count) } : {}),
       image: `${width} × ${height}`,
@@ -409,10 +468,15 @@ async function main() {
   const settings = JSON.parse(text("settings"));
   const paint = () => new Promise(resolve => requestAnimationFrame(() => setTimeout(resolve)));
   await paint();
-  const mesh = decodeMesh(await unpack(text("mesh")));
-  const splats = text("splats") ? decodeSplats(await unpack(text("splats"))) : null;
-  for (const id of ["mesh", "splats"]) element(id)?.remove();
-  await new App(settings, mesh, splats).start(JSON.parse(text("kernels")));
+  const take = id => {
+    const found = text(id);
+    element(id)?.remove();
+    return found;
+  };
+  const unpackFine = async () => decodeMesh(await unpack(take("mesh")));
+  const levels = text("coarse") ? { coarse: decodeMesh(await unpack(take("coarse"))) } : { fine: await unpackFine() };
+  const splats = text("splats") ? decodeSplats(await unpack(take("splats"))) : null;
+  await new App(settings, levels, splats, levels.fine ? null : unpackFine).start(JSON.parse(text("kernels")));
 }
 
 main().catch(error => {

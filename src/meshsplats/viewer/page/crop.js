@@ -5,9 +5,10 @@ import { project } from "./camera.js";
 const STEPS = 200;
 
 export class CropBox {
-  // extent: [[x, y, z], [x, y, z]], where the sliders end. changed(kept) as in SortedRenderer.crop.
-  constructor(extent, mesh, splats, changed) {
-    Object.assign(this, { extent, mesh, splats, changed });
+  // extent: [[x, y, z], [x, y, z]], where the sliders end. levels: meshes by name, to which others may be added later,
+  // followed by `again`. changed(kept) as in SortedRenderer.crop.
+  constructor(extent, levels, splats, changed) {
+    Object.assign(this, { extent, levels, splats, changed });
     this.marks = [[0, 0, 0], [STEPS, STEPS, STEPS]];
     this.inputs = [];
     const grid = document.querySelector("#crop .six");
@@ -45,6 +46,8 @@ export class CropBox {
     this.changed(null);
   }
 
+  again() { if (this.active) this.changed(this.#kept()); }
+
   #moved(axis, end, mark) {
     const other = this.marks[1 - end][axis];
     this.marks[end][axis] = end ? Math.max(mark, other + 1) : Math.min(mark, other - 1);
@@ -60,9 +63,13 @@ export class CropBox {
   }
 
   #kept() {
-    const { mesh, splats } = this, fans = this.#within(fanMiddles(mesh)), triangles = [];
-    for (const fan of fans) for (let f = mesh.fans[fan]; f < mesh.fans[fan + 1]; f++) triangles.push(f);
-    return { fans, triangles: Uint32Array.from(triangles), splats: splats ? this.#within(splats.means) : new Uint32Array(0) };
+    const kept = { splats: this.splats ? this.#within(this.splats.means) : new Uint32Array(0) };
+    for (const [level, mesh] of Object.entries(this.levels)) {
+      const fans = this.#within(fanMiddles(mesh)), triangles = [];
+      for (const fan of fans) for (let f = mesh.fans[fan]; f < mesh.fans[fan + 1]; f++) triangles.push(f);
+      kept[level] = { fans, triangles: Uint32Array.from(triangles) };
+    }
+    return kept;
   }
 
   // Indices of the points (3 each) in the box. A slider at its end does not bound the scene.

@@ -1,21 +1,26 @@
 // WebGPU: the exact image, by the kernels of meshsplats/webgpu. Their text and the steps of a frame are in the
 // page as Python wrote them; docs/webgpu.md says what a host has to do.
 
+import { counting } from "./scene.js";
+import { sortFarToNear } from "./sorted.js";
+
 const TILE = 8, RUN = 8;
 const NONE = 0xffffffff;
+const ROWS = 16; // strips of an image begin at multiples of it
+const DISPATCH = 65535; // workgroups along an axis, on every device
 
 // Sums frames and shows their mean over the background.
 const PRESENT = `
-struct Show { background: vec3f, gain: f32, size: vec2u, canvas: vec2f, weight: f32, linear: u32, first: u32 };
+struct Show { background: vec3f, gain: f32, size: vec2u, canvas: vec2f, weight: f32, linear: u32, first: u32, top: u32, rows: u32 };
 @group(0) @binding(0) var<uniform> show: Show;
 @group(0) @binding(1) var<storage, read> samples: array<vec4f>;
 @group(0) @binding(2) var<storage, read_write> sums: array<vec4f>;
 @group(0) @binding(3) var<storage, read> total: array<vec4f>;
 
 @compute @workgroup_size(8, 8) fn collect(@builtin(global_invocation_id) id: vec3u) {
-  if (any(id.xy >= show.size)) { return; }
-  let i = id.y * show.size.x + id.x;
-  sums[i] = select(sums[i], vec4f(0), show.first == 1u) + samples[i];
+  if (any(id.xy >= vec2u(show.size.x, show.rows))) { return; }
+  let i = (show.top + id.y) * show.size.x + id.x;
+  sums[i] = select(sums[i], vec4f(0), show.first == 1u) + samples[id.y * show.size.x + id.x];
 }
 @vertex fn corner(@builtin(vertex_index) i: u32) -> @builtin(position) vec4f {
   return vec4f(f32(i & 1u) * 4 - 1, f32(i >> 1u) * 4 - 1, 0, 1);
@@ -52,8 +57,8 @@ fn pixel(p: vec2i) -> vec4f {
 }`;
 
 export class ExactRenderer {
-  // lost(reason) is called when the device goes. Throws where there is no WebGPU, or the scene does not fit.
-  static async create(canvas, mesh, kernels, lost) {
+  // lost(reason) is called when the device goes. Throws where there is no WebGPU.
+  static async create(canvas, kernels, lost) {
     if (!navigator.gpu) throw new Error("this browser has no WebGPU");
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
     if (!adapter) throw new Error("WebGPU finds no graphics device");
@@ -61,18 +66,17 @@ export class ExactRenderer {
     const device = await adapter.requestDevice({ requiredLimits: { maxStorageBufferBindingSize, maxBufferSize } });
     const self = new ExactRenderer();
     const { vendor, architecture, description } = adapter.info ?? {};
-    Object.assign(self, { canvas, mesh, kernels, device, buffers: {}, groupsOfBindings: new Map() });
+    Object.assign(self, { canvas, kernels, device, levels: {}, buffers: {}, groupsOfBindings: new Map() });
     Object.assign(self, { capacity: kernels.limits.firstPairs, budget: kernels.limits.budgets[0] });
     self.name = description || [vendor, architecture].filter(Boolean).join(" ") || "WebGPU";
     self.most = Math.min(maxStorageBufferBindingSize, maxBufferSize);
+    self.capacity = Math.min(self.capacity, Math.floor(self.most / 8));
     device.lost.then(info => { if (info.reason !== "destroyed") lost(info.message || "no reason given"); });
     device.addEventListener("uncapturederror", event => { self.problem ??= event.error.message; });
     self.context = canvas.getContext("webgpu");
     self.format = navigator.gpu.getPreferredCanvasFormat();
     self.context.configure({ device, format: self.format, alphaMode: "opaque" });
     await self.#compile();
-    self.#upload("vertices", mesh.vertices);
-    self.#upload("values", mesh.colors);
     self.#allocate("plan", 64);
     self.#allocate("counters", 64);
     self.#allocate("frame", 256);
@@ -81,7 +85,6 @@ export class ExactRenderer {
     digits.forEach(([shift, word], i) => words.set([shift, word, 1], 64 * i));
     self.#upload("digits", words);
     self.back = device.createBuffer({ size: 64, usage: GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ });
-    self.crop(null);
     if (self.problem) throw new Error(self.problem);
     return self;
   }
@@ -109,9 +112,28 @@ export class ExactRenderer {
 
   // ---- The mesh
 
+  // Adds a mesh under the name `level`: the part of it that fits the device. Returns the share of triangles left out.
+  // Throws if not even parts fit.
+  add(level, mesh) {
+    const part = fitting(mesh, this.most, this.kernels.limits.runs, this.kernels.groups);
+    this.levels[level] = { mesh, part };
+    this.#upload(`${level}/vertices`, part?.vertices ?? mesh.vertices);
+    this.#upload(`${level}/values`, part?.colors ?? mesh.colors);
+    this.crop(this.kept ?? null);
+    if (this.problem) throw new Error(this.problem);
+    return part ? 1 - part.count / (mesh.faces.length / 3) : 0;
+  }
+
   // kept as in SortedRenderer.crop.
   crop(kept) {
-    const { mesh } = this, chosen = kept?.triangles;
+    this.kept = kept;
+    for (const level of Object.keys(this.levels)) this.#choose(level, kept?.[level].triangles);
+  }
+
+  // Uploads the triangles `chosen`, all by default, of a level.
+  #choose(level, chosen) {
+    const { mesh, part } = this.levels[level];
+    if (part) chosen = (chosen ?? counting(mesh.faces.length / 3)).filter(f => part.kept[f]);
     const pick = (array, width) => {
       if (!array || !chosen) return array;
       const some = new array.constructor(chosen.length * width);
@@ -121,28 +143,29 @@ export class ExactRenderer {
       return some;
     };
     const faces = pick(mesh.faces, 3), splat = pick(mesh.splat, 1), group = pick(mesh.group, 1);
-    const runs = findRuns(faces, splat), F = faces.length / 3;
-    if (runs.length >= this.kernels.limits.runs) throw new Error("the mesh has too many triangles for WebGPU");
-    this.counts = { one: 1, vertices: mesh.vertices.length / 3, faces: F, runs: runs.length, fans: 0, groups: 0 };
-    this.offsets = [3 * F, 0, 0];
+    if (part) for (let i = 0; i < faces.length; i++) faces[i] = part.vertexOf[faces[i]];
+    const vertices = part?.vertices ?? mesh.vertices, runs = findRuns(faces, splat), F = faces.length / 3;
+    const counts = { one: 1, vertices: vertices.length / 3, faces: F, runs: runs.length, fans: 0, groups: 0 };
+    let offsets = [3 * F, 0, 0];
     const parts = [faces, runs];
     if (this.kernels.groups) {
-      const { ofFace, largest } = findGroups(mesh.vertices, faces, group);
+      const { ofFace, largest } = findGroups(vertices, faces, group);
       parts.push(ofFace, largest);
-      this.offsets = [3 * F, 3 * F + runs.length, 3 * F + runs.length + F];
-      this.counts.groups = largest.length;
+      offsets = [3 * F, 3 * F + runs.length, 3 * F + runs.length + F];
+      counts.groups = largest.length;
     }
     if (mesh.filter > 0) {
       const fans = [];
       for (let f = 0; f < F; f++) if (f === 0 || splat[f] !== splat[f - 1]) fans.push(f);
-      this.counts.fans = fans.length;
-      this.#upload("fans", Uint32Array.from([...fans, F]));
+      counts.fans = fans.length;
+      this.#upload(`${level}/fans`, Uint32Array.from([...fans, F]));
     }
-    const joined = new Uint32Array(parts.reduce((sum, part) => sum + part.length, 0));
-    parts.reduce((at, part) => { joined.set(part, at); return at + part.length; }, 0);
-    this.#upload("mesh", joined);
-    this.#allocate("projected", 16 * (this.counts.vertices + 2 * this.counts.groups));
-    this.#allocate("group_bounds", 8 * this.counts.groups);
+    Object.assign(this.levels[level], { counts, offsets });
+    const joined = new Uint32Array(parts.reduce((sum, one) => sum + one.length, 0));
+    parts.reduce((at, one) => { joined.set(one, at); return at + one.length; }, 0);
+    this.#upload(`${level}/mesh`, joined);
+    this.#allocate("projected", 16 * (counts.vertices + 2 * counts.groups));
+    this.#allocate("group_bounds", 8 * counts.groups);
     this.#allocate("boxes", 8 * runs.length);
     this.#allocate("offsets", 4 * runs.length);
   }
@@ -168,33 +191,57 @@ export class ExactRenderer {
 
   // ---- Frames
 
-  // Draws one sample in each pixel and shows the mean of it and of the frames since the last one with `first`.
-  // filterScale: size of the image in that of the canvas, for the low-pass filter of the mesh.
-  async draw(pinhole, { first, background, gain, filterScale }) {
-    if (!this.counts.faces) {
-      this.#show(pinhole, { first, background, gain }, true);
-      return;
+  // Draws one sample in each pixel of a level and shows the mean of it and of the frames since the last one with
+  // `first`. filterScale: size of the image in that of the canvas, for the low-pass filter of the mesh.
+  async draw(level, pinhole, { first, background, gain, filterScale }) {
+    const { width, height } = pinhole, { mesh, counts } = this.levels[level];
+    if (16 * width * height > this.most) throw new Error("the image is too large");
+    this.#allocate("total", 16 * width * height);
+    this.frames = first ? 1 : this.frames + 1;
+    const show = { width, height, first, background, gain, linear: mesh.blending === "linear" };
+    // The whole image, or strips of it where tile lists or samples do not fit the device.
+    const waiting = [[0, height]];
+    while (waiting.length) {
+      const [top, rows] = waiting.pop();
+      if (!this.#fits(width, rows) || (counts.faces && !await this.#drawStrip(level, pinhole, top, rows, filterScale))) {
+        if (rows <= ROWS) throw new Error("the tile lists need more memory than WebGPU allows here");
+        const upper = ROWS * Math.ceil(rows / 2 / ROWS);
+        waiting.push([top + upper, rows - upper], [top, upper]);
+        continue;
+      }
+      this.#collect({ ...show, top, rows }, !counts.faces);
     }
-    this.#prepare(pinhole, filterScale);
+    this.#paint();
+  }
+
+  #fits(width, rows) {
+    const { tiles, window } = this.kernels.limits;
+    return Math.ceil(width / TILE) * Math.ceil(rows / TILE) <= tiles && width * rows <= Math.min(window, this.most / 32);
+  }
+
+  // Draws some rows of the image to `samples`; false if they have too many pairs of a run and a tile.
+  async #drawStrip(level, pinhole, top, rows, filterScale) {
+    const strip = { ...pinhole, cy: pinhole.cy - top, height: rows };
+    this.#prepare(level, strip, filterScale);
     // Loop iterations of one walk through a tile list, one limit after the other until all tiles are finished. Software
     // drivers cut loops after 65,535 iterations; walks are counted high, so the first is safe, and the second mostly.
     const { budgets, pairs, rounds } = this.kernels.limits;
-    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1, level = budgets.indexOf(this.budget);
+    let steps = [...this.kernels.lists, ...this.kernels.raster], walks = -1, at = budgets.indexOf(this.budget);
     for (let round = 0; ; round++) {
-      const counters = await this.#run(steps);
+      const counters = await this.#run(level, steps);
       if (this.problem) throw new Error(this.problem);
       if (counters[0] > this.capacity) {
         const most = Math.min(pairs, Math.floor(this.most / 8));
-        if (counters[0] > most) throw new Error("the tile lists need more memory than WebGPU allows here");
+        if (counters[0] > most) return false;
         this.capacity = Math.min(most, Math.ceil(counters[0] * 1.25));
-        this.#prepare(pinhole, filterScale);
+        this.#prepare(level, strip, filterScale);
         continue;
       }
-      if (counters[2] === this.counts.tiles) break;
+      if (counters[2] === this.tiles) return true;
       if (counters[9] || counters[12] || walks === counters[3] || round > rounds) {
-        if (++level === budgets.length) throw new Error("the graphics device did not finish the image");
-        this.budget = budgets[level];
-        this.#prepare(pinhole, filterScale);
+        if (++at === budgets.length) throw new Error("the graphics device did not finish the image");
+        this.budget = budgets[at];
+        this.#prepare(level, strip, filterScale);
         steps = [...this.kernels.lists, ...this.kernels.raster];
         walks = -1;
         round = 0;
@@ -203,30 +250,26 @@ export class ExactRenderer {
       walks = counters[3];
       steps = this.kernels.again;
     }
-    this.#show(pinhole, { first, background, gain }, false);
   }
 
-  #prepare(pinhole, filterScale) {
-    const { width, height } = pinhole, { counts } = this, { tiles, window } = this.kernels.limits;
-    const across = Math.ceil(width / TILE), down = Math.ceil(height / TILE);
-    if (across * down > tiles || width * height > window) throw new Error("the image is too large");
-    counts.tiles = across * down;
+  #prepare(level, pinhole, filterScale) {
+    const { width, height } = pinhole, { mesh, counts, offsets } = this.levels[level];
+    this.tiles = Math.ceil(width / TILE) * Math.ceil(height / TILE);
     const blocks = Math.ceil(this.capacity / 2048);
     this.#allocate("pairs_a", 8 * this.capacity);
     this.#allocate("pairs_b", 8 * this.capacity);
     this.#allocate("table", 4 * 256 * blocks);
     this.#allocate("sums", 4 * (2 + Math.max(Math.ceil(256 * blocks / 2048), Math.ceil(counts.runs / 2048))));
-    this.#allocate("lists", 16 * (counts.tiles + 1));
-    this.#allocate("again", 16 * (counts.tiles + 1));
+    this.#allocate("lists", 16 * (this.tiles + 1));
+    this.#allocate("again", 16 * (this.tiles + 1));
     this.#allocate("samples", 32 * width * height);
-    const filter = this.mesh.filter * filterScale * filterScale;
-    const frame = frameUniform(pinhole, counts, this.capacity, this.offsets, filter, this.budget);
-    this.device.queue.writeBuffer(this.buffers.frame, 0, frame);
+    const filter = mesh.filter * filterScale * filterScale;
+    this.device.queue.writeBuffer(this.buffers.frame, 0, frameUniform(pinhole, counts, this.capacity, offsets, filter, this.budget));
   }
 
   // Runs steps and returns the counters.
-  async #run(steps) {
-    const encoder = this.device.createCommandEncoder();
+  async #run(level, steps) {
+    const counts = { ...this.levels[level].counts, tiles: this.tiles }, encoder = this.device.createCommandEncoder();
     let pass = null;
     for (const step of steps) {
       if (step.clear) {
@@ -235,14 +278,14 @@ export class ExactRenderer {
         encoder.clearBuffer(this.buffers[step.clear], step.from);
         continue;
       }
-      if (step.if && !this.counts[step.if]) continue;
+      if (step.if && !counts[step.if]) continue;
       pass ??= encoder.beginComputePass();
       pass.setPipeline(this.pipelines[step.kernel]);
-      pass.setBindGroup(0, this.#bindings(step));
+      pass.setBindGroup(0, this.#bindings(level, step));
       if (step.indirect) {
         pass.dispatchWorkgroupsIndirect(this.buffers[step.indirect[0]], step.indirect[1]);
       } else {
-        pass.dispatchWorkgroups(Math.ceil(this.counts[step.count[0]] / step.count[1]));
+        pass.dispatchWorkgroups(Math.ceil(counts[step.count[0]] / step.count[1]));
       }
     }
     pass?.end();
@@ -254,53 +297,106 @@ export class ExactRenderer {
     return counters;
   }
 
-  #bindings(step) {
-    const known = this.groupsOfBindings.get(step);
+  #bindings(level, step) {
+    if (!this.groupsOfBindings.has(level)) this.groupsOfBindings.set(level, new Map());
+    const all = this.groupsOfBindings.get(level), known = all.get(step);
     if (known) return known;
     const entries = Object.entries(step.bind).map(([binding, name]) => {
-      const [base, index] = name.split("."), buffer = this.buffers[base];
+      const [base, index] = name.split("."), buffer = this.buffers[`${level}/${base}`] ?? this.buffers[base];
       const part = index === undefined ? {} : { offset: 256 * Number(index), size: 16 };
       return { binding: Number(binding), resource: { buffer, ...part } };
     });
     const made = this.device.createBindGroup({ layout: this.pipelines[step.kernel].getBindGroupLayout(0), entries });
-    this.groupsOfBindings.set(step, made);
+    all.set(step, made);
     return made;
   }
 
   // ---- The canvas
 
-  #show({ width, height }, { first, background, gain }, empty) {
+  // Adds the samples of some rows to the image; without triangles, transparent ones.
+  #collect({ width, height, first, background, gain, linear, top, rows }, empty) {
     const { device, canvas } = this;
-    this.#allocate("total", 16 * width * height);
-    this.#allocate("samples", 32 * width * height);
-    this.frames = first ? 1 : this.frames + 1;
+    this.#allocate("samples", 32 * width * rows);
     const floats = new Float32Array(16), words = new Uint32Array(floats.buffer);
     floats.set([...background, gain]);
     words.set([width, height], 4);
     floats.set([canvas.width, canvas.height, 1 / this.frames], 6);
-    words.set([Number(this.mesh.blending === "linear"), Number(first)], 9);
+    words.set([Number(linear), Number(first), top, rows], 9);
     device.queue.writeBuffer(this.buffers.show, 0, floats);
-    if (empty) device.queue.writeBuffer(this.buffers.samples, 0, new Float32Array(4 * width * height).map((_, i) => Number(i % 4 === 3)));
-    const encoder = device.createCommandEncoder(), part = name => ({ buffer: this.buffers[name] });
-    const collect = encoder.beginComputePass();
+    if (empty) device.queue.writeBuffer(this.buffers.samples, 0, new Float32Array(4 * width * rows).map((_, i) => Number(i % 4 === 3)));
+    const encoder = device.createCommandEncoder(), collect = encoder.beginComputePass();
     collect.setPipeline(this.pipelines.collect);
-    collect.setBindGroup(0, device.createBindGroup({
-      layout: this.pipelines.collect.getBindGroupLayout(0),
-      entries: [[0, "show"], [1, "samples"], [2, "total"]].map(([binding, name]) => ({ binding, resource: part(name) })),
-    }));
-    collect.dispatchWorkgroups(Math.ceil(width / 8), Math.ceil(height / 8));
+    collect.setBindGroup(0, this.#shown(this.pipelines.collect, [[0, "show"], [1, "samples"], [2, "total"]]));
+    collect.dispatchWorkgroups(Math.ceil(width / 8), Math.ceil(rows / 8));
     collect.end();
+    device.queue.submit([encoder.finish()]);
+  }
+
+  #paint() {
+    const { device } = this, encoder = device.createCommandEncoder();
     const view = this.context.getCurrentTexture().createView();
     const paint = encoder.beginRenderPass({ colorAttachments: [{ view, loadOp: "clear", storeOp: "store" }] });
     paint.setPipeline(this.painter);
-    paint.setBindGroup(0, device.createBindGroup({
-      layout: this.painter.getBindGroupLayout(0),
-      entries: [[0, "show"], [3, "total"]].map(([binding, name]) => ({ binding, resource: part(name) })),
-    }));
+    paint.setBindGroup(0, this.#shown(this.painter, [[0, "show"], [3, "total"]]));
     paint.draw(3);
     paint.end();
     device.queue.submit([encoder.finish()]);
   }
+
+  #shown(pipeline, names) {
+    const entries = names.map(([binding, name]) => ({ binding, resource: { buffer: this.buffers[name] } }));
+    return this.device.createBindGroup({ layout: pipeline.getBindGroupLayout(0), entries });
+  }
+}
+
+// The part of a mesh whose buffers fit into `most` bytes each, null if all of it does: the fans of the largest area times
+// opacity. runs: most runs. kept: 1 for each triangle in it, count: how many; vertices, colors: its own; vertexOf: the
+// new index of each old vertex.
+export function fitting(mesh, most, runs, groups) {
+  const { vertices, colors, faces, fans } = mesh, V = vertices.length / 3, F = faces.length / 3, n = fans.length - 1;
+  // A triangle takes three indices, a share of a run and, with depth groups, two words and two projected vertices.
+  const all = findRuns(faces, mesh.splat).length, words = 3 + Math.max(all / F, n / F) + (groups ? 2 : 0);
+  const room = Math.floor(most / 16) * (groups ? 1 / 3 : 1);
+  const mostVertices = Math.min(room, 256 * DISPATCH);
+  const mostFaces = Math.min(most / 4 / words, groups ? Math.min(room, 64 * DISPATCH) : Infinity, F * Math.min(1, (runs - 1) / all));
+  const mostFans = mesh.filter > 0 ? Math.min(64 * DISPATCH, most / 4 - 1) : Infinity;
+  if (V <= mostVertices && F <= mostFaces && n <= mostFans) return null;
+  const importance = new Float32Array(n), point = k => vertices.subarray(3 * k, 3 * k + 3);
+  for (let fan = 0; fan < n; fan++) {
+    for (let f = fans[fan]; f < fans[fan + 1]; f++) {
+      const [a, b, c] = [0, 1, 2].map(k => faces[3 * f + k]), [p, q, r] = [a, b, c].map(point);
+      const u = [0, 1, 2].map(k => q[k] - p[k]), v = [0, 1, 2].map(k => r[k] - p[k]);
+      const area = Math.hypot(u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]);
+      importance[fan] += area * (colors[4 * a + 3] + colors[4 * b + 3] + colors[4 * c + 3]);
+    }
+  }
+  const order = sortFarToNear(importance, counting(n), new Uint32Array(n));
+  const kept = new Uint8Array(F), used = new Uint8Array(V);
+  let count = 0, corners = 0;
+  for (let i = 0; i < Math.min(n, mostFans); i++) {
+    const from = fans[order[i]], to = fans[order[i] + 1];
+    if (count + to - from > mostFaces || corners + 3 * (to - from) > mostVertices && corners + fresh(faces, used, from, to) > mostVertices) break;
+    for (let k = 3 * from; k < 3 * to; k++) {
+      corners += 1 - used[faces[k]];
+      used[faces[k]] = 1;
+    }
+    kept.fill(1, from, to);
+    count += to - from;
+  }
+  if (!count) throw new Error("not even a part of the scene fits this graphics device");
+  const part = { kept, count, vertexOf: new Uint32Array(V), vertices: new Float32Array(3 * corners), colors: new Float32Array(4 * corners) };
+  for (let v = 0, at = 0; v < V; v++) {
+    if (!used[v]) continue;
+    part.vertices.set(point(v), 3 * at);
+    part.colors.set(colors.subarray(4 * v, 4 * v + 4), 4 * at);
+    part.vertexOf[v] = at++;
+  }
+  return part;
+}
+
+// Vertices of some triangles that are not used yet.
+function fresh(faces, used, from, to) {
+  return new Set(faces.subarray(3 * from, 3 * to).filter(v => !used[v])).size;
 }
 
 // The uniform `frame` of docs/webgpu.md, one sample a pixel: 64 words, the last four unused. filter: variance in square
@@ -342,7 +438,7 @@ export function findRuns(faces, splat) {
 // ofFace: the depth group of each face, without gaps, NONE for none; largest: the face of each with the largest area.
 export function findGroups(vertices, faces, group) {
   const F = faces.length / 3, ofFace = new Uint32Array(F).fill(NONE), names = new Map(), largest = [], areas = [];
-  for (let f = 0; f < F; f++) {
+  for (let f = 0; group && f < F; f++) {
     if (group[f] < 0) continue;
     const p = [0, 1, 2].map(k => vertices.subarray(3 * faces[3 * f + k], 3 * faces[3 * f + k] + 3));
     const u = [0, 1, 2].map(c => p[1][c] - p[0][c]), v = [0, 1, 2].map(c => p[2][c] - p[0][c]);

@@ -5,6 +5,8 @@ import { fanMiddles, middlesOf } from "./crop.js";
 import { counting } from "./scene.js";
 
 const WIDTH = 4096; // texels in a row of a data texture
+const PART = 1 << 18; // triangles of a draw call: long ones block slow devices, or lose them
+const SOLID = { blended: -1, opaque: 1, wireframe: 0.8 };
 const LENS = `
 uniform vec4 row0, row1, row2, lens; // world to camera; fx fy cx cy
 uniform vec3 size;                   // width, height, near
@@ -19,28 +21,18 @@ const HEAD = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
 `;
 const MESH_VERTEX = HEAD + LENS + `
-uniform sampler2D positions, colors;
-uniform usampler2D faces;
-in uint item;
-centroid out vec4 rgba; out vec3 corner;
+in vec3 position; in vec4 color;
+centroid out vec4 rgba;
 void main() {
-  uvec4 face = texelFetch(faces, place(item), 0);
-  uint v = gl_VertexID == 0 ? face.x : gl_VertexID == 1 ? face.y : face.z;
-  rgba = texelFetch(colors, place(v), 0);
-  corner = vec3(gl_VertexID == 0, gl_VertexID == 1, gl_VertexID == 2);
-  gl_Position = clip(seen(texelFetch(positions, place(v), 0).xyz));
+  rgba = color;
+  gl_Position = clip(seen(position));
 }`;
 const MESH_FRAGMENT = HEAD + `
-uniform int style; // 0 blended, 1 opaque, 2 wireframe
-centroid in vec4 rgba; in vec3 corner;
+uniform float solid; // opacity of all fragments; negative: that of the vertices
+centroid in vec4 rgba;
 out vec4 result;
 void main() {
-  float alpha = rgba.a;
-  if (style == 1) alpha = 1.;
-  if (style == 2) {
-    vec3 width = max(fwidth(corner), vec3(1e-6)), away = corner / width;
-    alpha = .8 * (1. - smoothstep(.4, 1.4, min(min(away.x, away.y), away.z)));
-  }
+  float alpha = solid < 0. ? rgba.a : solid;
   result = vec4(rgba.rgb * alpha, alpha);
 }`;
 const SPLAT_VERTEX = HEAD + LENS + `
@@ -129,40 +121,32 @@ function depthsOf(points, row, near, depths) {
 }
 
 export class SortedRenderer {
-  // Throws where there is no WebGL2.
-  constructor(canvas, mesh, splats) {
+  // levels: meshes by name; others may be added later. Throws where there is no WebGL2.
+  constructor(canvas, levels, splats) {
     const gl = canvas.getContext("webgl2", { alpha: true, antialias: false, premultipliedAlpha: true });
     if (!gl) throw new Error("this browser has no WebGL2");
-    Object.assign(this, { canvas, gl, mesh, splats, frames: new Map() });
+    Object.assign(this, { canvas, gl, levels, splats, triangles: {}, frames: new Map() });
     this.float = Boolean(gl.getExtension("EXT_color_buffer_float"));
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : gl.getParameter(gl.RENDERER);
     this.programs = { present: program(gl, PRESENT_VERTEX, PRESENT_FRAGMENT) };
-    this.triangles = null;
     this.cloud = null;
   }
 
-  #needMesh() {
-    if (this.triangles) return this.triangles;
-    const { gl, mesh } = this, { fans } = mesh, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
-    this.programs.mesh = program(gl, MESH_VERTEX, MESH_FRAGMENT);
-    const four = new Float32Array(4 * V), bytes = new Uint8Array(4 * V), corners = new Uint32Array(4 * F);
-    for (let v = 0; v < V; v++) four.set(mesh.vertices.subarray(3 * v, 3 * v + 3), 4 * v);
+  #needMesh(level) {
+    if (this.triangles[level]) return this.triangles[level];
+    const { gl } = this, mesh = this.levels[level], { fans } = mesh, F = mesh.faces.length / 3, V = mesh.vertices.length / 3;
+    this.programs.mesh ??= program(gl, MESH_VERTEX, MESH_FRAGMENT);
+    const bytes = new Uint8Array(4 * V);
     for (let i = 0; i < 4 * V; i++) bytes[i] = Math.round(255 * mesh.colors[i]);
-    for (let f = 0; f < F; f++) for (let k = 0; k < 3; k++) corners[4 * f + k] = mesh.faces[3 * f + k];
     const middles = fanMiddles(mesh), centers = fans.length - 1 === F ? middles : middlesOf(mesh, counting(F + 1));
-    this.triangles = {
-      textures: {
-        positions: texture(gl, gl.RGBA32F, gl.RGBA, gl.FLOAT, four),
-        colors: texture(gl, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, bytes),
-        faces: texture(gl, gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, corners),
-      },
-      ...vertexArray(gl, this.programs.mesh), centers, middles, fans, order: new Uint32Array(F),
+    this.triangles[level] = {
+      ...indexedArray(gl, this.programs.mesh, mesh.vertices, bytes), centers, middles, fans, order: new Uint32Array(F),
       depths: new Float32Array(F), fanDepths: new Float32Array(fans.length - 1),
       fanOrder: new Uint32Array(fans.length - 1), count: 0,
     };
     this.crop(this.kept ?? null);
-    return this.triangles;
+    return this.triangles[level];
   }
 
   #needSplats() {
@@ -185,13 +169,12 @@ export class SortedRenderer {
     return this.cloud;
   }
 
-  // kept: {fans, triangles, splats}, lists of indices in ascending order; null: everything.
+  // kept: {splats, and by level {fans, triangles}}, lists of indices in ascending order; null: everything.
   crop(kept) {
     this.kept = kept;
-    if (this.triangles) {
-      const all = this.triangles;
-      all.fanItems = kept ? kept.fans : counting(all.fans.length - 1);
-      all.items = kept ? kept.triangles : counting(all.order.length);
+    for (const [level, all] of Object.entries(this.triangles)) {
+      all.fanItems = kept ? kept[level].fans : counting(all.fans.length - 1);
+      all.items = kept ? kept[level].triangles : counting(all.order.length);
     }
     if (this.cloud) {
       this.cloud.items = kept ? kept.splats : counting(this.splats.count);
@@ -199,48 +182,69 @@ export class SortedRenderer {
   }
 
   // Draws parts [{what: "mesh" or "splats", from, to}] of the image's width, 0 to 1, and leaves the rest of the canvas
-  // transparent. scale: size of the image in that of the canvas; still: triangles are sorted one by one, not fan by fan.
-  draw({ view, parts, style, still, scale, background, gain }) {
+  // transparent. scale: size of the image in that of the canvas; still: triangles are sorted one by one, not fan by fan,
+  // and the device may take its time, unless stop() says that the image is not wanted any more: then the canvas stays as it is, and the result is false.
+  async draw({ view, level, parts, style, still, scale, background, gain, stop }) {
     const { gl, canvas } = this, w = Math.max(1, Math.round(canvas.width * scale));
-    const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h);
+    const h = Math.max(1, Math.round(canvas.height * scale)), pinhole = view.pinhole(w, h), images = [];
     gl.disable(gl.SCISSOR_TEST);
+    for (const { what } of parts) {
+      images.push(what === "mesh" ? await this.#drawMesh(level, pinhole, style, still, stop) : this.#drawSplats(pinhole, scale));
+      if (!images.at(-1)) return false;
+    }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    for (const { what, from, to } of parts) {
-      const image = what === "mesh" ? this.#drawMesh(pinhole, style, still) : this.#drawSplats(pinhole, scale);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    parts.forEach(({ what, from, to }, i) => {
       gl.viewport(0, 0, canvas.width, canvas.height);
       gl.enable(gl.SCISSOR_TEST);
       const x0 = Math.round(from * canvas.width), x1 = Math.round(to * canvas.width);
       gl.scissor(x0, 0, Math.max(0, x1 - x0), canvas.height);
       const { id, at } = this.programs.present;
       gl.useProgram(id);
-      bindTextures(gl, this.programs.present, { image });
+      bindTextures(gl, this.programs.present, { image: images[i] });
       gl.uniform3fv(at("background"), background);
       gl.uniform1f(at("gain"), gain);
-      gl.uniform1i(at("linear"), Number(what === "mesh" && this.mesh.blending === "linear"));
+      gl.uniform1i(at("linear"), Number(what === "mesh" && this.levels[level].blending === "linear"));
       gl.disable(gl.BLEND);
       gl.disable(gl.DEPTH_TEST);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
       gl.disable(gl.SCISSOR_TEST);
-    }
+    });
+    return true;
   }
 
-  #drawMesh(pinhole, style, still) {
-    const { gl } = this, all = this.#needMesh(), opaque = style === "opaque";
+  async #drawMesh(level, pinhole, style, still, stop) {
+    const { gl } = this, all = this.#needMesh(level), opaque = style === "opaque", wires = style === "wireframe";
     if (!opaque) this.#sortMesh(all, pinhole, still);
     const list = opaque ? all.items : all.order.subarray(0, all.count);
-    const frame = this.#frame(pinhole.width, pinhole.height, 4, opaque);
-    this.#begin(frame, this.programs.mesh, pinhole, all, list);
-    if (opaque) {
-      gl.disable(gl.BLEND);
-      gl.enable(gl.DEPTH_TEST);
+    const frame = this.#frame(pinhole.width, pinhole.height, 4, opaque), corners = wires ? 6 : 3;
+    for (let at = 0; at === 0 || at < list.length; at += PART) {
+      if (still && at > 0) {
+        await this.#idle();
+        if (stop()) return null;
+      }
+      const some = list.subarray(at, at + PART);
+      this.#begin(frame, this.programs.mesh, pinhole, at === 0);
+      if (opaque) {
+        gl.disable(gl.BLEND);
+        gl.enable(gl.DEPTH_TEST);
+      }
+      gl.uniform1f(this.programs.mesh.at("solid"), SOLID[style]);
+      gl.bindVertexArray(all.array);
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, cornersOf(this.levels[level].faces, some, wires), gl.STREAM_DRAW);
+      gl.drawElements(wires ? gl.LINES : gl.TRIANGLES, corners * some.length, gl.UNSIGNED_INT, 0);
+      gl.bindVertexArray(null);
     }
-    gl.uniform1i(this.programs.mesh.at("style"), ["blended", "opaque", "wireframe"].indexOf(style));
-    gl.drawArraysInstanced(gl.TRIANGLES, 0, 3, list.length);
-    gl.bindVertexArray(null);
     return resolve(gl, frame);
+  }
+
+  // Until the device has done what it was given.
+  async #idle() {
+    const { gl } = this, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise(done => setTimeout(done, 2));
+    gl.deleteSync(fence);
   }
 
   #sortMesh(all, pinhole, still) {
@@ -267,7 +271,11 @@ export class SortedRenderer {
     sortFarToNear(all.depths, all.items, all.order);
     const frame = this.#frame(pinhole.width, pinhole.height, 0, false);
     const list = all.order.subarray(0, all.items.length);
-    this.#begin(frame, this.programs.splats, pinhole, all, list);
+    this.#begin(frame, this.programs.splats, pinhole, true);
+    bindTextures(gl, this.programs.splats, all.textures);
+    gl.bindVertexArray(all.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, all.buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, list, gl.STREAM_DRAW);
     gl.uniform1f(this.programs.splats.at("dilation"), 0.3 * scale * scale);
     gl.uniform1i(this.programs.splats.at("antialiased"), Number(this.splats.kernel === "antialiased"));
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, list.length);
@@ -275,24 +283,20 @@ export class SortedRenderer {
     return resolve(gl, frame);
   }
 
-  #begin(frame, { id, at }, pinhole, { textures, array, buffer }, list) {
+  #begin(frame, { id, at }, pinhole, clear) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame.target);
     gl.viewport(0, 0, frame.width, frame.height);
     gl.clearColor(0, 0, 0, 0);
     gl.depthMask(true);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    if (clear) gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(id);
-    bindTextures(gl, { at }, textures);
     pinhole.rows.forEach((row, k) => gl.uniform4fv(at("row" + k), row));
     gl.uniform4f(at("lens"), pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy);
     gl.uniform3f(at("size"), pinhole.width, pinhole.height, pinhole.near);
-    gl.bindVertexArray(array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    gl.bufferData(gl.ARRAY_BUFFER, list, gl.STREAM_DRAW);
   }
 
   // A frame buffer of that size, kept until another size is asked for.
@@ -363,6 +367,40 @@ function program(gl, vertex, fragment) {
     return places.get(name);
   };
   return { id, at };
+}
+
+// Indices of the vertices of `some` triangles, three each; of their edges, two each.
+function cornersOf(faces, some, edges) {
+  const indices = new Uint32Array((edges ? 6 : 3) * some.length);
+  for (let i = 0, at = 0; i < some.length; i++) {
+    const from = 3 * some[i], a = faces[from], b = faces[from + 1], c = faces[from + 2];
+    indices[at++] = a;
+    indices[at++] = b;
+    if (edges) indices[at++] = b;
+    indices[at++] = c;
+    if (edges) {
+      indices[at++] = c;
+      indices[at++] = a;
+    }
+  }
+  return indices;
+}
+
+// Vertices with their colours, and room for indices.
+function indexedArray(gl, { id }, positions, colors) {
+  const array = gl.createVertexArray();
+  gl.bindVertexArray(array);
+  const attributes = [["position", positions, 3, gl.FLOAT, false], ["color", colors, 4, gl.UNSIGNED_BYTE, true]];
+  for (const [name, values, width, type, normalised] of attributes) {
+    const at = gl.getAttribLocation(id, name);
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(at);
+    gl.vertexAttribPointer(at, width, type, normalised, 0, 0);
+  }
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bindVertexArray(null);
+  return { array };
 }
 
 // One index an instance, far ones first.
