@@ -315,6 +315,65 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert "--alpha mask or hybrid, and --compression are for .glb" in capsys.readouterr().err
 
 
+def nested_balls(opacity: float) -> meshsplats.GaussianCloud:
+    """A blue ball, and a red one inside it, which comes later in the file."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(1200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    inside = np.arange(1200) >= 600
+    rgb = np.where(inside[:, None], (2.0, -1, -1), (-1, -1, 2.0))
+    return meshsplats.GaussianCloud(
+        directions * np.where(inside, 0.7, 1)[:, None],
+        np.tile([1.0, 0, 0, 0], (1200, 1)),
+        np.full((1200, 3), 0.09),
+        np.full(1200, opacity),
+        rgb[:, None],
+    )
+
+
+def material(path) -> dict:
+    return GltfDocument(path).json["materials"][0]
+
+
+def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
+    source, out = tmp_path / "balls.ply", tmp_path / "m.glb"
+    save_gaussians(nested_balls(0.95), source)
+    assert run(source, "-o", out, "--no-preview") == 0
+    assert material(out)["alphaMode"] == "MASK"
+    lines = capsys.readouterr().out.splitlines()
+    chosen = next(line for line in lines if line.startswith("alpha: "))
+    figures = re.fullmatch(
+        r"alpha: mask with cutoff (0\.\d), (.*) dB from the sorted image in viewers that do not sort;"
+        r" blend: (.*) dB",
+        chosen,
+    )
+    assert figures is not None
+    assert float(figures[1]) == material(out)["alphaCutoff"]
+    assert float(figures[2]) > float(figures[3])
+    better = lines[lines.index(chosen) + 1]
+    assert better.startswith("better there: meshsplats finetune ")
+    words = words_of(better.partition(": meshsplats ")[2].rpartition(" (")[0])
+    assert words[-4:] == ["--opacity", "cutoff", "--soft-share", "0.05"]
+    # A mesh gets the same choice, and what was asked for counts.
+    assert run(source, "-o", tmp_path / "m.npz", "--json", "--no-preview") == 0
+    assert json.loads(capsys.readouterr().out)["alpha"] is None
+    assert run(tmp_path / "m.npz", "-o", tmp_path / "again.glb", "--json", "--no-preview") == 0
+    assert material(tmp_path / "again.glb") == material(out)
+    assert json.loads(capsys.readouterr().out)["alpha"]["mask"] == pytest.approx(float(figures[2]), abs=0.06)
+    assert run(source, "-o", tmp_path / "b.glb", "--alpha", "blend", "--no-preview") == 0
+    assert material(tmp_path / "b.glb")["alphaMode"] == "BLEND"
+    assert "better there" not in capsys.readouterr().out
+    save_gaussians(nested_balls(0.05), source)
+    assert run(source, "-o", tmp_path / "faint.glb", "--no-preview") == 0
+    assert material(tmp_path / "faint.glb")["alphaMode"] == "BLEND"
+    assert "alpha: blend, " in capsys.readouterr().out
+    (tmp_path / "folder").mkdir()
+    source.rename(tmp_path / "folder" / "balls.ply")
+    assert run(tmp_path / "folder", "-o", tmp_path / "all", "--no-preview") == 0
+    assert "balls.glb (" in (line := capsys.readouterr().out)
+    assert ", alpha blend" in line
+
+
 def test_smooth_normals_are_those_of_the_surface(tmp_path, capsys):
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(600, 3))

@@ -1,5 +1,5 @@
-"""The compiled core's part in fine-tuning, on NumPy arrays: losses between images, Adam on selected rows, and
-shapes of fans.
+"""Parts of the compiled core on NumPy arrays: losses between images, Adam on selected rows, shapes of fans,
+images of web viewers.
 
 Callers have checked their arrays: C-contiguous, of the types and shapes named here.
 """
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._core.library import pointer, processors, run
+from meshsplats._core.library import CameraStruct, pointer, processors, run
 
 
 class ComparisonStruct(ctypes.Structure):
@@ -92,6 +92,25 @@ class EdgesStruct(ctypes.Structure):
         ("near", c_double),
         ("cutoff", c_double),
         ("result", c_void_p),
+    ]
+
+
+class ViewerStruct(ctypes.Structure):
+    """MsViewer of csrc/viewer.h."""
+
+    _fields_ = [
+        ("camera", CameraStruct),
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("vertices", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("background", c_void_p),
+        ("cutoffs", c_void_p),
+        ("color", c_void_p),
+        ("image_count", c_int32),
+        ("multisample", c_int32),
+        ("threads", c_int32),
     ]
 
 
@@ -255,4 +274,44 @@ def edge_gradients(
         result=pointer(result),
     )
     run("ms_edge_gradients", struct)
+    return result
+
+
+def viewer_images(
+    vertices: np.ndarray,
+    colors: np.ndarray,
+    faces: np.ndarray,
+    camera: CameraStruct,
+    background: np.ndarray,
+    cutoffs: np.ndarray,
+    *,
+    multisample: bool,
+    threads: int | None = None,
+) -> np.ndarray:
+    """(k, h, w, 3) float32 images of triangles in their order: see ``viewer_images`` in rendering/viewers.py.
+
+    The result has the same bits with any number of ``threads`` (all processors by default).
+
+    Args:
+        vertices, colors, faces: (v, 3) float32, (v, 4) float32 display values, (f, 3) int32.
+        background: (3,) float32.
+        cutoffs: (k,) float32 of the alpha test; negative: blend.
+        multisample: four samples of coverage to a pixel.
+    """
+    result = np.empty((len(cutoffs), camera.height, camera.width, 3), np.float32)
+    struct = ViewerStruct(
+        camera=camera,
+        vertex_count=len(vertices),
+        face_count=len(faces),
+        vertices=pointer(vertices),
+        colors=pointer(colors),
+        faces=pointer(faces),
+        background=pointer(background),
+        cutoffs=pointer(cutoffs),
+        color=pointer(result),
+        image_count=len(cutoffs),
+        multisample=multisample,
+        threads=min(threads or processors(), 256),
+    )
+    run("ms_viewer_images", struct)
     return result

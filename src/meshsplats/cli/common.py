@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -30,6 +30,7 @@ from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
+    from meshsplats.evaluation.viewers import AlphaChoice
     from meshsplats.formats.gaussians import SplatStream
     from meshsplats.tiles.tileset import Tileset
 
@@ -467,6 +468,24 @@ def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | 
         save_image(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
     else:
         save_image(path, render_splats(scene, camera).color)
+
+
+def alpha_record(choice: AlphaChoice | None) -> dict[str, Any] | None:
+    """A choice of the alpha mode for JSON; None where there was none."""
+    return None if choice is None else asdict(choice)
+
+
+def alpha_in_words(record: Mapping[str, Any] | None) -> str | None:
+    """The line about a choice of the alpha mode, from its record; None where nothing was measured."""
+    if record is None or record["blend"] is None:
+        return None
+    modes = {"blend": "blend", "mask": f"mask with cutoff {record['cutoff']:g}"}
+    taken = record["alpha"]
+    other = "mask" if taken == "blend" else "blend"
+    return (
+        f"alpha: {modes[taken]}, {record[taken]:.1f} dB from the sorted image in viewers that do not sort;"
+        f" {modes[other]}: {record[other]:.1f} dB"
+    )
 
 
 def size_of(path: Path) -> str:

@@ -10,8 +10,9 @@
 #include "fans.h"
 #include "gradient.h"
 #include "hidden_new.h"
-#ifndef MS_NO_MERGING
+#ifndef MS_WIDE_ONLY
 #include "merging.h"
+#include "viewer.h"
 #endif
 #include "mesh_tile.h"
 #include "splats.h"
@@ -293,13 +294,17 @@ MS_EXPORT int ms_edge_gradients(const MsEdges *edges, char *message, int message
     return guarded(message, message_size, [&] { ms::EdgePass(*edges).run(); });
 }
 
-#ifndef MS_NO_MERGING
+#ifndef MS_WIDE_ONLY
 MS_EXPORT int ms_nearest(const MsNearest *points, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::find_nearest(*points); });
 }
 
 MS_EXPORT int ms_merge_pairs(MsMerging *merging, char *message, int message_size) {
     return guarded(message, message_size, [&] { ms::merge_pairs(*merging); });
+}
+
+MS_EXPORT int ms_viewer_images(const MsViewer *viewer, char *message, int message_size) {
+    return guarded(message, message_size, [&] { ms::ViewerPass(*viewer).run(); });
 }
 #endif
 

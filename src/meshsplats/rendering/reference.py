@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.colors import linear_to_srgb
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh, checked_cutoff, checked_filter
 from meshsplats.rendering.api import Rendering
@@ -170,6 +171,60 @@ def render_splats(
 
 
 # Samples and pixels
+
+
+VIEWER_SAMPLES = ((0.375, 0.875), (0.875, 0.625), (0.125, 0.375), (0.625, 0.125))
+"""Right and down from a pixel's corner: the samples of MSAA in Direct3D and Vulkan, upside down."""
+
+
+def viewer_images(
+    mesh: SplatMesh,
+    camera: Camera,
+    cutoffs: Sequence[float | None] = (None,),
+    *,
+    multisample: bool = True,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+) -> np.ndarray:
+    """(k, h, w, 3) float64: a mesh as three.js draws it, see ``viewers.viewer_images``.
+
+    The triangles that show their backs (their corners turn clockwise in the image), then the others, each in
+    their order, go to every sample that they cover: with a = 1 where the opacity is at least the cutoff and
+    no nearer fragment is there, or blended with a without one. The sample is then rounded to 8 bits. Colour
+    and opacity, cut to [0, 1], are those of the plane of the triangle at the centre of the pixel.
+    """
+    positions = VIEWER_SAMPLES if multisample else ((0.5, 0.5),)
+    middle_x, middle_y = _sample_positions(camera, 1)
+    corners = _to_camera(mesh.vertices, camera)
+    corners[:, 0] = camera.fx * corners[:, 0] + camera.cx * corners[:, 2]
+    corners[:, 1] = camera.fy * corners[:, 1] + camera.cy * corners[:, 2]
+    corners = corners[mesh.faces]
+    edges, determinants = _edge_functions(corners)
+    shape = len(cutoffs), len(positions), len(middle_x)
+    color = np.broadcast_to(255 * np.asarray(background, np.float64), (*shape, 3)).copy()
+    nearest = np.full(shape, np.inf)
+    rgba = mesh.colors.astype(np.float64)
+    if mesh.blending == "linear":
+        rgba[:, :3] = linear_to_srgb(rgba[:, :3])
+    for face in np.argsort(determinants <= 0, kind="stable"):
+        for sample, (right, down) in enumerate(positions):
+            x, y = middle_x - 0.5 + right, middle_y - 0.5 + down
+            at, depth, _ = _cover(corners[face], edges[face], determinants[face], x, y, camera.near)
+            if not len(at):
+                continue
+            weights = np.column_stack([middle_x, middle_y, np.ones(len(middle_x))])[at] @ edges[face].T
+            weights /= weights.sum(axis=1, keepdims=True)
+            value = (weights @ rgba[mesh.faces[face]]).clip(0, 1)
+            for image, cutoff in enumerate(cutoffs):
+                drawn, alpha = np.ones(len(at), bool), value[:, 3]
+                if cutoff is not None:
+                    drawn = (alpha >= np.float32(cutoff)) & (depth <= nearest[image, sample, at])
+                    alpha = np.ones(len(at))
+                    nearest[image, sample, at[drawn]] = depth[drawn]
+                own, share = at[drawn], alpha[drawn, None]
+                before = color[image, sample, own]
+                mixed = before + share * (255 * value[drawn, :3] - before)
+                color[image, sample, own] = np.floor(mixed + 0.5)
+    return color.mean(axis=1).reshape(len(cutoffs), camera.height, camera.width, 3) / 255
 
 
 def _checked_background(background: Sequence[float] | np.ndarray, camera: Camera) -> np.ndarray:

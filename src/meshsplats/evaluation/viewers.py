@@ -1,0 +1,100 @@
+"""Which alpha mode suits a mesh in viewers that do not sort triangles: measured on images of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from meshsplats._arrays import subsample
+from meshsplats.camera import Camera
+from meshsplats.cameras.trajectories import orbit
+from meshsplats.formats.cutting import CUTOFF
+from meshsplats.formats.gltf.writer import Alpha
+from meshsplats.mesh import SplatMesh, solid_faces
+from meshsplats.rendering.api import render
+from meshsplats.rendering.viewers import viewer_images
+
+CUTOFFS = (0.1, CUTOFF, 0.3)
+"""Cutoffs of 'mask' that are tried. Each is the best on some scene; 0.5 was on none of ten."""
+CUTOFF_GAIN = 0.5
+"""A cutoff other than the usual one must gain this much, dB: it depends a little on the images' size."""
+MASK_GAIN = 0.2
+"""'mask' must gain this much, dB: it gains less in larger images, and never wins where a viewer sorts."""
+SIDE = 400
+"""Side in pixels of the images."""
+VIEWS = 4
+"""Number of images of a mesh of at most ``TRIANGLES``; never less than half of it."""
+TRIANGLES = 3_000_000
+SOLID = 0.5
+"""Share of solid triangles above which a mesh is one of solid triangles with a few soft ones."""
+_MOST = 200.0
+
+
+@dataclass(frozen=True)
+class AlphaChoice:
+    """The alpha mode of a `.glb` file for viewers that do not sort, and what it was chosen for."""
+
+    alpha: Alpha
+    """'blend' or 'mask'; 'opaque' for a solid mesh and 'hybrid' for one that is mostly solid, without
+    measurement."""
+    cutoff: float | None = None
+    """The best cutoff of 'mask'."""
+    blend: float | None = None
+    """PSNR in dB of such viewers' images with 'blend' against the sorted image of the same mesh, from the
+    mean square error over all views."""
+    mask: float | None = None
+    """That with 'mask' and ``cutoff``."""
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Arguments of ``save_mesh``."""
+        if self.alpha == "opaque":
+            return {}  # its default for a solid mesh, which needs no cut
+        return {"alpha": self.alpha} | ({"cutoff": self.cutoff} if self.alpha == "mask" else {})
+
+
+def choose_alpha(
+    mesh: SplatMesh,
+    cameras: Sequence[Camera] | None = None,
+    *,
+    threads: int | None = None,
+) -> AlphaChoice:
+    """The alpha mode with which viewers that do not sort triangles come nearest to the sorted image of
+    ``mesh``: three.js and what is built on it, Babylon.js, most engines.
+
+    Draws the mesh as such viewers do, with MSAA (``viewer_images``), blended and with an alpha test, and
+    takes the better. A mesh of many layers is better with the test: what is drawn late shows through the
+    front.
+
+    Args:
+        mesh: the mesh, its triangles in the order of the file.
+        cameras: where it will be seen from; a few of them are used, in images of at most ``SIDE`` pixels. By
+            default an orbit.
+        threads: at most this many; all processors by default. The result does not depend on it.
+
+    Raises ValueError for a mesh without triangles.
+    """
+    if not len(mesh.faces):
+        raise ValueError("a mesh without triangles has no alpha mode to choose")
+    solid = solid_faces(mesh).mean()
+    if solid == 1:
+        return AlphaChoice("opaque")
+    if solid > SOLID and mesh.binding is None:  # which 'hybrid' does not keep
+        return AlphaChoice("hybrid")
+    count = int(np.clip(VIEWS * TRIANGLES // len(mesh.faces), VIEWS // 2, VIEWS))
+    views = [camera.within(SIDE) for camera in subsample(cameras or (), count)]
+    views = views or orbit(mesh, count, elevation=20, width=SIDE, height=SIDE)
+    errors = np.zeros(1 + len(CUTOFFS))
+    for view in views:
+        truth = render(mesh, view, samples=2, threads=threads).color.clip(0, 1)
+        images = viewer_images(mesh, view, (None, *CUTOFFS), threads=threads)
+        errors += [np.square(image - truth, dtype=np.float64).mean() for image in images]
+    blend, *masks = np.minimum(-10 * np.log10(np.maximum(errors / len(views), 1e-30)), _MOST)
+    best = int(np.argmax(masks))
+    if masks[best] <= masks[CUTOFFS.index(CUTOFF)] + CUTOFF_GAIN:
+        best = CUTOFFS.index(CUTOFF)
+    chosen: Alpha = "mask" if masks[best] > blend + MASK_GAIN else "blend"
+    return AlphaChoice(chosen, CUTOFFS[best], round(float(blend), 2), round(float(masks[best]), 2))

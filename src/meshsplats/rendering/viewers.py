@@ -1,0 +1,61 @@
+"""Images of meshes as web viewers draw them: in the order of the file, unsorted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from meshsplats._core import kernels
+from meshsplats.camera import Camera
+from meshsplats.colors import linear_to_srgb
+from meshsplats.mesh import SplatMesh, checked_cutoff
+from meshsplats.rendering.api import Pointers, camera_struct, checked_options
+
+
+def viewer_images(
+    mesh: SplatMesh,
+    camera: Camera,
+    cutoffs: Sequence[float | None] = (None,),
+    *,
+    multisample: bool = True,
+    background: Sequence[float] | np.ndarray = (1, 1, 1),
+    threads: int | None = None,
+) -> np.ndarray:
+    """(k, h, w, 3) float32: images of ``mesh`` as three.js draws its `.glb` files with a stock loader, one
+    for each of ``cutoffs``.
+
+    None stands for the alpha mode 'blend': triangles are blended in their order, without a sort and without
+    writing depth; those that show their backs first, as three.js draws a double-sided material. A number is
+    the cutoff of 'mask': fragments of at least that opacity are solid, and the depth buffer keeps the nearest
+    of them. Colours are blended as display values and rounded to 8 bits after each fragment. The low-pass
+    filter of the mesh is left out.
+
+    Args:
+        mesh: the triangles, in the order of the file.
+        camera: viewpoint, lens and size of the image.
+        cutoffs: least opacities that are drawn, 0 to 1.
+        multisample: MSAA: four samples of a pixel's coverage, and one of the colour at its centre, even where
+            the triangle does not reach it. False: one sample of both.
+        background: RGB, (3,), display values.
+        threads: at most this many; all processors by default. The result does not depend on it.
+
+    Raises ValueError for an option out of its range.
+    """
+    backdrop = np.ascontiguousarray(background, np.float32)
+    if backdrop.shape != (3,):
+        raise ValueError(f"background must have shape (3,), got {backdrop.shape}")
+    checked_options(Pointers(), camera, backdrop, 1, threads)
+    colors = mesh.colors
+    if mesh.blending == "linear":
+        colors = np.concatenate([linear_to_srgb(colors[:, :3]), colors[:, 3:]], axis=1)
+    return kernels.viewer_images(
+        mesh.vertices,
+        np.ascontiguousarray(colors, np.float32),
+        mesh.faces,
+        camera_struct(camera),
+        backdrop,
+        np.array([-1 if c is None else checked_cutoff(c) for c in cutoffs], np.float32),
+        multisample=multisample,
+        threads=threads,
+    )

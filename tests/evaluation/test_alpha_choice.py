@@ -1,0 +1,123 @@
+"""choose_alpha: the alpha mode of a file for viewers that do not sort, by what they show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import shared_data
+
+from meshsplats import GaussianCloud, SplatMesh, convert, load_gaussians, load_mesh, orbit, render, save_mesh
+from meshsplats._arrays import subsample
+from meshsplats.evaluation import viewers
+from meshsplats.evaluation.viewers import AlphaChoice, choose_alpha
+from meshsplats.rendering.viewers import viewer_images
+
+
+def shell(radius: float, opacity: float, rgb, n: int = 500) -> GaussianCloud:
+    """Round splats evenly on a sphere."""
+    height = 1 - 2 * (np.arange(n) + 0.5) / n
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(n)
+    ring = np.sqrt(1 - height**2)
+    means = radius * np.stack([ring * np.cos(turn), height, ring * np.sin(turn)], axis=1)
+    sh = np.broadcast_to((np.asarray(rgb) - 0.5) / 0.28209479177387814, (n, 1, 3))
+    scales = np.full((n, 3), 2.2 * radius / np.sqrt(n))
+    return GaussianCloud(means, np.tile([1.0, 0, 0, 0], (n, 1)), scales, np.full(n, opacity), sh)
+
+
+def joined(*clouds: GaussianCloud) -> SplatMesh:
+    names = ("means", "quaternions", "scales", "opacities", "sh")
+    return convert(GaussianCloud(*(np.concatenate([getattr(c, n) for c in clouds]) for n in names)))
+
+
+RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
+
+
+def test_what_is_inside_must_not_show_through():
+    # Red is inside, and drawn last.
+    choice = choose_alpha(joined(shell(1, 0.95, BLUE), shell(0.7, 0.95, RED)))
+    assert choice.alpha == "mask"
+    assert choice.mask > choice.blend + 5
+    assert choice.options == {"alpha": "mask", "cutoff": choice.cutoff}
+
+
+def test_faint_layers_of_one_colour_need_no_order():
+    choice = choose_alpha(joined(shell(1, 0.1, BLUE), shell(0.7, 0.1, BLUE)))
+    assert choice.alpha == "blend"
+    assert choice.blend > choice.mask + 5
+    assert choice.options == {"alpha": "blend"}
+
+
+def test_cutoff_below_the_opacities():
+    # Many layers of 0.15 are solid together, and each of them is below the usual cutoff.
+    layers = [shell(1 - 0.02 * i, 0.15, BLUE if i < 20 else RED) for i in range(40)]
+    choice = choose_alpha(joined(*layers))
+    assert (choice.alpha, choice.cutoff) == ("mask", 0.1)
+
+
+def test_figures_are_those_of_the_images():
+    mesh = joined(shell(1, 0.5, BLUE, 100), shell(0.5, 0.9, RED, 100))
+    cameras = orbit(mesh, 9, width=600, height=300)
+    choice = choose_alpha(mesh, cameras)
+    used = [camera.scaled(400 / 600) for camera in subsample(cameras, 4)]
+    errors = np.zeros(2)
+    for camera in used:
+        truth = render(mesh, camera, samples=2).color
+        images = viewer_images(mesh, camera, [None, choice.cutoff])
+        errors += [np.mean((image - truth) ** 2) for image in images]
+    assert [choice.blend, choice.mask] == pytest.approx(-10 * np.log10(errors / len(used)), abs=0.01)
+
+
+def test_solid_meshes_are_not_measured(tmp_path, monkeypatch):
+    mesh = joined(shell(1, 0.9, BLUE, 50))
+    solid = replace(mesh, colors=np.concatenate([mesh.colors[:, :3], np.ones((len(mesh.colors), 1))], axis=1))
+    monkeypatch.setattr(viewers, "render", None)
+    assert choose_alpha(solid) == AlphaChoice("opaque")
+    assert AlphaChoice("opaque").options == {}  # no cut
+    colors = solid.colors.copy()
+    colors[solid.faces[:20].ravel(), 3] = 0.3
+    mixed = replace(solid, colors=colors)
+    assert choose_alpha(mixed).options == {"alpha": "hybrid"}
+    save_mesh(mixed, tmp_path / "mixed.glb", **choose_alpha(mixed).options)
+    assert len(load_mesh(tmp_path / "mixed.glb").faces) == len(mixed.faces)
+
+
+def test_large_meshes_have_fewer_views(monkeypatch):
+    mesh = joined(shell(1, 0.9, BLUE, 50))
+    counts = []
+    for most in (len(mesh.faces), len(mesh.faces) * 3 // 4, len(mesh.faces) // 10):
+        drawn = []
+        monkeypatch.setattr(viewers, "TRIANGLES", most)
+        monkeypatch.setattr(
+            viewers, "render", lambda *a, drawn=drawn, **k: drawn.append(0) or render(*a, **k)
+        )
+        choose_alpha(mesh)
+        counts.append(len(drawn))
+    assert counts == [4, 3, 2]
+
+
+def test_no_triangles():
+    with pytest.raises(ValueError, match="without triangles"):
+        choose_alpha(SplatMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 4))))
+
+
+@pytest.mark.parametrize(
+    ("name", "limit", "alpha"),
+    [
+        ("splats/playcanvas_logo_307k_sh0.ply", 50_000, "mask"),
+        ("splats/guitar_sh0.ply", 50_000, "mask"),
+        ("splats/tt_truck_sh0.ply", 50_000, "blend"),
+    ],
+)
+def test_real_scenes(name, limit, alpha):
+    mesh = convert(load_gaussians(shared_data(name)), max_splats=limit)
+    choice = choose_alpha(mesh)
+    assert choice.alpha == alpha, choice
+    # Of the explicit modes with the usual cutoff, from other cameras, it is the better one.
+    cameras = orbit(mesh, 3, elevation=10, azimuth=25, width=256, height=256)
+    scores = np.zeros(2)
+    for camera in cameras:
+        truth = render(mesh, camera, samples=2).color
+        scores -= [np.log10(np.mean((i - truth) ** 2)) for i in viewer_images(mesh, camera, [None, 0.2])]
+    assert ("blend", "mask")[int(np.argmax(scores))] == alpha
