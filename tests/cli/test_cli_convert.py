@@ -16,7 +16,7 @@ from PIL import Image
 import meshsplats
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import common, main, toml
 from meshsplats.conversion import convert, simplify
 from meshsplats.evaluation.comparison import compare
 from meshsplats.evaluation.metrics import psnr
@@ -313,6 +313,20 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
     assert "--alpha mask or hybrid, and --compression are for .glb" in capsys.readouterr().err
+
+
+def test_previews_of_large_meshes_are_quick(splats, tmp_path, monkeypatch):
+    mesh = convert(load_gaussians(splats))
+    camera = orbit(mesh, 1, azimuth=30, width=800, height=800)[0]
+    assert needed_samples(mesh, [camera.scaled(0.5)]) >= 2
+    for most, side in ((len(mesh.faces), 800), (len(mesh.faces) - 1, 400)):
+        monkeypatch.setattr(common, "PREVIEW_TRIANGLES", most)
+        common.draw_preview(mesh, tmp_path / "a.png")
+        with Image.open(tmp_path / "a.png") as image:
+            pixels = np.asarray(image) / 255
+        assert pixels.shape == (side, side, 3)
+    expected = render(mesh, camera.scaled(0.5), samples=2).color
+    assert np.abs(pixels - expected).max() < 1 / 255
 
 
 def nested_balls(opacity: float) -> meshsplats.GaussianCloud:

@@ -85,6 +85,7 @@ def test_solid_meshes_are_not_measured(tmp_path, monkeypatch):
 
 def test_large_meshes_have_fewer_views(monkeypatch):
     mesh = joined(shell(1, 0.9, BLUE, 50))
+    monkeypatch.setattr(viewers, "CLEAR", np.inf)
     counts = []
     for most in (len(mesh.faces), len(mesh.faces) * 3 // 4, len(mesh.faces) // 10):
         drawn = []
@@ -95,6 +96,15 @@ def test_large_meshes_have_fewer_views(monkeypatch):
         choose_alpha(mesh)
         counts.append(len(drawn))
     assert counts == [4, 3, 2]
+
+
+def test_two_views_suffice_where_the_choice_is_clear(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(viewers, "render", lambda *a, **k: drawn.append(a[1]) or render(*a, **k))
+    choose_alpha(joined(shell(1, 0.95, BLUE), shell(0.7, 0.95, RED)))
+    assert len(drawn) == 2
+    gaze = [camera.world_to_camera[2, :3] for camera in drawn]
+    assert gaze[0] @ gaze[1] < -0.7
 
 
 def test_no_triangles():

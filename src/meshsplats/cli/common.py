@@ -455,17 +455,26 @@ def plural(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
+PREVIEW_TRIANGLES = 1_000_000
+"""Triangles of a mesh above which its preview is half as wide, with the fewest samples. Of 2 to 17 million
+triangles, it is 36 to 39 dB from one with all samples, in a sixth of the time."""
+
+
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None) -> None:
     """Saves an image of ``scene`` from ``camera``; by default from the front and a little to the side."""
     from meshsplats.images.writing import save_image
     from meshsplats.rendering import render_splats
     from meshsplats.rendering.looks import image_of
-    from meshsplats.rendering.samples import needed_samples
+    from meshsplats.rendering.samples import FEWEST, needed_samples
 
     if camera is None:  # more of the shape than from the front
         camera = orbit(scene, 1, azimuth=30, width=800, height=800)[0]
     if isinstance(scene, SplatMesh):
-        save_image(path, image_of(scene, camera, (1, 1, 1), samples=needed_samples(scene, [camera]))[0])
+        if len(scene.faces) <= PREVIEW_TRIANGLES:
+            samples = needed_samples(scene, [camera])
+        else:
+            camera, samples = camera.scaled(0.5), 1 if scene.filter_px2 else FEWEST
+        save_image(path, image_of(scene, camera, (1, 1, 1), samples=samples)[0])
     else:
         save_image(path, render_splats(scene, camera).color)
 

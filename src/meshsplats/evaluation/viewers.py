@@ -19,15 +19,18 @@ from meshsplats.rendering.viewers import viewer_images
 
 CUTOFFS = (0.1, CUTOFF, 0.3)
 """Cutoffs of 'mask' that are tried. Each is the best on some scene; 0.5 was on none of ten."""
-CUTOFF_GAIN = 0.5
-"""A cutoff other than the usual one must gain this much, dB: it depends a little on the images' size."""
+CUTOFF_GAIN = 0.75
+"""A cutoff other than the usual one must gain this much, dB: a smaller gain may be a loss against the splats,
+or in larger images."""
 MASK_GAIN = 0.2
 """'mask' must gain this much, dB: it gains less in larger images, and never wins where a viewer sorts."""
 SIDE = 400
 """Side in pixels of the images."""
 VIEWS = 4
-"""Number of images of a mesh of at most ``TRIANGLES``; never less than half of it."""
+"""Largest number of images of a mesh of at most ``TRIANGLES``; fewer of larger ones, but two at least."""
 TRIANGLES = 3_000_000
+CLEAR = 2.0
+"""Two images suffice where they differ by this much, dB."""
 SOLID = 0.5
 """Share of solid triangles above which a mesh is one of solid triangles with a few soft ones."""
 _MOST = 200.0
@@ -41,7 +44,7 @@ class AlphaChoice:
     """'blend' or 'mask'; 'opaque' for a solid mesh and 'hybrid' for one that is mostly solid, without
     measurement."""
     cutoff: float | None = None
-    """The best cutoff of 'mask'."""
+    """The cutoff of 'mask' that was compared: the best one."""
     blend: float | None = None
     """PSNR in dB of such viewers' images with 'blend' against the sorted image of the same mesh, from the
     mean square error over all views."""
@@ -84,15 +87,19 @@ def choose_alpha(
         return AlphaChoice("opaque")
     if solid > SOLID and mesh.binding is None:  # which 'hybrid' does not keep
         return AlphaChoice("hybrid")
-    count = int(np.clip(VIEWS * TRIANGLES // len(mesh.faces), VIEWS // 2, VIEWS))
+    count = int(np.clip(VIEWS * TRIANGLES // len(mesh.faces), 2, VIEWS))
     views = [camera.within(SIDE) for camera in subsample(cameras or (), count)]
-    views = views or orbit(mesh, count, elevation=20, width=SIDE, height=SIDE)
+    if not views:
+        around = orbit(mesh, count, elevation=20, width=SIDE, height=SIDE)
+        views = [*around[::2], *around[1::2]]  # the second from the other side
     errors = np.zeros(1 + len(CUTOFFS))
-    for view in views:
+    for number, view in enumerate(views, 1):
         truth = render(mesh, view, samples=2, threads=threads).color.clip(0, 1)
         images = viewer_images(mesh, view, (None, *CUTOFFS), threads=threads)
         errors += [np.square(image - truth, dtype=np.float64).mean() for image in images]
-    blend, *masks = np.minimum(-10 * np.log10(np.maximum(errors / len(views), 1e-30)), _MOST)
+        blend, *masks = np.minimum(-10 * np.log10(np.maximum(errors / number, 1e-30)), _MOST)
+        if number > 1 and abs(max(masks) - blend) > CLEAR:
+            break
     best = int(np.argmax(masks))
     if masks[best] <= masks[CUTOFFS.index(CUTOFF)] + CUTOFF_GAIN:
         best = CUTOFFS.index(CUTOFF)
