@@ -14,6 +14,7 @@ from _meshes import random_mesh
 from meshsplats import DataWarning, FileFormatError, MissingDependencyError, SplatMesh, load_mesh, save_mesh
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.formats.gltf.writer import change_alpha
 
 MESH = random_mesh(np.random.default_rng(0), 20, 30)
 
@@ -227,3 +228,21 @@ def test_a_failing_gltfpack_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="status 3: out of luck"):
         save_mesh(MESH, tmp_path / "m.glb", compression="meshopt")
     assert os.listdir(tmp_path) == ["gltfpack"]
+
+
+def test_the_alpha_mode_of_a_file_is_changed_in_place(tmp_path):
+    path, expected = tmp_path / "a.glb", tmp_path / "b.glb"
+    for alpha, cutoff in (("mask", 0.3), ("blend", None)):
+        save_mesh(MESH, path, alpha="mask")
+        save_mesh(MESH, expected, alpha=alpha, cutoff=cutoff)
+        size = path.stat().st_size
+        change_alpha(path, alpha, 0.2 if cutoff is None else cutoff)
+        assert path.stat().st_size == size
+        documents = [GltfDocument(file).json for file in (path, expected)]
+        assert documents[0] == documents[1]
+        np.testing.assert_array_equal(load_mesh(path).colors, load_mesh(expected).colors)
+    save_mesh(MESH, path, alpha="blend")
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=r"no room for alpha mask with cutoff 0\.123"):
+        change_alpha(path, "mask", 0.123)
+    assert path.read_bytes() == before

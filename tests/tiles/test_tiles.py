@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from meshsplats import (
 from meshsplats.cli import main
 from meshsplats.conversion import ConversionOptions
 from meshsplats.demo_scene.city import city_blocks
+from meshsplats.evaluation.viewers import AlphaChoice
 from meshsplats.tiles import buckets, building
 from meshsplats.tiles import tileset as tilesets
 from meshsplats.tiles.building import TileOptions, build_tiles
@@ -236,6 +238,69 @@ def test_a_run_that_fails_anywhere_is_resumed(splats, tileset, tmp_path, monkeyp
     assert errors == [errno.ENOSPC] * (runs - 1)
     assert digest(out) == digest(tileset)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tiles"]
+
+
+def materials(folder):
+    return [glb(path)[0]["materials"][0] for path in sorted(folder.rglob("*.glb"))]
+
+
+@pytest.mark.parametrize("alpha", ["blend", "mask"])
+def test_one_alpha_mode_is_chosen_for_all_tiles(splats, tmp_path, monkeypatch, alpha):
+    chosen = AlphaChoice(alpha, 0.3, 20.0, 19.0 if alpha == "blend" else 21.0)
+    drawn = []
+
+    def choose(views, threads=None):
+        drawn.extend(views)
+        return chosen
+
+    monkeypatch.setattr(building, "choose_by_views", choose)
+    change, left = building.change_alpha, [3]
+
+    def fails(*arguments, **options):
+        left[0] -= 1
+        if not left[0]:
+            raise OSError(errno.EIO, "broken", "disk")
+        change(*arguments, **options)
+
+    monkeypatch.setattr(building, "change_alpha", fails)
+    with pytest.raises(OSError, match="broken"):
+        build_tiles(stream_gaussians(splats), tmp_path / "a", SMALL)
+    assert len({str(material) for material in materials(tmp_path / "a.partial")}) == 2
+    # It is chosen once: a resumed run goes on with it.
+    count = len(drawn)
+    found = build_tiles(stream_gaussians(splats), tmp_path / "a", SMALL, resume=True)
+    assert (found.alpha, len(drawn)) == (chosen, count)
+    wanted = {"alphaMode": alpha.upper()} | ({"alphaCutoff": 0.3} if alpha == "mask" else {})
+    for material in materials(tmp_path / "a"):
+        assert {name: value for name, value in material.items() if name.startswith("alpha")} == wanted
+    assert len(materials(tmp_path / "a")) == found.tiles
+    # The views are of the tiles that a viewer loads, the far ones first.
+    tileset = Tileset(tmp_path / "a")
+    for mesh, camera in drawn:
+        tiles = choose_tiles(tileset, [camera])[0]
+        assert len(mesh.faces) == sum(tile.triangles for tile in tiles)
+        depth = [camera.world_to_camera[2, :3] @ tile.center for tile in tiles]
+        farthest = tiles[int(np.argmax(depth))].load()
+        np.testing.assert_array_equal(mesh.vertices[: len(farthest.vertices)], farthest.vertices)
+
+
+def test_alpha_modes_that_are_asked_for(splats, tmp_path, monkeypatch):
+    monkeypatch.setattr(building, "choose_by_views", None)
+    for alpha in ("blend", "mask", "opaque"):
+        options = replace(SMALL, alpha=alpha)
+        found = build_tiles(stream_gaussians(splats), tmp_path / alpha, options)
+        assert found.alpha == AlphaChoice(alpha)
+        assert {material["alphaMode"] for material in materials(tmp_path / alpha)} == {alpha.upper()}
+    whole, cut = (
+        tiles_mesh(Tileset(tmp_path / a), orbit(Tileset(tmp_path / a).root.corners(), 1))[0]
+        for a in ("mask", "opaque")
+    )
+    assert (cut.colors[:, 3] == 1).all()
+    camera = orbit(whole, 1, width=64, height=64)[0]
+    difference = np.abs(render(whole, camera, cutoff=0.2).color - render(cut, camera).color).max(axis=2)
+    assert (difference > 0.01).mean() < 0.01
+    with pytest.raises(ValueError, match="alpha must be one of auto, blend, mask, opaque"):
+        build_tiles(stream_gaussians(splats), tmp_path / "x", replace(SMALL, alpha="hybrid"))
 
 
 RUN = """

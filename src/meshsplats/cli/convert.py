@@ -135,8 +135,8 @@ class Convert(Command):
     color_type: Literal["uint16", "float32"] = "uint16"
     """.glb: storage of colours."""
     alpha: Literal["auto", "blend", "mask", "opaque", "hybrid"] = "auto"
-    """auto: for .glb, blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by a
-    few images of both; else blend. blend: the viewer blends true opacities; mask (.glb): it draws as solid
+    """auto: for .glb, blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by
+    a few images of both; else blend. blend: the viewer blends true opacities; mask (.glb): it draws as solid
     what has at least --cutoff; opaque: solid triangles, cut there; hybrid (.glb), for a mesh of finetune
     --soft-share: solid and blended triangles apart."""
     cutoff: Number = None

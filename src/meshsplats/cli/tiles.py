@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     Text,
+    alpha_in_words,
     check_outputs,
     parse_up,
 )
@@ -68,6 +69,10 @@ class Tiles(Command):
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: -y."""
     lit: bool = False
     """A material that takes light and shadow, not one that shows the colours as they are."""
+    alpha: Literal["auto", "blend", "mask", "opaque"] = "auto"
+    """auto: blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by a few
+    images of both. blend: viewers blend true opacities; mask: they draw as solid what is at least 20 %
+    opaque; opaque: solid triangles, cut there."""
     resume: bool = False
     """Continue an interrupted run of the same command, from FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
@@ -113,6 +118,8 @@ class Tiles(Command):
             f"{found.splats:,} splats -> {found.triangles:,} triangles in {found.tiles:,} tiles of"
             f" {found.levels} levels, {found.bytes / 1e6:,.1f} MB, in {seconds:.1f} s"
         )
+        if line := alpha_in_words(asdict(found.alpha)):
+            print(line)
         print(f"{self.output / 'tileset.json'}: geometric error of the root {found.error:.3g}")
 
     def resolved(self) -> dict[str, Any]:
@@ -130,7 +137,7 @@ class Tiles(Command):
             raise UsageError("--resume continues, --force starts again: give one of them")
         conversion = ConversionOptions(look=self.look, min_opacity=self.min_opacity, crop=self.crop)
         x, y, z = DEFAULT_UP if self.up is None else (float(u) for u in parse_up(self.up))
-        options = TileOptions(self.max_triangles, self.preset, conversion, (x, y, z), self.lit)
+        options = TileOptions(self.max_triangles, self.preset, conversion, (x, y, z), self.lit, self.alpha)
         options.resolved()
         return options
 

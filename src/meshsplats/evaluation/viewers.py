@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,8 +92,13 @@ def choose_alpha(
     if not views:
         around = orbit(mesh, count, elevation=20, width=SIDE, height=SIDE)
         views = [*around[::2], *around[1::2]]  # the second from the other side
+    return choose_by_views(((mesh, view) for view in views), threads=threads)
+
+
+def choose_by_views(views: Iterable[tuple[SplatMesh, Camera]], *, threads: int | None = None) -> AlphaChoice:
+    """``choose_alpha`` by these views, at least one, each with what a viewer draws of the scene there."""
     errors = np.zeros(1 + len(CUTOFFS))
-    for number, view in enumerate(views, 1):
+    for number, (mesh, view) in enumerate(views, 1):
         truth = render(mesh, view, samples=2, threads=threads).color.clip(0, 1)
         images = viewer_images(mesh, view, (None, *CUTOFFS), threads=threads)
         errors += [np.square(image - truth, dtype=np.float64).mean() for image in images]

@@ -14,26 +14,36 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
 from meshsplats._files.atomic import atomic_path, write_bytes, write_text
 from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
+from meshsplats._options import check_choices
+from meshsplats.camera import Camera
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
+from meshsplats.cameras.trajectories import orbit
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import Fans
 from meshsplats.conversion.budget import triangles_each
 from meshsplats.conversion.merging import FILTER_PX2, merge
 from meshsplats.conversion.options import ConversionOptions, Preset
 from meshsplats.conversion.streaming import ScenePixels, Survey, refuse_whole, survey, worth_drawing
+from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, choose_by_views
+from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gaussians import SplatStream
+from meshsplats.formats.gltf.writer import Alpha, change_alpha
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles.buckets import BUCKET, DEPTH, RECORD, Buckets, Cube, cloud_of, read_records, records_of
+from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
-from meshsplats.tiles.tileset import Node, tile_frame, tile_path, write_tilesets
+from meshsplats.tiles.tileset import Node, Tileset, tile_frame, tile_path, write_tilesets
+
+TilesAlpha = Literal["auto", "blend", "mask", "opaque"]
 
 MAX_TRIANGLES = 1 << 16
 """Triangles of a tile."""
@@ -64,9 +74,14 @@ class TileOptions:
     """Direction that points up in the world frame."""
     lit: bool = False
     """A material that scene lights shade, instead of an unlit one."""
+    alpha: TilesAlpha = "auto"
+    """How viewers treat opacity, as in ``save_mesh``, the same in all tiles. auto: 'blend' or 'mask',
+    whichever is nearer to the sorted image in viewers that do not sort (``choose_alpha``), by images of the
+    tiles from around the scene."""
 
     def resolved(self) -> ConversionOptions:
         """The checked options of the conversion. Raises ValueError."""
+        check_choices(self, {"alpha": get_args(TilesAlpha)})
         chosen = (self.conversion or ConversionOptions()).resolved(self.preset, has_cameras=False)
         refuse_whole(chosen)
         if chosen.footprint == "filter":
@@ -93,6 +108,8 @@ class TilesetSummary:
     """Of all files."""
     error: float
     """Geometric error of the root, scene units."""
+    alpha: AlphaChoice
+    """The alpha mode of the tiles."""
 
 
 def build_tiles(
@@ -240,10 +257,43 @@ class _Build:
         leaves = [node for node in nodes.values() if not node.children]
         splats = sum(node.splats for node in leaves)
         write_tilesets(self._out, nodes, root, unit_up(self._options.up), splats)
+        alpha = self._alpha(scene, nodes)
         triangles = sum(node.triangles for node in leaves)
         size = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())
         levels = _height(nodes, root)
-        return TilesetSummary(splats, triangles, len(nodes), levels, size, nodes[root].error)
+        return TilesetSummary(splats, triangles, len(nodes), levels, size, nodes[root].error, alpha)
+
+    def _alpha(self, scene: Survey, nodes: dict[str, Node]) -> AlphaChoice:
+        """The alpha mode of the tiles, after choosing it if that is asked for. They are written with 'mask',
+        in whose place the choice fits."""
+        if self._options.alpha != "auto":
+            return AlphaChoice(self._options.alpha)
+        noted = self.journal.find("alpha")
+        if noted is None:
+            choice = self._chosen(scene)
+            self.journal.add("alpha", **asdict(choice))
+        else:
+            choice = AlphaChoice(**{name: value for name, value in noted.items() if name != "step"})
+        for key in nodes:
+            change_alpha(self._out / tile_path(key), **choice.options)
+        return choice
+
+    def _chosen(self, scene: Survey) -> AlphaChoice:
+        """The alpha mode that suits what viewers load of the tileset, far tiles drawn before near ones."""
+        tileset = Tileset(self._out)
+        cameras = orbit(
+            scene.sample, VIEWS, elevation=20, width=SIDE, height=SIDE, up=unit_up(self._options.up)
+        )
+
+        def views() -> Iterator[tuple[SplatMesh, Camera]]:
+            for camera in (*cameras[::2], *cameras[1::2]):
+                tiles, _ = choose_tiles(tileset, [camera], most=TRIANGLES)
+                tiles = tiles or [tileset.root]
+                depth = [camera.world_to_camera[2, :3] @ tile.center for tile in tiles]
+                order = np.argsort(depth, kind="stable")[::-1]
+                yield join_tiles(tileset, [tiles[i] for i in order]), camera
+
+        return choose_by_views(views(), threads=self._threads)
 
     def _tiles(self, threads: int | None) -> Shared[_Tiles]:
         return Shared(partial(_Tiles, self._folder, self._options, threads))
@@ -412,9 +462,14 @@ class _Tiles:
         fans = Fans.of(cloud, self._conversion, pixel)
         vertices, faces, colors, owners = fans.build(cloud, rows, cloud.colors, self._conversion.compensation)
         mesh = SplatMesh(vertices, faces, colors, face_splat=owners, up=self._up)
+        alpha: Alpha = "mask" if self._options.alpha == "auto" else self._options.alpha
+        if alpha == "opaque":
+            # A tile of nothing but fog keeps its densest part: glTF has no empty meshes.
+            mesh = cut_mesh(mesh, min(CUTOFF, 0.9 * float(colors[:, 3].max())))
         path = self._out / tile_path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_mesh(mesh, path, lit=True if self._options.lit else None)
+        lit = True if self._options.lit else None
+        save_mesh(mesh, path, lit=lit, alpha=None if alpha == "opaque" else alpha)
         corners = mesh.vertices.astype(np.float64) @ self._frame.T
         low = np.min([corners.min(axis=0), *(node.low for node in below)], axis=0)
         high = np.max([corners.max(axis=0), *(node.high for node in below)], axis=0)
@@ -424,8 +479,8 @@ class _Tiles:
             high=[float(x) for x in high],
             error=float(error),
             splats=len(cloud),
-            triangles=len(faces),
-            vertices=len(vertices),
+            triangles=len(mesh.faces),
+            vertices=len(mesh.vertices),
             children=children,
         )
 

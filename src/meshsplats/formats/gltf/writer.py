@@ -229,6 +229,27 @@ def _material(alpha: Alpha, lit: bool, cutoff: float) -> dict[str, Any]:
     return material
 
 
+def change_alpha(path: Path, alpha: Alpha, cutoff: float = CUTOFF) -> None:
+    """Makes the `.glb` at ``path``, which ``write_glb`` wrote with ``alpha='mask'``, one with 'blend', or
+    with another cutoff of 'mask', in place: nothing else in the file changes.
+
+    Raises ValueError for a text that does not fit, such as a cutoff of more digits.
+    """
+    with open(path, "r+b") as file:
+        length = struct.unpack("<12xI4x", file.read(20))[0]
+        document = json.loads(file.read(length))
+        for material in document["materials"]:
+            material["alphaMode"] = alpha.upper()
+            material.pop("alphaCutoff", None)
+            if alpha == "mask":
+                material["alphaCutoff"] = cutoff
+        text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+        if len(text) > length:
+            raise ValueError(f"{path}: no room for alpha {alpha} with cutoff {cutoff}")
+        file.seek(20)
+        file.write(text.ljust(length))
+
+
 def _add_own_arrays(
     buffer: _Buffer, mesh: SplatMesh, attributes: dict[str, int], extras: dict[str, Any]
 ) -> None:
