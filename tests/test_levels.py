@@ -8,10 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from meshsplats import convert, load_mesh, orbit, save_gaussians
+from meshsplats import ConversionOptions, convert, load_mesh, orbit, psnr, render, save_gaussians, simplify
 from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
-from meshsplats.levels import Level, level_targets, likeness, make_level, plan_levels
+from meshsplats.formats.gltf.document import GltfDocument
+from meshsplats.levels import (
+    FOOTPRINTS_PX2,
+    Level,
+    level_targets,
+    likeness,
+    make_level,
+    plan_levels,
+    views_to_score,
+)
 
 
 def test_plan():
@@ -91,6 +100,43 @@ def test_every_sixth_view_is_a_window():
     assert np.mean(focal > 1.5 * np.median(focal)) == 33 / 200
 
 
+def test_coarse_levels_take_the_filter_that_is_nearest():
+    cloud = make_scene(2000)
+    finest, *_, coarse = plan_levels(2000, 3, width=80)
+    targets = level_targets(cloud, coarse, sh_degree=0)
+    cameras = [view.camera for view in targets.test]
+    mesh = make_level(cloud, coarse, targets)
+    tried = {
+        px2: convert(cloud, cameras=cameras, max_splats=125, footprint_px2=px2) for px2 in FOOTPRINTS_PX2
+    }
+    taken = [px2 for px2, other in tried.items() if np.array_equal(mesh.vertices, other.vertices)]
+    assert len(taken) == 1
+    assert taken[0] > FOOTPRINTS_PX2[0]
+    views = targets.train[:2]
+
+    def error(mesh) -> float:
+        images = [(render(mesh, view.camera, samples=2).color, view.image) for view in views]
+        return -np.mean([psnr(a.clip(0, 1), b) for a, b in images])
+
+    errors = {px2: error(mesh) for px2, mesh in tried.items()}
+    assert min(errors, key=errors.get) == taken[0]
+    # The finest one is that of convert, and so is a level with options.
+    targets = level_targets(cloud, finest, sh_degree=0)
+    cameras = [view.camera for view in targets.test]
+    for made, expected in (
+        (make_level(cloud, finest, targets), convert(cloud, cameras=cameras)),
+        (
+            make_level(cloud, coarse, targets, options=ConversionOptions(mode="flat")),
+            convert(cloud, cameras=cameras, max_splats=125, mode="flat"),
+        ),
+    ):
+        np.testing.assert_array_equal(made.vertices, expected.vertices)
+
+
+def test_fewer_views_score_more_triangles():
+    assert [views_to_score(n) for n in (0, 250_000, 400_000, 900_000, 17_000_000)] == [8, 8, 5, 2, 2]
+
+
 @pytest.fixture
 def splats(tmp_path):
     save_gaussians(make_scene(400), tmp_path / "scene.ply")
@@ -160,6 +206,53 @@ def test_an_interrupted_chain_goes_on(splats, tmp_path, capsys, monkeypatch):
     assert run(splats, "-o", out, *QUICK, "--resume") == 0
     assert (out / "level_0.glb").stat().st_mtime_ns == first
     assert (out / "level_1.glb").is_file()
+
+
+@pytest.mark.parametrize("least", [50, 10**6])
+def test_levels_are_merged_from_those_above(splats, tmp_path, monkeypatch, least):
+    import meshsplats.levels as module
+
+    monkeypatch.setattr(module, "MERGED_FROM", least)
+    sizes = []
+
+    def counts(cloud, count, **options):
+        if count < len(cloud):
+            sizes.append((len(cloud), count))
+        return simplify(cloud, count, **options)
+
+    monkeypatch.setattr(module, "simplify", counts)
+    three = ("--no-tune", "--width", 64, "--levels", 3)
+    assert run(splats, "-o", tmp_path / "chain", *three) == 0
+    assert sizes == ([(400, 100), (100, 25)] if least == 50 else [(400, 100), (400, 25)])
+    # Resumed before the last level, it is the same.
+    (tmp_path / "chain").rename(tmp_path / "other.partial")
+    table = json.loads((tmp_path / "other.partial" / "levels.json").read_text())
+    for number, row in enumerate(table["levels"][:2]):
+        (tmp_path / "other.partial" / f"level_{number}.json").write_text(json.dumps(row))
+    last = tmp_path / "other.partial" / "level_2.glb"
+    expected = last.read_bytes()
+    last.unlink()
+    assert run(splats, "-o", tmp_path / "other", *three, "--resume") == 0
+    assert (tmp_path / "other" / "level_2.glb").read_bytes() == expected
+
+
+def test_alpha_modes(splats, tmp_path, capsys):
+    def modes(name):
+        return [GltfDocument(tmp_path / name / f"level_{i}.glb").json["materials"][0] for i in range(2)]
+
+    for alpha in ("blend", "mask", "opaque"):
+        assert run(splats, "-o", tmp_path / alpha, *QUICK, "--alpha", alpha) == 0
+        assert [mode["alphaMode"] for mode in modes(alpha)] == [alpha.upper()] * 2
+    capsys.readouterr()
+    assert run(splats, "-o", tmp_path / "auto", *QUICK) == 0
+    table = json.loads((tmp_path / "auto" / "levels.json").read_text())
+    for row, mode in zip(table["levels"], modes("auto"), strict=True):
+        assert row["alpha"]["alpha"].upper() == mode["alphaMode"]
+        assert row["alpha"]["blend"] > 10
+        assert row["views"] == 8
+    assert f"  {table['levels'][0]['alpha']['alpha']}\n" in capsys.readouterr().out
+    assert run(splats, "-o", tmp_path / "x", *QUICK, "--alpha", "mask", "--format", "ply") == 2
+    assert "--alpha mask is for .glb files, not .ply" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

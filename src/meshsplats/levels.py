@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.conversion import ConversionOptions, convert
-from meshsplats.datasets.splat_targets import splat_dataset
-from meshsplats.datasets.views import Dataset
+from meshsplats.conversion import ConversionOptions, convert, simplify
+from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset
+from meshsplats.datasets.views import Dataset, View
 from meshsplats.evaluation.comparison import compare
+from meshsplats.evaluation.metrics import psnr
 from meshsplats.finetuning import (
     FinetuneConfig,
     Progress,
@@ -26,12 +27,29 @@ from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starting_sides
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
+from meshsplats.rendering.api import render
 
 SMALLEST = 16
 """Minimum image width of a level in pixels."""
 
 SAMPLES = 2
 """Samples along each side of a pixel when a level is scored."""
+
+PLAIN_VIEWS = 2
+"""Views by which the filter of a level that is only converted is chosen, and the least number by which it is
+scored: more views of a fine one would take longer than all else."""
+
+SCORED_TRIANGLES = 2_000_000
+"""Triangles of a level that is only converted, times the views by which it is scored."""
+
+FOOTPRINTS_PX2 = (0.05, 0.1, 0.2, 0.3)
+"""Variances of the low-pass filter of coarse levels, square pixels, ascending: merged splats of about a pixel
+leave gaps without it. The first is that of ``convert``."""
+
+
+MERGED_FROM = 200_000
+"""Least number of splats of a level that the levels below it are merged from where they are only converted.
+Merging fewer is quick, and splats that are merged twice are up to 2 dB worse."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +92,7 @@ def level_targets(
     Their number suits a run with ``config`` (``worthwhile_views``), which sees some of them as windows
     (``worthwhile_zooms``). ``options`` are those of ``splat_dataset``.
     """
-    train = worthwhile_views(config) if config is not None else 1
+    train = worthwhile_views(config) if config is not None else PLAIN_VIEWS
     if config is not None:
         options = {"zooms": worthwhile_zooms(config, "area"), **options}
     return splat_dataset(cloud, train=train, width=level.width, **options)
@@ -95,15 +113,56 @@ def make_level(
     ``config`` says; without one, converted only. Without ``options``, splats have as many triangles as on the
     finest level, so that the numbers of triangles follow those of splats.
 
+    A level that is only converted may be made of the splats of the level before (``merged``). If it is not
+    the finest and there are no ``options``, the low-pass filter is the one of ``FOOTPRINTS_PX2`` that comes
+    nearest to the training views.
+
     ``options`` and ``up`` are those of ``convert``; ``run`` and ``on_progress`` those of ``finetune``.
     """
     if config is None:
         cameras = [view.camera for view in targets.test]
-        return convert(cloud, options, cameras=cameras, up=up, max_splats=level.splats)
+        cloud = merged(cloud, level, cameras)
+        if options is not None or level.splats == level.finest:
+            return convert(cloud, options, cameras=cameras, up=up)
+        best, found = -math.inf, None
+        for px2 in FOOTPRINTS_PX2:
+            mesh = convert(cloud, cameras=cameras, up=up, footprint_px2=px2)
+            score = _against(mesh, targets.train[:PLAIN_VIEWS], run.threads if run else None)
+            if score <= best:
+                break
+            best, found = score, mesh
+        assert found is not None
+        return found
     cameras = [view.camera for view in targets.train]
     options = options or ConversionOptions(sides=starting_sides(level.finest, config, len(cameras)))
     mesh = starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
     return finetune(mesh, targets, config, run=run, on_progress=on_progress)
+
+
+def merged(
+    cloud: GaussianCloud, level: Level, cameras: Sequence[Camera], threads: int | None = None
+) -> GaussianCloud:
+    """The splats of ``level``: similar ones of ``cloud`` merged, for images from ``cameras``."""
+    return simplify(cloud, level.splats, cameras=cameras, threads=threads)
+
+
+def merges_further(level: Level) -> bool:
+    """Whether the levels below ``level`` are made of its splats, not of those that it was made of itself."""
+    return level.splats >= MERGED_FROM
+
+
+def views_to_score(triangles: int) -> int:
+    """Number of views by which a level of so many triangles is scored if it is only converted."""
+    return min(max(SCORED_TRIANGLES // max(triangles, 1), PLAIN_VIEWS), HELD_OUT)
+
+
+def _against(mesh: SplatMesh, views: Sequence[View], threads: int | None) -> float:
+    """Mean PSNR in dB of the mesh against the images of ``views``."""
+    scores = []
+    for view in views:
+        image = render(mesh, view.camera, samples=SAMPLES, threads=threads).color
+        scores.append(psnr(image.clip(0, 1), view.image.clip(0, 1)))
+    return float(np.mean(scores))
 
 
 def likeness(

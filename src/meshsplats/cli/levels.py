@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,7 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     Text,
+    alpha_record,
     check_outputs,
     parse_up,
     size_of,
@@ -34,10 +36,21 @@ from meshsplats.cli.records import (
 )
 from meshsplats.cli.training import progress_display
 from meshsplats.errors import FileFormatError
+from meshsplats.evaluation.viewers import choose_alpha
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions, make_config
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.levels import SAMPLES, Level, level_targets, likeness, make_level, plan_levels
+from meshsplats.levels import (
+    SAMPLES,
+    Level,
+    level_targets,
+    likeness,
+    make_level,
+    merged,
+    merges_further,
+    plan_levels,
+    views_to_score,
+)
 from meshsplats.rendering.looks import comparison_in_words
 
 TABLE = "levels.json"
@@ -73,6 +86,10 @@ class Levels(Command):
     """Maximum number of splats of the finest level. Default: all."""
     format: Literal["glb", "npz", "ply", "usdc", "usda", "obj"] = "glb"
     """File format of the meshes."""
+    alpha: Literal["auto", "blend", "mask", "opaque"] = "auto"
+    """.glb: auto: blend or mask for each level, whichever is nearer to the sorted image in viewers that do
+    not sort; mask: viewers draw as solid what is at least 20 % opaque. opaque (any format): solid triangles,
+    cut there."""
     no_tune: bool = False
     """Convert only: seconds in place of minutes."""
     minutes: Number = None
@@ -103,11 +120,14 @@ class Levels(Command):
         chain = plan_levels(most, self.levels, factor=self.factor, width=self.width)
         folder = self._partial()
         rows = []
+        source, waiting = cloud, list[Level]()  # splats that are merged further, and for which levels
         for number, level in enumerate(chain):
             done = folder / f"level_{number}.json"
+            waiting.append(level)
             if not done.is_file():
                 try:
-                    row = self._make(cloud, number, level, config, folder)
+                    row, source = self._make(cloud, source, number, waiting, config, folder)
+                    waiting = []
                 except Interrupted as stop:
                     say(f"stopped in level {number}: the same command with --resume continues with it")
                     return 128 + (stop.signal or signal.SIGINT)
@@ -144,6 +164,8 @@ class Levels(Command):
             raise UsageError("give --minutes or --steps, not both")
         if self.resume and self.force:
             raise UsageError("--resume continues, --force starts again: give one of them")
+        if self.alpha not in ("auto", "opaque") and self.format != "glb":
+            raise UsageError(f"--alpha {self.alpha} is for .glb files, not .{self.format}")
         if self.up is not None:
             parse_up(self.up)
         if self.no_tune:
@@ -191,31 +213,54 @@ class Levels(Command):
         return partial
 
     def _make(
-        self, cloud: GaussianCloud, number: int, level: Level, config: FinetuneConfig | None, folder: Path
-    ) -> dict[str, Any]:
-        """Writes the mesh of a level; returns its row of the table."""
+        self,
+        cloud: GaussianCloud,
+        source: GaussianCloud,
+        number: int,
+        waiting: Sequence[Level],
+        config: FinetuneConfig | None,
+        folder: Path,
+    ) -> tuple[dict[str, Any], GaussianCloud]:
+        """Writes the mesh of the last level ``waiting``; its row of the table, and the splats that the
+        next levels are made of. ``source``: those of this one and the levels before it that wait."""
         from meshsplats.formats.meshes import save_mesh
 
         start = time.perf_counter()
+        level = waiting[-1]
         say(f"level {number}: {level.splats:,} splats for {level.width} pixels")
         up = None if self.up is None else parse_up(self.up)
-        targets = level_targets(cloud, level, config, up=up, sh_degree=self.sh_degree, threads=self.threads)
+        options = {"up": up, "sh_degree": self.sh_degree, "threads": self.threads}
+        targets = level_targets(cloud, level, config, **options)
+        cameras = [view.camera for view in targets.test]
+        splats = source
+        for each in waiting if config is None else ():
+            if each is level or merges_further(each):
+                seen = level_targets(cloud, each, config, **options).test
+                splats = merged(source, each, [view.camera for view in seen], self.threads)
+                source = splats if merges_further(each) else source
         run = RunOptions(threads=self.threads, spent=time.perf_counter() - start)
         with progress_display() as show:
-            mesh = make_level(cloud, level, targets, config, run=run, on_progress=show, up=up)
+            mesh = make_level(splats, level, targets, config, run=run, on_progress=show, up=up)
         path = folder / f"level_{number}.{self.format}"
-        save_mesh(mesh, path)
-        cameras = [view.camera for view in targets.test]
-        score = likeness(mesh, cloud, cameras, sh_degree=self.sh_degree, threads=self.threads)
-        return {
+        choice = None
+        if self.alpha == "auto" and self.format == "glb":
+            choice = choose_alpha(mesh, cameras, threads=self.threads)
+        asked = {} if self.alpha == "auto" else {"alpha": self.alpha}
+        save_mesh(mesh, path, **(asked if choice is None else choice.options))
+        scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces))]
+        score = likeness(mesh, cloud, scored, sh_degree=self.sh_degree, threads=self.threads)
+        row = {
             "file": path.name,
             "splats": mesh.splat_count,
             "triangles": len(mesh.faces),
             "bytes": path.stat().st_size,
             "screen_size": level.width,
             "psnr": round(score, 3),
+            "views": len(scored),
+            "alpha": alpha_record(choice) if choice else asked or None,
             "seconds": round(time.perf_counter() - start, 2),
         }
+        return row, source
 
     def _finish(self, folder: Path, table: dict[str, Any]) -> None:
         """The finished folder under its name, in place of an older one."""
@@ -231,12 +276,18 @@ class Levels(Command):
         shutil.rmtree(old)
 
     def _print_table(self, rows: list[dict[str, Any]]) -> None:
-        print(f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}")
+        heads = (
+            f"{'level':<16}{'splats':>12}{'triangles':>12}{'size':>10}{'pixels':>8}{'dB':>8}{'seconds':>9}"
+        )
+        print(f"{heads}  alpha" if self.format == "glb" else heads)
         for row in rows:
             size = size_of(self.output / row["file"])
             print(
                 f"{row['file']:<16}{row['splats']:>12,}{row['triangles']:>12,}{size:>10}"
                 f"{row['screen_size']:>8}{row['psnr']:>8.2f}{row['seconds']:>9.1f}"
+                + (f"  {row['alpha']['alpha']}" if self.format == "glb" and row["alpha"] else "")
             )
-        print(comparison_in_words("area", SAMPLES))
+        views = sorted({row["views"] for row in rows})
+        count = " to ".join(map(str, (views[0], views[-1])[: len(views)]))
+        print(f"{comparison_in_words('area', SAMPLES)}; {count} views")
         print(f"{self.output}/: {TABLE} has this table")
