@@ -134,7 +134,8 @@ def test_coarse_levels_take_the_filter_that_is_nearest():
 
 
 def test_fewer_views_score_more_triangles():
-    assert [views_to_score(n) for n in (0, 250_000, 400_000, 900_000, 17_000_000)] == [8, 8, 5, 2, 2]
+    assert [views_to_score(n, 9) for n in (0, 250_000, 400_000, 900_000, 17_000_000)] == [8, 8, 5, 2, 2]
+    assert [views_to_score(9, n) for n in (500_000, 1_000_000, 9_000_000)] == [8, 4, 2]
 
 
 @pytest.fixture

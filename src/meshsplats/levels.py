@@ -40,7 +40,8 @@ PLAIN_VIEWS = 2
 scored: more views of a fine one would take longer than all else."""
 
 SCORED_TRIANGLES = 2_000_000
-"""Triangles of a level that is only converted, times the views by which it is scored."""
+"""Triangles of a level that is only converted, times the views by which it is scored. Two splats of the ground
+truth count as one."""
 
 FOOTPRINTS_PX2 = (0.05, 0.1, 0.2, 0.3)
 """Variances of the low-pass filter of coarse levels, square pixels, ascending: merged splats of about a pixel
@@ -151,9 +152,10 @@ def merges_further(level: Level) -> bool:
     return level.splats >= MERGED_FROM
 
 
-def views_to_score(triangles: int) -> int:
-    """Number of views by which a level of so many triangles is scored if it is only converted."""
-    return min(max(SCORED_TRIANGLES // max(triangles, 1), PLAIN_VIEWS), HELD_OUT)
+def views_to_score(triangles: int, splats: int) -> int:
+    """Number of views by which a level of so many ``triangles`` is scored against all ``splats``, if it is
+    only converted."""
+    return min(max(SCORED_TRIANGLES // max(triangles, splats // 2, 1), PLAIN_VIEWS), HELD_OUT)
 
 
 def _against(mesh: SplatMesh, views: Sequence[View], threads: int | None) -> float:

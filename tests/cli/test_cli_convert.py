@@ -388,6 +388,20 @@ def test_alpha_is_chosen_by_what_viewers_show(tmp_path, capsys):
     assert ", alpha blend" in line
 
 
+def test_other_commands_choose_alpha_too(tmp_path):
+    mesh = convert(nested_balls(0.95))
+    assert common.alpha_for_viewers(mesh, tmp_path / "a.npz") == {}
+    options = common.alpha_for_viewers(mesh, tmp_path / "a.GLB")
+    assert options["alpha"] == "mask"
+    save_mesh(mesh, tmp_path / "m.npz")
+    assert main(["clean", str(tmp_path / "m.npz"), "-o", str(tmp_path / "c.glb")]) == 0
+    assert material(tmp_path / "c.glb")["alphaMode"] == "MASK"
+    filtered = convert(nested_balls(0.95), footprint="filter")
+    save_mesh(filtered, tmp_path / "f.npz")
+    assert main(["bake", str(tmp_path / "f.npz"), "-o", str(tmp_path / "b.glb")]) == 0
+    assert material(tmp_path / "b.glb")["alphaMode"] == "MASK"
+
+
 def test_smooth_normals_are_those_of_the_surface(tmp_path, capsys):
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(600, 3))

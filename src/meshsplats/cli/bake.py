@@ -14,6 +14,7 @@ from meshsplats.cli.common import (
     Number,
     Output,
     ViewOptions,
+    alpha_for_viewers,
     check_mesh_suffix,
     check_outputs,
     plural,
@@ -64,7 +65,7 @@ class Bake(Command):
             )
         cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS)
         baked = bake_filter(mesh, cameras, filter_px2=px2)
-        save_mesh(baked, self.output)
+        save_mesh(baked, self.output, **alpha_for_viewers(baked, self.output))
         seconds = time.perf_counter() - start
         if self.json:
             result = {

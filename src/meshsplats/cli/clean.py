@@ -20,6 +20,7 @@ from meshsplats.cli.common import (
     Count,
     Output,
     SplatOptions,
+    alpha_for_viewers,
     check_mesh_suffix,
     check_outputs,
     load_scene,
@@ -92,10 +93,13 @@ class Clean(Command):
             raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
         found = find(scene, rules)
         left = remove(scene, found)
+        alpha = {}
+        if isinstance(left, SplatMesh) and not self.preview_only:
+            alpha = alpha_for_viewers(left, self.output, self.threads)
         with together():
             if not self.preview_only:
                 if isinstance(left, SplatMesh):
-                    save_mesh(left, self.output)
+                    save_mesh(left, self.output, **alpha)
                 else:
                     save_gaussians(left, self.output)
             _draw(scene, left, found, preview, self.threads)

@@ -479,6 +479,15 @@ def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | 
         save_image(path, render_splats(scene, camera).color)
 
 
+def alpha_for_viewers(mesh: SplatMesh, path: Path, threads: int | None = None) -> dict[str, Any]:
+    """Arguments of ``save_mesh`` for the alpha mode that suits viewers that do not sort, where ``path`` is a
+    file for them."""
+    from meshsplats.evaluation.viewers import choose_alpha
+
+    glb = path.suffix.lower() == ".glb" and len(mesh.faces)
+    return choose_alpha(mesh, threads=threads).options if glb else {}
+
+
 def alpha_record(choice: AlphaChoice | None) -> dict[str, Any] | None:
     """A choice of the alpha mode for JSON; None where there was none."""
     return None if choice is None else asdict(choice)

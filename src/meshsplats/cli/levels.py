@@ -247,7 +247,7 @@ class Levels(Command):
             choice = choose_alpha(mesh, cameras, threads=self.threads)
         asked = {} if self.alpha == "auto" else {"alpha": self.alpha}
         save_mesh(mesh, path, **(asked if choice is None else choice.options))
-        scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces))]
+        scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces), len(cloud))]
         score = likeness(mesh, cloud, scored, sh_degree=self.sh_degree, threads=self.threads)
         row = {
             "file": path.name,

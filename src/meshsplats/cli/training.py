@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     Count,
     Number,
     Output,
+    alpha_for_viewers,
     check_outputs,
     chosen_background,
     draw_preview,
@@ -339,7 +340,8 @@ class TrainingCommand(Command):
             return self.report_interrupt(stop, files)
         except OtherRunError as error:
             raise self._naming_options(error, files) from None
-        save_mesh(trained.saved, files.mesh, alpha=trained.alpha)
+        given = {"alpha": trained.alpha} if trained.alpha else alpha_for_viewers(trained.saved, files.mesh)
+        save_mesh(trained.saved, files.mesh, **given)
         scored = self._scored(config, plan.dataset)
         background = {} if plan.background is None else plan.background.to_dict()
         write_configuration(files.config, self._name, self, scored | background)
