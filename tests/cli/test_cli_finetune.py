@@ -22,9 +22,11 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main, toml
 from meshsplats.cli.finetune import Finetune
 from meshsplats.cli.targets import TargetOptions
+from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config, worthwhile_views
 from meshsplats.finetuning.checkpoint import load_checkpoint
+from meshsplats.finetuning.pace import Pace
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.rendering import render_splats
@@ -423,3 +425,74 @@ def test_a_hybrid_mesh_for_engines(splats, tmp_path):
     one, two = (load_mesh(tmp_path / f"tuned.{suffix}") for suffix in ("glb", "npz"))
     assert len(one.faces) == len(two.faces)
     assert len(np.unique(one.colors[:, 3])) > 2
+
+
+def test_the_result_is_never_below_the_conversion(splats, tmp_path, capsys):
+    """Rates that ruin a mesh: what is written is what ``convert`` makes, with its score and a sentence."""
+    out, ruinous = tmp_path / "t.npz", ("--color-rate", "1", "--position-rate", "9")
+    assert run(splats, "-o", out, *SMALL, "--steps", "4", *ruinous) == 0
+    printed = capsys.readouterr().out
+    assert (
+        "the conversion is written: after 4 steps, the mesh was worse at 16 and 32 and 64 and 128 px"
+        in printed
+    )
+    conversion = convert(load_gaussians(splats))
+    assert np.array_equal(load_mesh(out).vertices, conversion.vertices)
+    shown, scored = printed_score(printed, capsys)
+    assert shown == pytest.approx(scored, abs=0.005)
+    assert run(splats, "-o", out, *SMALL, "--steps", "60", "--json", "--force") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["written"] == "tuned"
+    before, after = result["psnr_by_width"]["converted"], result["psnr_by_width"]["tuned"]
+    assert list(before) == list(after) == ["16", "32", "64", "128"]
+    assert all(after[width] > before[width] for width in before)
+    assert not np.array_equal(load_mesh(out).vertices.shape, conversion.vertices.shape)
+
+
+def test_dense_clouds_begin_as_their_conversion(splats, tmp_path, capsys):
+    """Three hundred splats in images of 256 pixels."""
+    dense = ("--views", "24", "--held-out", "3", "--width", "16", "--json", "--force")
+    conversion = convert(load_gaussians(splats))
+    assert run(splats, "-o", tmp_path / "t.npz", *dense, "--steps", "72") == 0
+    result = json.loads(capsys.readouterr().out)
+    mesh = load_mesh(tmp_path / "t.npz")
+    assert result["written"] == "tuned"
+    assert np.array_equal(mesh.faces, conversion.faces)
+    assert not np.array_equal(mesh.colors, conversion.colors)
+    record = json.loads((tmp_path / "t.npz.run" / "start.json").read_text())
+    assert record == {"max_splats": None, "images": None, "brief_steps": 72}
+    # A mesh that the user's own options make is not replaced.
+    assert run(splats, "-o", tmp_path / "t.npz", *dense, "--steps", "2", "--mode", "flat") == 0
+    assert json.loads((tmp_path / "t.npz.run" / "start.json").read_text())["brief_steps"] is None
+
+
+def test_a_timed_run_is_resumed_with_the_mesh_that_it_began_with(splats, tmp_path, capsys, monkeypatch):
+    """Though the machine is as fast as a hundred by then."""
+    slow, fast = Pace(1e-4, 1e-5, 1e-9), Pace(1e-6, 1e-9, 1e-9)
+    monkeypatch.setattr("meshsplats.cli.finetune.TIMED_SPLATS", 1)
+    monkeypatch.setattr("meshsplats.finetuning.pace.FEWEST_SPLATS", 50)
+    monkeypatch.setattr("meshsplats.finetuning.pace.FEWEST_STEPS", 1000)
+    monkeypatch.setattr("meshsplats.cli.finetune.measure_pace", lambda *_, **__: slow)
+    words = (splats, "-o", tmp_path / "t.glb", *SMALL, "--opacity", "cutoff", "--json", "--force")
+    assert run(*words, "--minutes", "0.03") == 0
+    record = json.loads((tmp_path / "t.glb.run" / "start.json").read_text())
+    assert 50 <= record["max_splats"] < 300
+    monkeypatch.setattr("meshsplats.cli.finetune.measure_pace", lambda *_, **__: fast)
+    capsys.readouterr()
+    assert run(*words, "--minutes", "0.05", "--resume") == 0
+    assert json.loads((tmp_path / "t.glb.run" / "start.json").read_text()) == record
+    assert run(*words, "--minutes", "0.03") == 0
+    assert json.loads((tmp_path / "t.glb.run" / "start.json").read_text())["max_splats"] is None
+
+
+def test_the_setup_is_shown_in_phases(splats, tmp_path, capsys):
+    assert run(splats, "-o", tmp_path / "t.npz", *SMALL, "--steps", "2") == 0
+    lines = [line.removeprefix("meshsplats: ") for line in capsys.readouterr().err.splitlines()]
+    wanted = [
+        "reading scene.ply",
+        "converting 300 splats",
+        "scoring the conversion",
+        "choosing numbers of triangles",
+    ]
+    assert [line for line in lines if line in wanted] == wanted
+    assert lines[0] == wanted[0]

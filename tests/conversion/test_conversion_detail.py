@@ -10,9 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from meshsplats import GaussianCloud, SplatMesh, convert, draw_splats, render
+from meshsplats._arrays import subsample
 from meshsplats.cameras.trajectories import look_at
 from meshsplats.conversion.detail import (
+    FEWEST_IMAGES,
     HIDDEN,
+    IMAGES,
     LEAST,
     LEVELS,
     MIN_VIEWS,
@@ -188,3 +191,22 @@ def test_max_triangles_is_kept():
     finer = convert(cloud, **options)
     assert 150 < len(finer.faces) <= 200
     assert finer.splat_count == 50  # of 4 triangles in the mean
+
+
+def test_images_end_early_where_there_is_no_time():
+    """After six, evenly spread: what they show is about what all show."""
+    cloud, views = scene(3), cameras(18)
+    calls: list[tuple[int, int]] = []
+    mesh = convert(cloud, mode="flat")
+
+    def hurried(done, total):
+        calls.append((done, total))
+        return False
+
+    some = visibility(mesh, cloud.means, cloud, views, "area", on_image=hurried)
+    total = len(subsample(views, IMAGES[0]))
+    assert calls == [(n, total) for n in range(1, FEWEST_IMAGES + 1)]
+    every = visibility(mesh, cloud.means, cloud, views, "area", on_image=lambda done, total: True)
+    whole = visibility(mesh, cloud.means, cloud, views, "area")
+    assert np.array_equal(every.pixels, whole.pixels)
+    np.testing.assert_allclose(some.pixels.sum(), whole.pixels.sum(), rtol=0.2)

@@ -86,7 +86,7 @@ SETUP_SHARE = 0.2
 """Largest share of the time, of a run with a length in minutes, before its first step."""
 BASELINE_SHARE = 0.05
 """Share of it in which the conversion is scored, and the result afterwards."""
-SAVE_SECONDS = 2e-6
+SAVE_SECONDS = 1e-6
 """Time to write a triangle and to draw it in the preview, with some to spare."""
 TIMED_SPLATS = 10_000
 """Steps are timed for clouds from this size on."""
