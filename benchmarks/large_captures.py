@@ -4,9 +4,9 @@
 
 Each command runs in a process of its own. Columns: processor seconds, seconds by the clock and the share of
 the processors that other programs took meanwhile, peak memory, triangles, size. dB: two views of an orbit,
-800 x 800 pixels, on white, against the splats at degree 0, look 'area'. *sorted*: triangles sorted at every
-sample; *viewer*: a blended or masked .glb as three.js draws it with MSAA (`viewer_images`). Of a page, its
-fine mesh as the page has it; of tiles, those with an error of a pixel at most; of splats, the splats left.
+800 x 800 pixels, on white, against the splats with all degrees, look 'area'. *sorted*: triangles sorted at
+every sample; *viewer*: a blended or masked .glb as three.js draws it with MSAA (`viewer_images`). Of a page,
+its fine mesh as the page has it; of tiles, those with an error of a pixel at most; of splats, those left.
 
 --copies N: first makes a cloud of N copies of each file, side by side, turned and in other shades. --blender:
 a Python with bpy and meshsplats, for the purpose 'blender'.
@@ -56,7 +56,6 @@ PURPOSES = {
         "blender blender.npz -o blender.png --width 800",
     ],
     "rays": ["convert {input} -o rays.usdc --max-triangles 4000000"],
-    "everything": ["convert {input} -o everything.npz"],
     "tiles": ["tiles {input} -o tiles"],
     "fewer": ["simplify {input} -o splats.ply --count 500000"],
 }
@@ -196,7 +195,7 @@ def save_copies(path: Path, target: Path, count: int) -> None:
 def truth(path: Path) -> tuple[list[ms.Camera], list[np.ndarray]]:
     cloud = ms.load_gaussians(path)
     cameras = ms.orbit(cloud, VIEWS, width=SIDE, height=SIDE)
-    return cameras, [ms.draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras]
+    return cameras, [ms.draw_splats(cloud, camera, "area").color for camera in cameras]
 
 
 def scored(path: Path, result: Path) -> tuple[int, list[float]]:
@@ -215,7 +214,7 @@ def scored(path: Path, result: Path) -> tuple[int, list[float]]:
         return 0, [score(image.color for image in tiles)]
     if result.suffix == ".ply":
         cloud = ms.load_gaussians(result)
-        return 0, [score(ms.draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras)]
+        return 0, [score(ms.draw_splats(cloud, camera, "area").color for camera in cameras)]
     mesh = page_mesh(result) if result.suffix == ".html" else ms.load_mesh(result)
     samples = ms.needed_samples(mesh, cameras)
     scores = [score(ms.render(mesh, camera, samples=samples).color for camera in cameras)]
