@@ -31,7 +31,7 @@ TOLERANCE = 1e-4
 CHANGES = 1e-3
 """Of the changes of colours and positions after a few steps, relative."""
 DECIDED_BY_ROUNDING = 4
-"""Values that may differ by a step: Adam divides by the size of a gradient, and where that is next to nothing,
+"""Values that may differ by a step: Adam divides by the size of a gradient; where that is next to nothing,
 rounding decides."""
 
 
