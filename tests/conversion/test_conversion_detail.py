@@ -210,3 +210,4 @@ def test_images_end_early_where_there_is_no_time():
     whole = visibility(mesh, cloud.means, cloud, views, "area")
     assert np.array_equal(every.pixels, whole.pixels)
     np.testing.assert_allclose(some.pixels.sum(), whole.pixels.sum(), rtol=0.2)
+    assert not some.hidden.any()  # six images do not tell

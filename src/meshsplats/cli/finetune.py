@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from meshsplats._arrays import subsample
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import (
@@ -25,6 +24,7 @@ from meshsplats.cli.common import (
 )
 from meshsplats.cli.messages import UsageError, command_line
 from meshsplats.cli.training import (
+    Display,
     Plan,
     RunFiles,
     Setup,
@@ -55,6 +55,7 @@ from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starts_with_filter
 from meshsplats.finetuning.memory import available_memory
 from meshsplats.finetuning.pace import (
+    BRIEF_RATES,
     BRIEF_ZOOMS,
     StartRecord,
     is_brief,
@@ -64,7 +65,7 @@ from meshsplats.finetuning.pace import (
     worthwhile_steps,
 )
 from meshsplats.finetuning.ranks import is_started_by_torchrun
-from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores
+from meshsplats.finetuning.run import SCORED_VIEWS, first_views, held_out_scores, scored_count
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -86,8 +87,8 @@ SETUP_SHARE = 0.2
 """Largest share of the time, of a run with a length in minutes, before its first step."""
 BASELINE_SHARE = 0.05
 """Share of it in which the conversion is scored, and the result afterwards."""
-SAVE_SECONDS = 1e-6
-"""Time to write a triangle and to draw it in the preview, with some to spare."""
+SAVE_SECONDS = 2e-6
+"""Time to write a triangle, to choose its alpha mode and to draw it in the preview, with some to spare."""
 TIMED_SPLATS = 10_000
 """Steps are timed for clouds from this size on."""
 
@@ -183,7 +184,8 @@ class Finetune(TrainingCommand):
             dataset = self._targets(cloud, config, earlier, BRIEF_ZOOMS)
         setup.phase(f"converting {len(cloud):,} splats")
         # Too many splats to fine-tune are too many to score.
-        most = record.max_splats if config.opacity == "blended" else None
+        few = config.opacity == "blended" or len(cloud) > (most_splats(available_memory()) or len(cloud))
+        most = record.max_splats if few else None
         conversion = self._conversion(cloud, dataset, config, most)
         setup.phase("scoring the conversion")
         seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
@@ -191,27 +193,37 @@ class Finetune(TrainingCommand):
         if record.brief_steps is not None:
             mesh = conversion
         else:
-            mesh = self._start(cloud, dataset, as_begun(config, earlier), record, setup)
+            begun, resumed = as_begun(config, earlier), earlier is not None
+            mesh = self._start(cloud, dataset, begun, record, setup, resumed=resumed)
         scorings = 1 if record.brief_steps is None else 2
-        reserve = scorings * baseline.seconds + SAVE_SECONDS * len(mesh.faces)
+        saving = SAVE_SECONDS * len(mesh.faces)
+        reserve = scorings * baseline.seconds + saving
 
-        def optimise(run: RunOptions, show: ShowProgress) -> Trained:
-            if not run.ranks.index:
+        def optimise(run: RunOptions, show: Display) -> Trained:
+            if earlier is None and not run.ranks.index:
                 record.save(self.files().folder)
             tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
+            if run.ranks.index:
+                return self._trained(tuned, config)  # which the first rank writes
+            show.phase("scoring the result")
             sizes = baseline.compare(tuned, config, self.threads)
             if not sizes.loses:
                 return self._trained(tuned, config, sizes)
             for share in SHARES if record.brief_steps is not None else ():
+                if setup.seconds is not None and setup.spent + baseline.seconds + saving > setup.seconds:
+                    break
                 less = partly(mesh, tuned, share)
                 if less is not None and not (found := baseline.compare(less, config, self.threads)).loses:
                     self._log_scores(less, dataset, config)
                     return self._trained(less, config, found)
-            converted = self._conversion(cloud, dataset, config, most)
-            self._log_scores(converted, dataset, config)
-            return self._trained(converted, config, sizes)
+            best = mesh
+            if record.brief_steps is None:
+                best = self._conversion(cloud, dataset, config, most)
+            self._log_scores(best, dataset, config)
+            return self._trained(best, config, sizes)
 
-        return Plan(mesh, dataset, _summary(mesh, cloud), None, optimise, reserve)
+        rates = {name: getattr(config, name) for name in BRIEF_RATES} if record.brief_steps else {}
+        return Plan(mesh, dataset, _summary(mesh, cloud), None, optimise, reserve, rates=rates)
 
     def _trained(self, mesh: SplatMesh, config: FinetuneConfig, sizes: SizeScores | None = None) -> Trained:
         count = len(mesh.faces)
@@ -233,7 +245,8 @@ class Finetune(TrainingCommand):
             count = min(count, most_splats(available_memory()) or count)
         if timed:
             setup.phase("timing steps")
-            pace = measure_pace(cloud, dataset, config, self._start_options(dataset), self.threads)
+            options = self._start_options(dataset)
+            pace = measure_pace(cloud, dataset, config, options, self.threads, self.device)
             left = (1 - SETUP_SHARE) * (setup.seconds or 0)
             if config.opacity == "cutoff" and not limited:
                 count = min(pace.splats(count, worthwhile_steps(config), left), count)
@@ -257,8 +270,11 @@ class Finetune(TrainingCommand):
         config: FinetuneConfig | None,
         record: StartRecord | None = None,
         setup: Setup | None = None,
+        *,
+        resumed: bool = False,
     ) -> SplatMesh:
-        """The starting mesh. ``record`` notes the images that there was time for."""
+        """The starting mesh. ``record`` notes the images that there was time for, or says it, if the run is
+        ``resumed``."""
         options = self._start_options(dataset)
         on_image = None
         if record is not None and setup is not None:
@@ -269,8 +285,11 @@ class Finetune(TrainingCommand):
             recorded = record.images
 
             def on_image(done: int, total: int) -> bool:
+                in_time = goes_on(done, total)
+                if resumed:
+                    return recorded is None or done < recorded
                 record.images = done
-                return goes_on(done, total) if recorded is None else done < recorded
+                return in_time
 
         return starting_mesh(
             cloud,
@@ -289,7 +308,9 @@ class Finetune(TrainingCommand):
         self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig, splats: int | None = None
     ) -> SplatMesh:
         options = self._start_options(dataset)
-        return converted(cloud, config, options if splats is None else replace(options, max_splats=splats))
+        if splats is not None:
+            options = replace(options, max_splats=splats)
+        return converted(cloud, config, options, [view.camera for view in dataset.train])
 
     def _scene(self) -> GaussianCloud | SplatMesh:
         scene = load_scene(self.input, self.reading)
@@ -352,11 +373,15 @@ class Finetune(TrainingCommand):
 
         if not dataset.test:
             return
-        views = subsample(dataset.test, SCORED_VIEWS)
         journal = Journal(self.files().folder)
+        views = first_views(dataset.test, scored_count(journal) or SCORED_VIEWS)
         decibels, similarity = held_out_scores(mesh, views, config, self.threads)
-        last = max((line["step"] for line in journal.metrics()), default=0)
-        journal.log_metrics(last, psnr=decibels, ssim=similarity, triangles=len(mesh.faces))
+        lines = journal.metrics()
+        if lines and lines[-1].get("psnr") == decibels:
+            return  # of a run that had ended, resumed again
+        last = max((line["step"] for line in lines), default=0)
+        count = len(mesh.faces)
+        journal.log_metrics(last, psnr=decibels, ssim=similarity, views=len(views), triangles=count)
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         if self.target.data is None and plan.dataset.test:

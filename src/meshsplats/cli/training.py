@@ -199,9 +199,11 @@ class Plan:
     summary: str
     background: Background | None
     """That of photographs; None without them."""
-    optimise: Callable[[RunOptions, ShowProgress], Trained]
+    optimise: Callable[[RunOptions, Display], Trained]
     reserve: float = 0.0
     """Seconds that ``optimise`` and the command need after the last step."""
+    rates: Mapping[str, float] = field(default_factory=dict)
+    """Learning rates that differ from those of the configuration."""
     needed: int | None = None
     """Estimated memory in bytes, which is there; None: that of fine-tuning ``mesh``, if there is one."""
 
@@ -313,6 +315,8 @@ class TrainingCommand(Command):
                 return self._execute(self.configured(), ranks)
             if not self.RANKS:
                 raise UsageError("torchrun is for meshsplats finetune")
+            if self.minutes is not None:
+                raise UsageError("--minutes is not for torchrun, as clocks differ: give --steps")
             batch = self.configured().batch
             tuning = replace(self.tuning, batch=ranks.count if batch == 1 else batch)
             command = replace(self, threads=threads, tuning=tuning)
@@ -330,7 +334,7 @@ class TrainingCommand(Command):
         try:
             with progress_display() as show:
                 setup = Setup(show, start, config.minutes)
-                setup.phase(f"reading {self.input.name}")
+                setup.phase(f"reading {self.input}")
                 plan = self.plan(config, earlier, setup)
                 print_plan(plan, self.target.cache_bytes)
                 with files.claimed(self.inputs, resume=self.resume, force=self.force):
@@ -344,7 +348,7 @@ class TrainingCommand(Command):
         save_mesh(trained.saved, files.mesh, **given)
         scored = self._scored(config, plan.dataset)
         background = {} if plan.background is None else plan.background.to_dict()
-        write_configuration(files.config, self._name, self, scored | background)
+        write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))
         self.save_more(files, plan, trained)
         draw_preview(trained.shown, files.preview, self.preview_camera(plan))
         self._print_result(files, time.perf_counter() - start, earlier, trained, scored)
@@ -455,6 +459,7 @@ class TrainingCommand(Command):
         """Prints the result of a run of ``seconds``, after those of the ``earlier`` part. ``scored``: see
         ``_scored``."""
         from meshsplats.finetuning.journal import Journal
+        from meshsplats.finetuning.run import SCORED_VIEWS
 
         lines = Journal(files.folder).metrics()
         scores = [line["psnr"] for line in lines if line.get("psnr") is not None]
@@ -483,7 +488,10 @@ class TrainingCommand(Command):
         if len(scores) == 1:
             quality = f"; held out: {scores[0]:.2f} dB"
         if scores:
-            quality += f" (look {scored['look']}, {scored['samples']} x {scored['samples']} samples)"
+            quality += f" (look {scored['look']}, {scored['samples']} x {scored['samples']} samples"
+            count = lines[-1].get("views") or SCORED_VIEWS
+            most = SCORED_VIEWS if self.has_photographs else min(self.target.held_out, SCORED_VIEWS)
+            quality += f", {plural(count, 'view')})" if count < most else ")"
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
         for line in _sizes_in_words(trained.sizes, steps):
             print(line)
@@ -507,12 +515,12 @@ def _sizes_in_words(sizes: SizeScores | None, steps: int) -> Iterator[str]:
         return
     pairs = (f"{width} px {old:.1f} -> {sizes.tuned[width]:.1f}" for width, old in sizes.converted.items())
     yield f"converted -> tuned, dB: {', '.join(pairs)}"
-    if not steps:
-        yield "there was no time for a step: this is the mesh at the start; more --minutes help"
-    elif sizes.loses:
-        where = " and ".join(str(width) for width in sizes.worse_at)
+    if sizes.loses:
+        where = ", ".join(str(width) for width in sizes.worse_at)
         yield f"the conversion is written: after {plural(steps, 'step')}, the mesh was worse at {where} px;"
-        yield "  more --minutes help, or fewer triangles (--max-splats); --resume --force continues this run"
+        yield "  a longer run helps, a new one rather than --resume, which keeps the start of a short one"
+    elif not steps:
+        yield "there was no time for a step: this is the mesh at the start; more --minutes help"
 
 
 def default_background(config: FinetuneConfig) -> tuple[float, float, float]:
@@ -580,7 +588,8 @@ def progress_display() -> Iterator[Display]:
     from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bar
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
+    plain = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[text]}"))
+    columns = (next(plain), BarColumn(), next(plain))
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
         yield _InBar(bar)
 
@@ -589,15 +598,21 @@ class _InBar:
     def __init__(self, bar: Bar) -> None:
         self._bar, self._task = bar, bar.add_task("", total=None, text="")
         self._loss: float | None = None
+        self._phase = ""
 
     def phase(self, text: str, share: float | None = None) -> None:
-        total = None if share is None else 1.0
-        self._bar.update(self._task, description=text, total=total, completed=share or 0.0)
+        if text != self._phase:  # rich takes a total of None for no change, and a new task for a pulse
+            self._phase = text
+            self._bar.remove_task(self._task)
+            self._task = self._bar.add_task(text, total=None, text="")
+        if share is not None:
+            self._bar.update(self._task, total=1.0, completed=share)
 
     def __call__(self, progress: Progress) -> None:
         if progress.loss is not None:  # smoothed: it differs from view to view
             self._loss = progress.loss if self._loss is None else 0.95 * self._loss + 0.05 * progress.loss
         text = _text(progress, self._loss)
+        self.phase("fine-tuning")
         self._bar.update(
             self._task, description="fine-tuning", total=1.0, completed=progress.fraction, text=text
         )

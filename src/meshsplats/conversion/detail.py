@@ -53,7 +53,9 @@ MIN_VIEWS = 4
 
 
 FEWEST_IMAGES = 6
-"""That are rendered, however little time there is."""
+"""That are rendered, however little time there is; no splat counts as hidden by less than ``IMAGES``."""
+
+GOLDEN = (5**0.5 - 1) / 2
 
 OnImage = Callable[[int, int], bool]
 """Called after each image, with how many are rendered and how many there will be; returns whether to go
@@ -103,8 +105,9 @@ def visibility(
     fewest, most = IMAGES
     chosen = subsample(cameras, min(max(len(cameras) // 8, fewest), most))
     done = 0
-    # Evenly spread, wherever this ends: every third camera, then those after them.
-    for own in (camera for first in range(3) for camera in chosen[first::3]):
+    # In an order of which every beginning is evenly spread: multiples of the golden ratio.
+    order = np.argsort(np.argsort(np.arange(len(chosen)) * GOLDEN % 1, kind="stable"), kind="stable")
+    for own in (chosen[i] for i in order):
         camera = own.within(SIDE)
         values = np.zeros((len(owner), 2), np.float32)
         rendering = TapedRendering.of(
@@ -122,7 +125,9 @@ def visibility(
         done += 1
         if on_image is not None and not on_image(done, len(chosen)) and done >= FEWEST_IMAGES:
             break
-    hidden = (pixels < HIDDEN * views) & (views >= MIN_VIEWS)
+    # A few images do not tell what is hidden from others.
+    told = done == len(chosen) or done >= fewest
+    hidden = told & (pixels < HIDDEN * views) & (views >= MIN_VIEWS)
     return Visibility(pixels / done, error / done, hidden)
 
 

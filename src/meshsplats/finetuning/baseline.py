@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from meshsplats._arrays import subsample
+from meshsplats.camera import Camera
+from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.datasets.splat_targets import RenderedSplats, splat_views, window_centers, window_of_image
 from meshsplats.datasets.views import Dataset, View
@@ -77,16 +79,30 @@ def converted(
     cloud: GaussianCloud,
     config: FinetuneConfig,
     options: ConversionOptions,
-    up: np.ndarray | None = None,
+    cameras: Sequence[Camera] = (),
 ) -> SplatMesh:
     """What ``convert`` makes of ``cloud`` with these ``options``, and with the look and opacity of a run with
-    ``config``: with the filter of 3DGS where the run has it, cut where its triangles are opaque."""
+    ``config``: with the filter of 3DGS where the run has it, cut where its triangles are opaque.
+
+    ``cameras``, of the views of the run, tell what is up, and the mean colours if these are asked for. Its
+    detail and footprint are those of a conversion without cameras.
+    """
     if starts_with_filter(cloud, options):
         options = replace(options, footprint="filter")
-    if options.detail == "cameras":
-        options = replace(options, detail=None)
-    mesh = convert(cloud, options, up=up)
+    wanted = without_cameras(options)
+    if options.colors == "cameras":
+        wanted = replace(wanted, colors="cameras")
+        if wanted.footprint is None and wanted.viewing_distance is None:
+            wanted = replace(wanted, footprint="framing")
+    seen_from = cameras if options.colors == "cameras" else None
+    mesh = convert(cloud, wanted, cameras=seen_from, up=guess_up(cloud, cameras))
     return cut_mesh(mesh, config.cutoff) if config.opacity == "cutoff" else mesh
+
+
+def without_cameras(options: ConversionOptions) -> ConversionOptions:
+    """``options`` with the default in place of what needs cameras."""
+    names = ("detail", "footprint", "colors")
+    return replace(options, **{name: None for name in names if getattr(options, name) == "cameras"})
 
 
 def partly(start: SplatMesh, tuned: SplatMesh, share: float) -> SplatMesh | None:

@@ -20,10 +20,12 @@ from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.datasets.splat_targets import ZOOMS
 from meshsplats.datasets.views import Dataset
 from meshsplats.errors import FileFormatError
+from meshsplats.finetuning.baseline import without_cameras
 from meshsplats.finetuning.config import FinetuneConfig, with_changes
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import make_step
 from meshsplats.gaussians import GaussianCloud
+from meshsplats.rendering.api import Device
 
 FEWEST_STEPS = 150
 """Steps that a run for opaque triangles should have."""
@@ -144,6 +146,7 @@ def measure_pace(
     config: FinetuneConfig,
     options: ConversionOptions,
     threads: int | None = None,
+    device: Device = "cpu",
 ) -> Pace:
     """Times steps with a part of ``cloud``, converted with ``options``, on views of ``dataset``."""
     every = -(-len(cloud) // TRIAL_SPLATS)
@@ -151,14 +154,15 @@ def measure_pace(
     start = time.perf_counter()
     simplify(part, max(1, len(part) // 2))
     merging = (time.perf_counter() - start) / len(part)
-    mesh = convert(part, replace(options, max_splats=None, max_triangles=None, crop=None))
+    free = replace(without_cameras(options), max_splats=None, max_triangles=None, crop=None)
+    mesh = convert(part, free)
     views = dataset.train[:2]
     times = []
     for view in views:
         start = time.perf_counter()
         view.load()
         times.append(time.perf_counter() - start)
-    state = State.begin(mesh, len(views), config, threads)
+    state = State.begin(mesh, len(views), config, threads, device=device)
     steps = []
     for number in range(2):  # the first one allocates
         start = time.perf_counter()

@@ -71,6 +71,9 @@ more, but at least ``FEWEST_SCORED``."""
 
 FEWEST_SCORED = 2
 
+SAVE_SECONDS = 4e-7
+"""Time to write a triangle's part of a checkpoint, before one was written."""
+
 CHECKPOINT_SHARE = 0.05
 """Largest share of the time that checkpoints take."""
 
@@ -297,7 +300,8 @@ class TrainingLoop:
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = self.save_cost = self.step_cost = 0.0
-        self.scored_views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
+        self.scored_views = first_views(dataset.test, SCORED_VIEWS)
+        self.views_limited = False
         self.quarter = int(MIN_PREVIEWS * self.fraction)
         share = config.opaque_share
         self.most_opaque = None if share == 1 else max(1, round(share * len(start.mesh.faces)))
@@ -333,7 +337,7 @@ class TrainingLoop:
             if self.step == 0:
                 self._report()
                 self._save_preview()
-                self._save_checkpoint()
+                self._save_first_checkpoint()
             while not self._done():
                 if ranks.any(signals.received is not None):
                     self._save_checkpoint()
@@ -353,13 +357,20 @@ class TrainingLoop:
                 if time.perf_counter() - self.save_time >= self._checkpoint_interval:
                     self._save_checkpoint()
                 self._notify()
-            if not self.options.resume or self.step > self.first_step:
+            if self.step > self.first_step:
                 self._report()
                 self._save_checkpoint()
             self._notify()
             if signals.received is not None:
                 raise Interrupted(self.step, signals.received)
         return self.result()
+
+    def _save_first_checkpoint(self) -> None:
+        """Not in a run whose time it would take: if that is interrupted, it saves one all the same."""
+        if self.config.minutes is None:
+            self._save_checkpoint()
+        else:
+            self.save_cost = SAVE_SECONDS * len(self.state.mesh.faces)
 
     @property
     def _checkpoint_interval(self) -> float:
@@ -465,6 +476,7 @@ class TrainingLoop:
                 loss=loss,
                 psnr=self.held_out,
                 ssim=mean_ssim,
+                views=len(self.scored_views),
                 triangles=len(self.state.mesh.faces),
                 seconds=round(self.seconds, 3),
             )
@@ -472,14 +484,19 @@ class TrainingLoop:
         self.report_cost = time.perf_counter() - start
 
     def _limit_scored_views(self) -> None:
-        """Leaves as many views to be scored as there is time for; all reports have the same."""
-        if self.config.minutes is None or self.step > self.first_step or len(self.scored_views) < 2:
+        """Leaves as many views to be scored as there is time for; all reports of a run have the same."""
+        if self.views_limited or self.config.minutes is None or len(self.scored_views) < 2:
+            return
+        self.views_limited = True
+        scored = None if self.journal is None else scored_count(self.journal)
+        if scored is not None and self.first_step:
+            self.scored_views = first_views(self.dataset.test, scored)
             return
         start = time.perf_counter()
         self._score(self.scored_views[:1])
         cost = time.perf_counter() - start
         count = int(REPORT_SHARE * 60 * self.config.minutes / cost) if cost > 0 else SCORED_VIEWS
-        self.scored_views = subsample(self.scored_views, max(count, FEWEST_SCORED))
+        self.scored_views = first_views(self.dataset.test, min(max(count, FEWEST_SCORED), SCORED_VIEWS))
 
     def _score(self, views: Sequence[View]) -> tuple[float, float]:
         options = self.options
@@ -539,6 +556,17 @@ class TrainingLoop:
                 len(self.state.mesh.faces),
             )
         )
+
+
+def first_views(views: Sequence[View], most: int) -> tuple[View, ...]:
+    """At most so many of the held-out ``views``, which are scored during a run; evenly spread."""
+    return tuple(subsample(tuple(views), most))
+
+
+def scored_count(journal: Journal) -> int | None:
+    """How many views the last scores in ``journal`` are means over; None if there are none."""
+    lines = [line.get("views") for line in journal.metrics()]
+    return lines[-1] if lines and isinstance(lines[-1], int) and lines[-1] > 0 else None
 
 
 def held_out_scores(
