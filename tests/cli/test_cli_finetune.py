@@ -520,3 +520,14 @@ def test_a_refused_resumption_changes_nothing(splats, tmp_path, capsys):
     # One from before there were records began with all images, whatever the time.
     record.unlink()
     assert run(*words, "--views", "20", "--minutes", "0.01", "--resume") == 0
+
+
+def test_a_run_without_time_for_steps_is_not_begun(splats, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("meshsplats.cli.finetune.TIMED_SPLATS", 1)
+    monkeypatch.setattr("meshsplats.cli.finetune.measure_pace", lambda *_, **__: Pace(100.0, 1.0, 1.0))
+    assert run(splats, "-o", tmp_path / "t.npz", *SMALL, "--minutes", "0.02") == 0
+    printed = capsys.readouterr().out
+    assert "0 steps in" in printed
+    assert "there was no time for steps: this is the mesh at the start; more --minutes help" in printed
+    assert "metrics.jsonl" not in printed
+    assert np.array_equal(load_mesh(tmp_path / "t.npz").vertices, convert(load_gaussians(splats)).vertices)

@@ -85,6 +85,8 @@ else:
 
 SETUP_SHARE = 0.2
 """Largest share of the time, of a run with a length in minutes, before its first step."""
+FEWEST_BRIEF_STEPS = 3
+"""With less time left than for so many steps, a brief run is not begun."""
 BASELINE_SHARE = 0.05
 """Share of it in which the conversion is scored, and the result afterwards."""
 SAVE_SECONDS = 2e-6
@@ -200,6 +202,8 @@ class Finetune(TrainingCommand):
         reserve = scorings * baseline.seconds + saving
 
         def optimise(run: RunOptions, show: Display) -> Trained:
+            if not self._has_time(record, setup, reserve) and earlier is None:
+                return self._trained(mesh, config, baseline.compared_with_itself())
             if earlier is None and not run.ranks.index:
                 record.save(self.files().folder)
             tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
@@ -224,6 +228,13 @@ class Finetune(TrainingCommand):
 
         rates = {name: getattr(config, name) for name in BRIEF_RATES} if record.brief_steps else {}
         return Plan(mesh, dataset, _summary(mesh, cloud), None, optimise, reserve, rates=rates)
+
+    def _has_time(self, record: StartRecord, setup: Setup, reserve: float) -> bool:
+        """Whether what is left of the time is worth beginning a brief run."""
+        if setup.seconds is None or record.brief_steps is None:
+            return True
+        step = (1 - SETUP_SHARE) * setup.seconds / record.brief_steps
+        return setup.seconds - setup.spent - reserve >= FEWEST_BRIEF_STEPS * step
 
     def _trained(self, mesh: SplatMesh, config: FinetuneConfig, sizes: SizeScores | None = None) -> Trained:
         count = len(mesh.faces)

@@ -495,7 +495,7 @@ class TrainingCommand(Command):
         print(f"{made}: {steps:,} steps in {total:.1f} s{resumed}{quality}")
         for line in _sizes_in_words(trained.sizes, steps):
             print(line)
-        print(f"preview: {files.preview}; metrics: {files.folder}/metrics.jsonl")
+        print(f"preview: {files.preview}" + (f"; metrics: {files.folder}/metrics.jsonl" if lines else ""))
 
 
 def _sizes_record(sizes: SizeScores | None) -> dict[str, Any]:
@@ -513,14 +513,17 @@ def _sizes_in_words(sizes: SizeScores | None, steps: int) -> Iterator[str]:
     """At each image width, the conversion against the tuned mesh; and which one was written, if not that."""
     if sizes is None:
         return
-    pairs = (f"{width} px {old:.1f} -> {sizes.tuned[width]:.1f}" for width, old in sizes.converted.items())
-    yield f"converted -> tuned, dB: {', '.join(pairs)}"
+    if steps:
+        pairs = (
+            f"{width} px {old:.1f} -> {sizes.tuned[width]:.1f}" for width, old in sizes.converted.items()
+        )
+        yield f"converted -> tuned, dB: {', '.join(pairs)}"
     if sizes.loses:
         where = ", ".join(str(width) for width in sizes.worse_at)
         yield f"the conversion is written: after {plural(steps, 'step')}, the mesh was worse at {where} px;"
         yield "  a longer run helps, a new one rather than --resume, which keeps the start of a short one"
     elif not steps:
-        yield "there was no time for a step: this is the mesh at the start; more --minutes help"
+        yield "there was no time for steps: this is the mesh at the start; more --minutes help"
 
 
 def default_background(config: FinetuneConfig) -> tuple[float, float, float]:

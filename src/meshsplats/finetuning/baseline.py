@@ -70,6 +70,10 @@ class Baseline:
     seconds: float
     """Time that scoring it took, without rendering the splats."""
 
+    def compared_with_itself(self) -> SizeScores:
+        """The scores of the conversion, also as those of the result."""
+        return SizeScores(self.scores, self.scores)
+
     def compare(self, mesh: SplatMesh, config: FinetuneConfig, threads: int | None = None) -> SizeScores:
         """Scores ``mesh`` likewise."""
         return SizeScores(self.scores, _scores(mesh, self.views, config, threads))
