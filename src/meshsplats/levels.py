@@ -11,6 +11,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.conversion import ConversionOptions, convert, simplify
+from meshsplats.conversion.footprint import FILTER_PX2
 from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset
 from meshsplats.datasets.views import Dataset, View
 from meshsplats.evaluation.comparison import compare
@@ -135,7 +136,11 @@ def make_level(
         assert found is not None
         return found
     cameras = [view.camera for view in targets.train]
-    options = options or ConversionOptions(sides=starting_sides(level.finest, config, len(cameras)))
+    if options is None:
+        # A level is seen at the size of its targets: their own footprint, not that of larger images.
+        px2 = FILTER_PX2["area"][cloud.kernel]
+        sides = starting_sides(level.finest, config, len(cameras))
+        options = ConversionOptions(sides=sides, footprint_px2=px2)
     mesh = starting_mesh(cloud, cameras, options, config=config, up=up, max_splats=level.splats)
     return finetune(mesh, targets, config, run=run, on_progress=on_progress)
 

@@ -37,6 +37,7 @@ from meshsplats.cli.training import (
 )
 from meshsplats.cluster import Shared
 from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.views import Dataset, ViewImage
 from meshsplats.errors import DataWarning
@@ -184,11 +185,12 @@ class Finetune(TrainingCommand):
             given = {name for name, value in asdict(self.tuning).items() if value is not None}
             config = of_brief_run(config, record.brief_steps, given)
             dataset = self._targets(cloud, config, earlier, BRIEF_ZOOMS)
-        setup.phase(f"converting {len(cloud):,} splats")
-        # Too many splats to fine-tune are too many to score.
-        few = config.opacity == "blended" or len(cloud) > (most_splats(available_memory()) or len(cloud))
-        most = record.max_splats if few else None
-        conversion = self._conversion(cloud, dataset, config, most)
+        used = cloud
+        if record.max_splats is not None:
+            setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
+            used = simplify_in_blocks(cloud, record.max_splats, threads=self.threads)
+        setup.phase(f"converting {len(used):,} splats")
+        conversion = self._conversion(used, dataset, config)
         setup.phase("scoring the conversion")
         seconds = None if setup.seconds is None else BASELINE_SHARE * setup.seconds
         baseline = measure_baseline(conversion, cloud, dataset, config, threads=self.threads, seconds=seconds)
@@ -196,7 +198,7 @@ class Finetune(TrainingCommand):
             mesh = conversion
         else:
             begun, resumed = as_begun(config, earlier), earlier is not None
-            mesh = self._start(cloud, dataset, begun, record, setup, resumed=resumed)
+            mesh = self._start(used, dataset, begun, record, setup, resumed=resumed)
         scorings = 1 if record.brief_steps is None else 2
         saving = SAVE_SECONDS * len(mesh.faces)
         reserve = scorings * baseline.seconds + saving
@@ -222,7 +224,7 @@ class Finetune(TrainingCommand):
                     return self._trained(less, config, found)
             best = mesh
             if record.brief_steps is None:
-                best = self._conversion(cloud, dataset, config, most)
+                best = self._conversion(used, dataset, config)
             self._log_scores(best, dataset, config)
             return self._trained(best, config, sizes)
 
@@ -289,9 +291,6 @@ class Finetune(TrainingCommand):
         options = self._start_options(dataset)
         on_image = None
         if record is not None and setup is not None:
-            if record.max_splats is not None:
-                options = replace(options, max_splats=record.max_splats)
-                setup.phase(f"merging {len(cloud):,} splats to {record.max_splats:,}")
             goes_on = setup.observer("choosing numbers of triangles", SETUP_SHARE)
             recorded = record.images
 
@@ -315,13 +314,9 @@ class Finetune(TrainingCommand):
     def _start_options(self, dataset: Dataset) -> ConversionOptions:
         return replace(self.conversion, crop=None, look=dataset.look)  # cropped already
 
-    def _conversion(
-        self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig, splats: int | None = None
-    ) -> SplatMesh:
-        options = self._start_options(dataset)
-        if splats is not None:
-            options = replace(options, max_splats=splats)
-        return converted(cloud, config, options, [view.camera for view in dataset.train])
+    def _conversion(self, cloud: GaussianCloud, dataset: Dataset, config: FinetuneConfig) -> SplatMesh:
+        cameras = [view.camera for view in dataset.train]
+        return converted(cloud, config, self._start_options(dataset), cameras)
 
     def _scene(self) -> GaussianCloud | SplatMesh:
         scene = load_scene(self.input, self.reading)
