@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import tyro
 
 from meshsplats.cameras.files import save_cameras
@@ -90,6 +91,8 @@ FEWEST_BRIEF_STEPS = 3
 """With less time left than for so many steps, a brief run is not begun."""
 BASELINE_SHARE = 0.05
 """Share of it in which the conversion is scored, and the result afterwards."""
+OVERTIME = 5.0
+"""Seconds that may be added to it for a result that is better than the conversion."""
 SAVE_SECONDS = 2e-6
 """Time to write a triangle, to choose its alpha mode and to draw it in the preview, with some to spare."""
 TIMED_SPLATS = 10_000
@@ -216,7 +219,8 @@ class Finetune(TrainingCommand):
             if not sizes.loses:
                 return self._trained(tuned, config, sizes)
             for share in SHARES if record.brief_steps is not None else ():
-                if setup.seconds is not None and setup.spent + baseline.seconds + saving > setup.seconds:
+                late = setup.spent + baseline.seconds + saving - (setup.seconds or np.inf)
+                if late > OVERTIME:
                     break
                 less = partly(mesh, tuned, share)
                 if less is not None and not (found := baseline.compare(less, config, self.threads)).loses:
