@@ -500,9 +500,10 @@ def alpha_in_words(record: Mapping[str, Any] | None) -> str | None:
     modes = {"blend": "blend", "mask": f"mask with cutoff {record['cutoff']:g}"}
     taken = record["alpha"]
     other = "mask" if taken == "blend" else "blend"
+    sorting = "" if taken == "blend" else " (--alpha blend for ray tracers and Blender's own importer)"
     return (
         f"alpha: {modes[taken]}, {record[taken]:.1f} dB from the sorted image in viewers that do not sort;"
-        f" {modes[other]}: {record[other]:.1f} dB"
+        f" {modes[other]}: {record[other]:.1f} dB{sorting}"
     )
 
 
