@@ -6,13 +6,18 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from torch.autograd.function import once_differentiable
 
 from meshsplats._kinds import described
 from meshsplats.camera import Camera
+from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.rendering.api import Device
 from meshsplats.rendering.gpu_backward import AnyRendering, taped_rendering
+
+try:
+    import torch
+    from torch.autograd.function import once_differentiable
+except ImportError as error:
+    raise MissingDependencyError(f"meshsplats.rendering.torch_operator needs torch; {GET_TORCH}") from error
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour, alpha and attributes of b images."""
