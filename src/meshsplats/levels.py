@@ -14,7 +14,7 @@ from meshsplats.conversion import ConversionOptions, convert, simplify
 from meshsplats.conversion.footprint import FILTER_PX2
 from meshsplats.datasets.splat_targets import HELD_OUT, splat_dataset
 from meshsplats.datasets.views import Dataset, View
-from meshsplats.evaluation.comparison import compare
+from meshsplats.evaluation.comparison import compare, images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.finetuning import (
     FinetuneConfig,
@@ -28,7 +28,6 @@ from meshsplats.finetuning.config import worthwhile_zooms
 from meshsplats.finetuning.initial import starting_sides
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import render
 
 SMALLEST = 16
 """Minimum image width of a level in pixels."""
@@ -165,11 +164,8 @@ def views_to_score(triangles: int, splats: int) -> int:
 
 def _against(mesh: SplatMesh, views: Sequence[View], threads: int | None) -> float:
     """Mean PSNR in dB of the mesh against the images of ``views``."""
-    scores = []
-    for view in views:
-        image = render(mesh, view.camera, samples=SAMPLES, threads=threads).color
-        scores.append(psnr(image.clip(0, 1), view.image.clip(0, 1)))
-    return float(np.mean(scores))
+    images = (images_of_view(mesh, view, samples=SAMPLES, threads=threads) for view in views)
+    return float(np.mean([psnr(*pair) for pair in images]))
 
 
 def likeness(

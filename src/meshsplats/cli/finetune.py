@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import tyro
 
+from meshsplats._arrays import subsample
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import as_cli_options
 from meshsplats.cli.common import (
@@ -38,6 +39,7 @@ from meshsplats.cli.training import (
 )
 from meshsplats.cluster import Shared
 from meshsplats.conversion import ConversionOptions
+from meshsplats.conversion.budget import usual_triangles_each
 from meshsplats.conversion.merging import simplify_in_blocks
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.views import Dataset, ViewImage
@@ -67,7 +69,7 @@ from meshsplats.finetuning.pace import (
     worthwhile_steps,
 )
 from meshsplats.finetuning.ranks import is_started_by_torchrun
-from meshsplats.finetuning.run import SCORED_VIEWS, first_views, held_out_scores, scored_count
+from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores, scored_count
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -266,7 +268,7 @@ class Finetune(TrainingCommand):
             pace = measure_pace(cloud, dataset, config, options, self.threads, self.device)
             left = (1 - SETUP_SHARE) * (setup.seconds or 0)
             if config.opacity == "cutoff" and not limited:
-                count = min(pace.splats(count, worthwhile_steps(config), left), count)
+                count = pace.splats(count, worthwhile_steps(config), left)
             steps = pace.steps(self._limited(count), left)
         brief = may_be_brief and steps is not None and is_brief(self._limited(count), pixels, steps, timed)
         return StartRecord(
@@ -277,8 +279,9 @@ class Finetune(TrainingCommand):
     def _limited(self, splats: int) -> int:
         """How many of them the options leave."""
         chosen = self.conversion
-        by_triangles = None if chosen.max_triangles is None else max(chosen.max_triangles // 8, 1)
-        return min(splats, chosen.max_splats or splats, by_triangles or splats)
+        if chosen.max_triangles is not None:
+            splats = min(splats, max(chosen.max_triangles // usual_triangles_each(), 1))
+        return min(splats, chosen.max_splats or splats)
 
     def _start(
         self,
@@ -384,7 +387,7 @@ class Finetune(TrainingCommand):
         if not dataset.test:
             return
         journal = Journal(self.files().folder)
-        views = first_views(dataset.test, scored_count(journal) or SCORED_VIEWS)
+        views = subsample(dataset.test, scored_count(journal) or SCORED_VIEWS)
         decibels, similarity = held_out_scores(mesh, views, config, self.threads)
         lines = journal.metrics()
         if lines and lines[-1].get("psnr") == decibels:

@@ -192,9 +192,10 @@ class View(Command):
             splats = None if self.splats is None else _degree_0(self.part.of(self.reading.load(self.splats)))
             return _Content(scene, splats, coarse=_coarse(scene, splats))
         from meshsplats.conversion import convert
+        from meshsplats.conversion.budget import usual_triangles_each
         from meshsplats.conversion.merging import simplify_in_blocks
 
-        each = _triangles_each()
+        each = usual_triangles_each()
         count = len(scene) if self.whole else max(1, (self.max_triangles or TRIANGLES) // each)
         _check_size(each * min(count, len(scene)), "leave --whole out, or make 'meshsplats tiles'")
         splats = simplify_in_blocks(scene, count)
@@ -312,22 +313,15 @@ def _degree_0(cloud: GaussianCloud) -> GaussianCloud:
     return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
 
 
-def _triangles_each() -> int:
-    """Triangles of a splat as converted by default."""
-    from meshsplats.conversion.budget import triangles_each
-    from meshsplats.conversion.options import ConversionOptions
-
-    return triangles_each(ConversionOptions().resolved("default", has_cameras=False))
-
-
 def _coarse(mesh: SplatMesh, splats: GaussianCloud | None) -> SplatMesh | None:
     """The coarse level of a mesh with many triangles, made of its splats."""
     if splats is None or len(mesh.faces) <= COARSE_TRIANGLES:
         return None
     from meshsplats.conversion import convert
+    from meshsplats.conversion.budget import usual_triangles_each
     from meshsplats.conversion.merging import simplify_in_blocks
 
-    return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // _triangles_each()), up=mesh.up)
+    return convert(simplify_in_blocks(splats, COARSE_TRIANGLES // usual_triangles_each()), up=mesh.up)
 
 
 def _check_size(triangles: int, advice: str) -> None:

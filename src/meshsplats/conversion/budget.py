@@ -22,6 +22,11 @@ def triangles_each(options: ConversionOptions) -> int:
     return ellipses * (2 * options.rings - 1) * options.sides  # type: ignore[operator]
 
 
+def usual_triangles_each() -> int:
+    """Those of a splat as ``convert`` makes them by default."""
+    return triangles_each(ConversionOptions().resolved("default", has_cameras=False))
+
+
 def within_limits(
     given: ConversionOptions, chosen: ConversionOptions, n: int
 ) -> tuple[ConversionOptions, int]:

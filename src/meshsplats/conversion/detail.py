@@ -56,6 +56,7 @@ FEWEST_IMAGES = 6
 """That are rendered, however little time there is; no splat counts as hidden by less than ``IMAGES``."""
 
 GOLDEN = (5**0.5 - 1) / 2
+"""The golden ratio: its multiples modulo 1 spread evenly, however many there are."""
 
 OnImage = Callable[[int, int], bool]
 """Called after each image, with how many are rendered and how many there will be; returns whether to go

@@ -27,7 +27,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import GaussianCloud
+from meshsplats.gaussians import GaussianCloud, joined
 
 NEIGHBOURS = 8
 """Nearest splats with which each may be merged at first; a merged one has the neighbours of both. With 16,
@@ -152,15 +152,7 @@ def simplify_in_blocks(
         for rows, share in zip(blocks, shares, strict=True)
         if share
     ]
-    joined = GaussianCloud(
-        np.concatenate([part.means for part in parts]),
-        np.concatenate([part.quaternions for part in parts]),
-        np.concatenate([part.scales for part in parts]),
-        np.concatenate([part.opacities for part in parts]),
-        np.concatenate([part.sh for part in parts]),
-        kernel=cloud.kernel,
-    )
-    return simplify(joined, count, threads=threads)
+    return simplify(joined(parts), count, threads=threads)
 
 
 def _blocks(means: np.ndarray, rows: np.ndarray, most: int) -> list[np.ndarray]:

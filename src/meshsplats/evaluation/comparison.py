@@ -11,6 +11,7 @@ import numpy as np
 
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
+from meshsplats.datasets.views import View
 from meshsplats.evaluation.metrics import psnr, ssim
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -112,6 +113,15 @@ def compare_views(
         b = np.clip(image_of(mesh, camera, background, **options)[0], 0, 1)
         score = ViewSimilarity(camera.name or f"view_{i:04d}", psnr(a, b), ssim(a, b))
         yield ComparedView(camera, a, b, score)
+
+
+def images_of_view(
+    mesh: SplatMesh, view: View, *, samples: int, threads: int | None = None, device: Device = "cpu"
+) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w, 3) display RGB: the image of ``mesh`` in ``view``, and the view's own, clipped to [0, 1].
+    Options are those of ``render``."""
+    image, _ = image_of(mesh, view.camera, view.background, samples=samples, threads=threads, device=device)
+    return np.clip(image, 0, 1), np.clip(view.image, 0, 1)
 
 
 def compare(

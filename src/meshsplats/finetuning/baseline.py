@@ -18,6 +18,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion import ConversionOptions, convert
 from meshsplats.datasets.splat_targets import RenderedSplats, splat_views, window_centers, window_of_image
 from meshsplats.datasets.views import Dataset, View
+from meshsplats.evaluation.comparison import images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.finetuning.config import FinetuneConfig
 from meshsplats.finetuning.initial import starts_with_filter
@@ -25,7 +26,6 @@ from meshsplats.finetuning.step import samples_of
 from meshsplats.formats.cutting import cut_mesh
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.looks import image_of
 
 ZOOMS = (0.5, 1, 2, 4)
 """Image sizes, as multiples of those of the training views: for 400 pixels, 200 to 1600. Of the larger images
@@ -181,6 +181,5 @@ def _scores(
 
 
 def _psnr(mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None) -> float:
-    samples = samples_of(view, config)
-    image, _ = image_of(mesh, view.camera, view.background, samples=samples, threads=threads)
-    return min(psnr(np.clip(image, 0, 1), np.clip(view.image, 0, 1)), 200.0)
+    images = images_of_view(mesh, view, samples=samples_of(view, config), threads=threads)
+    return min(psnr(*images), 200.0)

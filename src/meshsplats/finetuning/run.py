@@ -15,6 +15,7 @@ import numpy as np
 from meshsplats._arrays import checked_array, subsample
 from meshsplats._kinds import need, need_path
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
+from meshsplats.evaluation.comparison import images_of_view
 from meshsplats.evaluation.metrics import psnr
 from meshsplats.evaluation.report import masked_ssim
 from meshsplats.finetuning.checkpoint import (
@@ -44,7 +45,6 @@ from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_
 from meshsplats.formats.cutting import cut_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import Device, check_device
-from meshsplats.rendering.looks import image_of
 from meshsplats.webgpu.device import open_device
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ more, but at least ``FEWEST_SCORED``."""
 
 FEWEST_SCORED = 2
 
-SAVE_SECONDS = 4e-7
+CHECKPOINT_SECONDS = 4e-7
 """Time to write a triangle's part of a checkpoint, before one was written."""
 
 CHECKPOINT_SHARE = 0.05
@@ -300,7 +300,7 @@ class TrainingLoop:
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = self.save_cost = self.step_cost = 0.0
-        self.scored_views = first_views(dataset.test, SCORED_VIEWS)
+        self.scored_views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
         self.views_limited = False
         self.quarter = int(MIN_PREVIEWS * self.fraction)
         share = config.opaque_share
@@ -370,7 +370,7 @@ class TrainingLoop:
         if self.config.minutes is None:
             self._save_checkpoint()
         else:
-            self.save_cost = SAVE_SECONDS * len(self.state.mesh.faces)
+            self.save_cost = CHECKPOINT_SECONDS * len(self.state.mesh.faces)
 
     @property
     def _checkpoint_interval(self) -> float:
@@ -490,13 +490,13 @@ class TrainingLoop:
         self.views_limited = True
         scored = None if self.journal is None else scored_count(self.journal)
         if scored is not None and self.first_step:
-            self.scored_views = first_views(self.dataset.test, scored)
+            self.scored_views = subsample(self.dataset.test, scored)
             return
         start = time.perf_counter()
         self._score(self.scored_views[:1])
         cost = time.perf_counter() - start
         count = int(REPORT_SHARE * 60 * self.config.minutes / cost) if cost > 0 else SCORED_VIEWS
-        self.scored_views = first_views(self.dataset.test, min(max(count, FEWEST_SCORED), SCORED_VIEWS))
+        self.scored_views = subsample(self.dataset.test, min(max(count, FEWEST_SCORED), SCORED_VIEWS))
 
     def _score(self, views: Sequence[View]) -> tuple[float, float]:
         options = self.options
@@ -511,11 +511,11 @@ class TrainingLoop:
         if self.journal is None or not self.options.preview_every:
             return
         view = (self.scored_views or self.dataset.train)[0]
-        image = np.clip(self._render(self.result(), view), 0, 1)
-        self.journal.save_preview(self.step, np.clip(view.image, 0, 1), image)
-
-    def _render(self, mesh: SplatMesh, view: View) -> np.ndarray:
-        return _image_for(mesh, view, self.config, self.options.threads, self.options.device)
+        options, samples = self.options, samples_of(view, self.config)
+        image, target = images_of_view(
+            self.result(), view, samples=samples, threads=options.threads, device=options.device
+        )
+        self.journal.save_preview(self.step, target, image)
 
     def _save_checkpoint(self) -> None:
         self.save_time = time.perf_counter()
@@ -558,11 +558,6 @@ class TrainingLoop:
         )
 
 
-def first_views(views: Sequence[View], most: int) -> tuple[View, ...]:
-    """At most so many of the held-out ``views``, which are scored during a run; evenly spread."""
-    return tuple(subsample(tuple(views), most))
-
-
 def scored_count(journal: Journal) -> int | None:
     """How many views the last scores in ``journal`` are means over; None if there are none."""
     lines = [line.get("views") for line in journal.metrics()]
@@ -579,16 +574,9 @@ def held_out_scores(
     """Means of PSNR, in dB and at most 200, and SSIM of ``mesh`` in ``views``, at least one."""
     scores = []
     for view in views:
-        image = np.clip(_image_for(mesh, view, config, threads, device), 0, 1)
-        target = np.clip(view.image, 0, 1)
+        samples = samples_of(view, config)
+        image, target = images_of_view(mesh, view, samples=samples, threads=threads, device=device)
         decibels = min(psnr(image, target, mask=view.mask), 200.0)
         scores.append((decibels, masked_ssim(image, target, view.mask, threads)))
     mean_psnr, mean_ssim = (float(mean) for mean in np.mean(scores, axis=0))
     return mean_psnr, mean_ssim
-
-
-def _image_for(
-    mesh: SplatMesh, view: View, config: FinetuneConfig, threads: int | None, device: Device
-) -> np.ndarray:
-    samples = samples_of(view, config)
-    return image_of(mesh, view.camera, view.background, samples=samples, threads=threads, device=device)[0]
