@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import GaussianCloud, convert, load_gaussians, orbit, psnr, render, render_splats, simplify
+from meshsplats._core.structures import MergingStruct
 from meshsplats.conversion import ConversionOptions, merging
 from meshsplats.conversion.budget import within_limits
 from meshsplats.conversion.merging import nearest, opacity_of, optical_depth
@@ -266,7 +267,7 @@ class TestTwins:
         with pytest.raises(ValueError, match="neighbour 9 of 0 is not another of 4"):
             merging.run(
                 "ms_merge_pairs",
-                merging.MergingStruct(
+                MergingStruct(
                     count=4,
                     wanted=1,
                     neighbours=2,

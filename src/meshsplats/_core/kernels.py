@@ -6,112 +6,19 @@ Callers have checked their arrays: C-contiguous, of the types and shapes named h
 
 from __future__ import annotations
 
-import ctypes
-from ctypes import c_double, c_float, c_int32, c_int64, c_void_p
 from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._core.library import CameraStruct, pointer, processors, run
-
-
-class ComparisonStruct(ctypes.Structure):
-    """MsComparison of csrc/ssim.h."""
-
-    _fields_ = [
-        ("count", c_int64),
-        ("height", c_int32),
-        ("width", c_int32),
-        ("channels", c_int32),
-        ("threads", c_int32),
-        ("image", c_void_p),
-        ("target", c_void_p),
-        ("mask", c_void_p),
-        ("gradient", c_void_p),
-        ("l1_rate", c_float),
-        ("ssim_rate", c_float),
-        ("l1", c_double),
-        ("ssim", c_double),
-    ]
-
-
-class AdamStruct(ctypes.Structure):
-    """MsAdam of csrc/adam.h."""
-
-    _fields_ = [
-        ("rows", c_int64),
-        ("columns", c_int32),
-        ("threads", c_int32),
-        ("values", c_void_p),
-        ("mean", c_void_p),
-        ("square", c_void_p),
-        ("gradient", c_void_p),
-        ("scale", c_void_p),
-        ("chosen", c_void_p),
-        ("chosen_count", c_int64),
-        ("mask", c_void_p),
-        ("step", c_float),
-        ("one_minus_beta1", c_float),
-        ("one_minus_beta2", c_float),
-        ("epsilon", c_float),
-        ("low", c_float),
-        ("high", c_float),
-    ]
-
-
-class FansStruct(ctypes.Structure):
-    """MsFans of csrc/fans.h."""
-
-    _fields_ = [
-        ("count", c_int64),
-        ("sides", c_int32),
-        ("threads", c_int32),
-        ("vertices", c_void_p),
-        ("polygon", c_void_p),
-        ("share", c_double),
-    ]
-
-
-class EdgesStruct(ctypes.Structure):
-    """MsEdges of csrc/edges.h."""
-
-    _fields_ = [
-        ("width", c_int32),
-        ("height", c_int32),
-        ("samples", c_int32),
-        ("threads", c_int32),
-        ("vertex_count", c_int64),
-        ("face_count", c_int64),
-        ("screen", c_void_p),
-        ("colors", c_void_p),
-        ("faces", c_void_p),
-        ("beyond", c_void_p),
-        ("front", c_void_p),
-        ("color", c_void_p),
-        ("gradient", c_void_p),
-        ("near", c_double),
-        ("cutoff", c_double),
-        ("result", c_void_p),
-    ]
-
-
-class ViewerStruct(ctypes.Structure):
-    """MsViewer of csrc/viewer.h."""
-
-    _fields_ = [
-        ("camera", CameraStruct),
-        ("vertex_count", c_int64),
-        ("face_count", c_int64),
-        ("vertices", c_void_p),
-        ("colors", c_void_p),
-        ("faces", c_void_p),
-        ("background", c_void_p),
-        ("cutoffs", c_void_p),
-        ("color", c_void_p),
-        ("image_count", c_int32),
-        ("multisample", c_int32),
-        ("threads", c_int32),
-    ]
+from meshsplats._core.library import pointer, processors, run
+from meshsplats._core.structures import (
+    AdamStruct,
+    CameraStruct,
+    ComparisonStruct,
+    EdgesStruct,
+    FansStruct,
+    ViewerStruct,
+)
 
 
 class Comparison(NamedTuple):

@@ -1,15 +1,26 @@
-"""The compiled core behind ctypes: loads the variant that suits the processor and mirrors csrc/types.h."""
+"""The compiled core behind ctypes: loads the variant that suits the processor, calls its functions."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
-from ctypes import POINTER, c_char_p, c_double, c_float, c_int, c_int32, c_int64, c_void_p
+from ctypes import POINTER, c_char_p, c_int, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+
+from meshsplats._core.structures import (
+    CameraStruct,
+    ImageGradientsStruct,
+    ImageStruct,
+    MeshStruct,
+    OptionsStruct,
+    SplatsStruct,
+    VertexGradientsStruct,
+    check_layout,
+)
 
 VARIANTS = ("v4", "v3", "baseline")
 """Instruction sets of the cores, best first: x86-64-v4 (AVX-512), x86-64-v3 (AVX2), any processor."""
@@ -17,92 +28,7 @@ VARIANTS = ("v4", "v3", "baseline")
 SUFFIX = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 """Of the cores' file names on this system."""
 
-INTERFACE_VERSION = 8
-
-
-class CameraStruct(ctypes.Structure):
-    _fields_ = [
-        ("world_to_camera", c_double * 12),
-        ("fx", c_double),
-        ("fy", c_double),
-        ("cx", c_double),
-        ("cy", c_double),
-        ("near", c_double),
-        ("width", c_int32),
-        ("height", c_int32),
-    ]
-
-
-class OptionsStruct(ctypes.Structure):
-    _fields_ = [
-        ("samples", c_int32),
-        ("max_layers", c_int32),
-        ("threads", c_int32),
-        ("min_transmittance", c_float),
-        ("background", c_void_p),
-        ("background_per_pixel", c_int32),
-        ("cutoff", c_float),
-        ("ramp_slope", c_float),
-        ("ramp_height", c_float),
-        ("ramp_width", c_float),
-        ("ramp_leak", c_float),
-    ]
-
-
-class MeshStruct(ctypes.Structure):
-    _fields_ = [
-        ("vertex_count", c_int64),
-        ("face_count", c_int64),
-        ("vertices", c_void_p),
-        ("colors", c_void_p),
-        ("faces", c_void_p),
-        ("face_splat", c_void_p),
-        ("depth_group", c_void_p),
-        ("normals", c_void_p),
-        ("attributes", c_void_p),
-        ("attribute_count", c_int32),
-        ("filter_px2", c_double),
-    ]
-
-
-class SplatsStruct(ctypes.Structure):
-    _fields_ = [
-        ("count", c_int64),
-        ("means", c_void_p),
-        ("quaternions", c_void_p),
-        ("scales", c_void_p),
-        ("opacities", c_void_p),
-        ("sh", c_void_p),
-        ("sh_stored", c_int32),
-        ("sh_used", c_int32),
-        ("kernel", c_int32),
-        ("dilation", c_float),
-    ]
-
-
-class ImageStruct(ctypes.Structure):
-    _fields_ = [
-        ("color", c_void_p),
-        ("alpha", c_void_p),
-        ("depth", c_void_p),
-        ("normals", c_void_p),
-        ("attributes", c_void_p),
-        ("fragments", c_int64),
-    ]
-
-
-class ImageGradientsStruct(ctypes.Structure):
-    _fields_ = [
-        ("color", c_void_p),
-        ("alpha", c_void_p),
-        ("attributes", c_void_p),
-        ("expected_weight", c_void_p),
-        ("target", c_void_p),
-    ]
-
-
-class VertexGradientsStruct(ctypes.Structure):
-    _fields_ = [("vertices", c_void_p), ("colors", c_void_p), ("attributes", c_void_p)]
+INTERFACE_VERSION = 9
 
 
 def pointer(array: np.ndarray | None) -> int | None:
@@ -170,6 +96,7 @@ def _checked(library: ctypes.CDLL) -> ctypes.CDLL:
         raise ImportError(
             "the compiled core is of another version than the Python code: install the package again"
         )
+    check_layout(library)
     message = [c_char_p, c_int]
     mesh_and_camera = [POINTER(MeshStruct), POINTER(CameraStruct), POINTER(OptionsStruct)]
     signatures: dict[str, list[type]] = {

@@ -9,9 +9,7 @@ splats lie behind each other, and as long as opacities are small it is opacity t
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Sequence
-from ctypes import c_double, c_int32, c_int64, c_void_p
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -20,6 +18,7 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats._core.library import pointer, processors, run
+from meshsplats._core.structures import MergingStruct, NearestStruct
 from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
@@ -52,38 +51,6 @@ BLOCK = 1 << 16
 
 FEWEST_OF_BLOCK = 64
 """Splats that it leaves of a block at least, before the blocks are joined."""
-
-
-class NearestStruct(ctypes.Structure):
-    """MsNearest of csrc/merging.h."""
-
-    _fields_ = [
-        ("count", c_int64),
-        ("neighbours", c_int32),
-        ("threads", c_int32),
-        ("points", c_void_p),
-        ("order", c_void_p),
-        ("nearest", c_void_p),
-    ]
-
-
-class MergingStruct(ctypes.Structure):
-    """MsMerging of csrc/merging.h."""
-
-    _fields_ = [
-        ("count", c_int64),
-        ("wanted", c_int64),
-        ("neighbours", c_int32),
-        ("threads", c_int32),
-        ("means", c_void_p),
-        ("covariances", c_void_p),
-        ("masses", c_void_p),
-        ("colors", c_void_p),
-        ("nearest", c_void_p),
-        ("color_weight", c_double),
-        ("group", c_void_p),
-        ("remaining", c_int64),
-    ]
 
 
 def simplify(

@@ -1,6 +1,7 @@
 // The plain C interface of the core. Callers validate arguments and own the memory of results: see
 // _core/library.py.
 #include <cstdio>
+#include <iterator>
 #include <memory>
 #include <new>
 
@@ -10,6 +11,7 @@
 #include "fans.h"
 #include "gradient.h"
 #include "hidden_new.h"
+#include "layout.h"
 #ifndef MS_WIDE_ONLY
 #include "merging.h"
 #include "viewer.h"
@@ -215,7 +217,13 @@ int guarded(char *message, int size, Body body) {
 extern "C" {
 
 // Raise it with every change of a structure or function.
-MS_EXPORT int ms_interface_version() { return 8; }
+MS_EXPORT int ms_interface_version() { return 9; }
+
+// The fields of all structures of this library, and how many they are.
+MS_EXPORT const MsField *ms_layout(int32_t *count) {
+    *count = (int32_t)std::size(ms::FIELDS);
+    return ms::FIELDS;
+}
 
 MS_EXPORT const char *ms_variant() { return MS_VARIANT; }
 

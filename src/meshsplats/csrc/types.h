@@ -1,4 +1,4 @@
-// Structures of the C interface, mirrored in _core/library.py.
+// Structures of the C interface, mirrored in _core/structures.py.
 #pragma once
 
 #include <cstdint>

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from meshsplats._core import library
+from meshsplats._core import library, structures
 from meshsplats._kinds import need
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.gaussians import GaussianCloud
@@ -174,7 +174,7 @@ def render(
             named(drawn.values),
             drawn.work.fragments,
         )
-    triangles = library.MeshStruct(
+    triangles = structures.MeshStruct(
         vertex_count=len(mesh.vertices),
         face_count=len(mesh.faces),
         vertices=keep(mesh.vertices),
@@ -192,7 +192,7 @@ def render(
     depths = np.empty((h, w), np.float32) if depth else None
     directions = np.empty((h, w, 3), np.float32) if normals else None
     sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
-    image = library.ImageStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
+    image = structures.ImageStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
     library.call("ms_render_mesh", triangles, camera_struct(camera), options, image)
     return Rendering(color, alpha, depths, directions, named(sums), int(image.fragments))
 
@@ -248,7 +248,7 @@ def render_splats(
     if not (np.isfinite(dilation) and dilation >= 0):
         raise ValueError(f"dilation must be a variance in square pixels, >= 0, got {dilation}")
     degree = cloud.sh_degree if sh_degree is None else min(int(sh_degree), cloud.sh_degree)
-    splats = library.SplatsStruct(
+    splats = structures.SplatsStruct(
         count=len(cloud),
         means=keep(cloud.means),
         quaternions=keep(cloud.quaternions),
@@ -262,7 +262,7 @@ def render_splats(
     )
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
-    image = library.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
+    image = structures.ImageStruct(keep(color), keep(alpha), None, None, None, 0)
     library.call("ms_render_splats", splats, camera_struct(camera), options, image)
     return Rendering(color, alpha, fragments=int(image.fragments))
 
@@ -279,9 +279,9 @@ class Pointers:
         return library.pointer(array)
 
 
-def camera_struct(camera: Camera) -> library.CameraStruct:
+def camera_struct(camera: Camera) -> structures.CameraStruct:
     rows = (c_double * 12)(*camera.world_to_camera[:3].ravel())
-    return library.CameraStruct(
+    return structures.CameraStruct(
         rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height
     )
 
@@ -292,7 +292,7 @@ def checked_options(
     background: Sequence[float] | np.ndarray,
     samples: int,
     threads: int | None,
-) -> library.OptionsStruct:
+) -> structures.OptionsStruct:
     if not (isinstance(samples, (int, np.integer)) and 1 <= samples <= MAX_SAMPLES):
         raise ValueError(f"samples must be the side of the sample grid, 1 to {MAX_SAMPLES}, got {samples!r}")
     if threads is not None and not (isinstance(threads, (int, np.integer)) and threads >= 1):
@@ -305,7 +305,7 @@ def checked_options(
     if not np.isfinite(backdrop).all():
         raise ValueError("background must be finite")
     assert max(camera.width, camera.height) <= MAX_SIDE
-    return library.OptionsStruct(
+    return structures.OptionsStruct(
         samples=int(samples),
         max_layers=0,
         threads=min(int(threads) if threads else library.processors(), 256),

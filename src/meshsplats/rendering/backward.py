@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from meshsplats._core import library
+from meshsplats._core import library, structures
 from meshsplats.camera import Camera
 from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
 from meshsplats.rendering.api import (
@@ -113,7 +113,7 @@ class TapedRendering:
         if world_to_camera is not None:
             self._camera.world_to_camera = (ctypes.c_double * 12)(*world_to_camera[:3].ravel())
         width = 0 if attributes is None else attributes.shape[1]
-        self._mesh = library.MeshStruct(
+        self._mesh = structures.MeshStruct(
             vertex_count=len(vertices),
             face_count=len(faces),
             vertices=keep(vertices),
@@ -130,7 +130,7 @@ class TapedRendering:
         self.color = np.empty((h, w, 3), np.float32)
         self.alpha = np.empty((h, w), np.float32)
         self.attributes = np.empty((h, w, width), np.float32)
-        image = library.ImageStruct(
+        image = structures.ImageStruct(
             keep(self.color), keep(self.alpha), None, None, keep(self.attributes if width else None), 0
         )
         if tape_bytes is None:
@@ -214,14 +214,14 @@ class TapedRendering:
             raise ValueError("rendered without a tape (tape_bytes=None): no gradients are available")
         if attributes is not None and not self._mesh.attribute_count:
             attributes = None
-        image_gradients = library.ImageGradientsStruct(
+        image_gradients = structures.ImageGradientsStruct(
             library.pointer(color),
             library.pointer(alpha),
             library.pointer(attributes),
             None if expected is None else library.pointer(expected.weight),
             None if expected is None else library.pointer(expected.target),
         )
-        vertex_gradients = library.VertexGradientsStruct(
+        vertex_gradients = structures.VertexGradientsStruct(
             library.pointer(vertices),
             library.pointer(colors),
             None if attributes is None else library.pointer(vertex_attributes),

@@ -1,0 +1,258 @@
+"""The structures of csrc/ in Python: types.h, then those of the headers of single functions."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from ctypes import POINTER, c_char, c_char_p, c_double, c_float, c_int32, c_int64, c_void_p
+
+
+class CoreStruct(ctypes.Structure):
+    """``NameStruct`` mirrors ``MsName``: its fields, in their order."""
+
+
+class CameraStruct(CoreStruct):
+    _fields_ = [
+        ("world_to_camera", c_double * 12),
+        ("fx", c_double),
+        ("fy", c_double),
+        ("cx", c_double),
+        ("cy", c_double),
+        ("near", c_double),
+        ("width", c_int32),
+        ("height", c_int32),
+    ]
+
+
+class OptionsStruct(CoreStruct):
+    _fields_ = [
+        ("samples", c_int32),
+        ("max_layers", c_int32),
+        ("threads", c_int32),
+        ("min_transmittance", c_float),
+        ("background", c_void_p),
+        ("background_per_pixel", c_int32),
+        ("cutoff", c_float),
+        ("ramp_slope", c_float),
+        ("ramp_height", c_float),
+        ("ramp_width", c_float),
+        ("ramp_leak", c_float),
+    ]
+
+
+class MeshStruct(CoreStruct):
+    _fields_ = [
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("vertices", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("face_splat", c_void_p),
+        ("depth_group", c_void_p),
+        ("normals", c_void_p),
+        ("attributes", c_void_p),
+        ("attribute_count", c_int32),
+        ("filter_px2", c_double),
+    ]
+
+
+class SplatsStruct(CoreStruct):
+    _fields_ = [
+        ("count", c_int64),
+        ("means", c_void_p),
+        ("quaternions", c_void_p),
+        ("scales", c_void_p),
+        ("opacities", c_void_p),
+        ("sh", c_void_p),
+        ("sh_stored", c_int32),
+        ("sh_used", c_int32),
+        ("kernel", c_int32),
+        ("dilation", c_float),
+    ]
+
+
+class ImageStruct(CoreStruct):
+    _fields_ = [
+        ("color", c_void_p),
+        ("alpha", c_void_p),
+        ("depth", c_void_p),
+        ("normals", c_void_p),
+        ("attributes", c_void_p),
+        ("fragments", c_int64),
+    ]
+
+
+class ImageGradientsStruct(CoreStruct):
+    _fields_ = [
+        ("color", c_void_p),
+        ("alpha", c_void_p),
+        ("attributes", c_void_p),
+        ("expected_weight", c_void_p),
+        ("target", c_void_p),
+    ]
+
+
+class VertexGradientsStruct(CoreStruct):
+    _fields_ = [("vertices", c_void_p), ("colors", c_void_p), ("attributes", c_void_p)]
+
+
+class ComparisonStruct(CoreStruct):
+    _fields_ = [
+        ("count", c_int64),
+        ("height", c_int32),
+        ("width", c_int32),
+        ("channels", c_int32),
+        ("threads", c_int32),
+        ("image", c_void_p),
+        ("target", c_void_p),
+        ("mask", c_void_p),
+        ("gradient", c_void_p),
+        ("l1_rate", c_float),
+        ("ssim_rate", c_float),
+        ("l1", c_double),
+        ("ssim", c_double),
+    ]
+
+
+class AdamStruct(CoreStruct):
+    _fields_ = [
+        ("rows", c_int64),
+        ("columns", c_int32),
+        ("threads", c_int32),
+        ("values", c_void_p),
+        ("mean", c_void_p),
+        ("square", c_void_p),
+        ("gradient", c_void_p),
+        ("scale", c_void_p),
+        ("chosen", c_void_p),
+        ("chosen_count", c_int64),
+        ("mask", c_void_p),
+        ("step", c_float),
+        ("one_minus_beta1", c_float),
+        ("one_minus_beta2", c_float),
+        ("epsilon", c_float),
+        ("low", c_float),
+        ("high", c_float),
+    ]
+
+
+class FansStruct(CoreStruct):
+    _fields_ = [
+        ("count", c_int64),
+        ("sides", c_int32),
+        ("threads", c_int32),
+        ("vertices", c_void_p),
+        ("polygon", c_void_p),
+        ("share", c_double),
+    ]
+
+
+class EdgesStruct(CoreStruct):
+    _fields_ = [
+        ("width", c_int32),
+        ("height", c_int32),
+        ("samples", c_int32),
+        ("threads", c_int32),
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("screen", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("beyond", c_void_p),
+        ("front", c_void_p),
+        ("color", c_void_p),
+        ("gradient", c_void_p),
+        ("near", c_double),
+        ("cutoff", c_double),
+        ("result", c_void_p),
+    ]
+
+
+class ViewerStruct(CoreStruct):
+    _fields_ = [
+        ("camera", CameraStruct),
+        ("vertex_count", c_int64),
+        ("face_count", c_int64),
+        ("vertices", c_void_p),
+        ("colors", c_void_p),
+        ("faces", c_void_p),
+        ("background", c_void_p),
+        ("cutoffs", c_void_p),
+        ("color", c_void_p),
+        ("image_count", c_int32),
+        ("multisample", c_int32),
+        ("threads", c_int32),
+    ]
+
+
+class NearestStruct(CoreStruct):
+    _fields_ = [
+        ("count", c_int64),
+        ("neighbours", c_int32),
+        ("threads", c_int32),
+        ("points", c_void_p),
+        ("order", c_void_p),
+        ("nearest", c_void_p),
+    ]
+
+
+class MergingStruct(CoreStruct):
+    _fields_ = [
+        ("count", c_int64),
+        ("wanted", c_int64),
+        ("neighbours", c_int32),
+        ("threads", c_int32),
+        ("means", c_void_p),
+        ("covariances", c_void_p),
+        ("masses", c_void_p),
+        ("colors", c_void_p),
+        ("nearest", c_void_p),
+        ("color_weight", c_double),
+        ("group", c_void_p),
+        ("remaining", c_int64),
+    ]
+
+
+class _Field(ctypes.Structure):
+    """MsField of csrc/layout.h."""
+
+    _fields_ = [("name", c_char_p), ("offset", c_int32), ("size", c_int32), ("kind", c_char)]
+
+
+def check_layout(library: ctypes.CDLL) -> None:
+    """Raises ImportError unless every structure of the core has the same fields here, at the same places."""
+    library.ms_layout.restype = POINTER(_Field)
+    library.ms_layout.argtypes = [POINTER(c_int32)]
+    count = c_int32()
+    fields = library.ms_layout(count)
+    theirs = {f.name.decode(): (f.offset, f.size, f.kind.decode()) for f in fields[: count.value]}
+    known = {name for name in theirs if "." not in name}
+    ours: dict[str, tuple[int, int, str]] = {}
+    for struct in CoreStruct.__subclasses__():
+        name = f"Ms{struct.__name__.removesuffix('Struct')}"
+        if name in known:  # the cores of wide vectors lack some
+            ours |= layout(name, struct)
+    wrong = sorted(name for name in {*ours, *theirs} if ours.get(name) != theirs.get(name))
+    if wrong:
+        raise ImportError(
+            f"the compiled core and the Python code differ in {', '.join(wrong[:4])}: install the package"
+            " again"
+        )
+
+
+def layout(name: str, struct: type[ctypes.Structure]) -> Iterator[tuple[str, tuple[int, int, str]]]:
+    """Offset and size in bytes and kind of ``struct`` and of its fields, as csrc/layout.h names them."""
+    yield name, (0, ctypes.sizeof(struct), "s")
+    for field, kind, *_ in struct._fields_:
+        place = getattr(struct, field)
+        yield f"{name}.{field}", (place.offset, place.size, _kind(kind))
+
+
+def _kind(field: type) -> str:
+    if issubclass(field, ctypes.Array):
+        return _kind(field._type_)  # type: ignore[arg-type]
+    if issubclass(field, ctypes.Structure):
+        return "s"
+    if issubclass(field, c_void_p):
+        return "p"
+    return "f" if issubclass(field, (c_float, c_double)) else "i"
