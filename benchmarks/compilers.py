@@ -51,9 +51,7 @@ def main() -> None:
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
 
     def taped() -> TapedRendering:
-        return TapedRendering(
-            mesh.vertices, mesh.faces, mesh.colors, None, camera, face_splat=mesh.face_splat, threads=1
-        )
+        return TapedRendering(mesh.triangles, camera, threads=1)
 
     print("| variant, work | " + " | ".join(folders) + " | ratio |\n|---|---|---|---|", flush=True)
     for variant in args.variants:

@@ -66,16 +66,7 @@ def costs(works: Sequence[Callable[[], object]], repeat: int) -> list[float]:
 
 
 def forward_and_backward(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
-    taped = TapedRendering(
-        mesh.vertices,
-        mesh.faces,
-        mesh.colors,
-        None,
-        camera,
-        face_splat=mesh.face_splat,
-        filter_px2=filter_px2,
-        threads=1,
-    )
+    taped = TapedRendering(mesh.triangles._replace(filter_px2=filter_px2), camera, threads=1)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     taped.backward(np.ones_like(taped.color), None, None, vertices=points, colors=colors)
 

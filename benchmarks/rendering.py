@@ -94,9 +94,7 @@ def run(name: str, threads: int, repeat: int) -> None:
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
 
     def taped() -> TapedRendering:
-        return TapedRendering(
-            mesh.vertices, mesh.faces, mesh.colors, None, camera, face_splat=mesh.face_splat, threads=threads
-        )
+        return TapedRendering(mesh.triangles, camera, threads=threads)
 
     before = memory("VmRSS", reset=True)
     fragments = render(mesh, camera, threads=threads).fragments

@@ -53,15 +53,8 @@ class Step:
         self.optimizers = [RowAdam(self.vertices, lr=1e-9), RowAdam(self.colors, lr=1e-9, bounds=(0, 1))]
 
     def draw(self) -> TapedRendering:
-        return TapedRendering(
-            self.vertices,
-            self.mesh.faces,
-            self.colors,
-            None,
-            self.camera,
-            face_splat=self.mesh.face_splat,
-            threads=self.threads,
-        )
+        triangles = self.mesh.triangles._replace(vertices=self.vertices, colors=self.colors)
+        return TapedRendering(triangles, self.camera, threads=self.threads)
 
     def __call__(self) -> list[float]:
         times = [time.perf_counter()]

@@ -75,17 +75,7 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> str:
     for kind in (GpuRendering, GpuRendering, TapedRendering):  # the first compiles
         vertices, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
         start = time.process_time()
-        rendering = kind(
-            mesh.vertices,
-            mesh.faces,
-            mesh.colors,
-            None,
-            view,
-            face_splat=mesh.face_splat,
-            depth_group=mesh.depth_group,
-            filter_px2=mesh.filter_px2,
-            min_transmittance=1e-3,
-        )
+        rendering = kind(mesh.triangles, view, min_transmittance=1e-3)
         middle = time.process_time()
         rendering.backward(gradient, None, None, vertices=vertices, colors=colors)
         times += [middle - start, time.process_time() - middle]
@@ -96,7 +86,7 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> str:
         np.linalg.norm(gpu.astype(float) - core) / np.linalg.norm(core.astype(float))
         for gpu, core in zip(found[1], found[2], strict=True)
     ]
-    renderer = gradient_renderer(mesh.faces, len(mesh.vertices), mesh.face_splat, mesh.depth_group)
+    renderer = gradient_renderer(mesh.triangles)
     steps = [*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps(), *kernels.gradient_steps(0)]
     skipped = ("fans",) * (not mesh.filter_px2) + ("groups",) * (mesh.depth_group is None)
     same = all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))

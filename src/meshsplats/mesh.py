@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -19,6 +19,27 @@ MAX_FILTER_PX2 = 100.0
 
 MIN_TRANSMITTANCE = 1e-6
 """Early termination: a sample stops once its transmittance is below this. The error stays below it, too."""
+
+
+class Triangles(NamedTuple):
+    """What renderers take of a mesh, as one record: arrays as in ``SplatMesh``, C-contiguous. None is
+    checked, because a step of an optimisation must not look at every triangle."""
+
+    vertices: np.ndarray
+    """(v, 3) float32"""
+    faces: np.ndarray
+    """(f, 3) int32"""
+    colors: np.ndarray
+    """(v, 4) float32"""
+    values: np.ndarray | None = None
+    """(v, k) float32 further values to interpolate and blend as colours are."""
+    normals: np.ndarray | None = None
+    """(v, 3) float32"""
+    face_splat: np.ndarray | None = None
+    """(f,) int32"""
+    depth_group: np.ndarray | None = None
+    """(f,) int32"""
+    filter_px2: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +142,19 @@ class SplatMesh:
         parts += ["normals"] if self.normals is not None else []
         parts += ["bound to a base"] if self.binding is not None else []
         return f"SplatMesh({', '.join(parts)})"
+
+    @property
+    def triangles(self) -> Triangles:
+        """What renderers take; without ``attributes``."""
+        return Triangles(
+            self.vertices,
+            self.faces,
+            self.colors,
+            normals=self.normals,
+            face_splat=self.face_splat,
+            depth_group=self.depth_group,
+            filter_px2=self.filter_px2,
+        )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The contents of the mesh by name: its fields, ``attribute.NAME`` and ``binding.NAME``.

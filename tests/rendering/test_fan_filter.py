@@ -233,8 +233,7 @@ def test_what_stays_as_it_is():
 def test_an_invisible_splat_has_a_shape():
     """Its gradient is that of its contribution, at the position that its filter gives it."""
     mesh, view = diamond((20, 18), (2.0, 2.0), alpha=0.0), plain_camera()
-    options = {"face_splat": mesh.face_splat, "filter_px2": 8.0, "samples": 8}
-    image = TapedRendering(mesh.vertices, mesh.faces, mesh.colors, None, view, **options)
+    image = TapedRendering(mesh.triangles._replace(filter_px2=8.0), view, samples=8)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     nothing, all_pixels = np.zeros_like(image.color), np.ones_like(image.alpha)
     image.backward(nothing, all_pixels, None, vertices=points, colors=colors)
@@ -261,9 +260,7 @@ def test_hostile(view):
         )
         mixed = replace(own, vertices=scaled(own.vertices, 10 ** rng.uniform(-40, 38, (180, 1))))
         assert_image(render(mixed, view, filter_px2=100, samples=3, **options))
-        image = TapedRendering(
-            mixed.vertices, mixed.faces, mixed.colors, None, view, face_splat=own.face_splat, filter_px2=0.3
-        )
+        image = TapedRendering(mixed.triangles._replace(face_splat=own.face_splat, filter_px2=0.3), view)
         points, colors = np.zeros_like(mixed.vertices), np.zeros_like(mixed.colors)
         with np.errstate(all="ignore"):
             image.backward(np.ones_like(image.color), None, None, vertices=points, colors=colors)
@@ -356,16 +353,7 @@ def back(
     mesh: SplatMesh, threads: int | None = None, view: Camera | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     view = view or camera(70, 50)
-    image = TapedRendering(
-        mesh.vertices,
-        mesh.faces,
-        mesh.colors,
-        None,
-        view,
-        face_splat=mesh.face_splat,
-        filter_px2=0.3,
-        threads=threads,
-    )
+    image = TapedRendering(mesh.triangles._replace(filter_px2=0.3), view, threads=threads)
     points, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
     towards = np.random.default_rng(0).normal(size=image.color.shape).astype(np.float32)
     image.backward(towards, None, None, vertices=points, colors=colors)

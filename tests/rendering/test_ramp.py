@@ -17,7 +17,7 @@ VIEW = camera(48, 40)
 
 def drawn(mesh: SplatMesh, ramp: OpacityRamp | None, **options) -> TapedRendering:
     options.setdefault("min_transmittance", 0.0)
-    return TapedRendering(mesh.vertices, mesh.faces, mesh.colors, None, VIEW, ramp=ramp, **options)
+    return TapedRendering(mesh.triangles, VIEW, ramp=ramp, **options)
 
 
 def gradients(rendering: TapedRendering, grad_color, expected=None):

@@ -412,9 +412,9 @@ def test_a_taped_rendering_of_a_mesh_has_its_groups_and_its_filter():
         (replace(soup(3), depth_group=groups), soup(3)),
         (replace(fan(5, 8, 0.6), face_splat=np.zeros(8, np.int32), filter_px2=9.0), fan(5, 8, 0.6)),
     ):
-        image = TapedRendering.of(whole, view, background=(0, 0, 1)).color
+        image = TapedRendering(whole.triangles, view, background=(0, 0, 1)).color
         assert np.array_equal(image, render(whole, view, background=(0, 0, 1)).color)
         assert not np.array_equal(image, render(without, view, background=(0, 0, 1)).color)
     black = np.zeros_like(whole.colors)
-    image = TapedRendering.of(whole, view, colors=black, background=(0, 0, 1)).color
+    image = TapedRendering(whole.triangles._replace(colors=black), view, background=(0, 0, 1)).color
     assert np.array_equal(image, render(replace(whole, colors=black), view, background=(0, 0, 1)).color)

@@ -70,17 +70,8 @@ SCENES = [
 ]
 
 
-def of_mesh(kind, mesh: SplatMesh, view: Camera, **options):
-    return kind(
-        mesh.vertices,
-        mesh.faces,
-        mesh.colors,
-        None,
-        view,
-        face_splat=mesh.face_splat,
-        depth_group=mesh.depth_group,
-        **options,
-    )
+def of_mesh(kind, mesh: SplatMesh, view: Camera, *, filter_px2: float = 0.0, **options):
+    return kind(mesh.triangles._replace(filter_px2=filter_px2), view, **options)
 
 
 def random_gradient(view: Camera, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -193,7 +184,7 @@ def test_the_same_bits_every_time(name):
 
 
 def renderer_of(mesh: SplatMesh) -> GradientRenderer:
-    return gradients.gradient_renderer(mesh.faces, len(mesh.vertices), mesh.face_splat, mesh.depth_group)
+    return gradients.gradient_renderer(mesh.triangles)
 
 
 @pytest.mark.parametrize("queues", [(4, 4), (24, 8)])
@@ -203,7 +194,7 @@ def test_the_length_of_the_queue_does_not_change_a_bit(queues):
     gradient = np.concatenate([random_gradient(view)[0], np.zeros((view.height, view.width, 1))], axis=2)
 
     def found(settings: DrawSettings) -> tuple[bytes, bytes]:
-        forward = renderer.forward(mesh.vertices, mesh.colors, view, settings)
+        forward = renderer.forward(mesh.triangles, view, settings)
         color = forward.images.color.tobytes()
         return color, renderer.backward(forward, gradient.astype(np.float32))[0].tobytes()
 
@@ -258,7 +249,7 @@ def test_a_walk_that_cannot_end_is_an_error():
     mesh, view = soup(1, 500, spread=(2, 2, 2)), camera(70, 50, near=0.3)
     renderer = renderer_of(mesh)
     with pytest.raises(DeviceError, match="did not finish"):
-        renderer.forward(mesh.vertices, mesh.colors, view, DrawSettings(budget=1))
+        renderer.forward(mesh.triangles, view, DrawSettings(budget=1))
 
 
 def test_walks_that_exceed_their_budget_go_on_where_they_ended():
@@ -267,7 +258,7 @@ def test_walks_that_exceed_their_budget_go_on_where_they_ended():
     gradient = np.ones((view.height, view.width, 4), np.float32)
 
     def found(settings: DrawSettings) -> tuple[int, bytes]:
-        forward = renderer.forward(mesh.vertices, mesh.colors, view, settings)
+        forward = renderer.forward(mesh.triangles, view, settings)
         return forward.images.work.walks, renderer.backward(forward, gradient)[0].tobytes()
 
     usual, short = found(DrawSettings()), found(DrawSettings(budget=400))
@@ -292,9 +283,8 @@ def test_a_sample_with_too_many_fragments_is_an_error(monkeypatch):
 
 def test_what_needs_the_cpu_is_an_error(monkeypatch):
     mesh, view, _ = scene("a fan")
-    arrays = (mesh.vertices, mesh.faces, mesh.colors, None, view)
     with pytest.raises(ValueError, match="opacity ramps need device='cpu'"):
-        taped_rendering("gpu", *arrays, ramp=OpacityRamp(0.5))
+        taped_rendering("gpu", mesh.triangles, view, ramp=OpacityRamp(0.5))
     rendering = of_mesh(GpuRendering, mesh, view)
     color, alpha = random_gradient(view)
     with pytest.raises(ValueError, match="the expected error needs device='cpu'"):

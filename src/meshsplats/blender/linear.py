@@ -81,10 +81,9 @@ def linear_colors(
             seen = render(mesh, camera, background=(0, 0, 0), samples=samples, threads=threads)
             targets[id(camera)] = seen
         target = seen.color + (1 - seen.alpha)[:, :, None] * np.array(background, np.float32)
-        drawn = TapedRendering.of(
-            mesh,
+        drawn = TapedRendering(
+            mesh.triangles._replace(colors=colors),
             camera,
-            colors=colors,
             background=srgb_to_linear(np.array(background, np.float32)),
             samples=samples,
             threads=threads,

@@ -113,7 +113,7 @@ def _has_gradient() -> bool:
     ones, found = np.ones((3, 3, 3), np.float32), []
     devices: tuple[Device, ...] = ("cpu", "gpu")
     for device in devices:
-        rendering = taped_rendering(device, mesh.vertices, mesh.faces, mesh.colors, None, camera)
+        rendering = taped_rendering(device, mesh.triangles, camera)
         found.append((np.zeros((3, 3), np.float32), np.zeros((3, 4), np.float32)))
         rendering.backward(ones, None, None, vertices=found[-1][0], colors=found[-1][1])
     return all(bool(np.allclose(a, b, rtol=1e-4, atol=1e-4)) for a, b in zip(*found, strict=True))

@@ -110,10 +110,8 @@ def visibility(
     order = np.argsort(np.argsort(np.arange(len(chosen)) * GOLDEN % 1, kind="stable"), kind="stable")
     for own in (chosen[i] for i in order):
         camera = own.within(SIDE)
-        values = np.zeros((len(owner), 2), np.float32)
-        rendering = TapedRendering.of(
-            mesh, camera, values, background=(0, 0, 0), samples=samples, threads=threads
-        )
+        triangles = mesh.triangles._replace(values=np.zeros((len(owner), 2), np.float32))
+        rendering = TapedRendering(triangles, camera, background=(0, 0, 0), samples=samples, threads=threads)
         # Colours over black and alpha: then no background hides a difference.
         target = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples, threads=threads)
         square = np.square(rendering.color - target.color).sum(axis=2)

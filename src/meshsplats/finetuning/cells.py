@@ -449,16 +449,7 @@ def _views_that_show(
     store = ImageCache(run.cache_bytes)
     for view in views:
         camera = view.camera.within(SIDE)
-        pixels = visible_pixels(
-            mesh.vertices,
-            mesh.faces,
-            mesh.colors,
-            camera,
-            face_splat=mesh.face_splat,
-            depth_group=mesh.depth_group,
-            filter_px2=mesh.filter_px2,
-            threads=run.threads,
-        )
+        pixels = visible_pixels(mesh.triangles, camera, threads=run.threads)
         shown = own & (pixels > 0)
         if pixels[shown].sum() < SHOWN * camera.width * camera.height:
             continue

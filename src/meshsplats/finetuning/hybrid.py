@@ -84,8 +84,8 @@ def softness(
     for view in subsample(views, ERROR_VIEWS):
         background, camera = view.background, view.camera
         opaque = render(core, camera, background=background, samples=ERROR_SAMPLES, threads=threads).color
-        values = np.zeros((len(start.vertices), 1), np.float32)
-        rendering = TapedRendering.of(start, camera, values, background=background, threads=threads)
+        triangles = start.triangles._replace(values=np.zeros((len(start.vertices), 1), np.float32))
+        rendering = TapedRendering(triangles, camera, background=background, threads=threads)
         error, blended = (
             np.square(color - view.image).sum(axis=2, keepdims=True) for color in (opaque, rendering.color)
         )

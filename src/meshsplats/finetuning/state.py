@@ -21,7 +21,7 @@ from meshsplats.finetuning.config import FinetuneConfig, epsilons
 from meshsplats.finetuning.hybrid import MAX_OPACITY, ColorLimits
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
 from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
-from meshsplats.mesh import SplatMesh, solid_faces
+from meshsplats.mesh import SplatMesh, Triangles, solid_faces
 from meshsplats.rendering.api import Device
 from meshsplats.rendering.edges import corners_beyond
 from meshsplats.webgpu.device import open_device
@@ -110,6 +110,11 @@ class State:
     def vertices(self) -> np.ndarray:
         self._download()
         return self._vertices
+
+    @property
+    def triangles(self) -> Triangles:
+        """The mesh as it is now."""
+        return self.mesh.triangles._replace(vertices=self.vertices, colors=self.colors)
 
     @cached_property
     def beyond(self) -> np.ndarray:

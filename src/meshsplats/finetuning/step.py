@@ -148,17 +148,11 @@ def render_view(
     display = np.asarray(background, np.float32)
     rendering = taped_rendering(
         state.device,
-        state.vertices,
-        state.mesh.faces,
-        state.colors,
-        None,
+        state.triangles,
         view.camera,
         background=srgb_to_linear(display) if linear else display,
         samples=samples,
         min_transmittance=TRAINING_MIN_TRANSMITTANCE[state.mesh.blending],
-        face_splat=state.mesh.face_splat,
-        depth_group=state.mesh.depth_group,
-        filter_px2=state.mesh.filter_px2,
         ramp=ramp,
         threads=state.threads,
         limit=state.limit,
@@ -432,24 +426,15 @@ def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndar
         (v,) float32: pixels that the vertex contributes to all views together; (v,) bool: whether it lies in
         the frustum of any view.
     """
-    vertices, colors = state.vertices, state.colors
-    pixels = np.zeros(len(vertices), np.float32)
+    triangles = state.triangles
+    pixels = np.zeros(len(triangles.vertices), np.float32)
     in_view = np.zeros(len(pixels), bool)
     if state.device == "cpu":
         count = partial(visible_pixels, threads=state.threads)
     else:
         count = partial(gpu_visible_pixels, limit=WindowLimit())
     for view in views:
-        pixels += count(
-            vertices,
-            state.mesh.faces,
-            colors,
-            view.camera,
-            mask=view.mask,
-            samples=samples_of(view, state.config),
-            face_splat=state.mesh.face_splat,
-            depth_group=state.mesh.depth_group,
-            filter_px2=state.mesh.filter_px2,
-        )
-        in_view |= view.camera.sees(vertices)
+        samples = samples_of(view, state.config)
+        pixels += count(triangles, view.camera, mask=view.mask, samples=samples)
+        in_view |= view.camera.sees(triangles.vertices)
     return pixels, in_view

@@ -13,7 +13,7 @@ from meshsplats._core import library, structures
 from meshsplats._kinds import need
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
+from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, Triangles, checked_cutoff, checked_filter
 
 MAX_SAMPLES = 16
 """Largest side of the grid of samples in each pixel."""
@@ -174,26 +174,14 @@ def render(
             named(drawn.values),
             drawn.work.fragments,
         )
-    triangles = structures.MeshStruct(
-        vertex_count=len(mesh.vertices),
-        face_count=len(mesh.faces),
-        vertices=keep(mesh.vertices),
-        colors=keep(mesh.colors),
-        faces=keep(mesh.faces),
-        face_splat=keep(mesh.face_splat),
-        depth_group=keep(compact_groups(mesh.depth_group)),
-        normals=keep(mesh.normals),
-        attributes=keep(values),
-        attribute_count=sum(widths.values()),
-        filter_px2=px2,
-    )
+    struct = mesh_struct(keep, mesh.triangles._replace(values=values, filter_px2=px2))
     h, w = camera.height, camera.width
     color, alpha = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
     depths = np.empty((h, w), np.float32) if depth else None
     directions = np.empty((h, w, 3), np.float32) if normals else None
     sums = np.empty((h, w, sum(widths.values())), np.float32) if widths else None
     image = structures.ImageStruct(keep(color), keep(alpha), keep(depths), keep(directions), keep(sums), 0)
-    library.call("ms_render_mesh", triangles, camera_struct(camera), options, image)
+    library.call("ms_render_mesh", struct, camera_struct(camera), options, image)
     return Rendering(color, alpha, depths, directions, named(sums), int(image.fragments))
 
 
@@ -277,6 +265,28 @@ class Pointers:
         if array is not None:
             self._arrays.append(array)
         return library.pointer(array)
+
+
+def mesh_struct(keep: Pointers, triangles: Triangles) -> structures.MeshStruct:
+    """The core's structure of ``triangles``, whose arrays ``keep`` holds.
+
+    Raises ValueError for a filter that is out of range or has no splats.
+    """
+    values = triangles.values
+    width = 0 if values is None else values.shape[1]
+    return structures.MeshStruct(
+        vertex_count=len(triangles.vertices),
+        face_count=len(triangles.faces),
+        vertices=keep(triangles.vertices),
+        colors=keep(triangles.colors),
+        faces=keep(triangles.faces),
+        face_splat=keep(triangles.face_splat),
+        depth_group=keep(compact_groups(triangles.depth_group)),
+        normals=keep(triangles.normals),
+        attributes=keep(values if width else None),
+        attribute_count=width,
+        filter_px2=checked_filter(triangles.filter_px2, triangles.face_splat),
+    )
 
 
 def camera_struct(camera: Camera) -> structures.CameraStruct:

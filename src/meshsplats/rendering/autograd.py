@@ -113,8 +113,8 @@ def rasterize(
         attributes,
         background,
         world_to_camera,
-        Scene(views, faces, face_splat, depth_group),
-        dict(filter_px2=filter_px2, samples=samples, min_transmittance=min_transmittance, threads=threads),
+        Scene(views, faces, face_splat, depth_group, filter_px2),
+        dict(samples=samples, min_transmittance=min_transmittance, threads=threads),
         tape_bytes,
         device,
     )

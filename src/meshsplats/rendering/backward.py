@@ -5,18 +5,18 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from meshsplats._core import library, structures
 from meshsplats.camera import Camera
-from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, checked_cutoff, checked_filter
+from meshsplats.mesh import MIN_TRANSMITTANCE, Triangles, checked_cutoff
 from meshsplats.rendering.api import (
     Pointers,
     camera_struct,
     checked_options,
-    compact_groups,
+    mesh_struct,
 )
 
 TAPE_BYTES = 128 << 20
@@ -70,17 +70,11 @@ class TapedRendering:
 
     def __init__(
         self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        colors: np.ndarray,
-        attributes: np.ndarray | None,
+        triangles: Triangles,
         camera: Camera,
         *,
         background: Sequence[float] | np.ndarray = (1, 1, 1),
         world_to_camera: np.ndarray | None = None,
-        face_splat: np.ndarray | None = None,
-        depth_group: np.ndarray | None = None,
-        filter_px2: float = 0.0,
         samples: int = 1,
         min_transmittance: float = MIN_TRANSMITTANCE,
         ramp: OpacityRamp | None = None,
@@ -90,11 +84,10 @@ class TapedRendering:
         """Runs the forward pass.
 
         Args:
-            vertices, faces, colors, face_splat, depth_group: as in ``SplatMesh``; C-contiguous, float32 and
-                int32. They are kept, not copied, and must not change before ``backward``.
-            attributes: (v, k) further values to interpolate and blend, or None.
+            triangles: the mesh. Its arrays are kept, not copied, and must not change before ``backward``;
+                normals are not used.
             camera: viewpoint, lens and size of the image.
-            background, filter_px2, samples, min_transmittance, threads: as in ``render``.
+            background, samples, min_transmittance, threads: as in ``render``.
             world_to_camera: (4, 4) float64, overrides the camera's.
             ramp: changes opacities; none by default.
             tape_bytes: limit on the size of the tape; None: no tape and no backward pass, which is faster.
@@ -112,20 +105,8 @@ class TapedRendering:
         self._camera = camera_struct(camera)
         if world_to_camera is not None:
             self._camera.world_to_camera = (ctypes.c_double * 12)(*world_to_camera[:3].ravel())
-        width = 0 if attributes is None else attributes.shape[1]
-        self._mesh = structures.MeshStruct(
-            vertex_count=len(vertices),
-            face_count=len(faces),
-            vertices=keep(vertices),
-            colors=keep(colors),
-            faces=keep(faces),
-            face_splat=keep(face_splat),
-            depth_group=keep(compact_groups(depth_group)),
-            normals=None,
-            attributes=keep(attributes if width else None),
-            attribute_count=width,
-            filter_px2=checked_filter(filter_px2, face_splat),
-        )
+        self._mesh = mesh_struct(keep, triangles._replace(normals=None))
+        width = self._mesh.attribute_count
         h, w = camera.height, camera.width
         self.color = np.empty((h, w, 3), np.float32)
         self.alpha = np.empty((h, w), np.float32)
@@ -146,35 +127,6 @@ class TapedRendering:
                 ctypes.byref(self._tape),
             )
         self.fragments = int(image.fragments)
-
-    @classmethod
-    def of(
-        cls,
-        mesh: SplatMesh,
-        camera: Camera,
-        attributes: np.ndarray | None = None,
-        *,
-        colors: np.ndarray | None = None,
-        **options: Any,
-    ) -> TapedRendering:
-        """The rendering of ``mesh``, with its splats, depth groups and filter.
-
-        Args:
-            attributes: (v, k) float32, in place of those of the mesh.
-            colors: (v, 4) float32, in place of those of the mesh.
-            options: the other keywords of the constructor.
-        """
-        return cls(
-            mesh.vertices,
-            mesh.faces,
-            mesh.colors if colors is None else colors,
-            attributes,
-            camera,
-            face_splat=mesh.face_splat,
-            depth_group=mesh.depth_group,
-            filter_px2=mesh.filter_px2,
-            **options,
-        )
 
     @property
     def vertex_count(self) -> int:
@@ -257,16 +209,11 @@ class TapedRendering:
 
 
 def visible_pixels(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    colors: np.ndarray,
+    triangles: Triangles,
     camera: Camera,
     *,
     mask: np.ndarray | None = None,
     samples: int = 1,
-    face_splat: np.ndarray | None = None,
-    depth_group: np.ndarray | None = None,
-    filter_px2: float = 0.0,
     threads: int | None = None,
 ) -> np.ndarray:
     """(v,) float32 visible pixels of each vertex: sums of its blending weights over the image.
@@ -274,17 +221,7 @@ def visible_pixels(
     Args:
         mask: (h, w) bool pixels that count; all by default. The others are those of ``TapedRendering``.
     """
-    rendering = TapedRendering(
-        vertices,
-        faces,
-        colors,
-        np.zeros((len(vertices), 1), np.float32),
-        camera,
-        face_splat=face_splat,
-        depth_group=depth_group,
-        filter_px2=filter_px2,
-        samples=samples,
-        threads=threads,
-    )
+    blank = np.zeros((len(triangles.vertices), 1), np.float32)
+    rendering = TapedRendering(triangles._replace(values=blank), camera, samples=samples, threads=threads)
     ones = np.ones_like(rendering.attributes) if mask is None else mask[..., None]
     return rendering.scatter_to_vertices(ones)[:, 0]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.camera import Camera
-from meshsplats.mesh import MIN_TRANSMITTANCE, checked_filter
+from meshsplats.mesh import MIN_TRANSMITTANCE, Triangles, checked_filter
 from meshsplats.rendering.api import Device, Pointers, checked_options
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, OpacityRamp, TapedRendering
 from meshsplats.webgpu.gradients import WindowLimit, gradient_renderer
@@ -31,17 +31,11 @@ class GpuRendering:
 
     def __init__(
         self,
-        vertices: np.ndarray,
-        faces: np.ndarray,
-        colors: np.ndarray,
-        attributes: np.ndarray | None,
+        triangles: Triangles,
         camera: Camera,
         *,
         background: Sequence[float] | np.ndarray = (1, 1, 1),
         world_to_camera: np.ndarray | None = None,
-        face_splat: np.ndarray | None = None,
-        depth_group: np.ndarray | None = None,
-        filter_px2: float = 0.0,
         samples: int = 1,
         min_transmittance: float = MIN_TRANSMITTANCE,
         limit: WindowLimit | None = None,
@@ -58,16 +52,17 @@ class GpuRendering:
         options = checked_options(Pointers(), camera, background, samples, None)
         self._background = np.asarray(background, np.float32)
         self._matrix = camera.world_to_camera if world_to_camera is None else world_to_camera
-        values = None if attributes is None or not attributes.shape[1] else attributes
+        if triangles.values is not None and not triangles.values.shape[1]:
+            triangles = triangles._replace(values=None)
         settings = DrawSettings(
             samples=options.samples,
             min_transmittance=min_transmittance,
-            filter_px2=checked_filter(filter_px2, face_splat),
+            filter_px2=checked_filter(triangles.filter_px2, triangles.face_splat),
         )
         with gpu_errors():
-            self._renderer = gradient_renderer(faces, len(vertices), face_splat, depth_group)
+            self._renderer = gradient_renderer(triangles)
             self.forward = self._renderer.forward(
-                vertices, colors, camera, settings, pose=world_to_camera, values=values, limit=limit
+                triangles, camera, settings, pose=world_to_camera, limit=limit
             )
         images = self.forward.images
         self.color = images.color + images.transmittance[:, :, None] * self._background
@@ -78,7 +73,7 @@ class GpuRendering:
 
     @property
     def vertex_count(self) -> int:
-        return len(self.forward.vertices)
+        return len(self.forward.triangles.vertices)
 
     def backward(
         self,
@@ -120,10 +115,7 @@ AnyRendering = TapedRendering | GpuRendering
 
 def taped_rendering(
     device: Device,
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    colors: np.ndarray,
-    attributes: np.ndarray | None,
+    triangles: Triangles,
     camera: Camera,
     *,
     ramp: OpacityRamp | None = None,
@@ -141,36 +133,20 @@ def taped_rendering(
         ValueError: an option out of range, or a ramp on the GPU.
     """
     if device == "cpu":
-        return TapedRendering(
-            vertices,
-            faces,
-            colors,
-            attributes,
-            camera,
-            ramp=ramp,
-            threads=threads,
-            tape_bytes=tape_bytes,
-            **options,
-        )
+        return TapedRendering(triangles, camera, ramp=ramp, threads=threads, tape_bytes=tape_bytes, **options)
     if ramp is not None:
         raise ValueError("opacity ramps need device='cpu'")
-    return GpuRendering(vertices, faces, colors, attributes, camera, limit=limit, **options)
+    return GpuRendering(triangles, camera, limit=limit, **options)
 
 
 def gpu_visible_pixels(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    colors: np.ndarray,
-    camera: Camera,
-    *,
-    mask: np.ndarray | None = None,
-    **options: Any,
+    triangles: Triangles, camera: Camera, *, mask: np.ndarray | None = None, **options: Any
 ) -> np.ndarray:
     """``backward.visible_pixels`` on the GPU; arguments are those of it and of ``GpuRendering``."""
-    rendering = GpuRendering(vertices, faces, colors, None, camera, **options)
+    rendering = GpuRendering(triangles, camera, **options)
     # The derivative of a pixel's red with respect to the vertex's is the weight of the vertex.
     red = np.zeros((*rendering.alpha.shape, 3), np.float32)
     red[..., 0] = 1 if mask is None else mask
-    weights = np.zeros_like(colors)
-    rendering.backward(red, None, None, vertices=np.zeros_like(vertices), colors=weights)
+    weights = np.zeros_like(triangles.colors)
+    rendering.backward(red, None, None, vertices=np.zeros_like(triangles.vertices), colors=weights)
     return np.ascontiguousarray(weights[:, 0])

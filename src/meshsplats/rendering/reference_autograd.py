@@ -14,7 +14,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import MissingDependencyError
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.rendering import reference
 
 try:
@@ -65,8 +65,8 @@ def rasterize(
         return Raster(*(part[0] for part in batch))
     backdrop = torch.as_tensor(background).double()
     images = []
-    constant: dict[str, Any] = dict(
-        samples=samples, face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2, ramp=ramp
+    triangles = _detached(vertices, faces, attributes)._replace(
+        face_splat=face_splat, depth_group=depth_group, filter_px2=filter_px2
     )
     for i, camera in enumerate(cameras):
         pose = (
@@ -75,7 +75,9 @@ def rasterize(
             else world_to_camera[i].double()
         )
         own = backdrop[i] if backdrop.ndim == 4 else backdrop
-        images.append(_image(vertices.double(), faces, attributes.double(), camera, pose, own, **constant)[0])
+        images.append(
+            _image(vertices, attributes, triangles, camera, pose, own, samples=samples, ramp=ramp)[0]
+        )
     return Raster(*(torch.stack(parts) for parts in zip(*images, strict=True)))
 
 
@@ -94,20 +96,24 @@ def expected_error(
     ``target`` (h, w, 3) float64."""
     pose, backdrop = torch.from_numpy(camera.world_to_camera), torch.as_tensor(background).double()
     image, squares = _image(
-        vertices.double(),
-        faces,
-        attributes.double(),
+        vertices,
+        attributes,
+        _detached(vertices, faces, attributes),
         camera,
         pose,
         backdrop,
         samples=samples,
-        face_splat=None,
-        depth_group=None,
-        filter_px2=0.0,
         ramp=ramp,
     )
     # The weights of a sample add up to 1.
     return squares - 2 * (image.color * target).sum(dim=-1) + (target**2).sum(dim=-1)
+
+
+def _detached(vertices: torch.Tensor, faces: np.ndarray, attributes: torch.Tensor) -> Triangles:
+    """The order of whose fragments counts; of the colours, the filter reads the opacities."""
+    colors = np.zeros((len(vertices), 4))
+    colors[:, 3] = attributes[:, 3].detach().numpy()
+    return Triangles(vertices.detach().numpy(), faces, colors)
 
 
 def filtered(
@@ -153,33 +159,32 @@ def filtered(
 
 def _image(
     vertices: torch.Tensor,
-    faces: np.ndarray,
     attributes: torch.Tensor,
+    triangles: Triangles,
     camera: Camera,
     pose: torch.Tensor,
     background: torch.Tensor,
     *,
     samples: int,
-    face_splat: np.ndarray | None,
-    depth_group: np.ndarray | None,
-    filter_px2: float,
     ramp: OpacityRamp | None,
 ) -> tuple[Raster, torch.Tensor]:
     """The image, and (h, w) ``sum_k T_k a_k |c_k|^2``, with the background's."""
     posed = replace(camera, world_to_camera=pose.detach().numpy())
     x, y = reference._sample_positions(camera, samples)
-    colors = np.zeros((len(vertices), 4))
-    colors[:, 3] = attributes[:, 3].detach().numpy()  # read by the filter only
-    mesh = SplatMesh(vertices.detach().numpy(), faces, colors, face_splat=face_splat, depth_group=depth_group)
-    sheet = reference._fragments(mesh, posed, x, y, filter_px2)
+    vertices, attributes = vertices.double(), attributes.double()
+    faces, face_splat, px2 = triangles.faces, triangles.face_splat, triangles.filter_px2
+    mesh = SplatMesh(
+        triangles.vertices, faces, triangles.colors, face_splat=face_splat, depth_group=triangles.depth_group
+    )
+    sheet = reference._fragments(mesh, posed, x, y, px2)
     sample, face = torch.from_numpy(sheet.sample), torch.from_numpy(sheet.face)
 
     corner = torch.from_numpy(np.asarray(faces, np.int64))[face]
     # Weights of the corners at each fragment (reference._cover).
     in_camera = vertices @ pose[:3, :3].T + pose[:3, 3]
-    if filter_px2:
+    if px2:
         assert face_splat is not None
-        in_camera = filtered(in_camera, faces, attributes[:, 3], camera, face_splat, filter_px2)
+        in_camera = filtered(in_camera, faces, attributes[:, 3], camera, face_splat, px2)
     z = in_camera[:, 2]
     corners = torch.stack(
         [camera.fx * in_camera[:, 0] + camera.cx * z, camera.fy * in_camera[:, 1] + camera.cy * z, z], dim=1

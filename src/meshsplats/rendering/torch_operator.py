@@ -10,6 +10,7 @@ import numpy as np
 from meshsplats._kinds import described
 from meshsplats.camera import Camera
 from meshsplats.errors import GET_TORCH, MissingDependencyError
+from meshsplats.mesh import Triangles
 from meshsplats.rendering.api import Device
 from meshsplats.rendering.gpu_backward import AnyRendering, taped_rendering
 
@@ -30,13 +31,16 @@ class Scene(NamedTuple):
     faces: torch.Tensor | np.ndarray
     face_splat: torch.Tensor | np.ndarray | None
     depth_group: torch.Tensor | np.ndarray | None
+    filter_px2: float
+
+
+_NOTHING = np.zeros((0, 0), np.float32)
 
 
 class _Constant(NamedTuple):
     cameras: list[Camera]
-    faces: np.ndarray
-    face_splat: np.ndarray | None
-    depth_group: np.ndarray | None
+    triangles: Triangles
+    """Without positions and colours, which are tensors."""
     options: dict[str, Any]
     tape_bytes: int
     device: Device
@@ -80,9 +84,14 @@ def images_of(
     faces = _faces(scene.faces, len(vertices))
     constant = _Constant(
         views,
-        faces,
-        _per_face("face_splat", scene.face_splat, len(faces)),
-        _per_face("depth_group", scene.depth_group, len(faces)),
+        Triangles(
+            _NOTHING,
+            faces,
+            _NOTHING,
+            face_splat=_per_face("face_splat", scene.face_splat, len(faces)),
+            depth_group=_per_face("depth_group", scene.depth_group, len(faces)),
+            filter_px2=scene.filter_px2,
+        ),
         options,
         tape_bytes,
         device,
@@ -103,24 +112,21 @@ def _forward(
     tapes: list[AnyRendering] | None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Colour, alpha and attributes of the images; appends the renderings to ``tapes``, where there is one."""
-    points = _array(vertices)
     values = attributes.detach()
-    colors = _array(values if values.shape[1] == 4 else values[:, :4])
-    more = _array(values[:, 4:]) if values.shape[1] > 4 else None
+    triangles = constant.triangles._replace(
+        vertices=_array(vertices),
+        colors=_array(values if values.shape[1] == 4 else values[:, :4]),
+        values=_array(values[:, 4:]) if values.shape[1] > 4 else None,
+    )
     backdrop = background.detach().numpy()
     images = []
     for i, camera in enumerate(constant.cameras):
         rendering = taped_rendering(
             constant.device,
-            points,
-            constant.faces,
-            colors,
-            more,
+            triangles,
             camera,
             background=backdrop[i] if backdrop.ndim == 4 else backdrop,
             world_to_camera=None if poses is None else poses[i].detach().double().numpy(),
-            face_splat=constant.face_splat,
-            depth_group=constant.depth_group,
             tape_bytes=None if tapes is None else constant.tape_bytes,
             **constant.options,
         )

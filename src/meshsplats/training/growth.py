@@ -57,10 +57,9 @@ def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
     step = -(-len(views) // JUDGED_VIEWS)
     for index in range(turn % step, len(views), step):
         view = views[index]
-        rendering = TapedRendering.of(
-            mesh,
+        rendering = TapedRendering(
+            mesh.triangles._replace(values=np.zeros((len(mesh.vertices), 3), np.float32)),
             view.camera,
-            np.zeros((len(mesh.vertices), 3), np.float32),
             background=view.background,
             samples=samples_of(view, state.config),
             min_transmittance=TRAINING_MIN_TRANSMITTANCE[mesh.blending],

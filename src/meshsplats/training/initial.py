@@ -307,7 +307,7 @@ def colored(
     for view in subsample(views, COLOR_VIEWS):
         image = view.load()
         values = np.zeros((len(mesh.vertices), 4), np.float32)
-        rendering = TapedRendering.of(mesh, view.camera, values, threads=threads)
+        rendering = TapedRendering(mesh.triangles._replace(values=values), view.camera, threads=threads)
         # Colour times alpha, and alpha: mixed pixels on the outline show other things, too.
         alpha = np.ones(image.color.shape[:2], np.float32) if view.alpha is None else view.alpha.copy()
         if image.mask is not None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import SplatMesh
+from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device, open_device
 from meshsplats.webgpu.renderer import (
@@ -67,9 +67,7 @@ class _Window:
 class Forward:
     """A forward pass: its images, and what the backward pass starts from. Its arrays must not change."""
 
-    vertices: np.ndarray
-    colors: np.ndarray
-    values: np.ndarray | None
+    triangles: Triangles
     camera: Camera
     pose: np.ndarray | None
     settings: DrawSettings
@@ -116,20 +114,17 @@ _last: GradientRenderer | None = None
 _last_arrays: tuple[np.ndarray | None, ...] = ()
 
 
-def gradient_renderer(
-    faces: np.ndarray, vertices: int, face_splat: np.ndarray | None, depth_group: np.ndarray | None
-) -> GradientRenderer:
-    """The renderer of these triangles: that of the last call if they are the same.
-
-    Args:
-        faces: (f, 3) int32 vertex indices.
-        vertices: count of vertices.
-        face_splat: (f,) int32: consecutive triangles of one splat have the same value; or None.
-        depth_group: (f,) int32, as in ``SplatMesh``.
-    """
+def gradient_renderer(triangles: Triangles) -> GradientRenderer:
+    """The renderer of ``triangles``, wherever their vertices lie: that of the last call if they are the same.
+    Consecutive triangles of one splat have the same ``face_splat``, which need not ascend."""
     global _last, _last_arrays
     device = open_device()
-    arrays = (faces, face_splat, depth_group)
+    faces, face_splat, depth_group = arrays = (
+        triangles.faces,
+        triangles.face_splat,
+        triangles.depth_group,
+    )
+    vertices = len(triangles.vertices)
     with _lock:
         if (
             _last is None
@@ -233,22 +228,20 @@ class GradientRenderer(MeshRenderer):
 
     def forward(
         self,
-        vertices: np.ndarray,
-        colors: np.ndarray,
+        triangles: Triangles,
         camera: Camera,
         settings: DrawSettings,
         *,
         pose: np.ndarray | None = None,
-        values: np.ndarray | None = None,
         limit: WindowLimit | None = None,
     ) -> Forward:
-        """Renders the mesh with these positions and colours, and finds the windows of its tape.
+        """Renders the mesh with these positions, colours and further values, and finds the windows of its
+        tape.
 
         Args:
-            vertices, colors: (v, 3) and (v, 4) float32, C-contiguous.
+            triangles: those of ``gradient_renderer``.
             camera, settings: as in ``draw``; without ``max_layers`` and ``cutoff``.
             pose: (4, 4) float64 world to camera, overrides that of the camera.
-            values: (v, c) float32 further values of the vertices to blend.
             limit: of windows; by default that of all images of this renderer that have none.
 
         Raises:
@@ -258,8 +251,9 @@ class GradientRenderer(MeshRenderer):
         """
         h, w = camera.height, camera.width
         images = Images(np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32))
+        values = triangles.values
         images.values = None if values is None else np.zeros((h, w, values.shape[1]), np.float32)
-        result = Forward(vertices, colors, values, camera, pose, settings, images, [])
+        result = Forward(triangles, camera, pose, settings, images, [])
         if not len(self.mesh.faces):
             return result
         with self._lock:
@@ -288,17 +282,17 @@ class GradientRenderer(MeshRenderer):
             self._try_mark(forward, window.area, window.settings)
             pixels = self._read(window.area[2], window.area[3], window.settings.samples)
             out[..., columns] = pixels[..., : columns.stop - columns.start]
-        self._load_values(forward.colors)
+        self._load_values(forward.triangles.colors)
 
     def _load(self, forward: Forward) -> None:
         """Uploads positions and colours."""
         self._loaded, self._marked = None, None
         self._prepare_filter(forward.settings)
-        self._upload("vertices", forward.vertices)
-        self._upload("values", forward.colors)
-        self._load_values(forward.colors)
+        self._upload("vertices", forward.triangles.vertices)
+        self._upload("values", forward.triangles.colors)
+        self._load_values(forward.triangles.colors)
         if self._counts["groups"]:  # the plane of a group is that of its largest triangle
-            moved = replace(self.mesh, vertices=forward.vertices)
+            moved = replace(self.mesh, vertices=forward.triangles.vertices)
             largest = find_groups(moved)[1]
             self.device.device.queue.write_buffer(self._buffers["mesh"], 4 * self._offsets[2], largest)
         self._loaded = forward
@@ -387,7 +381,7 @@ class GradientRenderer(MeshRenderer):
         Raises:
             DeviceError: the GPU did not finish.
         """
-        count = len(forward.vertices)
+        count = len(forward.triangles.vertices)
         more = None if values is None else np.zeros((count, values.shape[2]), np.float32)
         if not forward.windows:
             return np.zeros((count, 8), np.float32), more
@@ -404,7 +398,7 @@ class GradientRenderer(MeshRenderer):
                     more[:, columns] = found[:, 4 : 4 + columns.stop - columns.start]
                     result[:, :3] += found[:, :3]
                     result[:, 7] += found[:, 7]
-                self._load_values(forward.colors)
+                self._load_values(forward.triangles.colors)
         return result, more
 
     def _add_windows(self, forward: Forward, gradient: np.ndarray) -> np.ndarray:
@@ -418,7 +412,7 @@ class GradientRenderer(MeshRenderer):
             last = forward.windows[-1]
             counts = self._begin(self._part(forward, last.area), last.settings, forward.pose)
             self._run(_FILTER_STEPS, "color", counts, last.settings)
-        size = 32 * len(forward.vertices)
+        size = 32 * len(forward.triangles.vertices)
         data = self.device.device.queue.read_buffer(self._buffers["gradients"], 0, size)
         return np.frombuffer(data, np.float32).reshape(-1, 8).copy()
 
@@ -451,10 +445,10 @@ class GradientRenderer(MeshRenderer):
 
 def _triples(forward: Forward) -> Iterator[tuple[slice, np.ndarray]]:
     """The further values, three at a time: their columns, and (v, 4) float32 with the opacities."""
-    values = forward.values
+    values, colors = forward.triangles.values, forward.triangles.colors
     for first in range(0, 0 if values is None else values.shape[1], 3):
         assert values is not None
         columns = slice(first, min(first + 3, values.shape[1]))
         some = np.zeros((len(values), 4), np.float32)
-        some[:, : columns.stop - first], some[:, 3] = values[:, columns], forward.colors[:, 3]
+        some[:, : columns.stop - first], some[:, 3] = values[:, columns], colors[:, 3]
         yield columns, some

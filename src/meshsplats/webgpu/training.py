@@ -144,9 +144,7 @@ class Trainer(GradientRenderer):
         with self._lock:
             self._prepare(camera, settings, target, mask)
             forward = Forward(
-                np.zeros((0, 3), np.float32),
-                np.zeros((0, 4), np.float32),
-                None,
+                self.mesh.triangles,
                 camera,
                 None,
                 settings,
