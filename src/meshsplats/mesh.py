@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import ClassVar, Literal, NamedTuple, get_args
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats.binding import ArrayField, Binding, check_fields
+from meshsplats.face_splats import FaceSplats
 
 Blending = Literal["display", "linear"]
 
@@ -201,7 +203,13 @@ class SplatMesh:
         """Count of splats with at least one triangle; None without ``face_splat``."""
         if self.face_splat is None:
             return None
-        return int(len(self.face_splat) > 0) + int(np.count_nonzero(np.diff(self.face_splat)))
+        return len(self.splats)
+
+    @cached_property
+    def splats(self) -> FaceSplats:
+        """Which triangles and vertices belong to which splat; without ``face_splat``, each triangle counts as
+        one."""
+        return FaceSplats(self.faces, self.face_splat, len(self.vertices))
 
     def keep_faces(self, keep: np.ndarray) -> SplatMesh:
         """The triangles of the mask ``keep`` (f,) bool, in order, without vertices that none of them uses."""
@@ -246,11 +254,6 @@ def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:
             " know its splats: give face_splat, or filter_px2=0"
         )
     return float(px2)
-
-
-def splat_starts(face_splat: np.ndarray) -> np.ndarray:
-    """Index of the first triangle of each splat in ``face_splat`` (f,), f > 0."""
-    return np.flatnonzero(np.concatenate([[True], np.diff(face_splat) > 0]))
 
 
 def solid_faces(mesh: SplatMesh) -> np.ndarray:

@@ -56,9 +56,7 @@ def linear_colors(
     plain = np.column_stack([srgb_to_linear(mesh.colors[:, :3]), mesh.colors[:, 3]]).astype(np.float32)
     if steps == 0 or not len(mesh.faces):
         return plain
-    owner = np.arange(len(plain)) if mesh.face_splat is None else np.zeros(len(plain), np.int64)
-    if mesh.face_splat is not None:
-        owner[mesh.faces] = mesh.face_splat[:, None]
+    owner = np.arange(len(plain)) if mesh.face_splat is None else np.maximum(mesh.splats.of_vertex, 0)
     count = int(owner.max()) + 1
     values = np.zeros((count, 4), np.float32)
     adam = RowAdam(values, lr=_RATE, betas=(0.5, 0.9), bounds=(-_LIMIT, _LIMIT), eps=1e-12, threads=threads)

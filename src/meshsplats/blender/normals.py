@@ -18,7 +18,7 @@ from meshsplats._geometry import spacing
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up, scene_bounds
 from meshsplats.cameras.trajectories import dome
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 
 CELL = 2.5
@@ -48,7 +48,7 @@ def shading_normals(
         return mesh.normals
     if len(mesh.faces) == 0:
         return np.zeros_like(mesh.vertices)
-    owner, centers, weights, spread = _splats(mesh)
+    centers, weights, spread = _splats(mesh)
     cell = CELL * typical_spacing(mesh, centers)
     around = _Neighbours(centers, cell)
     tensors = np.stack([spread[:, i, j] for i, j in _PAIRS], axis=1)
@@ -74,13 +74,13 @@ def shading_normals(
         smooth[part] = total
     flipped = np.einsum("ij,ij->i", normals, smooth) < 0
     smooth[flipped & (side != 0)] *= -1
-    return _to_vertices(mesh, owner, unit(smooth, normals))
+    return _to_vertices(mesh, mesh.splats.of_face, unit(smooth, normals))
 
 
 def typical_spacing(mesh: SplatMesh, centers: np.ndarray | None = None) -> float:
     """Median spacing of the splats of ``mesh``, scene units, > 0."""
     if centers is None:
-        centers = _splats(mesh)[1]
+        centers = _splats(mesh)[0]
     median = float(np.median(spacing(centers.astype(np.float32)))) if len(centers) else 0.0
     return median if median > 0 else max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-6) / 100
 
@@ -107,11 +107,10 @@ def unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
     return np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), instead)
 
 
-def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Index of the splat that each face belongs to (f,), and of the n splats: centres (n, 3), weights (n,),
-    area times opacity, and (n, 3, 3) sums of weight times normal times normal over their triangles."""
-    starts = np.arange(len(mesh.faces)) if mesh.face_splat is None else splat_starts(mesh.face_splat)
-    owner = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(mesh.faces))))
+def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the n splats: centres (n, 3), weights (n,), area times opacity, and (n, 3, 3) sums of weight times
+    normal times normal over their triangles."""
+    starts = mesh.splats.starts
     weights = np.empty(len(starts))
     centers = np.empty((len(starts), 3))
     spread = np.empty((len(starts), 3, 3))
@@ -130,7 +129,7 @@ def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
         centers[some] = centroids / weights[some, None]
         products = normal[:, :, None] * normal[:, None, :]
         spread[some] = np.add.reduceat(weight[:, None, None] * products, heads)
-    return owner, centers, weights / weights.max(), spread / weights.max()
+    return centers, weights / weights.max(), spread / weights.max()
 
 
 class _Neighbours:

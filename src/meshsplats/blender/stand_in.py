@@ -19,7 +19,7 @@ from meshsplats._geometry import vertex_normals
 from meshsplats.blender.normals import typical_spacing, unit, views_around
 from meshsplats.camera import Camera
 from meshsplats.conversion.cleaning import find
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import SplatMesh
 from meshsplats.prior.surface import MIN_PART, Grid, grid_around, signed_distances
 
 RESOLUTION = 96
@@ -210,11 +210,9 @@ class _Splats:
     """The splats of a mesh; without ``face_splat``, each triangle counts as one."""
 
     def __init__(self, mesh: SplatMesh, normals: np.ndarray) -> None:
-        starts = np.arange(len(mesh.faces)) if mesh.face_splat is None else splat_starts(mesh.face_splat)
-        count = len(starts)
-        self.of_face = np.repeat(np.arange(count), np.diff(np.append(starts, len(mesh.faces))))
-        self.of_vertex = np.zeros(len(mesh.vertices), np.int64)
-        self.of_vertex[mesh.faces] = self.of_face[:, None]
+        count = len(mesh.splats)
+        self.of_face = mesh.splats.of_face
+        self.of_vertex = np.maximum(mesh.splats.of_vertex, 0)  # vertices of no triangle are not drawn
         corner, owner = mesh.faces.ravel(), np.repeat(self.of_face, 3)
         weight = mesh.colors[corner, 3].astype(np.float64) + 1e-6
         total = np.bincount(owner, weight, count)

@@ -12,7 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, CameraCoverage
-from meshsplats.mesh import SplatMesh, checked_filter, splat_starts
+from meshsplats.mesh import SplatMesh, checked_filter
 
 MIN_VARIANCE = 1e-4
 """Least variance of a splat as a share of the filter's, as in ``render``."""
@@ -69,9 +69,9 @@ def bake_filter(
     if not cameras and pixel is None:
         cameras = orbit(mesh, FRAMING_VIEWS, width=FRAMING_PIXELS, height=FRAMING_PIXELS)
     assert mesh.face_splat is not None
-    starts = splat_starts(mesh.face_splat)
-    ends = np.append(starts[1:], len(mesh.faces))
-    owner = _owners(mesh, starts)
+    if mesh.splats.share_vertices:
+        raise ValueError("two splats share a vertex: the filter moves each splat's vertices on their own")
+    starts, ends, owner = mesh.splats.starts, mesh.splats.ends, mesh.splats.of_vertex
     means = np.empty((len(starts), 3))
     axes = np.empty((len(starts), 3, 3))
     variances = np.empty((len(starts), 3))
@@ -99,18 +99,6 @@ def bake_filter(
         offsets = np.einsum("nji,nj->ni", axes[fan], mesh.vertices[rows] - means[fan])
         vertices[rows] = means[fan] + np.einsum("nij,nj->ni", axes[fan], spread[fan] * offsets)
     return replace(mesh, vertices=vertices, filter_px2=0.0, binding=None)
-
-
-def _owners(mesh: SplatMesh, starts: np.ndarray) -> np.ndarray:
-    """(v,) index of the splat whose triangles use a vertex, by its place in ``starts``; -1: none."""
-    fan = np.zeros(len(mesh.faces), np.int64)
-    fan[starts[1:]] = 1
-    fan = np.cumsum(fan)
-    owner = np.full(len(mesh.vertices), -1, np.int64)
-    owner[mesh.faces] = fan[:, None]
-    if (owner[mesh.faces] != fan[:, None]).any():
-        raise ValueError("two splats share a vertex: the filter moves each splat's vertices on their own")
-    return owner
 
 
 def _shapes(

@@ -14,7 +14,7 @@ from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import SplatMesh
 
 Scene = TypeVar("Scene", GaussianCloud, SplatMesh, GaussianCloud | SplatMesh)
 CELL = 2.5
@@ -167,15 +167,13 @@ def _splats(
         return scene.means.astype(np.float64), np.concatenate([half, -half], axis=1), scene.opacities, None
     if not len(scene.faces):
         raise ValueError("the mesh has no triangles: there is nothing to clean")
-    starts = np.arange(len(scene.faces)) if scene.face_splat is None else splat_starts(scene.face_splat)
-    counts = np.diff(np.append(starts, len(scene.faces)))
-    owner = np.repeat(np.arange(len(starts)), counts)
+    splats, starts = scene.splats, scene.splats.starts
     corners = scene.vertices[scene.faces].astype(np.float64)
-    centers = np.add.reduceat(corners.mean(axis=1), starts) / counts[:, None]
+    centers = splats.sums(corners.mean(axis=1)) / splats.counts[:, None]
     # The ends along the two axes of the frame that the splat is longest in.
     low = np.minimum.reduceat(corners.min(axis=1), starts) - centers
     high = np.maximum.reduceat(corners.max(axis=1), starts) - centers
     across = np.argsort(high - low, axis=1)[:, 1:, None] == np.arange(3)
     ends = np.concatenate([across * high[:, None], across * low[:, None]], axis=1)
     opacities = np.maximum.reduceat(scene.colors[scene.faces, 3].max(axis=1), starts)
-    return centers, ends, opacities, owner
+    return centers, ends, opacities, splats.of_face

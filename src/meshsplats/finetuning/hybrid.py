@@ -78,8 +78,6 @@ def softness(
 ) -> np.ndarray:
     """The score of each splat, by its index; see ``with_soft_splats``."""
     assert start.face_splat is not None
-    vertex_splat = np.zeros(len(start.vertices), np.int64)
-    vertex_splat[start.faces] = start.face_splat[:, None]
     sums = np.zeros(len(start.vertices))
     for view in subsample(views, ERROR_VIEWS):
         background, camera = view.background, view.camera
@@ -95,7 +93,11 @@ def softness(
         sums += rendering.scatter_to_vertices(error)[:, 0]
     # A corner has the sum of e T a, weighted by its barycentric weight: by these, 1 - a is interpolated.
     sums *= 1 - start.colors[:, 3]
-    return np.bincount(vertex_splat, sums, int(start.face_splat.max()) + 1)
+    splats = start.splats
+    used = splats.of_vertex >= 0
+    scores = np.zeros(int(splats.numbers.max()) + 1)
+    scores[splats.numbers] = np.bincount(splats.of_vertex[used], sums[used], len(splats))
+    return scores
 
 
 class ColorLimits:

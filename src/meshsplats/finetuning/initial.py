@@ -15,7 +15,7 @@ from meshsplats.conversion.detail import OnImage
 from meshsplats.conversion.options import FLAT_SIDES, make_options
 from meshsplats.finetuning.config import FinetuneConfig, is_long
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -125,10 +125,7 @@ def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.sqrt(np.linalg.norm(normals, axis=1))
-    if mesh.face_splat is not None and len(size):
-        starts = splat_starts(mesh.face_splat)
-        counts = np.diff(np.append(starts, len(size)))
-        size = np.repeat(np.add.reduceat(size, starts) / counts, counts)
+    size = (mesh.splats.sums(size) / mesh.splats.counts)[mesh.splats.of_face]
     return vertex_means(mesh, size)
 
 

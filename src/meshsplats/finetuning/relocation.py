@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import SplatMesh
 
 IDLE = 0.2
 """A splat is idle, that is almost invisible, if its colour sum is below this share of the median."""
@@ -75,8 +75,7 @@ def plan_relocation(mesh: SplatMesh, sums: GradientSums, in_view: np.ndarray, sh
     none = np.zeros((0, 0), np.int64)
     if mesh.face_splat is None or not len(mesh.faces):
         return Relocation(none, none)
-    starts = splat_starts(mesh.face_splat)
-    ends = np.append(starts[1:], len(mesh.faces))
+    starts, ends = mesh.splats.starts, mesh.splats.ends
     low = np.minimum.reduceat(mesh.faces.min(axis=1), starts)
     high = np.maximum.reduceat(mesh.faces.max(axis=1), starts)
     topology = (ends - starts).astype(np.int64) * (len(mesh.vertices) + 1) + (high - low)

@@ -21,7 +21,6 @@ from meshsplats.finetuning.hybrid import SOLID, opaque_fraction, soft_fraction
 from meshsplats.finetuning.opaque import expected_error, expected_share, follows_edges, ramp_of
 from meshsplats.finetuning.ranks import ALONE, Part, Ranks
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
-from meshsplats.mesh import splat_starts
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
 from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
@@ -398,12 +397,11 @@ def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
         pixels, in_view = importance(state, sampled)
         pixels *= len(views) / len(sampled)  # extrapolated to all views
         face_pixels, face_in_view = pixels[mesh.faces].sum(axis=1), in_view[mesh.faces].any(axis=1)
-        if mesh.face_splat is not None and len(mesh.faces):
-            starts = splat_starts(mesh.face_splat)
-            counts = np.diff(np.append(starts, len(mesh.faces)))
+        if len(mesh.faces):
+            splats = mesh.splats
             # A corner shared by several triangles counts once for each, in all splats alike.
-            face_pixels = np.repeat(np.add.reduceat(face_pixels, starts), counts)
-            face_in_view = np.repeat(np.logical_or.reduceat(face_in_view, starts), counts)
+            face_pixels = splats.sums(face_pixels)[splats.of_face]
+            face_in_view = np.logical_or.reduceat(face_in_view, splats.starts)[splats.of_face]
         keep &= ~face_in_view | (face_pixels >= config.prune_importance)
     return keep if keep.any() else np.ones(len(keep), bool)
 

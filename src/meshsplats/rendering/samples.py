@@ -10,7 +10,7 @@ from meshsplats._arrays import subsample
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import weighted_quantile
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import SplatMesh
 
 FEWEST, MOST = 2, 8
 """Least and greatest side of the grid of samples in each pixel."""
@@ -42,10 +42,8 @@ def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
         return 1  # its filter is as wide as a pixel, as that of splats
     if mesh.face_splat is None or not len(mesh.faces):
         return FEWEST
-    starts = splat_starts(mesh.face_splat)
-    counts = np.diff(np.append(starts, len(mesh.faces)))
-    step = -(-len(starts) // FANS)
-    starts, counts = starts[::step], counts[::step]
+    step = -(-len(mesh.splats) // FANS)
+    starts, counts = mesh.splats.starts[::step], mesh.splats.counts[::step]
     first = np.cumsum(counts) - counts
     rows = np.arange(int(counts.sum())) - np.repeat(first, counts) + np.repeat(starts, counts)
     corners = mesh.faces[rows]

@@ -19,8 +19,9 @@ import numpy as np
 
 from meshsplats._arrays import subsample
 from meshsplats.cameras.framing import scene_bounds
+from meshsplats.face_splats import FaceSplats
 from meshsplats.gaussians import GaussianCloud
-from meshsplats.mesh import SplatMesh, splat_starts
+from meshsplats.mesh import SplatMesh
 from meshsplats.viewer.streams import Packer, Unpacker, rounded
 
 BYTES_A_TRIANGLE = 8.5
@@ -294,12 +295,12 @@ def _fans(faces: np.ndarray, face_splat: np.ndarray | None) -> _Fans | None:
     for too many patterns."""
     if face_splat is None:
         return None
-    starts = splat_starts(face_splat)
+    splats = FaceSplats(faces, face_splat, 0)
+    starts, counts = splats.starts, splats.counts
     low = np.minimum.reduceat(faces.min(axis=1), starts)
     high = np.maximum.reduceat(faces.max(axis=1), starts)
     if (low[1:] != high[:-1] + 1).any():
         return None
-    counts = np.diff(np.append(starts, len(faces)))
     local = faces - np.repeat(low, counts)[:, None]
     choice = np.zeros(len(starts), np.int64)
     patterns: list[np.ndarray] = []
@@ -313,7 +314,7 @@ def _fans(faces: np.ndarray, face_splat: np.ndarray | None) -> _Fans | None:
             choice[rows[same]] = len(patterns)
             patterns.append(own[0].reshape(count, 3))
             rows, own = rows[~same], own[~same]
-    return _Fans(low, choice, patterns, face_splat[starts].astype(np.int64))
+    return _Fans(low, choice, patterns, splats.numbers.astype(np.int64))
 
 
 def _pack_fans(
@@ -472,9 +473,7 @@ def _sample(mesh: SplatMesh) -> SplatMesh:
     if mesh.face_splat is None:
         keep = np.arange(len(mesh.faces)) < SAMPLE
         return mesh.keep_faces(keep)
-    starts = splat_starts(mesh.face_splat)
-    fan = np.cumsum(np.isin(np.arange(len(mesh.faces)), starts)) - 1
-    return mesh.keep_faces(fan % max(1, len(starts) // SAMPLE) == 0)
+    return mesh.keep_faces(mesh.splats.of_face % max(1, len(mesh.splats) // SAMPLE) == 0)
 
 
 # ---- Splats

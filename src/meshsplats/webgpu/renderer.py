@@ -12,7 +12,7 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.errors import DeviceError
-from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh, splat_starts
+from meshsplats.mesh import MIN_TRANSMITTANCE, SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import BUDGET, Device, open_device
 
@@ -589,17 +589,13 @@ def checked_fans(mesh: SplatMesh, most: int) -> np.ndarray:
         DeviceError: a splat of more than ``most`` triangles.
         ValueError: two splats share a vertex.
     """
-    splat = mesh.face_splat
-    assert splat is not None
-    starts = np.append(splat_starts(splat), len(splat)).astype(np.uint32)
+    starts = np.append(mesh.splats.starts, len(mesh.faces)).astype(np.uint32)
     if np.diff(starts).max() > most:
         raise DeviceError(
             f"the filter of the GPU takes splats of up to {most:,} triangles; one has"
             f" {np.diff(starts).max():,}. Use device='cpu'"
         )
-    owner = np.full(len(mesh.vertices), -1, np.int32)
-    owner[mesh.faces] = splat[:, None]
-    if (owner[mesh.faces] != splat[:, None]).any():
+    if mesh.splats.share_vertices:
         raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
     return starts
 
