@@ -31,8 +31,9 @@ from meshsplats.rendering.backward import TapedRendering
 from meshsplats.rendering.gpu_backward import GpuRendering
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import open_device
+from meshsplats.webgpu.frames import DrawSettings
 from meshsplats.webgpu.gradients import gradient_renderer
-from meshsplats.webgpu.renderer import DrawSettings, draw
+from meshsplats.webgpu.renderer import draw
 
 
 def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> str:

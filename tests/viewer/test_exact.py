@@ -17,7 +17,7 @@ from meshsplats.conversion.cleaning import cropped
 from meshsplats.demo_scene import make_scene
 from meshsplats.rendering.looks import image_of
 from meshsplats.viewer.page import _read
-from meshsplats.webgpu.renderer import DrawSettings, frame_uniform
+from meshsplats.webgpu.frames import DrawSettings, frame_uniform
 
 PATIENCE = 400
 """Seconds for shaders that a busy processor compiles."""

@@ -23,7 +23,7 @@ from meshsplats.finetuning.step import _part, importance, make_step, view_of_ste
 from meshsplats.prior import bind
 from meshsplats.webgpu import gradients
 from meshsplats.webgpu.device import open_device
-from meshsplats.webgpu.renderer import WINDOW_SAMPLES, DrawSettings
+from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
 
 GPU = RunOptions(device="gpu")
 TOLERANCE = 1e-4

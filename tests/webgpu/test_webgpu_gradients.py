@@ -16,8 +16,8 @@ from meshsplats.rendering.backward import ExpectedError, OpacityRamp, TapedRende
 from meshsplats.rendering.gpu_backward import GpuRendering, taped_rendering
 from meshsplats.webgpu import gradients, kernels
 from meshsplats.webgpu.device import open_device
+from meshsplats.webgpu.frames import DrawSettings
 from meshsplats.webgpu.gradients import GradientRenderer
-from meshsplats.webgpu.renderer import DrawSettings
 
 TOLERANCE = 1e-4
 """Of ||g - g_core|| / ||g_core||, for each array."""
@@ -224,9 +224,9 @@ def test_lists_grow():
     mesh = replace(mesh, faces=np.tile(mesh.faces, (40, 1)))
     gradients._last = None
     renderer = renderer_of(mesh)
-    renderer._capacity = 300
+    renderer.frames.capacity = 300
     assert_same_gradients(mesh, view)
-    assert renderer._capacity > 300
+    assert renderer.frames.capacity > 300
 
 
 def test_no_triangles_and_none_in_view():

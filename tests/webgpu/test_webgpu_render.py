@@ -12,8 +12,9 @@ from conftest import shared_data
 
 from meshsplats import Camera, SplatMesh, convert, load_gaussians, orbit, render
 from meshsplats.errors import DeviceError
-from meshsplats.webgpu import kernels, renderer
-from meshsplats.webgpu.renderer import DrawSettings, MeshRenderer, find_groups, find_runs
+from meshsplats.webgpu import frames, kernels, renderer
+from meshsplats.webgpu.frames import DrawSettings, find_groups, find_runs
+from meshsplats.webgpu.renderer import MeshRenderer
 
 
 @pytest.fixture(autouse=True)
@@ -114,7 +115,7 @@ def test_layers_within_rounding_of_each_other_have_the_order_of_the_core(samples
 
 
 def test_windows_leave_the_order_of_such_layers(monkeypatch):
-    monkeypatch.setattr(renderer, "WINDOW_SAMPLES", 2500)
+    monkeypatch.setattr(frames, "WINDOW_SAMPLES", 2500)
     mesh, view = nearly_coplanar(), camera(140, 30)
     assert_same_image(*both(mesh, view), most=1e-3)
     assert draw(mesh, view, DrawSettings()).work.windows == 2
@@ -277,7 +278,7 @@ def test_a_tile_that_cannot_end_is_an_error():
 def test_lists_grow(monkeypatch):
     mesh, view = many_triangles()
     usual = draw(mesh, view, DrawSettings())
-    monkeypatch.setattr(renderer, "FIRST_PAIRS", 4)
+    monkeypatch.setattr(frames, "FIRST_PAIRS", 4)
     grown = draw(replace(mesh), view, DrawSettings())
     assert grown.work.frames == 2
     assert bits(grown) == bits(usual)
@@ -286,7 +287,7 @@ def test_lists_grow(monkeypatch):
 def test_large_images_are_drawn_in_windows(monkeypatch):
     mesh, view = many_triangles()
     whole = render(mesh, view, samples=2, device="gpu", **EXTRAS)
-    monkeypatch.setattr(renderer, "WINDOW_SAMPLES", 5000)
+    monkeypatch.setattr(frames, "WINDOW_SAMPLES", 5000)
     assert_same_image(render(replace(mesh), view, samples=2, device="gpu", **EXTRAS), whole)
     assert draw(mesh, view, DrawSettings(samples=2)).work.windows == 4
 
@@ -294,7 +295,7 @@ def test_large_images_are_drawn_in_windows(monkeypatch):
 def test_windows_are_halved_while_they_have_too_many_pairs(monkeypatch):
     mesh, view = many_triangles()
     whole = render(mesh, view, device="gpu")
-    monkeypatch.setattr(renderer, "FIRST_PAIRS", 4)
+    monkeypatch.setattr(frames, "FIRST_PAIRS", 4)
     monkeypatch.setattr(kernels, "MAX_PAIRS", 6000)
     assert_same_image(render(replace(mesh), view, device="gpu"), whole)
     assert draw(replace(mesh), view, DrawSettings()).work.windows > 1
@@ -305,7 +306,7 @@ def test_windows_are_halved_while_they_have_too_many_pairs(monkeypatch):
 
 def test_what_does_not_fit_is_an_error_before_any_work(monkeypatch):
     mesh = many_triangles()[0]
-    monkeypatch.setattr(MeshRenderer, "max_fan", 3)
+    monkeypatch.setattr(renderer, "DRAWING", renderer.DRAWING._replace(most_fan=3))
     with pytest.raises(DeviceError, match="splats of up to 3 triangles"):
         render(random_fans(5), camera(), filter_px2=0.3, device="gpu")
     from meshsplats.webgpu.device import Device, find_adapters

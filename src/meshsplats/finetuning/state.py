@@ -25,8 +25,9 @@ from meshsplats.mesh import SplatMesh, Triangles, solid_faces
 from meshsplats.rendering.api import Device
 from meshsplats.rendering.edges import corners_beyond
 from meshsplats.webgpu.device import open_device
+from meshsplats.webgpu.frames import WINDOW_SAMPLES, DrawSettings
 from meshsplats.webgpu.gradients import WindowLimit, check_limits
-from meshsplats.webgpu.renderer import WINDOW_SAMPLES, DrawSettings, gpu_errors
+from meshsplats.webgpu.renderer import gpu_errors
 from meshsplats.webgpu.training import MAX_PIXELS, Moments, Rates, Sums, Trainer
 
 GAIN, OFFSET = slice(0, 3), slice(3, 6)

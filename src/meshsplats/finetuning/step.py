@@ -24,8 +24,8 @@ from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
 from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
 from meshsplats.rendering.edges import edge_gradients
 from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
+from meshsplats.webgpu.frames import DrawSettings
 from meshsplats.webgpu.gradients import WindowLimit
-from meshsplats.webgpu.renderer import DrawSettings
 
 IMPORTANCE_VIEWS = 64
 """Maximum number of training views, evenly spread, that measure the visibility of splats."""

@@ -155,7 +155,8 @@ def render(
         return parts
 
     if device == "gpu":
-        from meshsplats.webgpu.renderer import DrawSettings, draw
+        from meshsplats.webgpu.frames import DrawSettings
+        from meshsplats.webgpu.renderer import draw
 
         settings = DrawSettings(
             samples=options.samples,

@@ -11,8 +11,9 @@ from meshsplats.camera import Camera
 from meshsplats.mesh import MIN_TRANSMITTANCE, Triangles, checked_filter
 from meshsplats.rendering.api import Device, Pointers, checked_options
 from meshsplats.rendering.backward import TAPE_BYTES, ExpectedError, OpacityRamp, TapedRendering
+from meshsplats.webgpu.frames import DrawSettings
 from meshsplats.webgpu.gradients import WindowLimit, gradient_renderer
-from meshsplats.webgpu.renderer import DrawSettings, gpu_errors
+from meshsplats.webgpu.renderer import gpu_errors
 
 
 class GpuRendering:

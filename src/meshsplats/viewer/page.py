@@ -26,7 +26,7 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, pack_splats, quantise_mesh
-from meshsplats.webgpu import device, kernels, renderer
+from meshsplats.webgpu import device, frames, kernels
 
 MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")
 """The scripts of the page, in the order in which they are joined."""
@@ -138,12 +138,12 @@ def _kernels(groups: bool) -> dict[str, object]:
     return {
         "groups": groups,
         "limits": {
-            "window": renderer.WINDOW_SAMPLES,
-            "firstPairs": renderer.FIRST_PAIRS,
+            "window": frames.WINDOW_SAMPLES,
+            "firstPairs": frames.FIRST_PAIRS,
             "pairs": kernels.MAX_PAIRS,
             "runs": kernels.MAX_RUNS,
             "tiles": kernels.MAX_TILES,
-            "rounds": renderer.MAX_ROUNDS,
+            "rounds": frames.MAX_ROUNDS,
             "budgets": [*device.SOFTWARE_BUDGETS, device.BUDGET],
         },
         "digits": kernels.DIGITS,

@@ -18,17 +18,18 @@ from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh, Triangles
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import Device, open_device
-from meshsplats.webgpu.renderer import (
+from meshsplats.webgpu.frames import (
     WINDOW_SAMPLES,
     DrawSettings,
-    Images,
-    MeshRenderer,
+    MeshFrames,
+    Output,
+    Program,
     check_size,
     checked_fans,
     find_groups,
-    frame_uniform,
     halves,
 )
+from meshsplats.webgpu.renderer import DRAWING, Images, drawing_pipeline, fits
 
 PAIR_BYTES = 100
 """Bytes of the marks of a pair, and of its places on the tape."""
@@ -49,7 +50,7 @@ _gradient_steps = functools.lru_cache(maxsize=64)(kernels.gradient_steps)
 
 
 @dataclass(frozen=True)
-class _Window:
+class Window:
     """A part of an image whose tape fits."""
 
     area: tuple[int, int, int, int]
@@ -72,7 +73,11 @@ class Forward:
     pose: np.ndarray | None
     settings: DrawSettings
     images: Images
-    windows: list[_Window]
+    windows: list[Window]
+
+    def part(self, area: tuple[int, int, int, int]) -> Camera:
+        """The camera of a window."""
+        return self.camera.window(*area)
 
 
 @dataclass
@@ -152,7 +157,36 @@ def _same(one: np.ndarray | None, two: np.ndarray | None) -> bool:
     return one is two or (one is not None and two is not None and np.array_equal(one, two))
 
 
-class GradientRenderer(MeshRenderer):
+def _reserve(frames: MeshFrames, camera: Camera, settings: DrawSettings) -> None:
+    """Room for the samples of an image, and for the marks of its fragments."""
+    s = settings.samples
+    frames.allocate("sums", 4 * (3 + frames.capacity // 2048))
+    frames.allocate("samples", (32 * s * s + 16) * camera.width * camera.height)
+    frames.allocate("counters", 64 + PAIR_BYTES * frames.capacity)
+    for name in ("fragment_starts", "sum_starts", "marked"):
+        frames.allocate(name, 4 * frames.capacity)
+    frames.allocate("tape", FRAGMENT_BYTES)
+
+
+def gradient_pipeline(
+    device: Device, kernel: str, output: Output, settings: DrawSettings, groups: bool
+) -> Any:
+    """The pipeline of a kernel of images and their gradients."""
+    if kernel in kernels.GRADIENT_KERNELS or kernel in ("tape", "tape_again"):
+        queue = settings.long_queue if kernel == "tape_again" else settings.queue
+        entry = "raster" if kernel in ("tape", "tape_again") else kernel
+        return device.pipeline(
+            entry, ("tape", queue, groups), lambda: kernels.gradients_source(queue, groups=groups)
+        )
+    if kernel == "widen_backward":
+        return device.pipeline(kernel, ("filter",), kernels.filter_source)
+    return drawing_pipeline(device, kernel, output, settings, groups)
+
+
+GRADIENTS = Program(gradient_pipeline, _reserve, DRAWING.uniforms | {"modes"}, MAX_FAN)
+
+
+class GradientRenderer:
     """A mesh on a GPU whose positions and colours change.
 
     Args:
@@ -164,67 +198,35 @@ class GradientRenderer(MeshRenderer):
         DeviceError: a vertex with too many triangles.
     """
 
-    max_fan = MAX_FAN
-
-    def __init__(self, device: Device, mesh: SplatMesh) -> None:
+    def __init__(self, device: Device, mesh: SplatMesh, program: Program = GRADIENTS) -> None:
         check_limits(device, mesh)
-        super().__init__(device, mesh)
+        self.mesh, self.device = mesh, device
+        self.frames = MeshFrames(device, mesh, program)
+        self.limit = WindowLimit()
+        """Of windows, for images without one of their own."""
+        self.marked: Forward | None = None
+        """The forward pass whose only window is marked."""
         self._loaded: Forward | None = None  # whose positions and colours are on the GPU
-        self._marked: Forward | None = None  # whose only window is marked
-        self._limit = WindowLimit()
-        runs = self._counts["runs"]
-        self._counts["run_columns"] = min(runs, ROWS)
-        self._counts["run_rows"] = -(-runs // ROWS)
+        frames, counts = self.frames, self.frames.counts
+        counts["run_columns"] = min(counts["runs"], ROWS)
+        counts["run_rows"] = -(-counts["runs"] // ROWS)
         if not len(mesh.faces):
             return
-        vertices = self._counts["vertices"] + 2 * self._counts["groups"]
-        self._values_at = 16 * vertices
+        vertices = counts["vertices"] + 2 * counts["groups"]
+        self.values_at = 16 * vertices
+        """Byte of the buffer of projected vertices where what is blended begins."""
         corners = mesh.faces.ravel()
         starts = np.append(0, np.cumsum(np.bincount(corners, minlength=len(mesh.vertices))))
         parts = [starts, np.argsort(corners, kind="stable")]
-        self._allocate("projected", 16 * (vertices + len(mesh.vertices)))
-        self._allocate("gradients", 32 * len(mesh.vertices))
-        self._allocate("face_sums", SUM_BYTES * len(mesh.faces))
-        self._upload("vertex_corners", np.concatenate(parts).astype(np.uint32))
+        frames.allocate("projected", 16 * (vertices + len(mesh.vertices)))
+        frames.allocate("gradients", 32 * len(mesh.vertices))
+        frames.allocate("face_sums", SUM_BYTES * len(mesh.faces))
+        frames.upload("vertex_corners", np.concatenate(parts).astype(np.uint32))
         modes = np.zeros((len(kernels.MODES), 64), np.uint32)
         modes[:, :4] = kernels.MODES
-        self._upload("modes", modes)
+        frames.upload("modes", modes)
 
-    def _usage(self, name: str) -> int:
-        return super()._usage("frame" if name == "modes" else name)
-
-    def _begin(
-        self, camera: Camera, settings: DrawSettings, pose: np.ndarray | None = None
-    ) -> dict[str, int]:
-        s = settings.samples
-        w, h = camera.width * s, camera.height * s
-        self._allocate("sums", 4 * (3 + self._capacity // 2048))
-        self._allocate("samples", 32 * w * h + 16 * camera.width * camera.height)
-        self._allocate("counters", 64 + PAIR_BYTES * self._capacity)
-        for name in ("fragment_starts", "sum_starts", "marked"):
-            self._allocate(name, 4 * self._capacity)
-        self._allocate("tape", FRAGMENT_BYTES)
-        counts = super()._begin(camera, settings) | {"width": w, "height": h}
-        if pose is not None:
-            frame = frame_uniform(camera, settings, counts, self._capacity, self._offsets, pose)
-            self.device.device.queue.write_buffer(self._buffers["frame"], 0, frame)
-        return counts
-
-    def _pipeline(self, kernel: str, output: Any, settings: DrawSettings) -> Any:
-        groups = self._counts["groups"] > 0
-        if kernel in kernels.GRADIENT_KERNELS or kernel in ("tape", "tape_again"):
-            queue = settings.long_queue if kernel == "tape_again" else settings.queue
-            entry = "raster" if kernel in ("tape", "tape_again") else kernel
-            return self.device.pipeline(
-                entry,
-                ("tape", queue, groups),
-                lambda: kernels.gradients_source(queue, groups=groups),
-            )
-        if kernel == "widen_backward":
-            return self.device.pipeline(kernel, ("filter",), kernels.filter_source)
-        return super()._pipeline(kernel, output, settings)
-
-    # ------------------------------------------------------------------------------------------ forward pass
+    # ---- Forward pass
 
     def forward(
         self,
@@ -256,59 +258,54 @@ class GradientRenderer(MeshRenderer):
         result = Forward(triangles, camera, pose, settings, images, [])
         if not len(self.mesh.faces):
             return result
-        with self._lock:
+        with self.frames.lock:
             self._load(result)
             waiting = [(0, 0, w, h)]
             while waiting:
                 area = waiting.pop()
-                window = self._mark_window(result, area, limit or self._limit)
+                window = self.mark_window(result, area, limit or self.limit)
                 if window is None:
                     waiting += halves(area)
                     continue
                 result.windows.append(window)
                 images.work.add(window.tiles, window.counters)
                 part = np.s_[area[1] : area[1] + area[3], area[0] : area[0] + area[2]]
-                pixels = self._read(area[2], area[3], settings.samples)
+                pixels = self.frames.read_pixels(area[2], area[3], settings.samples)
                 images.color[part], images.transmittance[part] = pixels[..., :3], pixels[..., 3]
                 if images.values is not None:
                     self._render_values(result, window, images.values[part])
-            images.work.bytes = self.bytes
+            images.work.bytes = self.frames.bytes
         return result
 
-    def _render_values(self, forward: Forward, window: _Window, out: np.ndarray) -> None:
+    def _render_values(self, forward: Forward, window: Window, out: np.ndarray) -> None:
         """Blends the further values in place of the colours: the fragments and their marks are the same."""
         for columns, some in _triples(forward):
             self._load_values(some)
-            self._try_mark(forward, window.area, window.settings)
-            pixels = self._read(window.area[2], window.area[3], window.settings.samples)
+            self.try_mark(forward, window.area, window.settings)
+            pixels = self.frames.read_pixels(window.area[2], window.area[3], window.settings.samples)
             out[..., columns] = pixels[..., : columns.stop - columns.start]
         self._load_values(forward.triangles.colors)
 
     def _load(self, forward: Forward) -> None:
         """Uploads positions and colours."""
-        self._loaded, self._marked = None, None
-        self._prepare_filter(forward.settings)
-        self._upload("vertices", forward.triangles.vertices)
-        self._upload("values", forward.triangles.colors)
+        self._loaded, self.marked = None, None
+        self.frames.prepare_filter(forward.settings)
+        self.frames.upload("vertices", forward.triangles.vertices)
+        self.frames.upload("values", forward.triangles.colors)
         self._load_values(forward.triangles.colors)
-        if self._counts["groups"]:  # the plane of a group is that of its largest triangle
+        if self.frames.counts["groups"]:  # the plane of a group is that of its largest triangle
             moved = replace(self.mesh, vertices=forward.triangles.vertices)
             largest = find_groups(moved)[1]
-            self.device.device.queue.write_buffer(self._buffers["mesh"], 4 * self._offsets[2], largest)
+            self.frames.write("mesh", largest, 4 * self.frames.offsets[2])
         self._loaded = forward
 
     def _load_values(self, values: np.ndarray) -> None:
         """Uploads what is blended: (v, 4) float32 colours and opacities."""
-        self.device.device.queue.write_buffer(
-            self._buffers["projected"], self._values_at, np.ascontiguousarray(values)
-        )
+        self.frames.write("projected", np.ascontiguousarray(values), self.values_at)
 
-    def _part(self, forward: Forward, area: tuple[int, int, int, int]) -> Camera:
-        return forward.camera.window(*area)
-
-    def _mark_window(
+    def mark_window(
         self, forward: Forward, area: tuple[int, int, int, int], limit: WindowLimit
-    ) -> _Window | None:
+    ) -> Window | None:
         """``_mark``, which is left out for windows as large as one that had too many fragments."""
         samples = area[2] * area[3] * forward.settings.samples**2
         if samples > limit.samples and area[2:] != (1, 1):
@@ -318,7 +315,7 @@ class GradientRenderer(MeshRenderer):
             limit.samples = samples - 1
         return window
 
-    def _mark(self, forward: Forward, area: tuple[int, int, int, int]) -> _Window | None:
+    def _mark(self, forward: Forward, area: tuple[int, int, int, int]) -> Window | None:
         """Renders a window and marks its fragments; None if it has too many."""
         if not self._fits(area, forward.settings.samples):
             return None
@@ -326,7 +323,7 @@ class GradientRenderer(MeshRenderer):
         for budget in budgets:
             settings = replace(forward.settings, budget=budget)
             try:
-                return self._try_mark(forward, area, settings)
+                return self.try_mark(forward, area, settings)
             except DeviceError:
                 if budget == budgets[-1]:
                     raise
@@ -334,35 +331,42 @@ class GradientRenderer(MeshRenderer):
 
     def _fits(self, window: tuple[int, int, int, int], samples: int) -> bool:
         size = window[2] * window[3] * (32 * samples**2 + 16)
-        return size <= self.device.binding_limit and super()._fits(window, samples)
+        return size <= self.device.binding_limit and fits(self.device, window, samples)
 
-    def _try_mark(
+    def try_mark(
         self, forward: Forward, area: tuple[int, int, int, int], settings: DrawSettings
-    ) -> _Window | None:
-        self._marked = None
-        part = self._part(forward, area)
+    ) -> Window | None:
+        self.marked = None
+        part = forward.part(area)
         most = min(kernels.MAX_PAIRS, (self.device.binding_limit - 64) // PAIR_BYTES)
-        counts = self._begin(part, settings, forward.pose)
+        counts = self.frames.begin(part, settings, forward.pose)
         work = forward.images.work
         while True:
-            rounds, counters = self._repeat(_MARK_STEPS, _MARK_AGAIN_STEPS, "color", counts, settings, work)
+            rounds, counters = self.frames.repeat(
+                _MARK_STEPS, _MARK_AGAIN_STEPS, "color", counts, settings, work
+            )
             needed = int(counters[0])
-            if needed <= self._capacity:
+            if needed <= self.frames.capacity:
                 break
             if needed > most:
                 return None
-            self._capacity = min(most, needed + needed // 4)
-            counts = self._begin(part, settings, forward.pose)
+            self.frames.capacity = min(most, needed + needed // 4)
+            counts = self.frames.begin(part, settings, forward.pose)
         fragments, sums = int(counters[13]), int(counters[14])
         limit = self.device.binding_limit
         if FRAGMENT_BYTES * fragments > limit or SUM_BYTES * sums > limit:
             return None
-        window = _Window(area, settings, rounds, fragments, sums, counts["tiles"], counters)
+        window = Window(area, settings, rounds, fragments, sums, counts["tiles"], counters)
         if area[2:] == (forward.camera.width, forward.camera.height):
-            self._marked = forward
+            self.marked = forward
         return window
 
-    # ------------------------------------------------------------------------------------------ backward pass
+    def mark_again(self, forward: Forward, window: Window) -> None:
+        """Marks the fragments of a window of ``forward``, unless they are marked."""
+        if self.marked is not forward and not self.try_mark(forward, window.area, window.settings):
+            raise DeviceError(f"the GPU did not repeat its own image ({self.device.name})")
+
+    # ---- Backward pass
 
     def backward(
         self, forward: Forward, gradient: np.ndarray, values: np.ndarray | None = None
@@ -385,7 +389,7 @@ class GradientRenderer(MeshRenderer):
         more = None if values is None else np.zeros((count, values.shape[2]), np.float32)
         if not forward.windows:
             return np.zeros((count, 8), np.float32), more
-        with self._lock:
+        with self.frames.lock:
             if self._loaded is not forward:
                 self._load(forward)
             result = self._add_windows(forward, gradient)
@@ -403,44 +407,37 @@ class GradientRenderer(MeshRenderer):
 
     def _add_windows(self, forward: Forward, gradient: np.ndarray) -> np.ndarray:
         """(v, 8) float32 gradients of what is blended now."""
-        self._clear("gradients")
+        self.frames.clear("gradients")
         for window in forward.windows:
-            if self._marked is not forward and not self._try_mark(forward, window.area, window.settings):
-                raise DeviceError(f"the GPU did not repeat its own image ({self.device.name})")
+            self.mark_again(forward, window)
             self._add_window(forward, window, gradient)
         if forward.settings.filter_px2:
             last = forward.windows[-1]
-            counts = self._begin(self._part(forward, last.area), last.settings, forward.pose)
-            self._run(_FILTER_STEPS, "color", counts, last.settings)
+            counts = self.frames.begin(forward.part(last.area), last.settings, forward.pose)
+            self.frames.run(_FILTER_STEPS, "color", counts, last.settings)
         size = 32 * len(forward.triangles.vertices)
-        data = self.device.device.queue.read_buffer(self._buffers["gradients"], 0, size)
-        return np.frombuffer(data, np.float32).reshape(-1, 8).copy()
+        return self.frames.read("gradients", size).view(np.float32).reshape(-1, 8).copy()
 
-    def _add_window(self, forward: Forward, window: _Window, gradient: np.ndarray) -> None:
+    def _add_window(self, forward: Forward, window: Window, gradient: np.ndarray) -> None:
         """Adds the gradients of a window whose fragments are marked."""
         x, y, w, h = window.area
         s = window.settings.samples
-        counts = self._make_room(forward, window)
+        counts = self.make_room(forward, window)
         of_samples = np.ascontiguousarray(gradient[y : y + h, x : x + w]) * np.float32(1 / s**2)
-        self.device.device.queue.write_buffer(self._buffers["samples"], 32 * w * h * s**2, of_samples)
-        self._run(_gradient_steps(window.rounds), "color", counts, window.settings)
-        counters = self._counters()
+        self.frames.write("samples", of_samples, 32 * w * h * s**2)
+        self.frames.run(_gradient_steps(window.rounds), "color", counts, window.settings)
+        counters = self.frames.counters()
         if counters[2] != counts["tiles"]:
-            raise self._unfinished(counts, counters)
+            raise self.frames.unfinished(counts, counters)
         if counters[15]:
             raise DeviceError("a sample has too many fragments for gradients on the GPU: use device='cpu'")
 
-    def _make_room(self, forward: Forward, window: _Window) -> dict[str, int]:
+    def make_room(self, forward: Forward, window: Window) -> dict[str, int]:
         """Room for the tape of a window, its frame and counts."""
-        counts = self._begin(self._part(forward, window.area), window.settings, forward.pose)
-        self._allocate("tape", FRAGMENT_BYTES * window.fragments)
-        self._allocate("tile_sums", SUM_BYTES * window.sums)
+        counts = self.frames.begin(forward.part(window.area), window.settings, forward.pose)
+        self.frames.allocate("tape", FRAGMENT_BYTES * window.fragments)
+        self.frames.allocate("tile_sums", SUM_BYTES * window.sums)
         return counts
-
-    def _clear(self, name: str) -> None:
-        encoder = self.device.device.create_command_encoder()
-        encoder.clear_buffer(self._buffers[name])
-        self.device.device.queue.submit([encoder.finish()])
 
 
 def _triples(forward: Forward) -> Iterator[tuple[slice, np.ndarray]]:

@@ -17,8 +17,9 @@ from meshsplats.errors import DeviceError
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu import kernels
 from meshsplats.webgpu.device import CORE_BINDING, Device
-from meshsplats.webgpu.gradients import Forward, GradientRenderer, WindowLimit
-from meshsplats.webgpu.renderer import DrawSettings, Images, halves
+from meshsplats.webgpu.frames import DrawSettings, Output, halves
+from meshsplats.webgpu.gradients import GRADIENTS, Forward, GradientRenderer, WindowLimit, gradient_pipeline
+from meshsplats.webgpu.renderer import Images
 
 DERIVATIVE_BYTES = 48
 """Bytes of the derivatives of SSIM in each pixel, the largest buffer of an image."""
@@ -64,7 +65,16 @@ class Sums(NamedTuple):
     finite: bool
 
 
-class Trainer(GradientRenderer):
+def _pipeline(device: Device, kernel: str, output: Output, settings: DrawSettings, groups: bool) -> Any:
+    if kernel in kernels.TRAINING_KERNELS:
+        return device.pipeline(kernel, ("training",), kernels.training_source)
+    return gradient_pipeline(device, kernel, output, settings, groups)
+
+
+TRAINING = GRADIENTS._replace(pipeline=_pipeline, uniforms=GRADIENTS.uniforms | {"step"})
+
+
+class Trainer:
     """A mesh whose positions, colours and moments are on a GPU.
 
     Args:
@@ -93,27 +103,21 @@ class Trainer(GradientRenderer):
         transparent: np.ndarray,
         limit: WindowLimit,
     ) -> None:
-        super().__init__(device, mesh)
+        self.mesh = mesh
+        self._taping = GradientRenderer(device, mesh, TRAINING)
+        self._frames = self._taping.frames
         self._limit = limit
-        assert not self._counts["groups"]
+        assert not self._frames.counts["groups"]
         count = len(mesh.vertices)
-        self._upload("vertices", vertices)
-        self._upload("values", colors)
+        self._frames.upload("vertices", vertices)
+        self._frames.upload("values", colors)
         padded = np.zeros((count, 2, 4), np.float32)
         padded[:, 0, :3], padded[:, 1, :3] = position_moments
-        self._upload("position_moments", padded)
-        self._upload("color_moments", np.stack(color_moments, axis=1))
-        self._upload("traits", np.stack([units, transparent.astype(np.float32)], axis=1))
-        self._allocate("results", 64)
-        self._allocate("step", 80)
-
-    def _usage(self, name: str) -> int:
-        return super()._usage("frame" if name == "step" else name)
-
-    def _pipeline(self, kernel: str, output: Any, settings: DrawSettings) -> Any:
-        if kernel in kernels.TRAINING_KERNELS:
-            return self.device.pipeline(kernel, ("training",), kernels.training_source)
-        return super()._pipeline(kernel, output, settings)
+        self._frames.upload("position_moments", padded)
+        self._frames.upload("color_moments", np.stack(color_moments, axis=1))
+        self._frames.upload("traits", np.stack([units, transparent.astype(np.float32)], axis=1))
+        self._frames.allocate("results", 64)
+        self._frames.allocate("step", 80)
 
     def step(
         self,
@@ -141,7 +145,7 @@ class Trainer(GradientRenderer):
             DeviceError: the GPU did not finish; nothing has changed.
             MemoryError: a single pixel does not fit.
         """
-        with self._lock:
+        with self._frames.lock:
             self._prepare(camera, settings, target, mask)
             forward = Forward(
                 self.mesh.triangles,
@@ -154,7 +158,7 @@ class Trainer(GradientRenderer):
             waiting = [(0, 0, camera.width, camera.height)]
             while waiting:
                 area = waiting.pop()
-                window = self._mark_window(forward, area, self._limit)
+                window = self._taping.mark_window(forward, area, self._limit)
                 if window is None:
                     waiting += halves(area)
                     continue
@@ -162,22 +166,20 @@ class Trainer(GradientRenderer):
                 self._write_step(forward, window.area, 0, background, rates)
                 self._run_for(_STORE_STEPS, forward, window.area)
             self._run_for(_LOSS_STEPS, forward, forward.windows[-1].area)
-            self._clear("gradients")
+            self._frames.clear("gradients")
             for window in forward.windows:
-                if self._marked is not forward and not self._try_mark(forward, window.area, window.settings):
-                    raise DeviceError(f"the GPU did not repeat its own image ({self.device.name})")
-                counts = self._make_room(forward, window)
+                self._taping.mark_again(forward, window)
+                counts = self._taping.make_room(forward, window)
                 self._write_step(forward, window.area, counts["tiles"], background, rates)
                 steps = _window_steps(window.rounds)
-                self._run(steps, "color", counts | self._image_counts(camera), window.settings)
+                self._frames.run(steps, "color", counts | self._image_counts(camera), window.settings)
             last = forward.windows[-1]
-            counts = self._begin(self._part(forward, last.area), last.settings)
-            self._run(_ADAM_STEPS, "color", counts, last.settings)
-            data = self.device.device.queue.read_buffer(self._buffers["results"], 0, 32)
-        words = np.frombuffer(data, np.uint32)
+            counts = self._frames.begin(forward.part(last.area), last.settings)
+            self._frames.run(_ADAM_STEPS, "color", counts, last.settings)
+            words = self._frames.read("results", 32)
         if words[4]:
             raise DeviceError(
-                f"the GPU did not finish a backward pass ({self.device.name}): use device='cpu'"
+                f"the GPU did not finish a backward pass ({self._frames.device.name}): use device='cpu'"
             )
         l1, l2, ssim = (float(value) for value in words[:3].view(np.float32))
         return Sums(l1, ssim, l2, not words[5])
@@ -197,7 +199,7 @@ class Trainer(GradientRenderer):
         )
 
     def _download(self, name: str, size: int) -> np.ndarray:
-        return np.frombuffer(self.device.device.queue.read_buffer(self._buffers[name], 0, size), np.float32)
+        return self._frames.read(name, size).view(np.float32)
 
     def _prepare(
         self, camera: Camera, settings: DrawSettings, target: np.ndarray, mask: np.ndarray | None
@@ -205,26 +207,18 @@ class Trainer(GradientRenderer):
         """Makes room for an image, and uploads its target."""
         pixels = camera.width * camera.height
         assert pixels <= MAX_PIXELS
-        self._prepare_filter(settings)
-        self._allocate("image", 16 * pixels)
-        self._allocate("image_gradient", 16 * pixels)
-        self._allocate("derivatives", DERIVATIVE_BYTES * pixels)
-        counts = self._image_counts(camera)
-        self._allocate("losses", 16 * -(-counts["image_columns"] // SIDE) * -(-counts["image_rows"] // SIDE))
+        self._frames.prepare_filter(settings)
+        self._frames.allocate("image", 16 * pixels)
+        self._frames.allocate("image_gradient", 16 * pixels)
+        self._frames.allocate("derivatives", DERIVATIVE_BYTES * pixels)
+        groups = -(-camera.width // SIDE) * -(-camera.height // SIDE)
+        self._frames.allocate("losses", 16 * groups)
         padded = np.ones((camera.height, camera.width, 4), np.float32)
         padded[..., :3] = target
         if mask is not None:
             padded[..., 3] = mask
-        self._upload("target", padded)
-        encoder = self.device.device.create_command_encoder()
-        encoder.copy_buffer_to_buffer(
-            self._buffers["values"],
-            0,
-            self._buffers["projected"],
-            self._values_at,
-            16 * len(self.mesh.vertices),
-        )
-        self.device.device.queue.submit([encoder.finish()])
+        self._frames.upload("target", padded)
+        self._frames.copy("values", "projected", self._taping.values_at, 16 * len(self.mesh.vertices))
 
     @staticmethod
     def _image_counts(camera: Camera) -> dict[str, int]:
@@ -233,8 +227,9 @@ class Trainer(GradientRenderer):
     def _run_for(
         self, steps: Sequence[dict[str, Any]], forward: Forward, area: tuple[int, int, int, int]
     ) -> None:
-        counts = self._counts | self._image_counts(forward.camera) | {"columns": area[2], "rows": area[3]}
-        self._run(steps, "color", counts, forward.settings)
+        counts = self._frames.counts | self._image_counts(forward.camera)
+        counts |= {"columns": area[2], "rows": area[3]}
+        self._frames.run(steps, "color", counts, forward.settings)
 
     def _write_step(
         self,
@@ -252,4 +247,4 @@ class Trainer(GradientRenderer):
         data[8:12] = *background, rates.epsilons[1]
         data[12:16] = rates.l1, rates.ssim, rates.l2, rates.epsilons[0]
         data[16:20] = rates.colors, rates.positions, 1 - rates.betas[0], 1 - rates.betas[1]
-        self.device.device.queue.write_buffer(self._buffers["step"], 0, data)
+        self._frames.write("step", data)
