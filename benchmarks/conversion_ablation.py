@@ -39,7 +39,7 @@ STANDARD = {
     "playbot": "playbot_lod3_31k_sh2.ply",
 }
 DISTANCES = ("close", "mid", "far")
-_WITHOUT_CAMERAS = ("none", "density", "framing")
+_WITHOUT_CAMERAS = ("none", "framing")
 
 PRESETS: list[tuple[str, dict]] = [
     ("paper", dict(preset="paper")),
@@ -62,7 +62,6 @@ VARIATIONS: list[tuple[str, dict]] = [
     ("footprint_px2 0.4", dict(footprint_px2=0.4)),
     ("footprint_px2 0.6", dict(footprint_px2=0.6)),
     ("footprint_px2 0.8", dict(footprint_px2=0.8)),
-    ("footprint from the density", dict(footprint="density")),
     ("no compensation", dict(compensation=0.0)),
     ("compensation 0.5", dict(compensation=0.5)),
     ("always two ellipses (flat_below 0)", dict(flat_below=0.0)),

@@ -61,7 +61,7 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, required=True, help="folder of the real data")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
-    parser.add_argument("--presets", nargs="+", default=["default", "paper", "published"])
+    parser.add_argument("--presets", nargs="+", default=["default", "paper"])
     parser.add_argument("--minutes", type=float, default=2.0)
     parser.add_argument("--steps", type=int, help="steps, instead of a time")
     parser.add_argument("--clock", choices=["wall", "processor"], default="wall")

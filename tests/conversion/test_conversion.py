@@ -276,7 +276,7 @@ class TestInvariance:
     @given(seed=st.integers(0, 10**6), which=st.integers(0, 3))
     def test_moving_the_cloud_moves_the_mesh(self, seed, which):
         rng = np.random.default_rng(seed)
-        # The grid of the density footprint is tied to the axes: state the distance instead.
+        # The cameras of the framing are tied to the axes: state the distance instead.
         options = self.OPTIONS[which] if which < 3 else dict(viewing_distance=3.0)
         cloud = many(12, seed)
         w, x, y, z = turn = (q := rng.normal(size=4)) / np.linalg.norm(q)

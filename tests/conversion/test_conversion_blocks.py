@@ -104,7 +104,6 @@ def test_what_needs_the_whole_is_refused():
         ({"max_splats": 100}, "limits on splats"),
         ({"max_triangles": 100}, "limits on splats"),
         ({"detail": "cameras", "cameras": orbit(cloud, 2)}, "detail='cameras'"),
-        ({"footprint": "density"}, "footprint='density'"),
     ]:
         with pytest.raises(ValueError, match=message):
             next(convert_blocks([cloud], **options))

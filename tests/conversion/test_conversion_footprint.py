@@ -204,14 +204,6 @@ class TestSpacing:
         order = rng.permutation(60)
         np.testing.assert_array_equal(spacing(points)[order], spacing(points[order]))
 
-    def test_density_footprint(self):
-        """Splats grow by the order of their spacing; one splat alone does not."""
-        cloud = grid(64)
-        mesh = convert(cloud, footprint="density", footprint_px2=1, **FLAT)
-        np.testing.assert_allclose(np.median(reaches(mesh, cloud)), module.SPACING_SHARE, rtol=0.15)
-        alone = convert(cloud.select([0]), footprint="density", **FLAT)
-        np.testing.assert_allclose(np.sort(reach(alone)), [0, 1e-4, 1e-4], rtol=1e-5)
-
 
 class TestFraming:
     def test_pixel_of_an_image_that_holds_the_subject(self):

@@ -142,7 +142,7 @@ REFUSED = [
     (dict(footprint="cameras"), "needs cameras"),
     (dict(footprint="distance"), "needs viewing_distance"),
     (dict(viewing_distance=0), "viewing_distance"),
-    (dict(viewing_distance=3, footprint="density"), "viewing_distance is for footprint='distance'"),
+    (dict(viewing_distance=3, footprint="framing"), "viewing_distance is for footprint='distance'"),
     (dict(focal=100), "focal is for footprint='distance'"),
     (
         dict(preset="paper", viewing_distance=3),

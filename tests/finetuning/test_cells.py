@@ -177,8 +177,8 @@ def test_frozen_vertices_stay(held, tmp_path):
     np.testing.assert_array_equal(again.colors, whole.colors)
     with pytest.raises(ValueError, match="frozen must have shape"):
         finetune(mesh, held.dataset, config, frozen=frozen[1:])
-    with pytest.raises(ValueError, match="not for relocate_share"):
-        finetune(mesh, held.dataset, replace(config, relocate_share=0.1), frozen=frozen)
+    with pytest.raises(ValueError, match="not for opacity 'cutoff'"):
+        finetune(mesh, held.dataset, replace(config, opacity="cutoff"), frozen=frozen)
 
 
 # ---- Whole runs
@@ -330,7 +330,6 @@ def test_a_killed_run_is_resumed(whole_run, tmp_path):
 def test_what_is_for_a_whole_scene_is_refused(held, tmp_path):
     for changes, message in (
         ({"minutes": 1.0}, "minutes is for a whole scene"),
-        ({"relocate_share": 0.1}, "relocate_share is for"),
         ({"exposure": True}, "exposure is for"),
         ({"opacity": "cutoff"}, "opacity is for"),
         ({"blending": "linear"}, "blending is for"),

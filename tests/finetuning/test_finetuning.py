@@ -28,10 +28,8 @@ from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import (
     TRAINING_MIN_TRANSMITTANCE,
-    importance,
     kept_faces,
     make_step,
-    relocate,
     target_of,
     view_of_step,
 )
@@ -86,11 +84,10 @@ def test_soft_edges_stay_soft(scene):
     assert (free.colors[clear, 3] > 0).mean() > 0.2
 
 
-@pytest.mark.parametrize("preset", ["paper", "published"])
-def test_the_papers_presets_improve_its_conversion(scene, preset):
+def test_the_papers_preset_improves_its_conversion(scene):
     cloud, dataset, _ = scene
     mesh = convert(cloud, preset="paper")
-    tuned = finetune(mesh, dataset, make_config(preset, epochs=6))
+    tuned = finetune(mesh, dataset, make_config("paper", epochs=6))
     assert score(tuned, dataset) > score(mesh, dataset) + 1
 
 
@@ -220,14 +217,12 @@ def test_the_same_seed_gives_the_same_bits_with_any_number_of_threads(scene):
 
 
 def test_a_resumed_run_ends_with_the_same_bits(scene, tmp_path):
-    """Pruned by opacity and importance and relocated on the way, and stopped three times."""
+    """Pruned on the way, and stopped three times."""
     _, dataset, mesh = scene
     config = make_config(
         epochs=4,
         prune_epochs=1,
         prune_opacity=0.05,
-        prune_importance=0.3,
-        relocate_share=0.1,
         exposure=True,
     )
     unstopped = tmp_path / "unstopped"
@@ -415,34 +410,13 @@ def test_values_that_are_not_finite_name_their_view(scene, tmp_path):
 # ---- Pruning
 
 
-def test_importance_is_what_the_images_show():
-    """An opaque square before another, and one behind the camera: pixels, none, and not in view."""
-    camera = Camera(np.eye(4), 10, 10, 12, 8, 24, 16)
-    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.5
-    ahead = np.array([0, 0, 1])
-    corners = np.concatenate([square + ahead, square * 0.5 + 2 * ahead, square - ahead])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    mesh = SplatMesh(
-        corners,
-        np.concatenate([faces, faces + 4, faces + 8]),
-        np.ones((12, 4)),
-        face_splat=[0, 0, 1, 1, 2, 2],
-    )
-    view = View(camera, ViewImage(np.zeros((16, 24, 3), np.float32)))
-    state = State.begin(mesh, 1, make_config(prune_importance=0.5), None)
-    shown, before = importance(state, [view])
-    assert shown.reshape(3, 4).sum(axis=1) == pytest.approx([100, 0, 0], abs=1e-3)
-    assert before.reshape(3, 4).any(axis=1).tolist() == [True, True, False]
-    assert kept_faces(state, [view]).tolist() == [True, True, False, False, True, True]
-
-
 def test_faint_triangles_are_dropped_with_their_vertices_and_moments(scene):
     _, dataset, mesh = scene
     config = make_config(prune_opacity=0.3, prune_epochs=1)
     state = State.begin(mesh, len(dataset.train), config, None)
     for step in range(3):
         make_step(state, dataset.train, step, 0.0)
-    keep = kept_faces(state, dataset.train)
+    keep = kept_faces(state)
     assert 0 < keep.sum() < len(keep)
     expected = state.result().prune(0.3)
     used = np.unique(mesh.faces[keep])
@@ -452,37 +426,6 @@ def test_faint_triangles_are_dropped_with_their_vertices_and_moments(scene):
         for key in ("mean", "square"):
             assert np.array_equal(smaller.arrays()[f"{name}.{key}"], state.arrays()[f"{name}.{key}"][used])
     assert np.array_equal(smaller.sizes, state.sizes[used])
-
-
-def test_relocated_splats_begin_anew_where_they_are_needed(scene):
-    _, dataset, mesh = scene
-    config = make_config(relocate_share=0.1)
-    state = State.begin(mesh, len(dataset.train), config, None)
-    for step in range(len(dataset.train)):
-        make_step(state, dataset.train, step, 0.0)
-    before, sizes = state.arrays(), state.sizes.copy()
-    assert state.relocate(np.zeros(len(mesh.vertices), bool)) == 0
-    assert not state.arrays()["usage.color"].any()
-    state = State.resume(before, "display", len(dataset.train), config, None)
-    tuned = state.result()
-    moved = relocate(state, dataset.train)
-    after = state.arrays()
-    assert 0 < moved <= 0.1 * len(np.unique(mesh.face_splat))
-    changed = (state.result().vertices != tuned.vertices).any(axis=1)
-    splats = np.unique(mesh.face_splat[changed[mesh.faces].any(axis=1)])
-    assert len(splats) == 2 * moved
-    taken = np.zeros(len(changed), bool)
-    taken[mesh.faces[np.isin(mesh.face_splat, splats)]] = True
-    assert not changed[~taken].any()
-    assert np.array_equal(state.sizes[~taken], sizes[~taken])
-    assert (state.sizes[taken] != sizes[taken]).all()
-    for name in ("positions", "colors"):
-        assert not after[f"{name}.mean"][taken].any()
-        assert np.array_equal(after[f"{name}.mean"][~taken], before[f"{name}.mean"][~taken])
-    assert not after["usage.color"].any()
-    assert not after["usage.position"].any()
-    kept = make_config(relocate_share=0)
-    assert relocate(State.begin(mesh, len(dataset.train), kept, None), dataset.train) == 0
 
 
 # ---- Runs

@@ -24,7 +24,6 @@ from meshsplats.finetuning.config import PRESETS, FinetuneConfig, is_long, learn
 from meshsplats.finetuning.initial import boundary_vertices, starting_mesh, starting_sides, vertex_sizes
 from meshsplats.finetuning.interruption import StopSignals
 from meshsplats.finetuning.journal import METRICS, Journal
-from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh
 
 ROOT = Path(__file__).parents[2]
@@ -35,17 +34,15 @@ ROOT = Path(__file__).parents[2]
 
 def test_presets_are_pinned():
     """What the paper's text and its code say; a change here is a change of meaning."""
-    paper, published = PRESETS["paper"], PRESETS["published"]
+    paper = PRESETS["paper"]
     assert paper.position_rate == pytest.approx(math.exp(-3) * paper.color_rate)
     assert paper.prune_opacity == pytest.approx(math.exp(-4))
-    assert (published.color_rate, published.position_rate, published.prune_opacity) == (1e-2, 1e-6, 1e-4)
-    for preset in (paper, published):
-        assert (preset.epochs, preset.steps, preset.minutes) == (15, None, None)
-        assert (preset.ssim_weight, preset.l2_weight, preset.prune_epochs) == (0.4, 0, 10)
-        assert (preset.color_step_decay, preset.final_share) == (0.999, 1)
-        assert (preset.background, preset.position_unit, preset.exposure) == ("white", "scene", False)
-        assert (preset.beta1, preset.beta2, preset.epsilon) == (0.9, 0.999, 1e-8)
-        assert preset.soft_edges is False
+    assert (paper.epochs, paper.steps, paper.minutes) == (15, None, None)
+    assert (paper.ssim_weight, paper.l2_weight, paper.prune_epochs) == (0.4, 0, 10)
+    assert (paper.color_step_decay, paper.final_share) == (0.999, 1)
+    assert (paper.background, paper.position_unit, paper.exposure) == ("white", "scene", False)
+    assert (paper.beta1, paper.beta2, paper.epsilon) == (0.9, 0.999, 1e-8)
+    assert paper.soft_edges is False
     assert PRESETS["default"] == FinetuneConfig()
 
 
@@ -56,11 +53,11 @@ def test_the_documented_table_has_the_presets_values():
         for line in text.splitlines()
         if line.startswith("| `")
     ]
-    table = {row[0].strip("`"): row[1:4] for row in rows}
+    table = {row[0].strip("`"): row[1:3] for row in rows}
     names = [name for name in FinetuneConfig.__dataclass_fields__ if name != "preset"]
     assert set(names) <= set(table)
     for name in names:
-        for cell, preset in zip(table[name], ("paper", "published", "default"), strict=True):
+        for cell, preset in zip(table[name], ("paper", "default"), strict=True):
             value = getattr(PRESETS[preset], name)
             shown = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
             assert cell == shown, f"{name} of {preset}"
@@ -124,7 +121,7 @@ def test_values_out_of_range(changes, message):
 
 
 def test_names_that_do_not_exist():
-    with pytest.raises(ValueError, match="preset must be one of default, paper, published"):
+    with pytest.raises(ValueError, match="preset must be one of default, paper"):
         make_config("best")
     with pytest.raises(TypeError, match="did you mean 'color_rate'"):
         make_config(colour_rate=1)
@@ -193,54 +190,6 @@ def fans(count: int, sides: int = 4) -> SplatMesh:
     )
 
 
-def usage(color: list[float], position: list[float], corners: int) -> GradientSums:
-    return GradientSums(*(np.repeat(np.array(values, np.float32), corners) for values in (color, position)))
-
-
-def test_the_idlest_splats_go_to_those_that_are_pushed_most():
-    mesh = fans(6)
-    seen = np.ones(30, bool)
-    # Splat 2 is idle, 4 idler; 5 is pushed most, then 0; 3 shows too little to be halved.
-    of = usage([10, 10, 1.2, 3, 1, 20], [4, 1, 9, 9, 9, 5], 5)
-    idle, needed = plan_relocation(mesh, of, seen, 0.5)
-    assert (idle[:, 0] // 5).tolist() == [4, 2]
-    assert (needed[:, 0] // 5).tolist() == [5, 0]
-    assert np.array_equal(idle - idle[:, :1], np.tile(np.arange(5), (2, 1)))
-    assert (plan_relocation(mesh, of, seen, 0.2).idle[:, 0] // 5).tolist() == [4]
-    # What no view looks at may be all there is of its place.
-    seen[20:25] = False
-    assert (plan_relocation(mesh, of, seen, 0.5).idle[:, 0] // 5).tolist() == [2]
-
-
-def test_only_splats_of_the_commonest_form_with_vertices_of_their_own_move():
-    mesh = fans(6)
-    of = usage([10, 10, 1, 10, 1, 20], [1, 1, 1, 1, 1, 1], 5)
-    seen = np.ones(30, bool)
-    assert len(plan_relocation(mesh, of, seen, 0.5).idle) == 2
-    cut = replace(mesh, faces=np.delete(mesh.faces, 8, 0), face_splat=np.delete(mesh.face_splat, 8))
-    assert (plan_relocation(cut, of, seen, 0.5).idle[:, 0] // 5).tolist() == [4]
-    faces = mesh.faces.copy()
-    faces[16] = [10, 21, 22]  # a triangle of splat 4 hangs on splat 2
-    assert len(plan_relocation(replace(mesh, faces=faces), of, seen, 0.5).idle) == 0
-    assert len(plan_relocation(replace(mesh, face_splat=None), of, seen, 0.5).idle) == 0
-    still = usage([10, 10, 1, 10, 1, 20], [0, 0, 1, 0, 1, 0], 5)
-    assert len(plan_relocation(mesh, still, seen, 0.5).idle) == 0
-
-
-def test_halves_lie_side_by_side_along_the_longest_axis():
-    fan = fans(1).vertices[None] + np.float32([3, 1, 2])
-    right, left = split_in_halves(fan)
-    if right[0, :, 0].mean() < left[0, :, 0].mean():
-        right, left = left, right
-    reach = lambda half, axis: (half[0, :, axis].min(), half[0, :, axis].max())  # noqa: E731
-    assert reach(right, 0) == pytest.approx((3 - 0.4, 5), abs=1e-5)
-    assert reach(left, 0) == pytest.approx((1, 3 + 0.4), abs=1e-5)
-    for half in (right, left):
-        assert reach(half, 1) == pytest.approx((0, 2), abs=1e-5)
-        assert half[0, :, 2] == pytest.approx(2, abs=1e-5)
-    assert pytest.approx(0.6) == HALF
-
-
 def test_triangles_of_a_splat_suit_the_run(monkeypatch):
     cloud = make_scene(200)
     cameras = orbit(cloud, 3, width=40, height=40)
@@ -293,9 +242,8 @@ def test_each_preset_begins_with_its_conversion():
     assert 3 * 190 < len(starting_mesh(cloud, cameras, sides=3).faces) <= 3 * 200
     assert len(starting_mesh(cloud, cameras, rings=2).faces) == 24 * 200
     assert len(starting_mesh(cloud, cameras, mode="3d", sides=4).faces) == 12 * 200
-    for preset in ("paper", "published"):
-        paper = convert(cloud, preset="paper")
-        assert np.array_equal(starting_mesh(cloud, cameras, preset=preset).vertices, paper.vertices)
+    paper = convert(cloud, preset="paper")
+    assert np.array_equal(starting_mesh(cloud, cameras, preset="paper").vertices, paper.vertices)
 
 
 # ---- Memory
@@ -318,16 +266,6 @@ def test_memory_is_refused_with_advice(monkeypatch):
         memory.check_memory(mesh, data)
     monkeypatch.setattr(memory, "available_memory", lambda: None)
     memory.check_memory(mesh, data)
-
-
-@pytest.mark.skipif(memory.available_memory() is None, reason="the system does not say what is free")
-def test_ranks_share_the_memory_of_their_machine(monkeypatch):
-    whole = memory.available_memory()
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")  # of another program
-    assert memory.available_memory() > whole / 2
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "x")
-    monkeypatch.setenv("WORLD_SIZE", "8")
-    assert whole / 8 < memory.available_memory() < whole / 2
 
 
 def test_splats_that_targets_are_drawn_from_count():

@@ -161,8 +161,6 @@ def test_a_vertex_with_a_gradient_of_its_colour_alone_moves(scene):
     ("changes", "message"),
     [
         ({"exposure": True}, "exposure is for opacity 'blended'"),
-        ({"relocate_share": 0.1}, "relocate_share is for opacity 'blended'"),
-        ({"prune_importance": 2.0}, "prune_importance is for opacity 'blended'"),
         ({"opacity_decay": 0.1}, "opacity_decay is for opacity 'blended'"),
         ({"blending": "linear"}, "opaque triangles are not blended"),
         ({"opaque_share": 0.5, "anneal_share": 0.6}, "annealing must end before the mesh settles"),

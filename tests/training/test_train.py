@@ -22,7 +22,6 @@ from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import Interrupted, RunOptions, finetune, make_config
 from meshsplats.finetuning import step as training_step
 from meshsplats.finetuning.checkpoint import OtherRunError
-from meshsplats.finetuning.ranks import Ranks
 from meshsplats.finetuning.run import run_start
 from meshsplats.finetuning.state import Gradients, State
 from meshsplats.formats.gaussians import load_gaussians
@@ -31,7 +30,17 @@ from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render_splats
 from meshsplats.training import starting_fans, train, train_config
 from meshsplats.training.as_splats import splats_of_fans
-from meshsplats.training.growth import NearFields, Scores, colors_at, fan_count, grow, score, select_fans
+from meshsplats.training.growth import (
+    HALF,
+    NearFields,
+    Scores,
+    colors_at,
+    fan_count,
+    grow,
+    score,
+    select_fans,
+    split_in_halves,
+)
 from meshsplats.training.initial import fans_of
 from meshsplats.training.run import SO_FAR, GrowingLoop, check_training_memory
 from meshsplats.training.schedule import budget, events_passed, image_factor
@@ -452,22 +461,30 @@ def test_bad_input_is_refused_before_the_work(ball, tmp_path):
         train_config(opacity="cutoff")
     with pytest.raises(ValueError, match="blending 'linear' is not for training"):
         train_config(blending="linear")
-    for name, value in (("prune_opacity", 0.1), ("prune_importance", 2), ("relocate_epochs", 2)):
+    for name, value in (("prune_opacity", 0.1), ("prune_epochs", 2)):
         with pytest.raises(ValueError, match=f"{name} must be"):
             train_config(**{name: value})
     with pytest.raises(ValueError, match=r"point_share must be 0\.4"):
         train_config(point_share=0.1)
-    run = RunOptions(tmp_path / "ranks", ranks=TwoRanks())
-    with pytest.raises(ValueError, match="one process, got 2 ranks"):
-        train(ball, train_config(steps=1), run=run)
     with pytest.raises(TypeError, match="did you mean 'max_splats'"):
         train_config(max_splat=3)
     with pytest.raises(FileNotFoundError, match=r"no .*start\.npz: leave out --resume"):
         train(ball, train_config(steps=1), run=RunOptions(tmp_path / "none", resume=True))
 
 
-class TwoRanks(Ranks):
-    count = 2
+def test_halves_lie_side_by_side_along_the_longest_axis():
+    rim = [(2, 0, 0), (0, 1, 0), (-2, 0, 0), (0, -1, 0)]
+    fan = np.float32([[(0, 0, 0), *rim]]) + np.float32([3, 1, 2])
+    right, left = split_in_halves(fan)
+    if right[0, :, 0].mean() < left[0, :, 0].mean():
+        right, left = left, right
+    reach = lambda half, axis: (half[0, :, axis].min(), half[0, :, axis].max())  # noqa: E731
+    assert reach(right, 0) == pytest.approx((3 - 0.4, 5), abs=1e-5)
+    assert reach(left, 0) == pytest.approx((1, 3 + 0.4), abs=1e-5)
+    for half in (right, left):
+        assert reach(half, 1) == pytest.approx((0, 2), abs=1e-5)
+        assert half[0, :, 2] == pytest.approx(2, abs=1e-5)
+    assert pytest.approx(0.6) == HALF
 
 
 def test_a_missing_gpu_is_found_before_the_work(ball, tmp_path, monkeypatch):

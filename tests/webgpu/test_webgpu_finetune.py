@@ -17,9 +17,8 @@ from meshsplats.datasets.views import View, ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DeviceError, DivergenceError, FileFormatError, MissingDependencyError
 from meshsplats.finetuning import RunOptions, finetune, make_config
-from meshsplats.finetuning.ranks import Part
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import _part, importance, make_step, view_of_step
+from meshsplats.finetuning.step import make_step, view_of_step
 from meshsplats.prior import bind
 from meshsplats.webgpu import gradients
 from meshsplats.webgpu.device import open_device
@@ -63,7 +62,6 @@ OPTIONS = [
     {"epsilon": 1e-3},
     {"epsilon": 1e-3, "position_unit": "scene"},
     {"blending": "linear"},
-    {"relocate_share": 0.1},
     {"exposure": True},
 ]
 
@@ -119,7 +117,7 @@ def test_arrays_stay_on_the_gpu_where_all_of_a_step_runs_there(scene):
     camera = dataset.train[0].camera
     assert steps(scene, "gpu")[1].trains_on_gpu(camera)
     assert not steps(scene, "cpu", 0)[1].trains_on_gpu(camera)
-    for options in ({"blending": "linear"}, {"relocate_share": 0.1}, {"exposure": True}):
+    for options in ({"blending": "linear"}, {"exposure": True}):
         assert not steps(scene, "gpu", 0, **options)[1].trains_on_gpu(camera)
     assert not steps(scene, "gpu", 0)[1].trains_on_gpu(replace(camera, width=2000, height=2000))
 
@@ -199,7 +197,7 @@ def test_the_same_bits_every_time(scene):
     assert one.colors.tobytes() == two.colors.tobytes()
 
 
-@pytest.mark.parametrize("options", [{}, {"relocate_share": 0.1}], ids=lambda options: ", ".join(options))
+@pytest.mark.parametrize("options", [{}, {"opacity_decay": 0.01}], ids=lambda options: ", ".join(options))
 def test_a_resumed_run_in_windows_has_the_same_bits(scene, tmp_path, monkeypatch, options):
     """Also where it stops between an image that has too many fragments and one that has not."""
     need_gpu()
@@ -233,26 +231,6 @@ def test_a_broken_limit_of_windows_is_refused(scene, value):
     arrays = State.begin(mesh, 6, config, None, device="gpu").arrays()
     with pytest.raises(FileFormatError, match="window_samples must be a whole number"):
         State.resume(arrays | {"window_samples": np.asarray(value)}, "display", 6, config, None, "gpu")
-
-
-def test_ranks_find_the_gradients_of_one_process(scene, monkeypatch):
-    """Also of a view that fits, after one that has too many fragments."""
-    need_gpu()
-    dataset, mesh = scene
-    config = make_config(steps=8, batch=2)
-    near = dataset.train[view_of_step(make_config(steps=8), 2, len(dataset.train))]
-    far = replace(near.camera, fx=near.camera.fx / 8, fy=near.camera.fy / 8)
-    views = [near, replace(near, camera=far, source=near.load())]
-    monkeypatch.setattr(gradients, "FRAGMENT_BYTES", 20_000)  # as if there were more fragments
-
-    def part(*places: int) -> Part:
-        state = State.begin(mesh, 2, config, None, device="gpu")
-        return _part(state, views, [0, 1], 0, 0.0, range(places[0], places[-1] + 1))
-
-    whole, first, second = part(0, 1), part(0), part(1)
-    for name in ("vertices", "colors"):
-        assert np.array_equal(getattr(whole, name), getattr(first, name) + getattr(second, name))
-    assert whole.window_samples == first.window_samples < second.window_samples == WINDOW_SAMPLES
 
 
 def test_a_resumed_run_has_the_same_bits(scene, tmp_path):
@@ -290,20 +268,12 @@ def test_a_run_gets_better_and_is_scored_and_pruned(scene, tmp_path):
     tuned = finetune(
         mesh,
         dataset,
-        make_config(epochs=6, prune_epochs=2, prune_importance=0.5),
+        make_config(epochs=6, prune_epochs=2, prune_opacity=0.3),
         run=RunOptions(tmp_path / "run", device="gpu", report_every=10),
         on_progress=lambda progress: losses.append(progress.loss),
     )
     assert np.mean(losses[-6:]) < 0.7 * np.mean(losses[:6])
     assert 0 < len(tuned.faces) < len(mesh.faces)
-
-
-def test_visible_pixels_are_those_of_the_core(scene):
-    need_gpu()
-    dataset, _ = scene
-    found = [importance(steps(scene, device, 0)[1], dataset.train) for device in ("gpu", "cpu")]
-    assert np.allclose(found[0][0], found[1][0], rtol=1e-4, atol=1e-4)
-    assert np.array_equal(found[0][1], found[1][1])
 
 
 def test_what_needs_the_cpu_is_an_error_before_anything_is_written(scene, tmp_path):

@@ -122,8 +122,8 @@ class Evaluate(Command):
     ] = None
     """Score all scenes of a benchmark as in the paper's Table 1."""
     tune: Annotated[
-        Literal["default", "paper", "published"] | None,
-        tyro.conf.arg(metavar="{default,paper,published}", help_behavior_hint=""),
+        Literal["default", "paper"] | None,
+        tyro.conf.arg(metavar="{default,paper}", help_behavior_hint=""),
     ] = None
     """With --protocol: first fine-tune each scene on its training views, with this preset."""
     strips: int = 8

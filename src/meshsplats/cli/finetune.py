@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -68,7 +68,6 @@ from meshsplats.finetuning.pace import (
     of_brief_run,
     worthwhile_steps,
 )
-from meshsplats.finetuning.ranks import is_started_by_torchrun
 from meshsplats.finetuning.run import SCORED_VIEWS, held_out_scores, scored_count
 from meshsplats.finetuning.step import samples_of
 from meshsplats.gaussians import GaussianCloud
@@ -114,17 +113,15 @@ class Finetune(TrainingCommand):
         *("look", "max_triangles", "threads", "device", "resume", "force"),
     )
 
-    RANKS = True
-
     input: tyro.conf.Positional[Path]
     """Splats, a model folder, or, with --data, a mesh."""
     output: Output
     """The tuned mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
-    preset: Literal["default", "paper", "published"] = "default"
-    """default: best quality at equal time. paper: the text of the MeshSplats paper. published: its code."""
+    preset: Annotated[Literal["default", "paper"], tyro.conf.arg(metavar="NAME")] = "default"
+    """default: best quality at equal time. paper: the text of the MeshSplats paper."""
     start: Literal["same", "default", "paper"] = "same"
     """Conversion of splats; same: that of --preset. default: an ellipse of 5 to 32 triangles a splat. paper:
-    the paper's conversion, also for published."""
+    the paper's conversion."""
     conversion: StartOptions = field(default_factory=StartOptions)
     cell_splats: Count = None
     """Tune splats in cells of at most N, in the memory of a cell, one after the other or by --cluster."""
@@ -211,11 +208,9 @@ class Finetune(TrainingCommand):
         def optimise(run: RunOptions, show: Display) -> Trained:
             if not self._has_time(record, setup, reserve) and earlier is None:
                 return self._trained(mesh, config, baseline.compared_with_itself())
-            if earlier is None and not run.ranks.index:
+            if earlier is None:
                 record.save(self.files().folder)
             tuned = finetune(mesh, dataset, config, run=run, on_progress=show)
-            if run.ranks.index:
-                return self._trained(tuned, config)  # which the first rank writes
             show.phase("scoring the result")
             sizes = baseline.compare(tuned, config, self.threads)
             if not sizes.loses:
@@ -358,8 +353,6 @@ class Finetune(TrainingCommand):
     ) -> Plan:
         from meshsplats.finetuning.cells import CellOptions, CellScene, check_for_cells, finetune_cells
 
-        if is_started_by_torchrun():
-            raise UsageError("--cell-splats is for --cluster, not for torchrun")
         if isinstance(scene, SplatMesh):
             raise UsageError(f"{self.input} is a mesh: --cell-splats divides splats")
         options = CellOptions(self.cell_splats or 0, self.conversion, self._start_preset)

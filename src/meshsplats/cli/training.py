@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol
 
@@ -46,7 +45,6 @@ from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOpti
 from meshsplats.finetuning.baseline import SizeScores
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
 from meshsplats.finetuning.config import LENGTHS, with_changes
-from meshsplats.finetuning.ranks import Ranks, joined_ranks
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu.device import open_device
@@ -71,16 +69,6 @@ class Display(Protocol):
         """Shows what begins, or how much of it is done, 0 to 1."""
 
     def __call__(self, progress: Progress) -> None: ...
-
-
-class Silent:
-    """Shows nothing."""
-
-    def phase(self, text: str, share: float | None = None) -> None:
-        pass
-
-    def __call__(self, progress: Progress) -> None:
-        pass
 
 
 def tuning_options(default_of: Callable[[str], str]) -> type[FinetuneConfig]:
@@ -242,8 +230,6 @@ class TrainingCommand(Command):
 
     CONFIGURABLE = True
     EXCLUSIVE: ClassVar[tuple[tuple[str, ...], ...]] = (("epochs", "steps", "minutes"), ("data", "cameras"))
-    RANKS: ClassVar[bool] = False
-    """Whether torchrun may start several processes of it, which share the views."""
 
     input: tyro.conf.Positional[Path]
     """Input."""
@@ -310,22 +296,9 @@ class TrainingCommand(Command):
         return self.configured().to_dict()
 
     def execute(self) -> int:
-        with joined_ranks(self.threads) as (ranks, threads):
-            if ranks.count == 1:
-                return self._execute(self.configured(), ranks)
-            if not self.RANKS:
-                raise UsageError("torchrun is for meshsplats finetune")
-            if self.minutes is not None:
-                raise UsageError("--minutes is not for torchrun, as clocks differ: give --steps")
-            batch = self.configured().batch
-            tuning = replace(self.tuning, batch=ranks.count if batch == 1 else batch)
-            command = replace(self, threads=threads, tuning=tuning)
-            config = command.configured()
-            return command._assist(config, ranks) if ranks.index else command._execute(config, ranks)
-
-    def _execute(self, config: FinetuneConfig, ranks: Ranks) -> int:
         from meshsplats.formats.meshes import save_mesh
 
+        config = self.configured()
         start = time.perf_counter() - STARTUP_SECONDS
         self.check()
         files = self.files()
@@ -339,7 +312,7 @@ class TrainingCommand(Command):
                 print_plan(plan, self.target.cache_bytes)
                 with files.claimed(self.inputs, resume=self.resume, force=self.force):
                     self._record_start(files)
-                    trained = plan.optimise(self._run_options(files, start, ranks, plan.reserve), show)
+                    trained = plan.optimise(self._run_options(files, start, plan.reserve), show)
         except Interrupted as stop:
             return self.report_interrupt(stop, files)
         except OtherRunError as error:
@@ -355,19 +328,6 @@ class TrainingCommand(Command):
         if not self.json:
             for line in self.next_steps(files, config, plan):
                 print(line)
-        return 0
-
-    def _assist(self, config: FinetuneConfig, ranks: Ranks) -> int:
-        """Takes the part of a rank that is not the first: it writes nothing, and prints errors only."""
-        self.check()
-        files = self.files()
-        with open(os.devnull, "w") as nowhere, redirect_stderr(nowhere), redirect_stdout(nowhere):
-            begun = time.perf_counter()
-            plan = self.plan(config, self._earlier(files), Setup(Silent(), begun, config.minutes))
-            try:
-                plan.optimise(self._run_options(files, begun, ranks, plan.reserve), Silent())
-            except Interrupted as stop:
-                return 128 + stop.signal
         return 0
 
     def preview_camera(self, plan: Plan) -> Camera | None:
@@ -406,7 +366,7 @@ class TrainingCommand(Command):
         whole = self.resume and not files.in_cells
         return load_checkpoint(files.folder / CHECKPOINT, only_header=True) if whole else None
 
-    def _run_options(self, files: RunFiles, start: float, ranks: Ranks, reserve: float) -> RunOptions:
+    def _run_options(self, files: RunFiles, start: float, reserve: float) -> RunOptions:
         """Of a run whose command started at ``start`` by the performance counter, and needs ``reserve``
         seconds afterwards."""
         return RunOptions(
@@ -419,7 +379,6 @@ class TrainingCommand(Command):
             spent=time.perf_counter() - start,
             reserve=reserve,
             cache_bytes=self.target.cache_bytes,
-            ranks=ranks,
         )
 
     def _record_start(self, files: RunFiles) -> None:

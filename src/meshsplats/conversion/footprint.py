@@ -35,20 +35,12 @@ DRAWN_PX2 = 0.3
 MAX_CAMERAS = 32
 """Of more cameras this many are used, evenly spaced in their order."""
 
-SPACING_SHARE = 0.35
-"""Pixel size as a share of the spacing of the splats, where nothing else is known. In the training images of
-six scenes, or the images that they are shown in, it is 0.31 to 0.91."""
-
-SPACING_POWER = 0.3
-"""How far the pixel size follows the local spacing (1) rather than the scene's median (0). Splats are denser
-where there is more detail, not only where cameras are closer."""
-
 FRAMING_PIXELS = 1000
 FRAMING_VIEWS = 6
 """Side and count of the square images for 'framing'."""
 FRAMING_SPACING = 0.7
-"""Largest pixel for 'framing', as a share of the median spacing of the splats: twice that of 'density'. Only
-clouds with far more detail than such images can show reach it."""
+"""Largest pixel for 'framing', as a share of the median spacing of the splats. Only clouds with far more
+detail than such images can show reach it."""
 
 _CHUNK = 1 << 14
 
@@ -198,11 +190,6 @@ def pixel_sizes(
     if options.footprint == "distance":
         pixel = options.viewing_distance / options.focal  # type: ignore[operator]
         return np.full(len(cloud), pixel, np.float32)
-    if options.footprint == "density":
-        local = spacing(cloud.means)
-        typical = np.median(local)
-        relative = np.divide(local, typical, out=np.ones_like(local), where=typical > 0)
-        return np.float32(SPACING_SHARE) * typical * np.power(relative, np.float32(SPACING_POWER))
     if options.footprint == "framing":
         side = FRAMING_PIXELS
         coverage = CameraCoverage(cloud.means, orbit(cloud, FRAMING_VIEWS, width=side, height=side, up=up))
@@ -213,7 +200,7 @@ def pixel_sizes(
     if not seen.any():
         raise ValueError(
             f"none of the {len(coverage.cameras)} cameras sees any of the {len(cloud)} splats: are they of"
-            " one scene? Choose footprint='density' or 'none' to go without them"
+            " one scene? Choose footprint='framing' or 'none' to go without them"
         )
     sizes = np.where(seen, sizes, np.median(sizes[seen]))
     if options.footprint == "framing":

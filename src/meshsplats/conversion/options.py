@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 Mode = Literal["crossed", "flat", "3d"]
-Footprint = Literal["cameras", "framing", "distance", "density", "filter", "none"]
+Footprint = Literal["cameras", "framing", "distance", "filter", "none"]
 Colors = Literal["degree0", "cameras"]
 Detail = Literal["even", "cameras"]
 Budget = Literal["merge", "drop"]
@@ -70,11 +70,10 @@ class ConversionOptions:
     footprint: Footprint | None = None
     """Source of the size of a pixel at each splat, for the low-pass filter that splats were trained with.
     cameras: the given cameras. framing: images of 1000 pixels from all sides that just hold the subject, with
-    finer pixels for very dense splats. distance: ``viewing_distance``. density: the spacing of the splats.
-    filter: the mesh gets a filter of its own (``SplatMesh.filter_px2``) instead, which is right at every size
-    but which only this project's renderer applies; for splats of kernel '3dgs'. none: no filter, for a model
-    trained without one. Default: cameras if there are any, else distance if it is given, else framing; paper:
-    none."""
+    finer pixels for very dense splats. distance: ``viewing_distance``. filter: the mesh gets a filter of its
+    own (``SplatMesh.filter_px2``) instead, which is right at every size but which only this project's
+    renderer applies; for splats of kernel '3dgs'. none: no filter, for a model trained without one. Default:
+    cameras if there are any, else distance if it is given, else framing; paper: none."""
     footprint_px2: float | None = None
     """Variance of that filter in square pixels, 0 to 100. Every standard deviation s becomes
     sqrt(s^2 + v * pixel^2), or max(s, sqrt(v) * pixel) for splats of kernel '2dgs', with v this variance.
@@ -153,7 +152,7 @@ class ConversionOptions:
                 )
         if self.footprint == "cameras" and not has_cameras:
             raise ValueError(
-                "footprint='cameras' needs cameras: give some, or choose framing, distance, density or none"
+                "footprint='cameras' needs cameras: give some, or choose framing, distance or none"
             )
         if self.footprint == "distance" and self.viewing_distance is None:
             raise ValueError("footprint='distance' needs viewing_distance, in scene units")

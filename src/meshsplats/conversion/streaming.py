@@ -140,7 +140,7 @@ class ScenePixels:
         if not (sizes > 0).any():
             raise ValueError(
                 f"none of the {len(self._cameras)} cameras sees any of {len(sizes):,} splats: are they of one"
-                " scene? Choose footprint='none' to go without them"
+                " scene? Choose footprint='framing' or 'none' to go without them"
             )
         self.unseen = np.median(sizes[sizes > 0])
 
@@ -189,7 +189,7 @@ def convert_blocks(
 
     Raises:
         ValueError: as ``convert``; and for what needs all splats at once: limits that splats are merged or
-            dropped for, ``detail='cameras'`` and ``footprint='density'``.
+            dropped for, and ``detail='cameras'``.
     """
     source = each(GaussianCloud, "source", source, again=True)
     need(ConversionOptions, options=options, optional=True)
@@ -230,8 +230,6 @@ def refuse_whole(options: ConversionOptions) -> None:
         raise ValueError("limits on splats or triangles need all splats in memory: use convert")
     if options.detail == "cameras":
         raise ValueError("detail='cameras' needs all splats in memory: use convert")
-    if options.footprint == "density":
-        raise ValueError("footprint='density' needs all splats in memory: choose framing, distance or none")
 
 
 @dataclass(frozen=True, eq=False)

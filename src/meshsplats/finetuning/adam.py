@@ -193,17 +193,9 @@ class RowAdam:
         result.mean, result.square, result.steps = self.mean[indices], self.square[indices], self.steps
         return result
 
-    def restart(self, rows: np.ndarray, like: np.ndarray, scale: np.ndarray | None = None) -> None:
-        """Zeroes the first moment of ``rows`` and copies the second from the rows ``like``, after their
-        values were replaced.
-
-        ``rows`` and ``like`` are index arrays of one shape; ``scale`` of that shape replaces their factors of
-        the learning rate.
-        """
+    def restart(self, rows: np.ndarray) -> None:
+        """Zeroes the first moments of ``rows``, after their values were replaced."""
         self.mean[rows] = 0
-        self.square[rows] = self.square[like]
-        if scale is not None and self.scale is not None:
-            self.scale[rows] = scale
 
 
 def _as_numpy(array: Any) -> Any:

@@ -200,7 +200,7 @@ def finetune_cells(
     Args:
         scene: splats and views. On a cluster, each worker makes them.
         config: as of ``finetune``, for the whole scene: a cell takes the share of the steps that its share of
-            the views is. Not the length in minutes, relocation, exposures or opacity 'cutoff'.
+            the views is. Not the length in minutes, exposures or opacity 'cutoff'.
         options: how the scene is divided.
         run: the folder, which must be given and exist, resumption, checkpoints, threads. There are no
             previews, and no scores on the way.
@@ -261,7 +261,6 @@ def check_for_cells(config: FinetuneConfig) -> None:
     """ValueError for options that need the whole scene at once."""
     for name, possible in (
         ("minutes", (None,)),
-        ("relocate_share", (0,)),
         ("exposure", (False,)),
         ("opacity", ("blended",)),
         ("blending", ("mesh", "display")),

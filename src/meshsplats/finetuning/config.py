@@ -95,19 +95,10 @@ class FinetuneConfig:
     exposure_rate: float = 0.002
     """Adam's learning rate of these gains and offsets."""
     prune_epochs: float = 5.0
-    """Epochs between two prunings of the mesh (``prune_opacity``, ``prune_importance``). 0: no pruning."""
+    """Epochs between two prunings of the mesh. 0: no pruning."""
     prune_opacity: float = 1 / 255
     """Prune triangles whose corners all have less opacity than this, and the vertices that no triangle then
     uses."""
-    prune_importance: float = 0.0
-    """Also prune splats that contribute less than this many pixels to all training views together, because
-    they are faint or occluded. Splats outside every view are kept. 0: none."""
-    relocate_share: float = 0.0
-    """Largest fraction of the splats that is relocated at a time (densification with a fixed number of
-    triangles): splats that are almost invisible each take over half of a splat that is needed most. For long
-    runs, since the halves have to converge again. 0, or on a base mesh: none."""
-    relocate_epochs: float = 1.0
-    """Epochs between two relocations, in the first half of the run."""
     blending: Literal["mesh", "display", "linear"] = "mesh"
     """Colour space in which triangles are blended. mesh: that of the mesh. display: display values. linear:
     linear light, for exports to engines that light or blend in linear light."""
@@ -146,10 +137,6 @@ class FinetuneConfig:
     one_sample_share: float = 0.0
     """For photographs: for this initial fraction of the run, draw one sample per pixel, which takes half the
     time."""
-    batch: int = 1
-    """Views whose gradients are summed for a step, which then counts as that many steps: a run of the same
-    length sees as many views. Learning rates are multiplied by its square root. For runs on several ranks,
-    which share the views of a batch; not with exposures and opacity 'cutoff'."""
     seed: int = 0
     """Seed of the order of the views and of random backgrounds. The same seed gives the same bits, with any
     number of threads, unless the length is given in minutes."""
@@ -164,8 +151,6 @@ class FinetuneConfig:
             for f in fields(self):
                 if f.name in OF_CUTOFF and getattr(self, f.name) != f.default:
                     raise ValueError(f"{f.name} has no effect without opacity 'cutoff'")
-        if self.batch > 1 and (self.exposure or self.opacity == "cutoff"):
-            raise ValueError("a batch of several views is not for exposure and opacity 'cutoff'")
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
@@ -174,8 +159,6 @@ class FinetuneConfig:
         """ValueError for options that have no meaning, or were never tried, without blending."""
         for name, standard in (
             ("exposure", False),
-            ("relocate_share", 0.0),
-            ("prune_importance", 0.0),
             ("opacity_decay", 0.0),
         ):
             if getattr(self, name) != standard:
@@ -208,10 +191,6 @@ class FinetuneConfig:
     def prune_interval(self, views: int) -> int:
         """Number of steps between two prunings; 0: never."""
         return max(1, round(self.prune_epochs * views)) if self.prune_epochs else 0
-
-    def relocate_interval(self, views: int) -> int:
-        """Number of steps between two relocations; 0: never."""
-        return max(1, round(self.relocate_epochs * views)) if self.relocate_share else 0
 
     def to_dict(self) -> dict[str, Any]:
         """All fields, for JSON."""
@@ -255,9 +234,6 @@ _RANGES: list[Range] = [
     ("exposure_rate", 1e-9, 1, False),
     ("prune_epochs", 0, 1e6, False),
     ("prune_opacity", 0, 1, False),
-    ("prune_importance", 0, 1e6, False),
-    ("relocate_share", 0, 0.5, False),
-    ("relocate_epochs", 1e-3, 1e6, False),
     ("samples", 1, 16, True),
     ("cutoff", 0, 1, False),
     ("anneal_share", 0, 1, False),
@@ -269,7 +245,6 @@ _RANGES: list[Range] = [
     ("soft_phase", 0.01, 0.99, False),
     ("point_share", 0, 1, False),
     ("one_sample_share", 0, 1, False),
-    ("batch", 1, 4096, True),
     ("seed", 0, 2**63 - 1, True),
 ]
 
@@ -294,17 +269,14 @@ _PAPER = FinetuneConfig(
     prune_epochs=10,
     epsilon=1e-8,
     prune_opacity=math.exp(-4),
-    prune_importance=0.0,
 )
 
 PRESETS: Mapping[str, FinetuneConfig] = {
     "default": FinetuneConfig(),
     "paper": _PAPER,
-    "published": replace(_PAPER, preset="published", color_rate=1e-2, position_rate=1e-6, prune_opacity=1e-4),
 }
 """default: the best in our measurements at equal time. paper: the values in the text of arXiv 2502.07754,
-with the colour learning rate of its code, since the text gives none. published: the values of its code, with
-SSIM and background as intended. ``docs/finetuning.md`` has the table."""
+with the colour learning rate of its code, since the text gives none. ``docs/finetuning.md`` has the table."""
 
 
 class FinetuneChanges(TypedDict, total=False):
@@ -331,9 +303,6 @@ class FinetuneChanges(TypedDict, total=False):
     exposure_rate: float
     prune_epochs: float
     prune_opacity: float
-    prune_importance: float
-    relocate_share: float
-    relocate_epochs: float
     blending: Literal["mesh", "display", "linear"]
     samples: int | None
     opacity: Literal["blended", "cutoff"]
@@ -347,7 +316,6 @@ class FinetuneChanges(TypedDict, total=False):
     soft_phase: float
     point_share: float
     one_sample_share: float
-    batch: int
     seed: int
 
 

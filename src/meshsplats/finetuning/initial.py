@@ -59,7 +59,7 @@ def starting_mesh(
     """``cloud`` converted for the fine-tuning of ``preset``, to be seen from ``cameras``, those of all its
     training views.
 
-    For 'paper' and 'published' this is the paper's conversion. For 'default' it is ours, with one ellipse per
+    For 'paper' this is the paper's conversion. For 'default' it is ours, with one ellipse per
     splat (``mode='flat'``) of as many triangles as ``starting_sides`` says, on average, and more where much
     is visible (``detail='cameras'``), unless ``options`` or ``changes``, as in ``convert``, say otherwise:
     two crossed ellipses look better before fine-tuning, but a step takes longer and the result is worse. With

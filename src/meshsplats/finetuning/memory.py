@@ -7,7 +7,6 @@ from pathlib import Path
 from meshsplats.cluster import memory_of_task
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import CACHE_BYTES, Dataset
-from meshsplats.finetuning.ranks import ranks_of_machine
 from meshsplats.mesh import SplatMesh
 
 VERTEX_BYTES = 7 * 4 * 6 + 4
@@ -57,7 +56,7 @@ def estimate_bytes(vertices: int, faces: int, dataset: Dataset, cache_bytes: int
 
 def available_memory() -> int | None:
     """Bytes that this process may still allocate, by the system, the container and its Dask worker; None if
-    unknown. The ranks on a machine have equal shares."""
+    unknown."""
     found = []
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
@@ -75,7 +74,6 @@ def available_memory() -> int | None:
                 found.append(max(int(most) - int(Path(used).read_text()), 0))
         except (OSError, ValueError):
             continue
-    found = [size // ranks_of_machine() for size in found]
     of_task = memory_of_task()
     return min(found if of_task is None else [*found, of_task], default=None)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +21,6 @@ from meshsplats.finetuning.checkpoint import (
     OtherRunError,
     check_same_run,
     dataset_fingerprint,
-    load_checkpoint,
     mesh_fingerprint,
     planned_length,
 )
@@ -39,9 +36,8 @@ from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.memory import check_memory
 from meshsplats.finetuning.opaque import visible_samples
 from meshsplats.finetuning.outlines import fewer_triangles
-from meshsplats.finetuning.ranks import ALONE, Ranks
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import kept_faces, make_step, relocate, samples_of
+from meshsplats.finetuning.step import kept_faces, make_step, samples_of
 from meshsplats.formats.cutting import cut_mesh
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.api import Device, check_device
@@ -51,9 +47,6 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from meshsplats.finetuning.config import FinetuneChanges
-
-RELOCATION_END = 0.5
-"""Splats are relocated in this first share of the run: later ones would not converge."""
 
 WRAP_UP_SECONDS = 1.5
 """Time that a run with a length in minutes reserves for writing the mesh and rendering its preview. In short
@@ -103,9 +96,6 @@ class RunOptions:
     """Seconds that the caller needs afterwards, which count likewise."""
     cache_bytes: int = CACHE_BYTES
     """Limit of the data set's image cache, for the memory estimate."""
-    ranks: Ranks = ALONE
-    """Processes that share the views of each batch (``ranks.joined_ranks``). The first one writes; the folder
-    of a run that is resumed is at the same path on all."""
 
     def __post_init__(self) -> None:
         if self.folder is not None:
@@ -166,15 +156,14 @@ def finetune(
         config: the configuration; the preset 'default' by default.
         run: output folder, resumption from a checkpoint, logging and resources.
         frozen: (v,) bool, True for vertices of ``mesh`` that keep their positions and colours; none by
-            default. Not with relocation or opacity 'cutoff'.
+            default. Not with opacity 'cutoff'.
         on_progress: called after every step.
         changes: fields of ``FinetuneConfig`` in place of those of ``config``: ``finetune(mesh, data,
             minutes=2)``.
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: no training view, an empty mesh, ``frozen`` of another shape; a batch that the ranks
-            cannot share, or that has more views than there are.
+        ValueError: no training view, an empty mesh, ``frozen`` of another shape.
         OtherRunError: the checkpoint is of another run.
         MemoryError: the estimated memory is not available, or the mesh does not fit on the GPU; of a run that
             starts, nothing was written.
@@ -193,11 +182,10 @@ def finetune(
         raise ValueError("the data set has no training views")
     if not len(mesh.faces):
         raise ValueError("the mesh has no triangles: there is nothing to fine-tune")
-    _check_batch(config, len(dataset.train), run.ranks)
     if frozen is not None:
         frozen = checked_array("frozen", frozen, bool, (len(mesh.vertices),))
-        if config.relocate_share or config.opacity == "cutoff":
-            raise ValueError("frozen vertices are not for relocate_share and opacity 'cutoff'")
+        if config.opacity == "cutoff":
+            raise ValueError("frozen vertices are not for opacity 'cutoff'")
     if run.device == "gpu":
         if config.opacity == "cutoff":
             raise ValueError("opacity 'cutoff' needs device 'cpu': the GPU has no gradients for a cutoff")
@@ -205,21 +193,9 @@ def finetune(
     check_memory(mesh, dataset, cache_bytes=run.cache_bytes)
     journal = None if run.folder is None else Journal(run.folder)
     start = run_start(mesh, dataset, config, run, journal, frozen)
-    run.ranks.wait()  # before the first one writes what the others have read
-    loop = TrainingLoop(start, dataset, config, run, None if run.ranks.index else journal, on_progress)
+    loop = TrainingLoop(start, dataset, config, run, journal, on_progress)
     del start
     return loop.run()
-
-
-def _check_batch(config: FinetuneConfig, views: int, ranks: Ranks) -> None:
-    if config.batch % ranks.count:
-        raise ValueError(
-            f"a batch of {config.batch} cannot be shared by {ranks.count} ranks: give a multiple"
-        )
-    if config.batch > views:
-        raise ValueError(f"a batch of {config.batch} needs as many training views, there are {views}")
-    if ranks.count > 1 and config.minutes is not None:
-        raise ValueError("a length in minutes is not for several ranks, whose clocks differ")
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,8 +233,7 @@ def run_start(
     fingerprints = mesh_fingerprint(mesh, frozen), dataset_fingerprint(dataset)
     if not options.resume:
         state = State.begin(mesh, views, config, options.threads, frozen=frozen, device=options.device)
-        if not options.ranks.index:
-            journal.begin(config.to_dict())
+        journal.begin(config.to_dict())
         return RunStart(state, fingerprints, mesh)
     total = config.total_steps(views)
 
@@ -267,10 +242,7 @@ def run_start(
         if total is not None and found.step > total:
             raise OtherRunError(f"the run has taken {found.step:,} steps already, {total:,} were requested")
 
-    if options.ranks.index:
-        check(found := load_checkpoint(journal.checkpoint_path))
-    else:
-        found = journal.resume(config.to_dict(), check)
+    found = journal.resume(config.to_dict(), check)
     blending = "linear" if config.blending == "linear" else mesh.blending
     state = State.resume(found.arrays, blending, views, config, options.threads, options.device)
     return RunStart(state, fingerprints, mesh, found.step, found.seconds, found.losses, planned_length(found))
@@ -332,21 +304,19 @@ class TrainingLoop:
 
     def run(self) -> SplatMesh:
         """Takes all steps. Interrupted, after a checkpoint, if a signal arrived."""
-        ranks = self.options.ranks
         with StopSignals() as signals:
             if self.step == 0:
                 self._report()
                 self._save_preview()
                 self._save_first_checkpoint()
             while not self._done():
-                if ranks.any(signals.received is not None):
+                if signals.received is not None:
                     self._save_checkpoint()
-                    raise Interrupted(self.step, signals.received or signal.SIGTERM)
+                    raise Interrupted(self.step, signals.received)
                 start, before = time.perf_counter(), self.step
-                batch = min(self.config.batch, (self.steps or sys.maxsize) - before)
-                loss = make_step(self.state, self._views(), before, self.fraction, batch=batch, ranks=ranks)
+                loss = make_step(self.state, self._views(), before, self.fraction)
                 self.step_cost = time.perf_counter() - start
-                self.step += batch
+                self.step += 1
                 if loss is not None:
                     self._note(before, loss)
                 self._adapt(before)
@@ -393,19 +363,16 @@ class TrainingLoop:
         self.last_loss = loss
 
     def _adapt(self, before: int) -> None:
-        """Removes and relocates triangles where the steps since ``before`` make that due."""
+        """Removes triangles where the steps since ``before`` make that due."""
         views = self.dataset.train
         if self._settles():
             self._remove_hidden()
         if self._becomes_hybrid():
             self._cut()
         if self._due(self.config.prune_interval(len(views)), before) and not self._done():
-            self.state = self.state.prune(kept_faces(self.state, views))
+            self.state = self.state.prune(kept_faces(self.state))
         if self.state.solid is not None:
             self._limit_colors()
-        due = self._due(self.config.relocate_interval(len(views)), before)
-        if due and self.fraction <= RELOCATION_END:
-            relocate(self.state, views)
 
     def _due(self, interval: int, before: int) -> bool:
         """Whether the steps since ``before`` have come to a multiple of ``interval``; 0: never."""
@@ -461,9 +428,6 @@ class TrainingLoop:
 
     def _report(self) -> None:
         """Scores the held-out views and writes a line of the metrics."""
-        if self.options.ranks.index:
-            self.losses.clear()
-            return
         start = time.perf_counter()
         loss = float(np.mean(self.losses)) if self.losses else None
         mean_ssim = None

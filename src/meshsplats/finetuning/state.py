@@ -20,7 +20,6 @@ from meshsplats.finetuning.checkpoint import mesh_arrays, stored_mesh
 from meshsplats.finetuning.config import FinetuneConfig, epsilons
 from meshsplats.finetuning.hybrid import MAX_OPACITY, ColorLimits
 from meshsplats.finetuning.initial import boundary_vertices, vertex_sizes
-from meshsplats.finetuning.relocation import HALF, GradientSums, plan_relocation, split_in_halves
 from meshsplats.mesh import SplatMesh, Triangles, solid_faces
 from meshsplats.rendering.api import Device
 from meshsplats.rendering.edges import corners_beyond
@@ -99,8 +98,6 @@ class State:
         self._exposures = None
         if self.exposures is not None:
             self._exposures = adam(self.exposures, lr=config.exposure_rate, eps=color_epsilon)
-        relocates = config.relocate_share and self.bound is None
-        self._sums = GradientSums.zeros(len(mesh.vertices)) if relocates else None
         self.solid: np.ndarray | None = None
         self.color_limits: ColorLimits | None = None
         self.frozen: np.ndarray | None = None
@@ -206,10 +203,6 @@ class State:
                 state.frozen = checked_array("frozen", arrays["frozen"], bool, (len(mesh.vertices),))
             if device == "gpu" and "window_samples" in arrays:
                 state.limit.samples = _checked_limit(arrays["window_samples"])
-            if state._sums is not None:
-                shape = (len(mesh.vertices),)
-                parts = (_checked_shape(arrays[name], shape) for name in state._sums.arrays())
-                state._sums = GradientSums(*(part.copy() for part in parts))
         except KeyError as error:
             raise FileFormatError(f"the checkpoint lacks {error}") from None
         except (ValueError, TypeError) as error:
@@ -224,8 +217,6 @@ class State:
             arrays["exposure.values"] = self.exposures
         for name, adam in self._optimisers().items():
             arrays |= {f"{name}.{key}": value for key, value in adam.state().items()}
-        if self._sums is not None:
-            arrays |= self._sums.arrays()
         if self.solid is not None:
             arrays["solid"] = np.ones((), np.int32)
         if self.color_limits is not None:
@@ -267,8 +258,6 @@ class State:
             gradients.colors[self.solid, 3] = 0
         opacity = self.colors[:, 3]
         transparent = None if self._boundary is None else self._boundary & (opacity == 0)
-        if self._sums is not None:
-            self._sums.add(gradients.colors, gradients.vertices, self.sizes, reached)
         self._colors.lr = color_rate
         self._colors.step(gradients.colors, reached)
         if self.config.opacity_decay:
@@ -305,13 +294,12 @@ class State:
         """Whether ``step_on_gpu`` takes steps with images of that size.
 
         Others render on the GPU, and compare images and take their step here: those of base meshes,
-        exposures, linear light, relocation, decaying opacities and shapes, frozen vertices, depth groups.
+        exposures, linear light, decaying opacities and shapes, frozen vertices, depth groups.
         """
         return (
             self.device == "gpu"
             and self.bound is None
             and self.exposures is None
-            and self._sums is None
             and self.solid is None
             and self.frozen is None
             and not self.config.opacity_decay
@@ -387,30 +375,6 @@ class State:
             optimiser.mean[:], optimiser.square[:] = moments
         self._ahead = False
 
-    def relocate(self, in_view: np.ndarray) -> int:
-        """Relocates splats that are almost invisible (see ``relocation``) and restarts the gradient sums.
-
-        ``in_view`` (v,) bool marks the vertices in any view. Returns the number of relocated splats, at most
-        ``relocate_share`` of all.
-        """
-        if self._sums is None:
-            return 0
-        self._download()
-        self._trainer = None
-        idle, needed = plan_relocation(self.mesh, self._sums, in_view, self.config.relocate_share)
-        if len(idle):
-            positions, colors = self.vertices, self.colors
-            positions[needed], positions[idle] = split_in_halves(positions[needed])
-            colors[idle] = colors[needed]
-            # Sizes are square roots of areas.
-            self.sizes[needed] *= np.sqrt(np.float32(HALF))
-            self.sizes[idle] = self.sizes[needed]
-            for rows in (idle, needed):
-                self._positions.restart(rows, needed, self.sizes[rows])
-                self._colors.restart(rows, needed)
-        self._sums.clear()
-        return len(idle)
-
     def round_fans(self, corners: int, share: float) -> None:
         """Moves each fan of ``corners`` vertices, centre first, towards a flat ellipse, by a ``share`` of
         the distance; for meshes that consist of such fans, one after the other."""
@@ -446,8 +410,6 @@ class State:
         if self._exposures is not None:
             every = np.arange(len(self._exposures.mean))
             result._exposures = self._exposures.select(result.exposures, every)
-        if self._sums is not None:
-            result._sums = GradientSums(self._sums.color[rows], self._sums.position[rows])
         if self.solid is not None:
             result.solid = self.solid[rows]
         if self.frozen is not None:
@@ -458,8 +420,8 @@ class State:
         """Zeroes the first moments of the vertices ``rows``, after their values were replaced."""
         self._download()
         self._trainer = None
-        self._positions.restart(rows, rows)
-        self._colors.restart(rows, rows)
+        self._positions.restart(rows)
+        self._colors.restart(rows)
 
     def _optimisers(self) -> dict[str, RowAdam]:
         found = {"positions": self._positions, "colors": self._colors}

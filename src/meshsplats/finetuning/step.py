@@ -1,16 +1,13 @@
-"""One optimisation step: render a view, compute the loss, descend the gradient. Pruning and relocation."""
+"""One optimisation step: render a view, compute the loss, descend the gradient. Pruning."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from meshsplats._arrays import subsample
 from meshsplats._core.kernels import compare_images
 from meshsplats.colors import encoding_slope, linear_to_srgb, srgb_to_linear
 from meshsplats.datasets.splat_targets import RenderedSplats
@@ -19,16 +16,11 @@ from meshsplats.errors import DivergenceError
 from meshsplats.finetuning.config import BACKGROUNDS, FinetuneConfig, learning_rates
 from meshsplats.finetuning.hybrid import SOLID, opaque_fraction, soft_fraction
 from meshsplats.finetuning.opaque import expected_error, expected_share, follows_edges, ramp_of
-from meshsplats.finetuning.ranks import ALONE, Part, Ranks
 from meshsplats.finetuning.state import GAIN, OFFSET, Gradients, State
-from meshsplats.rendering.backward import ExpectedError, OpacityRamp, visible_pixels
+from meshsplats.rendering.backward import ExpectedError, OpacityRamp
 from meshsplats.rendering.edges import edge_gradients
-from meshsplats.rendering.gpu_backward import AnyRendering, gpu_visible_pixels, taped_rendering
+from meshsplats.rendering.gpu_backward import AnyRendering, taped_rendering
 from meshsplats.webgpu.frames import DrawSettings
-from meshsplats.webgpu.gradients import WindowLimit
-
-IMPORTANCE_VIEWS = 64
-"""Maximum number of training views, evenly spread, that measure the visibility of splats."""
 
 TRAINING_MIN_TRANSMITTANCE = {"display": 1e-3, "linear": 1e-4}
 """Early termination: a pixel stops below this transmittance, and the background gets the rest. It saves a
@@ -58,20 +50,6 @@ def view_of_step(config: FinetuneConfig, step: int, views: int) -> int:
     """Index of the training view of step ``step``, of ``views``: a new permutation in each epoch."""
     epoch, position = divmod(step, views)
     return int(np.random.default_rng([config.seed, epoch, 0]).permutation(views)[position])
-
-
-def view_of_place(config: FinetuneConfig, number: int, place: int, views: int) -> int:
-    """Index of the training view at ``place`` of the batch with that ``number``, of ``views``.
-
-    A place goes through views of its own, every ``config.batch``-th of all, in a new permutation each time:
-    so a rank needs the images of its share of the views only.
-    """
-    if config.batch == 1:
-        return view_of_step(config, number, views)
-    own = len(range(place, views, config.batch))
-    epoch, position = divmod(number, own)
-    order = np.random.default_rng([config.seed, epoch, 0, place]).permutation(own)
-    return place + config.batch * int(order[position])
 
 
 def uses_point_targets(view: View, config: FinetuneConfig, fraction: float) -> bool:
@@ -221,82 +199,30 @@ class ViewGradients(NamedTuple):
     """Whether they include the motion of edges."""
 
 
-def make_step(
-    state: State,
-    views: Sequence[View],
-    step: int,
-    fraction: float,
-    *,
-    batch: int = 1,
-    ranks: Ranks = ALONE,
-) -> float | None:
-    """Takes step ``step`` (from 0), after ``fraction`` (0 to 1) of the run, with a ``batch`` of views, at
-    most that of the configuration; returns the mean of their losses.
+def make_step(state: State, views: Sequence[View], step: int, fraction: float) -> float | None:
+    """Takes step ``step`` (from 0), after ``fraction`` (0 to 1) of the run; returns the loss of its view.
 
-    Returns None if no pixel of the views counts; the state has not changed then. Raises DivergenceError,
-    before anything has changed, if a loss or a gradient is not finite.
+    Returns None if no pixel of the view counts; the state has not changed then. Raises DivergenceError,
+    before anything has changed, if the loss or a gradient is not finite.
     """
     config = state.config
-    hybrid, steps_before, edges = state.solid is not None, 0.0, False
-    number = step // config.batch
-    indices = [view_of_place(config, number, place, len(views)) for place in range(batch)]
-    if batch == config.batch == ranks.count == 1:
-        if state.trains_on_gpu(views[indices[0]].camera):
-            return _step_on_gpu(state, views[indices[0]], step, fraction)
-        found = view_gradients(state, views, indices[0], step, fraction)
-        if found is None:
-            return None
-        loss, gradients = found.loss, found.gradients
-        failed, edges = 0 if found.finite else 1, found.edges
-    else:
-        total = ranks.total(_part(state, views, indices, step, fraction, ranks.share(batch)))
-        state.limit.samples = total.window_samples
-        if not total.views and not total.failed:
-            return None
-        loss, failed = total.loss / max(total.views, 1), total.failed
-        gradients = Gradients(total.vertices, total.colors)
-    if failed or gradients is None:
-        culprit = "the loss" if gradients is None else "a gradient"
-        if batch > 1:
-            culprit = "the loss or a gradient"
-        raise _divergence(step, views[indices[failed - 1]], culprit)
-    if hybrid:
+    index = view_of_step(config, step, len(views))
+    if state.trains_on_gpu(views[index].camera):
+        return _step_on_gpu(state, views[index], step, fraction)
+    found = view_gradients(state, views, index, step, fraction)
+    if found is None:
+        return None
+    if found.gradients is None or not found.finite:
+        raise _divergence(step, views[index], "the loss" if found.gradients is None else "a gradient")
+    steps_before = 0.0
+    if state.solid is not None:
         steps_before = step * (1 - config.soft_phase) / fraction
         fraction = soft_fraction(config, fraction)
     else:
         fraction = opaque_fraction(config, fraction)
     color_rate, position_rate = learning_rates(config, step - steps_before, fraction)
-    if batch > 1:
-        color_rate, position_rate = color_rate * math.sqrt(batch), position_rate * math.sqrt(batch)
-    state.step(gradients, color_rate, position_rate, indices[0], edges=edges)
-    return loss
-
-
-def _part(
-    state: State, views: Sequence[View], indices: Sequence[int], step: int, fraction: float, share: range
-) -> Part:
-    """The sum over the places of a batch in ``share``."""
-    limit = state.limit.samples
-    total = Part(np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32), 0.0, 0, 0, limit)
-    for place in share:
-        state.limit.samples = limit  # whichever rank computes the view
-        found = view_gradients(state, views, indices[place], step + place, fraction)
-        total = total._replace(window_samples=min(total.window_samples, state.limit.samples))
-        if found is None:
-            continue
-        if found.gradients is None or not found.finite:
-            total = total._replace(failed=place + 1)
-            break
-        if total.views:
-            np.add(total.vertices, found.gradients.vertices, out=total.vertices)
-            np.add(total.colors, found.gradients.colors, out=total.colors)
-        else:
-            total = total._replace(vertices=found.gradients.vertices, colors=found.gradients.colors)
-        total = total._replace(loss=total.loss + found.loss, views=total.views + 1)
-    if total.views:
-        return total
-    count = len(state.vertices)
-    return total._replace(vertices=np.zeros((count, 3), np.float32), colors=np.zeros((count, 4), np.float32))
+    state.step(found.gradients, color_rate, position_rate, index, edges=found.edges)
+    return found.loss
 
 
 def view_gradients(
@@ -388,51 +314,8 @@ def exposure_gradient(image: np.ndarray, grad_image: np.ndarray) -> np.ndarray:
     return gradient
 
 
-def kept_faces(state: State, views: Sequence[View]) -> np.ndarray:
+def kept_faces(state: State) -> np.ndarray:
     """(f,) bool: the triangles that pruning keeps."""
-    config, mesh = state.config, state.result()
-    keep = (mesh.colors[mesh.faces, 3] >= config.prune_opacity).any(axis=1)
-    if config.prune_importance > 0:
-        sampled = subsample(views, IMPORTANCE_VIEWS)
-        pixels, in_view = importance(state, sampled)
-        pixels *= len(views) / len(sampled)  # extrapolated to all views
-        face_pixels, face_in_view = pixels[mesh.faces].sum(axis=1), in_view[mesh.faces].any(axis=1)
-        if len(mesh.faces):
-            splats = mesh.splats
-            # A corner shared by several triangles counts once for each, in all splats alike.
-            face_pixels = splats.sums(face_pixels)[splats.of_face]
-            face_in_view = np.logical_or.reduceat(face_in_view, splats.starts)[splats.of_face]
-        keep &= ~face_in_view | (face_pixels >= config.prune_importance)
+    mesh = state.result()
+    keep = (mesh.colors[mesh.faces, 3] >= state.config.prune_opacity).any(axis=1)
     return keep if keep.any() else np.ones(len(keep), bool)
-
-
-def relocate(state: State, views: Sequence[View]) -> int:
-    """Relocates splats that are almost invisible (see ``relocation``); returns their number."""
-    if not state.config.relocate_share or state.bound is not None:
-        return 0
-    positions = state.vertices
-    in_view = np.zeros(len(positions), bool)
-    for view in subsample(views, IMPORTANCE_VIEWS):
-        in_view |= view.camera.sees(positions)
-    return state.relocate(in_view)
-
-
-def importance(state: State, views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
-    """Visibility of each vertex in ``views``.
-
-    Returns:
-        (v,) float32: pixels that the vertex contributes to all views together; (v,) bool: whether it lies in
-        the frustum of any view.
-    """
-    triangles = state.triangles
-    pixels = np.zeros(len(triangles.vertices), np.float32)
-    in_view = np.zeros(len(pixels), bool)
-    if state.device == "cpu":
-        count = partial(visible_pixels, threads=state.threads)
-    else:
-        count = partial(gpu_visible_pixels, limit=WindowLimit())
-    for view in views:
-        samples = samples_of(view, state.config)
-        pixels += count(triangles, view.camera, mask=view.mask, samples=samples)
-        in_view |= view.camera.sees(triangles.vertices)
-    return pixels, in_view

@@ -138,16 +138,3 @@ def taped_rendering(
     if ramp is not None:
         raise ValueError("opacity ramps need device='cpu'")
     return GpuRendering(triangles, camera, limit=limit, **options)
-
-
-def gpu_visible_pixels(
-    triangles: Triangles, camera: Camera, *, mask: np.ndarray | None = None, **options: Any
-) -> np.ndarray:
-    """``backward.visible_pixels`` on the GPU; arguments are those of it and of ``GpuRendering``."""
-    rendering = GpuRendering(triangles, camera, **options)
-    # The derivative of a pixel's red with respect to the vertex's is the weight of the vertex.
-    red = np.zeros((*rendering.alpha.shape, 3), np.float32)
-    red[..., 0] = 1 if mask is None else mask
-    weights = np.zeros_like(triangles.colors)
-    rendering.backward(red, None, None, vertices=np.zeros_like(triangles.vertices), colors=weights)
-    return np.ascontiguousarray(weights[:, 0])

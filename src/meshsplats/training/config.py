@@ -74,15 +74,10 @@ _RANGES: list[Range] = [
 FIXED: dict[str, Any] = {
     "opacity": "blended",
     "prune_epochs": 0.0,
-    "relocate_share": 0.0,
-    "batch": 1,
-    **{
-        name: getattr(FinetuneConfig, name)
-        for name in ("prune_opacity", "prune_importance", "relocate_epochs", "point_share")
-    },
+    **{name: getattr(FinetuneConfig, name) for name in ("prune_opacity", "point_share")},
 }
-"""Options of fine-tuning that change its set of triangles, or share its steps, those that belong to them, and
-one for rendered images."""
+"""Options of fine-tuning that change its set of triangles, those that belong to them, and one for rendered
+images."""
 
 
 def train_config(**changes: Any) -> TrainConfig:

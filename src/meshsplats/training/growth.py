@@ -10,7 +10,6 @@ import numpy as np
 
 from meshsplats.camera import Camera
 from meshsplats.datasets.views import View
-from meshsplats.finetuning.relocation import HALF, split_in_halves
 from meshsplats.finetuning.state import GAIN, OFFSET, State
 from meshsplats.finetuning.step import TRAINING_MIN_TRANSMITTANCE, samples_of
 from meshsplats.mesh import SplatMesh
@@ -30,6 +29,12 @@ NEAR = 0.3
 """Depth of a near field, as a share of the depth where the scene begins."""
 SMALLEST = 0.7
 """Pixels that a fan must contribute to a view to be halved."""
+
+OVERLAP = 0.2
+"""The halves of a splat of length 2 along its longest axis reach from -OVERLAP to 1, and back."""
+
+HALF = (1 + OVERLAP) / 2
+"""Share of the splat's area that each half fills."""
 
 
 class Scores(NamedTuple):
@@ -211,3 +216,18 @@ def colors_at(fans: np.ndarray, colors: np.ndarray, points: np.ndarray) -> np.nd
     found = np.take_along_axis(colors[:, None], corners.reshape(len(fans), 1, -1, 1), axis=2)
     found = found.reshape(*corners.shape, colors.shape[2])
     return np.einsum("nmk,nmkc->nmc", weights, found).astype(np.float32)
+
+
+def split_in_halves(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of two halves, (n, k, 3) float32 each, of every splat with vertices ``positions``.
+
+    ``positions`` is (n, k, 3). The halves lie side by side along the splat's longest axis and overlap a
+    little.
+    """
+    exact = positions.astype(np.float64)
+    offset = exact - exact.mean(axis=1, keepdims=True)
+    axis = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 2]
+    along = np.einsum("nki,ni->nk", offset, axis)
+    narrower = exact - (1 - HALF) * along[..., None] * axis[:, None]
+    shift = (1 - HALF) * np.abs(along).max(axis=1)[:, None, None] * axis[:, None]
+    return (narrower + shift).astype(np.float32), (narrower - shift).astype(np.float32)

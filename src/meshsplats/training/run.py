@@ -82,7 +82,7 @@ def train(
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: fewer than two training views, several ranks, or masks that do not fit the cameras.
+        ValueError: fewer than two training views, or masks that do not fit the cameras.
         OtherRunError, MemoryError, DivergenceError, MissingDependencyError, DeviceError, Interrupted: as by
             ``finetune``. Interrupted leaves the mesh so far in the folder, too.
 
@@ -96,8 +96,6 @@ def train(
     config, run = with_train_changes(config or TrainConfig(), **changes), run or RunOptions()
     if len(dataset.train) < 2:
         raise ValueError(f"at least 2 training views are needed, the data set has {len(dataset.train)}")
-    if run.ranks.count > 1:
-        raise ValueError(f"train runs in one process, got {run.ranks.count} ranks; finetune shares views")
     if run.device == "gpu":
         open_device()
     check_training_memory(dataset, config, cache_bytes=run.cache_bytes)
