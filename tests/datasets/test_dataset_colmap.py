@@ -271,11 +271,6 @@ def test_names_that_are_not_text_and_names_twice_are_refused(tmp_path):
         ("images", "1 1 0 0 0 0 0 0 1\n\n", "line 1: an image is"),
         ("images", "# x\n1 1 0 0 0 0 0 y 1 a.png\n\n", "line 2: expected numbers"),
         ("images", "\n", "names no images"),
-        (
-            "images",
-            "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b 7.png\n",
-            "line 2: an image, where the points of the one before it are expected",
-        ),
     ],
 )
 def test_broken_text_is_refused(tmp_path, name, text, message):
@@ -298,12 +293,13 @@ def test_an_endless_line_of_points_is_skipped_without_memory(tmp_path):
     tracemalloc.stop()
 
 
-def test_missing_images_are_counted_and_left_out(tmp_path):
+def test_missing_images_are_counted_and_left_out_on_demand(tmp_path):
     folder = simple_colmap(tmp_path, 5)
     (folder / "images/p01.png").unlink()
     (folder / "images/p03.png").unlink()
+    refused(folder, r"2 of 5 images are missing \(images/p01\.png, images/p03\.png\).*--missing skip")
     with pytest.warns(DataWarning, match=r"2 images are missing.*images/p01\.png, images/p03\.png"):
-        dataset = load_dataset(folder, test_every=2)
+        dataset = load_dataset(folder, test_every=2, missing="skip")
     # Held out is every second of those that are there.
     assert [view.name for view in dataset.test] == ["p00.png", "p04.png"]
 
@@ -341,12 +337,19 @@ def test_a_model_beside_its_images_is_no_numbered_one(tmp_path):
     assert (len(dataset.train), len(dataset.test)) == (2, 1)
 
 
-def test_a_larger_second_model_is_told(tmp_path):
-    folder = simple_colmap(tmp_path, 2)
-    write_colmap(
-        folder, *GOOD[:1], [(f"{i}.png", (1, 0, 0, 0), (0, 0, 0), 1) for i in range(9)], place="sparse/1"
-    )
-    with pytest.warns(DataWarning, match="model 1 is larger than model 0"):
+def test_of_several_models_the_one_with_the_most_images_is_taken(tmp_path):
+    folder = simple_colmap(tmp_path, 5, place="sparse/3")
+    few = [(f"p{i:02d}.png", (1, 0, 0, 0), (0, 0, 0), 1) for i in range(2)]
+    write_colmap(folder, [(1, "PINHOLE", 12, 8, (1.0, 1, 2, 2))], few, place="sparse/0")
+    with pytest.warns(DataWarning, match=r"sparse.3: this model is taken.*sparse.0 \(2\)"):
+        assert len(load_dataset(folder).views) == 5
+    assert len(load_dataset(folder / "sparse/0").views) == 2  # by name
+    # One whose images are elsewhere does not count, and the first needs no word.
+    many = [(f"{i}.png", (1, 0, 0, 0), (0, 0, 0), 1) for i in range(9)]
+    write_colmap(folder, GOOD[0], many, place="sparse/2")
+    (folder / "sparse/3").rename(folder / "elsewhere")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         assert len(load_dataset(folder).views) == 2
 
 
@@ -355,13 +358,9 @@ def test_a_larger_second_model_is_told(tmp_path):
     [
         (lambda f: None, "it holds nothing"),
         (lambda f: (f / "sparse").mkdir(), "sparse/ holds no cameras"),
-        (
-            lambda f: [simple_colmap(f, place=f"sparse/{k}") for k in (1, 2)],
-            "holds the models 1, 2 but none named 0: rename",
-        ),
         (lambda f: (f / "database.db").touch(), "without a sparse model"),
         (lambda f: (f / "point_cloud").mkdir(), "a trained model"),
-        (lambda f: (f / "cameras.bin").touch(), "a sparse model by itself"),
+        (lambda f: (f / "cameras.bin").touch(), r"cameras\.bin is there, half of COLMAP's model"),
         (lambda f: simple_colmap(f / "inner"), "inner/ in it looks like one"),
         (lambda f: (f / "notes.md").touch(), r"it holds notes\.md"),
     ],

@@ -102,9 +102,11 @@ class ViewOptions:
     """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model folder that has
     one."""
     data: Folder = None
-    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio): the cameras of its test views."""
+    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): the cameras of its test views."""
     downscale: int = 1
     """With --data: factor by which images are smaller than the photographs."""
+    missing: Literal["error", "skip"] = "error"
+    """With --data: images that are missing are an error, or their views are left out."""
     elevation: Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0
@@ -137,7 +139,7 @@ class ViewOptions:
             return None
         from meshsplats.datasets.folder import load_dataset
 
-        return load_dataset(self.data, downscale=self.downscale)
+        return load_dataset(self.data, downscale=self.downscale, missing=self.missing)
 
     def make(
         self,
@@ -192,6 +194,8 @@ class ViewOptions:
                 if self.data is None
                 else "give --downscale or --width"
             )
+        if self.missing != "error" and self.data is None:
+            raise UsageError("--missing has no effect without --data")
         modes = [
             name
             for name in ("orbit", "dome", "look_around", "cameras", "data")

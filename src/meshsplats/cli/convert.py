@@ -125,6 +125,8 @@ class Convert(Command):
     folder that has one. Default: those of the input if it is a model folder, else none."""
     data: Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
+    missing: Literal["error", "skip"] = "error"
+    """With --data: images that are missing are an error, or their views are left out."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else -y."""
     lit: bool = False
@@ -231,6 +233,8 @@ class Convert(Command):
             checked_cutoff(self.cutoff)
         if self.data is not None and self.cameras is not None:
             raise UsageError("give --cameras or --data, not both")
+        if self.missing != "error" and self.data is None:
+            raise UsageError("--missing has no effect without --data")
         if self.up is not None:
             parse_up(self.up)
         self._resolved(sources(self.input))  # checks the values before the work
@@ -260,7 +264,7 @@ class Convert(Command):
     def _cameras(self) -> list[Camera] | None:
         """The cameras of the options; None: each input may have its own."""
         if self.data is not None:
-            dataset = load_dataset(self.data)
+            dataset = load_dataset(self.data, missing=self.missing)
             return [view.camera for view in dataset.train or dataset.views]
         return None if self.cameras is None else load_cameras(self.cameras)
 
@@ -602,6 +606,7 @@ class Convert(Command):
         words += ["--look", self._look] if self._look != "area" else []
         if self.data is not None:
             words += ["--data", self.data]
+            words += ["--missing", self.missing] if self.missing != "error" else []
         elif cameras:
             words += ["--cameras", source if self.cameras is None else self.cameras]
         return command_line([*words, *self.reading.again(), "-o", f"{folder}-compare"])
@@ -611,6 +616,7 @@ class Convert(Command):
         words: list[str | Path] = ["meshsplats", "finetune", shown_path(self.input[0])]
         if self.data is not None:
             words += ["--data", self.data]
+            words += ["--missing", self.missing] if self.missing != "error" else []
         words += [*self.reading.again(), "-o", self.output.with_suffix(".solid.glb")]
         command = command_line([*words, "--opacity", "cutoff", "--soft-share", "0.05"])
         return f"{command} ({ENGINE_GAIN})"

@@ -116,6 +116,8 @@ class Evaluate(Command):
     """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
     """Every n-th view is held out, if the data set has no split."""
+    missing: Literal["error", "skip"] = "error"
+    """With --data: images that are missing are an error, or their views are left out."""
     protocol: Annotated[
         Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None,
         tyro.conf.arg(metavar="{" + ",".join(BENCHMARKS) + "}", help_behavior_hint=""),
@@ -179,6 +181,8 @@ class Evaluate(Command):
             for name in ("before", "splats", "images", "cameras", "sh_degree"):
                 if getattr(self, name) is not None:
                     raise UsageError(f"{flag(name)} has no effect with --protocol")
+            if self.missing != "error":
+                raise UsageError("--missing has no effect with --protocol, which needs every image")
             return
         if self.cluster.cluster is not None:
             raise UsageError("--cluster is for the scenes of --protocol")
@@ -194,6 +198,8 @@ class Evaluate(Command):
                 raise UsageError(f"{flag(name)} has no effect with --data")
         if self.data is None and self.downscale is not None:
             raise UsageError("--downscale has no effect without --data")
+        if self.data is None and self.missing != "error":
+            raise UsageError("--missing has no effect without --data")
 
     def _check_outputs(self, folder: Path) -> None:
         names = (RESULTS, PER_VIEW, REPORT, TABLE, CONFIGURATION)
@@ -209,7 +215,12 @@ class Evaluate(Command):
 
     def _dataset(self, splats: GaussianCloud | None) -> Dataset:
         if self.data is not None:
-            return load_dataset(self.data, downscale=self.downscale or 1, test_every=self.test_every)
+            return load_dataset(
+                self.data,
+                downscale=self.downscale or 1,
+                test_every=self.test_every,
+                missing=self.missing,
+            )
         background = WHITE if self.background is None else parse_color(self.background)
         assert splats is not None
         assert self.splats is not None

@@ -404,6 +404,7 @@ class Finetune(TrainingCommand):
             words += ["--data", target.data]
             words += ["--downscale", target.downscale] if target.downscale != 1 else []
             words += ["--test-every", target.test_every] if target.test_every != 8 else []
+            words += ["--missing", target.missing] if target.missing != "error" else []
         else:
             words += ["--splats", self.input, "--cameras", files.held_out, *self.reading.again()]
             words += ["--look", dataset.look] if dataset.look != "area" else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +20,9 @@ from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import SplatOptions, cameras_beside
 from meshsplats.cli.messages import shown_path
 from meshsplats.datasets.colmap import count_points
-from meshsplats.datasets.folder import Layout, find_layout, load_dataset
+from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.image_files import PhotoFile
+from meshsplats.datasets.layouts import Layout, find_layout
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gaussians import splat_file, splat_format
 from meshsplats.formats.sniff import identify
@@ -92,8 +94,10 @@ def _layout(path: Path) -> Layout | None:
 
 
 def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
-    dataset = load_dataset(path)
-    own = not dataset.test or bool(load_dataset(path, test_every=0).test)
+    dataset = load_dataset(path, missing="skip")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # those of the first time
+        own = not dataset.test or bool(load_dataset(path, test_every=0, missing="skip").test)
     sources = [view.source for view in dataset.views]
     photos = [source for source in sources if isinstance(source, PhotoFile)]
     lenses = sorted({photo.lens.model for photo in photos})

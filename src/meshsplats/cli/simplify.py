@@ -6,6 +6,7 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -56,6 +57,8 @@ class Simplify(Command):
     model folder, else images of 1000 pixels that hold the subject."""
     data: Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
+    missing: Literal["error", "skip"] = "error"
+    """With --data: images that are missing are an error, or their views are left out."""
     no_preview: bool = False
     """Write no preview."""
     reading: SplatOptions = field(default_factory=SplatOptions)
@@ -116,10 +119,12 @@ class Simplify(Command):
             raise UsageError(f"--share must be above 0 and at most 1, got {self.share}")
         if self.cameras is not None and self.data is not None:
             raise UsageError("give --cameras or --data, not both")
+        if self.missing != "error" and self.data is None:
+            raise UsageError("--missing has no effect without --data")
 
     def _cameras(self) -> list[Camera] | None:
         if self.data is not None:
-            dataset = load_dataset(self.data)
+            dataset = load_dataset(self.data, missing=self.missing)
             return [view.camera for view in dataset.train or dataset.views]
         if self.cameras is not None:
             return load_cameras(self.cameras)

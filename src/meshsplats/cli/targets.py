@@ -28,11 +28,13 @@ class TargetOptions:
     """Targets: photographs (--data), else images of the splats."""
 
     data: Folder = None
-    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio)."""
+    """Data set of photographs (COLMAP, NeRF, nerfstudio, LLFF)."""
     downscale: int = 1
     """With --data: factor by which images are smaller than the photographs."""
     test_every: int = 8
     """With --data: every n-th view is held out, if the data set has no split; 0: none."""
+    missing: Literal["error", "skip"] = "error"
+    """With --data: images that are missing are an error, or their views are left out."""
     views: Count = None
     """Without --data: number of training images. Default: one per second, or per two --steps, from 200 to
     1000."""
@@ -65,7 +67,8 @@ class TargetOptions:
     def check(self) -> None:
         """UsageError for options without effect."""
         idle = ("views", "held_out", "width", "distance", "placement", "cameras", "up", "look", "sh_degree")
-        names, source = (idle, "--data") if self.data is not None else (("downscale", "test_every"), "splats")
+        of_data = ("downscale", "test_every", "missing")
+        names, source = (idle, "--data") if self.data is not None else (of_data, "splats")
         for name in names:
             if self._is_set(name):
                 raise UsageError(f"{flag(name)} has no effect with {source}")
@@ -106,6 +109,7 @@ class TargetOptions:
                 test_every=self.test_every,
                 background=background,
                 cache_bytes=self.cache_bytes,
+                missing=self.missing,
             )
             if not dataset.train:
                 raise ValueError(

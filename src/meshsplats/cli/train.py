@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -49,6 +49,10 @@ class PhotographOptions:
     """Factor by which images are smaller than the photographs."""
     test_every: int = 8
     """Every n-th view is held out for scores, if the data set has no split; 0: none."""
+    missing: Literal["error", "skip"] = "error"
+    """Photographs that are missing are an error, or their cameras are left out."""
+    estimate_cameras: bool = False
+    """Find the cameras of the photographs though the folder holds some of a kind that is not read."""
     cache: float = 2.0
     """Gigabytes of images kept in memory; others are read again when they are needed."""
 
@@ -64,7 +68,7 @@ class PhotographOptions:
 
 @dataclass(frozen=True)
 class Train(TrainingCommand):
-    """Makes a mesh from photographs with cameras: COLMAP, NeRF-synthetic or nerfstudio folders.
+    """Makes a mesh from photographs with cameras: COLMAP, NeRF-synthetic, nerfstudio or LLFF folders.
 
     Without cameras, they are found first (extra photos) and saved beside the photographs. Beside the result
     NAME: its configuration, a preview, and a folder NAME.run with metrics, previews and a checkpoint, from
@@ -105,10 +109,16 @@ class Train(TrainingCommand):
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
         from meshsplats.datasets.points import load_points
-        from meshsplats.training.reconstruction import bare_photographs, find_cameras
+        from meshsplats.training.reconstruction import (
+            bare_photographs,
+            find_cameras,
+            refuse_unread_cameras,
+        )
 
         assert isinstance(config, TrainConfig)
         if bare_photographs(self.input):
+            if not self.target.estimate_cameras:
+                refuse_unread_cameras(self.input)
             find_cameras(self.input, say)
         dataset, background = self._dataset(config)
         points = load_points(self.input)
@@ -150,6 +160,7 @@ class Train(TrainingCommand):
         words = ["meshsplats", "evaluate", self.output, "--data", self.input]
         words += ["--downscale", target.downscale] if target.downscale != 1 else []
         words += ["--test-every", target.test_every] if target.test_every != 8 else []
+        words += ["--missing", target.missing] if target.missing != "error" else []
         if plan.background is not None:
             words += ["--background", plan.background.name]
         words += ["--samples", samples_of(plan.dataset.train[0], config), "-o", f"{folder}-evaluation"]
@@ -159,6 +170,7 @@ class Train(TrainingCommand):
         from meshsplats.datasets.folder import load_dataset
 
         options: dict[str, Any] = {"downscale": self.target.downscale, "test_every": self.target.test_every}
+        options["missing"] = self.target.missing
         dataset = load_dataset(self.input, cache_bytes=self.target.cache_bytes, **options)
         if len(dataset.train) < 2:
             raise ValueError(

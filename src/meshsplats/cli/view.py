@@ -7,7 +7,7 @@ import os
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -117,7 +117,9 @@ class View(Command):
     """Viewpoints to choose from: a JSON list of cameras, a cameras.json of a 3DGS trainer, or the model
     folder that has one. Default: those of the input, if it is a model folder."""
     data: Folder = None
-    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio): viewpoints to choose from."""
+    """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): viewpoints to choose from."""
+    missing: Literal["error", "skip"] = "error"
+    """With --data: images that are missing are an error, or their views are left out."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else of the
     mesh."""
@@ -161,6 +163,8 @@ class View(Command):
             raise UsageError("--no-open has no effect with -o, which opens nothing")
         if self.output is None and self.force:
             raise UsageError("--force has no effect without -o")
+        if self.missing != "error" and self.data is None:
+            raise UsageError("--missing has no effect without --data")
         for first, second in self.EXCLUSIVE:
             if getattr(self, first) and getattr(self, second):
                 raise UsageError(f"give --{first} or --{second.replace('_', '-')}, not both")
@@ -208,7 +212,7 @@ class View(Command):
             return None
         from meshsplats.datasets.folder import load_dataset
 
-        return load_dataset(self.data)
+        return load_dataset(self.data, missing=self.missing)
 
     def _cameras(self, photographs: Dataset | None) -> list[Camera]:
         if photographs is not None:

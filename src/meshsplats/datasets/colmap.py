@@ -24,7 +24,14 @@ from meshsplats.errors import FileFormatError
 
 MAX_FRAMES = 200_000
 """More cameras or images than this are refused."""
+MODEL_FILES = tuple(
+    name + suffix for name in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")
+)
 _MODEL_NAMES = list(MODELS)
+_BOM = b"\xef\xbb\xbf"
+"""Begins text files of some programs for Windows."""
+_LONGEST_IMAGE_LINE = 4 * MAX_NAME + 400
+"""Bytes that suffice for the line of an image."""
 _CAMERA = struct.Struct("<IiQQ")
 _IMAGE = struct.Struct("<I7dI")
 _POINT_BYTES = 24
@@ -42,11 +49,12 @@ def find_model(folder: Path, places: tuple[str, ...]) -> Path | None:
 
 
 def read_model(model: Path, images: str) -> list[Frame]:
-    """The images of a sparse model, sorted by name; their files lie in the folder ``images``.
+    """The images of a sparse model, sorted by name; their files lie in the folder ``images``; if it is empty,
+    in that of the data set itself.
 
     Raises FileFormatError, which names file and record, for what is broken.
     """
-    if (model / "cameras.bin").is_file() and (model / "images.bin").is_file():
+    if _is_binary(model):
         lenses = _binary_cameras(model / "cameras.bin")
         frames = _binary_images(model / "images.bin", lenses, images)
     else:
@@ -57,6 +65,18 @@ def read_model(model: Path, images: str) -> list[Frame]:
         if before.name == after.name:
             raise FileFormatError(f"{model}: two images have the name {after.name[:200]!r}")
     return frames
+
+
+def image_names(model: Path) -> list[str]:
+    """The names of the images of a sparse model, in the order of the file. Raises FileFormatError for what is
+    broken."""
+    if _is_binary(model):
+        return [name for _, name, *_ in _binary_records(model / "images.bin")]
+    return [name for _, name, *_ in _text_records(model / "images.txt")]
+
+
+def _is_binary(model: Path) -> bool:
+    return (model / "cameras.bin").is_file() and (model / "images.bin").is_file()
 
 
 def count_points(model: Path) -> int | None:
@@ -146,7 +166,14 @@ def _binary_cameras(path: Path) -> dict[int, Lens]:
 
 
 def _binary_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame]:
-    frames = []
+    return [
+        _frame(name, pose, camera, lenses, images, f"{path}: {what} ({name[:60]!r})")
+        for what, name, pose, camera in _binary_records(path)
+    ]
+
+
+def _binary_records(path: Path) -> Iterator[tuple[str, str, list[float], int]]:
+    """Of each image: what to call it in messages, its name, its pose and the number of its camera."""
     with _mapped(path) as data:
         for i in range(data.count(_IMAGE.size + 9, "images")):
             what = f"image {i}"
@@ -154,8 +181,7 @@ def _binary_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Fra
             name = data.text(f"the name of {what}")
             (points,) = data.unpack(struct.Struct("<Q"), what)
             data.skip(points * _POINT_BYTES, f"the points of {what}")
-            frames.append(_frame(name, pose, camera, lenses, images, f"{path}: {what} ({name[:60]!r})"))
-    return frames
+            yield what, name, pose, camera
 
 
 # ---- Text
@@ -163,6 +189,8 @@ def _binary_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Fra
 
 def _lines(file: IO[bytes]) -> Iterator[bytes]:
     """Lines of up to 64 KiB; what a line has beyond that, thousands of points, is dropped."""
+    if file.read(len(_BOM)) != _BOM:
+        file.seek(0)
     while line := file.readline(1 << 16):
         rest = line
         while not rest.endswith(b"\n") and (rest := file.readline(1 << 16)):
@@ -189,11 +217,23 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 
 
 def _text_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame]:
-    frames: list[Frame] = []
+    return [
+        _frame(name, pose, camera, lenses, images, where) for where, name, pose, camera in _text_records(path)
+    ]
+
+
+def _text_records(path: Path) -> Iterator[tuple[str, str, list[float], int]]:
+    """Of each image: how messages about it begin, its name, its pose and the number of its camera.
+
+    The line of an image is followed by one of its points, which may be blank. Some programs leave it out.
+    """
+    count, points_due = 0, False
     with open(path, "rb") as file:
-        lines = enumerate(_lines(file), 1)
-        for row, line in lines:
-            if not line or line.startswith(b"#"):
+        for row, line in enumerate(_lines(file), 1):
+            if line.startswith(b"#"):
+                continue
+            if not line or (points_due and not _is_image_line(line)):
+                points_due = False
                 continue
             where = f"{path}: line {row}"
             words = line.split(None, 9)
@@ -202,27 +242,29 @@ def _text_images(path: Path, lenses: dict[int, Lens], images: str) -> list[Frame
                     f"{where}: an image is 'ID QW QX QY QZ TX TY TZ CAMERA NAME', then a line of points"
                 )
             name = _decoded(words[9], path, f"line {row}")
-            pose = list(_floats(words[1:8], where))
-            frames.append(_frame(name, pose, _whole(words[8], where), lenses, images, where))
-            if len(frames) > MAX_FRAMES:
+            count, points_due = count + 1, True
+            if count > MAX_FRAMES:
                 raise FileFormatError(f"{path}: more than {MAX_FRAMES:,} images")
-            points = next(lines, None)  # on a line that may be empty
-            if points is not None and _looks_like_an_image_line(points[1]):
-                raise FileFormatError(
-                    f"{path}: line {points[0]}: an image, where the points of the one before it are"
-                    " expected; a line for them must be there, if empty"
-                )
-    return frames
+            yield where, name, list(_floats(words[1:8], where)), _whole(words[8], where)
 
 
-def _looks_like_an_image_line(line: bytes) -> bool:
-    """Points are numbers throughout; an image's line ends in a name."""
-    words = line.split(None, 9)
+def _is_image_line(line: bytes) -> bool:
+    """Whether a line is that of an image, where points may be expected. Points are numbers, three for each;
+    an image has ten words, the last of them a name, which may be a number or contain blanks."""
+    if len(line) > _LONGEST_IMAGE_LINE:
+        return False
+    words = line.split()
+    if len(words) < 10 or not (words[0].isdigit() and words[8].isdigit()):
+        return False
+    return len(words) == 10 or not all(map(_is_number, words[9:]))
+
+
+def _is_number(word: bytes) -> bool:
     try:
-        float(words[9].split()[0] if len(words) == 10 else 0)
+        float(word)
     except ValueError:
-        return True
-    return False
+        return False
+    return True
 
 
 def _decoded(raw: bytes, path: Path, what: str) -> str:
@@ -272,4 +314,4 @@ def _frame(
     matrix = np.eye(4)
     matrix[:3, :3] = list(rotation_rows(w, x, y, z))
     matrix[:3, 3] = pose[4:7]
-    return Frame(name, f"{images}/{name}", lenses[camera], matrix)
+    return Frame(name, f"{images}/{name}" if images else name, lenses[camera], matrix)

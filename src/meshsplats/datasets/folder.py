@@ -7,13 +7,15 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import get_args
 
 import numpy as np
 
 from meshsplats._kinds import need_path
-from meshsplats.datasets.colmap import find_model, read_model
-from meshsplats.datasets.image_files import Album, Frame, Taken, split
+from meshsplats.datasets.colmap import read_model
+from meshsplats.datasets.image_files import Album, Frame, Missing, Taken, split
+from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
+from meshsplats.datasets.llff import read_poses_bounds
 from meshsplats.datasets.transforms import read_transforms
 from meshsplats.datasets.views import CACHE_BYTES, WHITE, Dataset, ImageCache, View
 from meshsplats.errors import DataWarning, FileFormatError
@@ -22,7 +24,7 @@ Views = tuple[list[View], list[View]]
 MAX_LIST_BYTES = 16 << 20
 
 
-def read_folder(path: Path, downscale: int, test_every: int, store: ImageCache) -> Views:
+def read_folder(path: Path, downscale: int, test_every: int, store: ImageCache, missing: Missing) -> Views:
     """Training and test views of the data set at ``path``; see ``load_dataset``."""
     if not path.exists():
         raise FileNotFoundError(errno.ENOENT, "no such data set", str(path))
@@ -30,67 +32,42 @@ def read_folder(path: Path, downscale: int, test_every: int, store: ImageCache) 
     if layout is None:
         if path.is_file():
             raise FileFormatError(f"{path}: a data set is a folder, or its transforms.json")
-        raise FileFormatError(f"{path}: {_what_is_there(path)}")
-    album = Album(path.parent if path.is_file() else path, downscale, store)
+        raise FileFormatError(f"{path}: {what_is_there(path)}")
+    album = Album(layout.root, downscale, store, missing, layout.images)
     if layout.name == "COLMAP":
-        return _colmap(layout.source, album, test_every)
+        return _colmap(layout, album, test_every)
+    if layout.name == "LLFF":
+        frames = read_poses_bounds(layout.source, layout.images)
+        return _views(*split(_taken(frames, layout.source, album), test_every))
     if layout.name == "NeRF-synthetic":
         return _nerf_synthetic(layout.source.parent, album)
     return _nerfstudio(layout.source, album, test_every)
 
 
-class Layout(NamedTuple):
-    """How a data set is laid out."""
-
-    name: Literal["COLMAP", "NeRF-synthetic", "nerfstudio"]
-    source: Path
-    """The sparse model's folder, or the file of the (training) frames."""
-
-
-def find_layout(path: Path) -> Layout | None:
-    """That of the folder or .json file ``path``, which is there; None for any other."""
-    if path.is_file():
-        if path.suffix.lower() != ".json":
-            return None
-        return Layout("NeRF-synthetic" if path.name == "transforms_train.json" else "nerfstudio", path)
-    if (path / "transforms_train.json").is_file():
-        return Layout("NeRF-synthetic", path / "transforms_train.json")
-    model = find_model(path, ("sparse/0", "sparse"))
-    if model is None and (path / "transforms.json").is_file():
-        return Layout("nerfstudio", path / "transforms.json")
-    model = model or find_model(path, ("colmap/sparse/0", "colmap/sparse")) or _other_model(path)
-    return None if model is None else Layout("COLMAP", model)
-
-
-def _other_model(path: Path) -> Path | None:
-    """The only numbered model in sparse/, or one beside the folder of its images."""
-    if (path / "sparse").is_dir():
-        numbers = [name for name in os.listdir(path / "sparse") if name.isdecimal()]
-        found = [model for name in numbers if (model := find_model(path / "sparse", (name,)))]
-        if len(found) > 1:
-            raise FileFormatError(
-                f"{path}: sparse/ holds the models {', '.join(sorted(m.name for m in found))} but none named"
-                " 0: rename the one to use"
-            )
-        if found:
-            return found[0]
-    return find_model(path, (".",)) if (path / "images").is_dir() else None
-
-
-def _colmap(model: Path, album: Album, test_every: int) -> Views:
+def _colmap(layout: Layout, album: Album, test_every: int) -> Views:
+    model = layout.source
+    if layout.before:
+        warnings.warn(
+            f"{model}: this model is taken, as it has the most images; others are {', '.join(layout.before)}."
+            " Give the folder of a model to take that one",
+            DataWarning,
+            stacklevel=2,
+        )
     # Cameras of the model have the size of the files in images/; without it, these may lie beside sparse/.
-    frames = read_model(model, "images")
-    numbered = model.parent.name == "sparse"
-    if numbered:
-        _warn_of_larger_model(model)
-    taken = album.views(frames, str(model))
-    album.report(str(model), len(taken))
-    chosen = _listed_test(model / "test.txt") if numbered or model.name == "sparse" else None
+    taken = _taken(read_model(model, layout.images), model, album)
+    listed = model.parent.name == "sparse" or model.name == "sparse"
+    chosen = _listed_test(model / "test.txt") if listed else None
     if chosen is None:
         return _views(*split(taken, test_every))
     stems = {name.rsplit(".", 1)[0] for name in chosen}
     test = [views for views in taken if _stem(views) in stems]
     return _views([views for views in taken if _stem(views) not in stems], test)
+
+
+def _taken(frames: list[Frame], where: Path, album: Album, *, needed: bool = True) -> list[Taken]:
+    taken = album.views(frames, str(where))
+    album.report(str(where), len(taken), needed=needed)
+    return taken
 
 
 def _stem(views: Taken) -> str:
@@ -104,36 +81,16 @@ def _listed_test(path: Path) -> set[str] | None:
     with open(path, "rb") as file:
         text = file.read(MAX_LIST_BYTES)
     try:
-        return {line.strip() for line in text.decode("utf-8").splitlines() if line.strip()}
+        return {line.strip() for line in text.decode("utf-8-sig").splitlines() if line.strip()}
     except UnicodeDecodeError:
         raise FileFormatError(f"{path}: not UTF-8 text") from None
 
 
-def _warn_of_larger_model(model: Path) -> None:
-    """COLMAP cuts what it cannot connect into several models, and the first need not be the largest."""
-    if model.name != "0":
-        return
-    sizes = {
-        other.name: file.stat().st_size
-        for other in sorted(model.parent.iterdir())
-        for file in (other / "images.bin", other / "images.txt")
-        if file.is_file()
-    }
-    largest = max(sizes, key=lambda name: sizes[name])
-    if sizes[largest] > 2 * sizes["0"]:
-        warnings.warn(
-            f"{model.parent}: model {largest} is larger than model 0, which is used; rename {largest} to 0"
-            " to use it instead",
-            DataWarning,
-            stacklevel=2,
-        )
-
-
 def _nerf_synthetic(folder: Path, album: Album) -> Views:
-    train = _taken(folder / "transforms_train.json", album)
+    train = _numbered(folder / "transforms_train.json", album)
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
-            return _views(train, _taken(folder / name, album))
+            return _views(train, _numbered(folder / name, album, needed=False))
     warnings.warn(
         f"{folder}: neither transforms_test.json nor transforms_val.json: there are no test views",
         DataWarning,
@@ -142,13 +99,8 @@ def _nerf_synthetic(folder: Path, album: Album) -> Views:
     return _views(train, [])
 
 
-def _taken(path: Path, album: Album) -> list[Taken]:
-    frames = sorted(read_transforms(path).frames, key=_by_number)
-    album.missing.clear()
-    album.no_mask.clear()
-    taken = album.views(frames, str(path))
-    album.report(str(path), len(taken))
-    return taken
+def _numbered(path: Path, album: Album, *, needed: bool = True) -> list[Taken]:
+    return _taken(sorted(read_transforms(path).frames, key=_by_number), path, album, needed=needed)
 
 
 def _by_number(frame: Frame) -> tuple[str, int, str]:
@@ -162,8 +114,7 @@ def _by_number(frame: Frame) -> tuple[str, int, str]:
 def _nerfstudio(path: Path, album: Album, test_every: int) -> Views:
     content = read_transforms(path)
     frames = sorted(content.frames, key=lambda frame: frame.name)
-    taken = album.views(frames, str(path))
-    album.report(str(path), len(taken))
+    taken = _taken(frames, path, album)
     held = {key: {name.removeprefix("./") for name in names} for key, names in content.splits.items()}
     out = held.get("test") or held.get("val")
     if not held.get("train") or not out:
@@ -183,34 +134,6 @@ def _views(train: list[Taken], test: list[Taken]) -> Views:
     return next(flat), next(flat)
 
 
-def _what_is_there(path: Path) -> str:
-    """Why this is no data set, for people: what is close to one."""
-    names = sorted(os.listdir(path))[:10_000]
-    wanted = (
-        "no data set of a known layout: expected transforms_train.json, transforms.json, or images/ beside"
-        " sparse/0/ with cameras and images, .bin or .txt"
-    )
-    inner = [name for name in names if _looks_like_one(path / name)]
-    if (path / "cameras.bin").is_file() or (path / "cameras.txt").is_file():
-        return "a sparse model by itself; give the folder above it that holds images/ too"
-    if "sparse" in names:
-        return "sparse/ holds no cameras and images, .bin or .txt: was the reconstruction finished?"
-    if "database.db" in names:
-        return "COLMAP's data base without a sparse model: run its mapper first"
-    if inner:
-        return f"{wanted}. {inner[0]}/ in it looks like one"
-    if any(name.startswith("point_cloud") for name in names):
-        return "a trained model, not the photographs it was trained on"
-    return f"{wanted}; it holds {', '.join(names[:6]) or 'nothing'}"
-
-
-def _looks_like_one(path: Path) -> bool:
-    named = ("transforms_train.json", "transforms.json")
-    return (
-        any((path / name).is_file() for name in named) or find_model(path, ("sparse/0", "sparse")) is not None
-    )
-
-
 def load_dataset(
     path: str | os.PathLike[str],
     *,
@@ -218,6 +141,7 @@ def load_dataset(
     test_every: int = 8,
     background: Sequence[float] = WHITE,
     cache_bytes: int = CACHE_BYTES,
+    missing: Missing = "error",
 ) -> Dataset:
     """The photographs and cameras in a folder.
 
@@ -226,10 +150,11 @@ def load_dataset(
     - NeRF-synthetic: ``transforms_train.json``, with ``transforms_test.json`` (else ``transforms_val.json``)
       as the test views;
     - COLMAP, as INRIA's 3DGS and Mip-NeRF 360 use it: ``images/`` and ``sparse/0/`` or ``sparse/``, binary or
-      text, any camera model;
+      text, any camera model. Of several models the one with the most images;
     - nerfstudio: ``transforms.json``, also named itself as ``path``;
-    - COLMAP with ``colmap/sparse/0/`` or ``colmap/sparse/``, with the only model in ``sparse/``, or with the
-      model beside ``images/``.
+    - COLMAP in other places: ``colmap/sparse/0/``, ``dense/0/`` or ``dense/``, which undistortion writes, the
+      model beside the images, as RealityCapture exports it, or the folder of a model itself;
+    - LLFF: ``poses_bounds.npy``.
 
     ``masks/``, or the masks that a file names, say which pixels count. Photographs of lenses that are not
     pinholes are undistorted when they are read; pixels that the lens did not see are black and masked. Only
@@ -245,15 +170,18 @@ def load_dataset(
             another.
         cache_bytes: images are kept up to this many bytes after their first use; the others are read anew
             each time.
+        missing: what images that are missing mean: an ``'error'``, or that their views are left out
+            (``'skip'``), with a DataWarning.
 
     Raises:
-        FileFormatError: a folder of no known layout, a broken file in it, an image whose shape does not fit
-            its camera, a path that leaves the folder, or a folder without any image.
+        FileFormatError: a folder of no known layout, a broken file in it, a missing image, one whose shape
+            does not fit its camera, or a path that leaves the folder.
         FileNotFoundError: nothing at ``path``.
         ValueError: an option out of its range.
 
-    Warns with a DataWarning if images or masks are missing: views without an image are left out, all pixels
-    of those without a mask count.
+    Warns with a DataWarning where masks are missing, which leaves all pixels of those views to count, and
+    where an image has another suffix than the file gives it, or is written in letters of another case: it is
+    taken if no other can be meant.
     """
     need_path(path=path)
     for option, value, least, most in (("downscale", downscale, 1, 64), ("test_every", test_every, 0, 10**9)):
@@ -262,8 +190,10 @@ def load_dataset(
     color = np.asarray(background, np.float64)
     if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
         raise ValueError(f"background must be three numbers in [0, 1], got {background!r}")
+    if missing not in get_args(Missing):
+        raise ValueError(f"missing must be 'error' or 'skip', got {missing!r}")
     if test_every == 1:
         raise ValueError("test_every must be 0 (no test views) or at least 2: 1 leaves nothing to train with")
     store = ImageCache(cache_bytes)
-    train, test = read_folder(Path(path), int(downscale), int(test_every), store)
+    train, test = read_folder(Path(path), int(downscale), int(test_every), store, missing)
     return Dataset(tuple(train), tuple(test), Path(os.path.abspath(path)).name).over(color.tolist())

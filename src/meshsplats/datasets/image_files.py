@@ -4,10 +4,13 @@ needed."""
 from __future__ import annotations
 
 import os
+import unicodedata
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,6 +22,13 @@ from meshsplats.images.reading import Header, load_image, read_header
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".PNG", ".JPG", ".JPEG")
 """Tried, in this order, for names without a suffix, and for smaller copies stored in another format."""
+READABLE = (*dict.fromkeys(suffix.lower() for suffix in SUFFIXES), ".ppm", ".heic", ".heif")
+"""Suffixes of photographs, in letters of any case."""
+UNREADABLE = (
+    *(".exr", ".hdr", ".tga", ".avif", ".jxl", ".jp2", ".gif"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2", ".raw"),
+)
+"""Suffixes of images that are not read."""
 MAX_NAME = 1000
 MAX_STRETCH = 0.02
 """Largest difference between the scales of width and height at which an image still fits its camera."""
@@ -37,6 +47,8 @@ class Frame:
     world_to_camera: np.ndarray
     mask: str | None = None
     """Path of its mask in the folder; None: looked for in ``masks/``."""
+    near: float | None = None
+    """Depth of the near plane, scene units; None: as cameras have it that name none."""
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
@@ -75,6 +87,74 @@ def find(folder: Path, name: str, where: str, *, other_suffix: bool = False) -> 
             # The link could be on this one.
             return inside(folder, str(candidate.relative_to(folder)), where)
     return None
+
+
+def is_hidden(name: str) -> bool:
+    """Whether a file or folder is not the user's: dot files (as macOS leaves beside each file on foreign
+    disks) and the thumbnails of Windows."""
+    return name.startswith(".") or name.casefold() in ("thumbs.db", "desktop.ini", "__macosx")
+
+
+class Shelf:
+    """The images below a folder, found by what people take for the same name: in letters of another case,
+    with accents composed otherwise, or with another suffix of images."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._files: dict[PurePosixPath, dict[str, list[str]]] = {}
+        self._folders: dict[PurePosixPath, dict[str, list[str]]] = {}
+
+    def alike(self, name: str) -> list[str]:
+        """The files, relative to the folder, that may be meant by ``name``, sorted. Those in the folders that
+        it names, else those of its last part in the folder itself."""
+        parts = PurePosixPath(name.replace("\\", "/")).parts
+        if not parts or len(name) > MAX_NAME or ".." in parts or parts[0] == "/":
+            return []
+        places = [PurePosixPath()]
+        for part in parts[:-1]:
+            key = _fold(part)
+            places = [place / found for place in places for found in self._listed(place)[1].get(key, ())]
+        stem = _stem_of(parts[-1])
+        found = [str(place / file) for place in places for file in self._listed(place)[0].get(stem, ())]
+        if not found and len(parts) > 1:
+            found = list(self._listed(PurePosixPath())[0].get(stem, ()))
+        return sorted(found)
+
+    def images(self) -> list[str]:
+        """The names of the readable images in the folder itself, sorted."""
+        listed = self._listed(PurePosixPath())[0].values()
+        return sorted(name for names in listed for name in names if is_readable(name))
+
+    def _listed(self, place: PurePosixPath) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+        """Images of a folder by their stems, and folders in it by their names, both folded."""
+        if place not in self._files:
+            files: dict[str, list[str]] = {}
+            folders: dict[str, list[str]] = {}
+            try:
+                with os.scandir(self.folder / place) as entries:
+                    for entry in entries:
+                        if entry.is_dir():
+                            folders.setdefault(_fold(entry.name), []).append(entry.name)
+                        elif entry.name.lower().endswith((*READABLE, *UNREADABLE)):
+                            files.setdefault(_stem_of(entry.name), []).append(entry.name)
+            except OSError:
+                pass
+            self._files[place], self._folders[place] = files, folders
+        return self._files[place], self._folders[place]
+
+
+def is_readable(name: str) -> bool:
+    """Whether a file's name is that of a photograph that can be read, and not hidden."""
+    return name.lower().endswith(READABLE) and not is_hidden(name)
+
+
+def _fold(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _stem_of(name: str) -> str:
+    suffix = PurePosixPath(name).suffix
+    return _fold(name[: len(name) - len(suffix)] if suffix.lower() in (*READABLE, *UNREADABLE) else name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +234,9 @@ Taken = list[tuple[Camera, PhotoFile]]
 """The views made from one photograph: one, or the six of a panorama."""
 
 
+Missing = Literal["error", "skip"]
+
+
 @dataclass
 class Album:
     """Turns the frames of a data set into cameras with their photographs, and counts what is missing."""
@@ -162,17 +245,25 @@ class Album:
     """The data set's folder, which no path may leave."""
     downscale: int
     store: ImageCache
+    on_missing: Missing = "error"
+    images: str = ""
+    """Folder of the images in it, where names of their own lead nowhere; empty: ``folder`` itself."""
     missing: list[str] = field(default_factory=list)
     no_mask: list[str] = field(default_factory=list)
+    renamed: list[str] = field(default_factory=list)
+    _shelf: Shelf = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._shelf = Shelf(self.folder)
 
     def views(self, frames: Iterable[Frame], where: str) -> list[Taken]:
         """Cameras and photographs of each frame whose image is there, in order."""
+        self.missing, self.no_mask, self.renamed = [], [], []
         result: list[Taken] = []
         masks = (self.folder / "masks").is_dir()
-        for frame in frames:
-            label = f"{where}: image {frame.name[:60]!r}"
-            full = find(self.folder, frame.file, label)
-            small = self._smaller(frame.file, label)
+        frames = list(frames)
+        labels = [f"{where}: image {frame.name[:60]!r}" for frame in frames]
+        for frame, label, (full, small) in zip(frames, labels, self._files(frames, labels), strict=True):
             if frame.lens is None or (full is None and small is None):
                 self.missing.append(frame.file)
                 continue
@@ -183,7 +274,7 @@ class Album:
             width, height = header.width, header.height
             if small is None:
                 width, height = (max(1, round(side / self.downscale)) for side in (width, height))
-            mask = self._mask(frame, label, masks)
+            mask = self._mask(frame, full, label, masks)
             if mask is not None:
                 _check_shape(frame.lens, read_header(mask), mask)
             lens = frame.lens.scaled(width, height)
@@ -193,6 +284,31 @@ class Album:
                 taken.append((_camera(frame, pinhole, label), source))
             result.append(taken)
         return result
+
+    def _files(self, frames: Sequence[Frame], labels: Sequence[str]) -> list[tuple[Path | None, Path | None]]:
+        """The image of each frame and its smaller copy, if they are there: under the name that the file
+        gives, else the only image that can be meant by it and by no other."""
+        found = [
+            (find(self.folder, frame.file, label), self._smaller(frame.file, label))
+            for frame, label in zip(frames, labels, strict=True)
+        ]
+        lacking = [i for i, paths in enumerate(found) if paths == (None, None)]
+        if not lacking:
+            return found
+        alike = {i: [name for name in self.alike(frames[i].file) if is_readable(name)] for i in lacking}
+        claims = Counter(self.folder / names[0] for names in alike.values() if len(names) == 1)
+        claims.update(full for full, _ in found if full is not None)
+        for i, names in alike.items():
+            if len(names) == 1 and claims[self.folder / names[0]] == 1:
+                found[i] = inside(self.folder, names[0], labels[i]), self._smaller(names[0], labels[i])
+                self.renamed.append(f"{frames[i].file}: {names[0]}")
+        return found
+
+    def alike(self, name: str) -> list[str]:
+        """The files in the data set that may be meant by ``name``, which is not there."""
+        base = f"{self.images}/" if self.images else ""
+        found = self._shelf.alike(name)
+        return found or self._shelf.alike(base + PurePosixPath(name.replace("\\", "/")).name)
 
     def _smaller(self, name: str, where: str) -> Path | None:
         """The copy in ``images_<downscale>/``, if there is such a folder."""
@@ -211,7 +327,7 @@ class Album:
                 return found
         return None
 
-    def _mask(self, frame: Frame, where: str, folder: bool) -> Path | None:
+    def _mask(self, frame: Frame, image: Path | None, where: str, folder: bool) -> Path | None:
         if frame.mask is not None:
             found = find(self.folder, frame.mask, where)
             if found is None:
@@ -220,28 +336,38 @@ class Album:
         if not folder:
             return None
         # images/a/b.jpg has masks/a/b.jpg.png (COLMAP's way), masks/a/b.png or masks/a/b.jpg.
-        parts = PurePosixPath(frame.file.replace("\\", "/")).parts
-        below = len(parts) > 1 and parts[0].startswith("images")
-        inner = PurePosixPath("masks", *(parts[1:] if below else parts))
-        for candidate in (f"{inner}.png", str(inner.with_suffix(".png")), str(inner)):
-            found = find(self.folder, candidate, where)
-            if found is not None:
-                return found
+        names = [frame.file.replace("\\", "/")]
+        names += [image.relative_to(self.folder).as_posix()] if image is not None else []
+        for name in dict.fromkeys(names):  # as the file has it, and as it is
+            parts = PurePosixPath(name).parts
+            below = len(parts) > 1 and parts[0].casefold().startswith(("images", "input"))
+            inner = PurePosixPath("masks", *(parts[1:] if below else parts))
+            for candidate in (f"{inner}.png", str(inner.with_suffix(".png")), str(inner)):
+                found = find(self.folder, candidate, where)
+                if found is not None:
+                    return found
         self.no_mask.append(str(inner))
         return None
 
-    def report(self, where: str, found: int) -> None:
-        """Warns of what is missing; FileFormatError if nothing is left."""
-        if not found:
+    def report(self, where: str, found: int, *, needed: bool = True) -> None:
+        """Warns of what differs from the file. FileFormatError if images are missing, unless they may be, or
+        if nothing is left, unless nothing is ``needed``."""
+        if not found and (needed or self.on_missing == "error" or not self.missing):
             what = "names no images" if not self.missing else f"none of its images is there{self._hint()}"
             raise FileFormatError(f"{where}: {what}")
+        if self.missing and self.on_missing == "error":
+            raise FileFormatError(
+                f"{where}: {len(self.missing)} of {found + len(self.missing)} images are missing"
+                f" ({_first(self.missing)}){self._near()}; complete the folder, or leave their views out:"
+                " --missing skip, missing='skip' in Python"
+            )
         for names, text in (
             (self.missing, "images are missing; their views are left out"),
+            (self.renamed, "images have another name than the file gives them, and are taken"),
             (self.no_mask, "images have no mask and count wholly"),
         ):
             if names:
-                shown = ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
-                warnings.warn(f"{where}: {len(names)} {text} ({shown})", DataWarning, stacklevel=2)
+                warnings.warn(f"{where}: {len(names)} {text} ({_first(names)})", DataWarning, stacklevel=2)
 
     def _hint(self) -> str:
         name = self.missing[0]
@@ -251,13 +377,35 @@ class Album:
         if not (self.folder / first).is_dir() and smaller:
             factors = ", ".join(s.removeprefix("images_") for s in smaller)
             hint += f"; there are {', '.join(smaller)}: give a downscale of {factors}"
-        return hint
+        return hint + self._near()
+
+    def _near(self) -> str:
+        """What is there in place of the first image that is missing."""
+        name = PurePosixPath(self.missing[0].replace("\\", "/")).name
+        near = self.alike(self.missing[0])
+        if len(near) == 1 and not is_readable(near[0]):
+            return f"; {near[0]} is there, but {PurePosixPath(near[0]).suffix} images are not read here"
+        if len(near) == 1:
+            return f"; {near[0]} is there, which another image of the file may mean, too: rename it"
+        if near:
+            return f"; {' and '.join(near[:3])} may both be meant: keep one of them"
+        with os.scandir(self.folder) as entries:
+            folders = sorted(e.name for e in entries if e.is_dir() and not is_hidden(e.name))
+        elsewhere = [folder for folder in folders if Shelf(self.folder / folder).alike(name)]
+        if elsewhere:
+            return f"; {elsewhere[0]}/ has an image of that name: name that folder 'images'"
+        return ""
+
+
+def _first(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (" ..." if len(names) > 3 else "")
 
 
 def _camera(frame: Frame, pinhole: Pinhole, where: str) -> Camera:
     matrix = np.eye(4)
     matrix[:3] = pinhole.rotation @ frame.world_to_camera[:3]
-    lens = {key: getattr(pinhole, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
+    lens: dict[str, Any] = {key: getattr(pinhole, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
+    lens |= {} if frame.near is None else {"near": frame.near}
     try:
         return Camera(matrix, **lens, name=frame.name + pinhole.suffix)
     except ValueError as error:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from meshsplats._kinds import need_path
-from meshsplats.datasets.folder import find_layout
 from meshsplats.datasets.image_files import inside
+from meshsplats.datasets.layouts import find_layout
 from meshsplats.datasets.transforms import points_file
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.ply.header import read_header
@@ -61,6 +61,8 @@ def load_points(path: str | os.PathLike[str]) -> ScenePoints | None:
         if binary.is_file():
             return _binary(binary)
         return _text(text) if text.is_file() else None
+    if layout.name == "LLFF":
+        return None
     named = points_file(layout.source)
     if named is None:
         return None
@@ -116,7 +118,7 @@ def _text(path: Path) -> ScenePoints:
     count = 0
     with open(path, "rb") as file:
         for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), b""), 1):
-            words = line.split()
+            words = line.removeprefix(b"\xef\xbb\xbf").split()  # a mark of UTF-8 may begin the file
             if not words or words[0].startswith(b"#"):
                 continue
             try:

@@ -6,6 +6,7 @@ docs.nerf.studio/quickstart/data_conventions.html and the files of the NeRF-synt
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 
 from meshsplats._json import read_json
 from meshsplats.camera import MAX_SIDE
-from meshsplats.datasets.image_files import Frame, find
+from meshsplats.datasets.image_files import Frame, Shelf, find, inside, is_readable
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import FileFormatError
 from meshsplats.images.reading import read_header
@@ -53,13 +54,14 @@ def read_transforms(path: Path) -> Transforms:
         raise FileFormatError(f"{path}: {len(frames):,} frames, more than the {MAX_FRAMES:,} accepted")
     splits = {}
     for key in _SPLITS:
-        if key in content:
+        if content.get(key) is not None:
             names = content[key]
             if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
                 raise FileFormatError(f"{path}: {key!r} must be a list of file names")
             splits[key.removesuffix("_filenames")] = set(names)
     common = {key: value for key, value in content.items() if key != "frames"}
-    return Transforms([_frame(path, common, f, i) for i, f in enumerate(frames)], splits)
+    shelf = Shelf(path.parent)
+    return Transforms([_frame(path, shelf, common, f, i) for i, f in enumerate(frames)], splits)
 
 
 def points_file(path: Path) -> str | None:
@@ -77,7 +79,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _frame(path: Path, common: dict[str, Any], frame: object, i: int) -> Frame:
+def _frame(path: Path, shelf: Shelf, common: dict[str, Any], frame: object, i: int) -> Frame:
     where = f"{path}: frame {i}"
     if not isinstance(frame, dict):
         raise FileFormatError(f"{where}: must be a JSON object")
@@ -87,13 +89,15 @@ def _frame(path: Path, common: dict[str, Any], frame: object, i: int) -> Frame:
     if mask is not None and not isinstance(mask, str):
         raise FileFormatError(f"{where}: 'mask_path' must be a file name")
     where = f"{where} ({file[:60]!r})"
-    values = common | frame
-    lens = _lens(path.parent, values, file, where)
+    # Some writers name what they do not know, with null.
+    values = common | {key: value for key, value in frame.items() if value is not None}
+    values = {key: value for key, value in values.items() if value is not None}
+    lens = _lens(shelf, values, file, where)
     return Frame(file.removeprefix("./"), file, lens, _world_to_camera(frame, where), mask)
 
 
-def _lens(folder: Path, values: dict[str, Any], file: str, where: str) -> Lens | None:
-    size = _size(folder, values, file, where)
+def _lens(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> Lens | None:
+    size = _size(shelf, values, file, where)
     if size is None:
         return None
     width, height = size
@@ -131,7 +135,7 @@ def _lens(folder: Path, values: dict[str, Any], file: str, where: str) -> Lens |
         raise FileFormatError(f"{where}: {error}") from None
 
 
-def _size(folder: Path, values: dict[str, Any], file: str, where: str) -> tuple[int, int] | None:
+def _size(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> tuple[int, int] | None:
     """(width, height) that the intrinsics are meant for."""
     if "w" in values and "h" in values:
         sides = (_number(values, "w", where), _number(values, "h", where))
@@ -141,7 +145,10 @@ def _size(folder: Path, values: dict[str, Any], file: str, where: str) -> tuple[
                 f" got {sides[0]:g}, {sides[1]:g}"
             )
         return int(sides[0]), int(sides[1])
-    found = find(folder, file, where)
+    found = find(shelf.folder, file, where)
+    alike = [name for name in shelf.alike(file) if is_readable(name)] if found is None else []
+    if len(alike) == 1:
+        found = inside(shelf.folder, alike[0], where)
     if found is None:
         return None
     header = read_header(found)
@@ -197,6 +204,9 @@ def _world_to_camera(frame: dict[str, Any], where: str) -> np.ndarray:
 
 def _number(values: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value: Any = values.get(key, default)
+    if isinstance(value, str):  # as some writers have their numbers
+        with suppress(ValueError):
+            value = float(value)
     if type(value) not in (int, float) or not -1e12 < value < 1e12:  # false for NaN too
         raise FileFormatError(f"{where}: {key!r} must be a finite number, got {str(value)[:40]!r}")
     return float(value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ MAX_PIXELS = 1 << 26
 """Images of more pixels than this (67 million) are refused: a small file can claim any size."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 """Formats that Pillow may read here. Others start programs, or hold no photographs."""
+_HEIF = re.compile(rb"....ftyp(heic|heix|heim|heis|hevc|hevx|mif1|msf1)", re.DOTALL)
+"""How HEIF files begin, as iPhones take photographs."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +63,40 @@ def load_image(path: str | os.PathLike[str], data: bytes | None = None) -> np.nd
             raise FileFormatError(f"{path}: a broken image: {str(error)[:120]}") from None
 
 
+def read_exif(path: Path) -> bytes:
+    """The EXIF data of an image; empty if it has none."""
+    with _opened(path) as image:
+        return bytes(image.getexif().tobytes())
+
+
+def _formats(path: str | os.PathLike[str], data: bytes | None) -> tuple[str, ...]:
+    """The formats to try. Raises MissingDependencyError for HEIF without its library."""
+    if data is None:
+        with open(path, "rb") as file:
+            head = file.read(12)
+    else:
+        head = data[:12]
+    if not _HEIF.match(head):
+        return FORMATS
+    try:
+        from pillow_heif import register_heif_opener
+    except ImportError:
+        raise MissingDependencyError(
+            f"{path}: a HEIF image (.heic), which needs the library pillow-heif: pip install"
+            " 'meshsplats[heic]'; or convert it to JPEG"
+        ) from None
+    register_heif_opener()
+    return (*FORMATS, "HEIF")
+
+
 def _opened(path: str | os.PathLike[str], data: bytes | None = None) -> Any:
     try:
         from PIL import Image
     except ImportError:
         raise MissingDependencyError("reading images needs Pillow: pip install pillow") from None
     try:
-        image = Image.open(path if data is None else io.BytesIO(data), formats=FORMATS)
+        formats = _formats(path, data)
+        image = Image.open(path if data is None else io.BytesIO(data), formats=formats)
     except (FileNotFoundError, PermissionError):
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:

@@ -7,17 +7,17 @@ import json
 import os
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from meshsplats._files.atomic import write_bytes, write_text
-from meshsplats.datasets.folder import find_layout
-from meshsplats.datasets.image_files import SUFFIXES
-from meshsplats.errors import DataWarning, MissingDependencyError
-from meshsplats.images.reading import read_header
+from meshsplats.datasets.image_files import Shelf
+from meshsplats.datasets.layouts import find_layout, image_folders, unread_cameras
+from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
+from meshsplats.images.reading import load_image, read_exif, read_header
 
 CAMERAS, POINTS = "transforms.json", "sparse_points.ply"
 """Files beside the photographs."""
@@ -31,12 +31,21 @@ NEEDS = "photographs without cameras need the library pycolmap: pip install 'mes
 
 
 def bare_photographs(folder: Path) -> list[Path]:
-    """The image files in ``folder``/images, else in ``folder`` itself, sorted; none for a data set that has
-    cameras."""
+    """The image files in ``folder``/images or ``folder``/input, else in ``folder`` itself, sorted; none for a
+    data set that has cameras."""
     if not folder.is_dir() or find_layout(folder) is not None:
         return []
-    place = folder / "images" if (folder / "images").is_dir() else folder
-    return sorted(path for path in place.iterdir() if path.suffix in SUFFIXES and path.is_file())
+    for name in image_folders(folder):
+        if found := Shelf(folder / name).images():
+            return [folder / name / image for image in found]
+    return []
+
+
+def refuse_unread_cameras(folder: Path) -> None:
+    """FileFormatError if cameras that are not read belong to the photographs in ``folder``: estimated ones
+    would have another frame, without a word."""
+    if there := unread_cameras(folder):
+        raise FileFormatError(f"{folder}: {there}; --estimate-cameras finds cameras in their place")
 
 
 def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -> None:
@@ -72,17 +81,20 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
     except ImportError:
         raise MissingDependencyError(NEEDS) from None
     place = photographs[0].parent
+    prefix = f"{place.name}/" if place != folder else ""
     sizes = {(header.width, header.height) for header in map(read_header, photographs)}
     pycolmap.logging.minloglevel = 3
     pycolmap.set_random_seed(0)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as work:
         database = os.path.join(work, "database.db")
+        images = _for_pycolmap(photographs, Path(work))
+        place = images[0].parent
         mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.PER_IMAGE
         say(f"finding the cameras of {len(photographs)} photographs: features")
         pycolmap.extract_features(
             database,
             place,
-            [path.name for path in photographs],  # else all images in folders below, too
+            [path.name for path in images],  # else all images in folders below, too
             camera_mode=mode,
             device=pycolmap.Device.cpu,
             **_feature_options(pycolmap),
@@ -99,8 +111,9 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
             " Photographs must overlap by two thirds, be sharp, and show a subject with texture that does not"
             " move"
         )
-    names = {image.name for image in best.images.values() if image.has_pose}
-    lost = [path.name for path in photographs if path.name not in names]
+    named = {image.name: path.name for image, path in zip(images, photographs, strict=True)}
+    placed = {named[image.name] for image in best.images.values() if image.has_pose}
+    lost = [path.name for path in photographs if path.name not in placed]
     if lost:
         warnings.warn(
             f"{folder}: {len(lost)} of {len(photographs)} photographs match no others and are left out:"
@@ -108,8 +121,7 @@ def find_cameras(folder: Path, say: Callable[[str], None] = lambda text: None) -
             DataWarning,
             stacklevel=2,
         )
-    prefix = "images/" if place != folder else ""
-    cameras = json.dumps(_transforms(best, prefix), indent=1) + "\n"
+    cameras = json.dumps(_transforms(best, prefix, named), indent=1) + "\n"
     write_bytes(folder / POINTS, _points(best))
     try:
         write_text(folder / CAMERAS, cameras)
@@ -129,8 +141,25 @@ def _feature_options(pycolmap: Any) -> dict[str, Any]:
     return {"sift_options": {"max_image_size": MAX_SIDE, "max_num_features": MAX_FEATURES}}
 
 
-def _transforms(model: Any, prefix: str) -> dict[str, Any]:
-    """The cameras of ``model`` as in nerfstudio's file: OpenGL axes, one radial term."""
+def _for_pycolmap(photographs: list[Path], work: Path) -> list[Path]:
+    """Files that pycolmap reads, in one folder, one for each of ``photographs``: themselves, or copies in the
+    folder ``work`` where some are HEIF images."""
+    if not any(path.suffix.lower() in (".heic", ".heif") for path in photographs):
+        return photographs
+    from PIL import Image
+
+    folder = work / "images"
+    folder.mkdir()
+    copies = [folder / f"{path.name}.png" for path in photographs]
+    for path, copy in zip(photographs, copies, strict=True):
+        pixels = load_image(path)
+        Image.fromarray(pixels[..., :3]).save(copy, exif=read_exif(path), compress_level=1)
+    return copies
+
+
+def _transforms(model: Any, prefix: str, named: Mapping[str, str]) -> dict[str, Any]:
+    """The cameras of ``model`` as in nerfstudio's file: OpenGL axes, one radial term. ``named``: the files of
+    the photographs by the names of its images."""
     frames = []
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if not image.has_pose:
@@ -144,7 +173,9 @@ def _transforms(model: Any, prefix: str) -> dict[str, Any]:
         focal, cx, cy, k1 = map(float, camera.params)  # SIMPLE_RADIAL
         lens = {"fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "k1": k1}
         size = {"w": int(camera.width), "h": int(camera.height)}
-        frames.append({"file_path": prefix + image.name, "transform_matrix": world.tolist(), **lens, **size})
+        frames.append(
+            {"file_path": prefix + named[image.name], "transform_matrix": world.tolist(), **lens, **size}
+        )
     return {"camera_model": "OPENCV", "ply_file_path": POINTS, "frames": frames}
 
 

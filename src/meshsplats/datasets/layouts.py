@@ -1,0 +1,222 @@
+"""Which layout a data set's folder has: where its cameras and its images lie."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from meshsplats.datasets.cameras_of_others import cameras_of_others
+from meshsplats.datasets.colmap import MODEL_FILES, find_model, image_names
+from meshsplats.datasets.image_files import Shelf, is_hidden
+from meshsplats.errors import FileFormatError
+
+POSES_BOUNDS = "poses_bounds.npy"
+"""LLFF's file of cameras."""
+IMAGE_FOLDERS = ("images", "input")
+"""Names, in letters of any case, of folders of images beside a sparse model; the second is that in which
+INRIA's 3DGS expects what it is yet to undistort."""
+_SAMPLE = 50
+"""How many names of a model are looked for to tell whether a folder holds its images."""
+_NAMED = ("transforms_train.json", "transforms.json", POSES_BOUNDS)
+
+
+class Layout(NamedTuple):
+    """How a data set is laid out."""
+
+    name: Literal["COLMAP", "NeRF-synthetic", "nerfstudio", "LLFF"]
+    source: Path
+    """The sparse model's folder, or the file of the (training) frames."""
+    root: Path
+    """The data set's folder, which no path in it may leave."""
+    images: str = ""
+    """COLMAP and LLFF: the folder of the images, relative to ``root``; empty: ``root`` itself."""
+    before: tuple[str, ...] = ()
+    """COLMAP: models with lower numbers, and their images, which are fewer than those of this one."""
+
+
+def find_layout(path: Path) -> Layout | None:
+    """That of the folder or file ``path``, which is there; None for any other.
+
+    Of the models of a folder, those come first whose images are there, and of these the one with the most.
+    """
+    if path.is_file():
+        if path.name in MODEL_FILES:
+            return find_layout(path.parent)
+        if path.name == POSES_BOUNDS:
+            return _llff(path.parent)
+        if path.suffix.lower() != ".json":
+            return None
+        name = "NeRF-synthetic" if path.name == "transforms_train.json" else "nerfstudio"
+        return Layout(name, path, path.parent)  # type: ignore[arg-type]
+    if (path / "transforms_train.json").is_file():
+        return Layout("NeRF-synthetic", path / "transforms_train.json", path)
+    usual = _best(_models(path, "sparse", path))
+    if usual is not None and _has_images(usual):
+        return usual
+    if (path / "transforms.json").is_file():
+        return Layout("nerfstudio", path / "transforms.json", path)
+    others = [usual] if usual is not None else []
+    for found in _unusual(path):
+        if _has_images(found):
+            return found
+        others.append(found)
+    if (path / POSES_BOUNDS).is_file():
+        return _llff(path)
+    return others[0] if others else None
+
+
+def _llff(root: Path) -> Layout:
+    folders = [name for name in image_folders(root) if name and Shelf(root / name).images()]
+    return Layout("LLFF", root / POSES_BOUNDS, root, folders[0] if folders else "")
+
+
+def _unusual(path: Path) -> Iterator[Layout]:
+    """Models elsewhere than in ``path``/sparse: those of nerfstudio, of COLMAP's undistortion and automatic
+    reconstruction, of INRIA's conversion; beside the images; and ``path`` itself where it is one inside a
+    data set."""
+    for place in ("colmap/sparse", "distorted/sparse"):
+        if found := _best(_models(path, place, path)):
+            yield found
+    if model := find_model(path, ("colmap",)):
+        yield from _candidates(path, [model])
+    dense = [path / "dense" / name for name in _numbered(path / "dense")]
+    roots = (*dense, path / "dense")
+    if found := _best([found for root in roots for found in _models(root, "sparse", root)]):
+        yield found
+    if model := find_model(path, (".",)):
+        yield from _candidates(path, [model])
+        above = path.absolute().parent
+        if above.name == "sparse":
+            yield from _candidates(above.parent, [model])
+        if path.absolute().name == "sparse":
+            yield from _candidates(above, [model])
+
+
+def _models(path: Path, place: str, root: Path) -> list[Layout]:
+    """Those of ``path``/``place``/0, 1 ... and of ``path``/``place`` itself, which comes last."""
+    names = [*_numbered(path / place), "."]
+    found = [model for name in names if (model := find_model(path / place, (name,)))]
+    return _candidates(root, found)
+
+
+def _candidates(root: Path, models: Sequence[Path]) -> list[Layout]:
+    """The layouts with ``models`` in the data set ``root``, each with the first folder that holds some of its
+    images, else ``images``."""
+    result = []
+    for model in models:
+        folders = image_folders(root)
+        if model.is_relative_to(root) and model != root:
+            folders.append(model.relative_to(root).as_posix())
+        names = _sample(model)
+        holding = next((folder for folder in folders if _holds(root, folder, names)), None)
+        result.append(Layout("COLMAP", model, root, "images" if holding is None else holding))
+    return result
+
+
+def _best(models: Sequence[Layout]) -> Layout | None:
+    """The one with the most images of those whose images are there, else of all."""
+    if not models:
+        return None
+    there = [found for found in models if len(models) > 1 and _has_images(found)] or list(models)
+    sizes = [len(_names(found.source)) if len(there) > 1 else 0 for found in there]
+    best = sizes.index(max(sizes))
+    before = tuple(f"{there[i].source} ({sizes[i]})" for i in range(best))
+    return there[best]._replace(before=before)
+
+
+def _has_images(layout: Layout) -> bool:
+    """Whether some of its images are there, or copies of them for a downscale."""
+    smaller = any(name.startswith(f"{layout.images}_") for name in _folders(layout.root))
+    return (smaller and layout.images != "") or _holds(layout.root, layout.images, _sample(layout.source))
+
+
+def _holds(root: Path, folder: str, names: Sequence[str] | None) -> bool:
+    """Whether ``folder`` in ``root`` holds one of ``names``, also in letters of another case or with another
+    suffix. True for None, the names of a model that cannot be read: its reader says so."""
+    place = root / folder
+    if not place.is_dir():
+        return False
+    if names is None:
+        return True
+    shelf = Shelf(place)
+    return any(shelf.alike(name) for name in names)
+
+
+def _sample(model: Path) -> Sequence[str] | None:
+    """Some of the names of the images of ``model``; None if it cannot be read."""
+    try:
+        names = image_names(model)
+    except FileFormatError:
+        return None
+    return names[:: -(-len(names) // _SAMPLE)] if names else None
+
+
+def _names(model: Path) -> Sequence[str]:
+    try:
+        return image_names(model)
+    except FileFormatError:
+        return ()
+
+
+def image_folders(root: Path) -> list[str]:
+    """The folders in ``root`` where images usually lie, and ``root`` itself, which is last."""
+    found = _folders(root)
+    named = [name for wanted in IMAGE_FOLDERS for name in found if name.casefold() == wanted]
+    return [*sorted(named, key=lambda name: IMAGE_FOLDERS.index(name.casefold())), ""]
+
+
+def _folders(root: Path) -> list[str]:
+    """The names of the folders in ``root``, sorted; lower case comes first."""
+    try:
+        with os.scandir(root) as entries:
+            found = [entry.name for entry in entries if entry.is_dir() and not is_hidden(entry.name)]
+    except OSError:
+        return []
+    return sorted(found, key=lambda name: (name.casefold(), name.swapcase()))
+
+
+def _numbered(folder: Path) -> list[str]:
+    return sorted((name for name in _folders(folder) if name.isdecimal()), key=lambda name: (int(name), name))
+
+
+def what_is_there(path: Path) -> str:
+    """Why the folder ``path`` is no data set, for people: what is close to one."""
+    names = sorted(name for name in os.listdir(path) if not is_hidden(name))[:10_000]
+    wanted = (
+        "no data set of a known layout: expected transforms_train.json, transforms.json, poses_bounds.npy, or"
+        " cameras and images, .bin or .txt, in sparse/0/ or beside the images"
+    )
+    inner = [name for name in names if _looks_like_one(path / name)]
+    if inner:
+        return f"{wanted}. {inner[0]}/ in it looks like one"
+    if foreign := cameras_of_others(path):
+        return foreign
+    if "sparse" in names:
+        return "sparse/ holds no cameras and images, .bin or .txt: was the reconstruction finished?"
+    if "database.db" in names:
+        return "COLMAP's data base without a sparse model: run its mapper first"
+    if any(name.startswith("point_cloud") for name in names):
+        return "a trained model, not the photographs it was trained on"
+    if path.name.casefold() in IMAGE_FOLDERS and _looks_like_one(path.absolute().parent):
+        return f"the images alone; give the folder above it, {path.absolute().parent}, which has the cameras"
+    return f"{wanted}; it holds {', '.join(names[:6]) or 'nothing'}"
+
+
+def unread_cameras(path: Path) -> str:
+    """What tells that cameras belong to the folder ``path`` of photographs, though none of a known layout is
+    there; empty if nothing does."""
+    names = [name for name in os.listdir(path) if not is_hidden(name)]
+    alone = path.name.casefold() in IMAGE_FOLDERS and _looks_like_one(path.absolute().parent)
+    inner = any(_looks_like_one(path / name) for name in names)
+    if alone or inner or any(name.startswith("sparse") and (path / name).is_dir() for name in names):
+        return what_is_there(path)
+    return cameras_of_others(path)
+
+
+def _looks_like_one(path: Path) -> bool:
+    if any((path / name).is_file() for name in _NAMED):
+        return True
+    places = ("sparse", *(f"sparse/{name}" for name in _numbered(path / "sparse")))
+    return find_model(path, places) is not None
