@@ -47,7 +47,7 @@ def test_things_that_are_no_mesh(tmp_path):
     path = tmp_path / "file"
     for data, match in (
         (b"", "the file is empty"),
-        (b"\x89PNG\r\n\x1a\n", "not a mesh file of a known format"),
+        (b"\x89PNG\r\n\x1a\n", "an image; 'meshsplats train' makes a mesh of a folder of photographs"),
         (b"Dear reader,\nthis is text.\n", "not a mesh file of a known format"),
         (b"{}", "not a glTF 2 file"),
         (b'[{"name": "a"}]', "not a mesh file"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from meshsplats._files.atomic import write_text
+from meshsplats._foreign import what_it_is
 from meshsplats._json import read_json
 from meshsplats._kinds import need_all, need_path
 from meshsplats.camera import Camera
+from meshsplats.cameras.camera_path import cameras_of_path, is_camera_path
 from meshsplats.errors import FileFormatError
 
 MAX_CAMERAS = 20_000
@@ -22,11 +25,12 @@ MAX_CAMERAS = 20_000
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """Cameras of a JSON file, in file order.
 
-    Two forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
+    Three forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
     4x4 matrix and OpenCV axes; ``name``, ``near``, and cx and cy (then the image's centre) may be missing.
-    The other is the ``cameras.json`` that INRIA's 3DGS trainer writes: ``{img_name, width, height, position,
+    Another is the ``cameras.json`` that INRIA's 3DGS trainer writes: ``{img_name, width, height, position,
     rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and the principal point at the image's
-    centre. For a folder, the ``cameras.json`` in it is read.
+    centre. The third is nerfstudio's ``camera_path.json``, whose cameras are in the frame of the splats that
+    ``ns-export`` writes. For a folder, the ``cameras.json`` in it is read.
 
     Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
     format, and OSError if it cannot be opened.
@@ -34,8 +38,12 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     need_path(path=path)
     path = Path(path)
     if path.is_dir():
-        path = path / "cameras.json"
+        path = _file_in(path)
+    if path.is_file() and (what := _foreign(path)):
+        raise FileFormatError(f"{path}: {what}; a camera file is a JSON list of cameras")
     entries = read_json(path)
+    if is_camera_path(entries):
+        return cameras_of_path(entries, path, MAX_CAMERAS)
     if not isinstance(entries, list):
         other = isinstance(entries, dict) and "frames" in entries
         what = " with 'frames', a data set: read it with load_dataset or --data" if other else ""
@@ -49,6 +57,34 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
             f"{path}: {len(entries)} cameras, more than the {MAX_CAMERAS} that are accepted"
         )
     return [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+
+
+def _file_in(folder: Path) -> Path:
+    """The camera file of a model folder. FileFormatError for the folder of a data set, which has another
+    option."""
+    path = folder / "cameras.json"
+    names = (
+        "transforms.json",
+        "transforms_train.json",
+        "sparse",
+        "images.txt",
+        "images.bin",
+        "poses_bounds.npy",
+    )
+    there = [] if path.is_file() else [name for name in names if (folder / name).exists()]
+    if there:
+        raise FileFormatError(
+            f"{folder}: a data set ({there[0]} is there): read it with load_dataset, or --data in place of"
+            " --cameras"
+        )
+    return path
+
+
+def _foreign(path: Path) -> str:
+    """What a file is that cannot be JSON; empty if it can, or if that is unknown."""
+    with open(path, "rb") as file:
+        head = file.read(64)
+    return "" if re.match(rb"(\xef\xbb\xbf)?\s*[\[{]", head) else what_it_is(path)
 
 
 def save_cameras(cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:

@@ -14,6 +14,7 @@ import tyro
 
 from meshsplats._json import read_json
 from meshsplats.camera import Camera
+from meshsplats.cameras.camera_path import is_camera_path
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds
 from meshsplats.cli.arguments import Command
@@ -76,6 +77,10 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
         found |= _mesh(load_mesh(path))
     else:
         found |= _cameras(load_cameras(path))
+        if is_camera_path(read_json(path)):
+            found["frame"] = "nerfstudio's, that of the splats it exports"
+            if (path.parent / "dataparser_transforms.json").is_file():
+                found["frame"] += "; dataparser_transforms.json leads from that of the photographs to it"
     return found
 
 

@@ -11,6 +11,7 @@ from typing import get_args
 
 import numpy as np
 
+from meshsplats._foreign import what_it_is
 from meshsplats._kinds import need_path
 from meshsplats.datasets.colmap import read_model
 from meshsplats.datasets.image_files import Album, Frame, Missing, Taken, split
@@ -31,7 +32,8 @@ def read_folder(path: Path, downscale: int, test_every: int, store: ImageCache, 
     layout = find_layout(path)
     if layout is None:
         if path.is_file():
-            raise FileFormatError(f"{path}: a data set is a folder, or its transforms.json")
+            what = what_it_is(path)
+            raise FileFormatError(f"{path}: {what or 'a data set is a folder, or its transforms.json'}")
         raise FileFormatError(f"{path}: {what_is_there(path)}")
     album = Album(layout.root, downscale, store, missing, layout.images)
     if layout.name == "COLMAP":

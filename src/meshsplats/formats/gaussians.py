@@ -10,6 +10,7 @@ from typing import BinaryIO, Literal, get_args
 
 import numpy as np
 
+from meshsplats._foreign import IMAGE_SUFFIXES
 from meshsplats._kinds import described, each, need, need_path, require_path
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
@@ -30,6 +31,11 @@ SPLAT_SUFFIXES = (".ply", ".ply.gz", ".splat", ".spz", ".sog", ".glb", ".gltf")
 """How the names of splat files end, wherever names decide: which files of a folder are read."""
 _MODEL_FILES = ("point_cloud.ply", "point_cloud.ply.gz")
 """Names of the splats in a model folder; the first that is there counts."""
+_OF_PHOTOGRAPHS = (
+    *("transforms.json", "transforms_train.json", "sparse", "poses_bounds.npy"),
+    *("cameras.bin", "cameras.txt", "dense"),
+)
+"""Names that tell a data set of photographs."""
 _DOUBLE_SUFFIXES = (".compressed.ply", ".compressed.ply.gz", ".ply.gz")
 
 
@@ -40,7 +46,7 @@ def load_gaussians(
 
     The content decides the format, not the name: `.ply` (float or PlayCanvas compressed, also gzipped),
     `.splat`, SPZ 1 to 4, SOG (archive, folder or its meta.json), streamed SOG (folder or its lod-meta.json),
-    glTF and GLB with KHR_gaussian_splatting.
+    glTF and GLB with KHR_gaussian_splatting. Of the first three, also the only one in a zip archive.
 
     A folder is a model of the 3D Gaussian Splatting code, read from the highest iteration of
     ``point_cloud/iteration_*/point_cloud.ply``, or an unpacked SOG file. A streamed SOG scene is read at the
@@ -145,7 +151,10 @@ class SplatStream:
         kind, stored = content.splat_format(), None
         with content.open() as file:
             reader = _reader(content, kind, file, path)
-            if kind == "spz":
+            whole: GaussianCloud | None = None
+            if kind == "spz" and content.member is not None:  # its streams are not apart there
+                whole, stored = read_spz(file.read(), path, Budget(path), strict=self.strict)
+            elif kind == "spz":
                 reader, stored = open_spz(path)
             readers: Iterable[SplatReader] = () if reader is None else (reader,)
             if kind == "streamed sog":
@@ -155,10 +164,11 @@ class SplatStream:
                 for block in reader.blocks(self.block, strict=self.strict):
                     yield transformed(block, to_y_down)
         if kind == "gltf":
-            cloud = read_splat_gltf(path, strict=self.strict)
-            for start in range(0, len(cloud), self.block):
-                part = np.arange(start, min(start + self.block, len(cloud)))
-                yield transformed(cloud.select(part), to_y_down)
+            whole = read_splat_gltf(path, strict=self.strict)
+        if whole is not None:
+            for start in range(0, len(whole), self.block):
+                part = np.arange(start, min(start + self.block, len(whole)))
+                yield transformed(whole.select(part), to_y_down)
 
 
 def stream_gaussians(
@@ -345,11 +355,16 @@ def splat_file(path: Path) -> Path:
             return found
     if (path / "tileset.json").is_file():
         raise FileFormatError(f"{path}: a tileset, not splats; render and info take it")
-    photographs = [n for n in ("transforms.json", "transforms_train.json", "sparse") if (path / n).exists()]
+    photographs = [name for name in _OF_PHOTOGRAPHS if (path / name).exists()]
     if photographs:
         raise FileFormatError(
             f"{path}: photographs, not splats ({photographs[0]} is there); commands take them with --data,"
             " load_dataset reads them"
+        )
+    if images := files_named(path, IMAGE_SUFFIXES):
+        raise FileFormatError(
+            f"{path}: a folder of images ({images[0].name} is there), not splats; 'meshsplats train' makes a"
+            " mesh of photographs"
         )
     raise FileFormatError(
         f"{path}: a folder without splats; expected a model folder with"

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats._files.atomic import atomic_path
+from meshsplats._foreign import foreign, foreign_archive
 from meshsplats._kinds import each, need, need_path
 from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.formats._zipped import Archive
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
 from meshsplats.formats.gltf.reader import read_gltf
@@ -60,11 +62,15 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
     source = Path(path)
     content = Content(source)
     content.refuse_empty()
+    if content.member is not None:
+        raise FileFormatError(f"{source}: splats in a zip archive ({content.member[:200]}), no mesh")
     if content.container == "zip":
         if source.suffix.lower() == ".usdz":
             raise FileFormatError(
                 f"{source}: .usdz packages are not read; unpack it: usdcat in.usdz -o out.usdc"
             )
+        if source.suffix.lower() != ".npz" and (what := foreign_archive(source, Archive(source).names)):
+            raise FileFormatError(f"{source}: {what}")
         return read_npz(source)
     if content.container == "ply":
         return read_mesh_ply(source)
@@ -74,6 +80,8 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
         return read_usd(source)
     if content.is_obj:
         return read_obj(source)
+    if what := foreign(source, content.head):
+        raise FileFormatError(f"{source}: {what}")
     raise FileFormatError(
         f"{source}: not a mesh file of a known format, it begins with {content.head[:8]!r};"
         " expected .npz, .ply, .glb, .gltf, .usdc, .usda or .obj"

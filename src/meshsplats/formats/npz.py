@@ -11,8 +11,6 @@ three names are those of the published MeshSplats code, whose files are read as 
 from __future__ import annotations
 
 import ast
-import io
-import os
 import re
 import struct
 import zipfile
@@ -25,6 +23,7 @@ import numpy as np
 from meshsplats.binding import Binding
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget, check_attribute_names, checked, straight_colors
+from meshsplats.formats._zipped import BoundedReader
 from meshsplats.mesh import SplatMesh
 
 _ATTRIBUTE = "attribute_"
@@ -79,7 +78,7 @@ def read_npz(path: Path) -> SplatMesh:
     Shapes are read, compared with each other and with the archive's own sizes before any array is allocated.
     Raises FileFormatError.
     """
-    with _BoundedReader(io.FileIO(path)) as file:
+    with BoundedReader(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
                 return _read(archive, path)
@@ -87,21 +86,6 @@ def read_npz(path: Path) -> SplatMesh:
             raise
         except _BROKEN_ZIP as error:
             raise FileFormatError(f"{path}: not a readable .npz file: {error}") from None
-
-
-class _BoundedReader(io.BufferedReader):
-    """Refuses a single read beyond 16 MiB: a zip directory of that size is an attack, and members are read
-    block by block."""
-
-    _limit = 1 << 24
-
-    def read(self, size: int | None = -1) -> bytes:
-        # BufferedReader would allocate ``size`` bytes even where the file ends earlier.
-        left = os.fstat(self.fileno()).st_size - self.tell()
-        wanted = left if size is None or size < 0 else min(size, left)
-        if wanted > self._limit:
-            raise zipfile.BadZipFile("its directory is absurdly large")
-        return super().read(max(wanted, 0))
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,15 @@ from __future__ import annotations
 import errno
 import os
 import re
-import zipfile
 import zlib
 from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, Literal, cast
 
+from meshsplats._foreign import foreign
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._gzipped import GzippedFile
+from meshsplats.formats._zipped import Archive, ZippedFile
 from meshsplats.formats.gltf.splats import has_splats
 from meshsplats.formats.ply.compressed_splats import is_compressed_splat
 from meshsplats.formats.ply.header import PlyHeader, read_header
@@ -37,7 +38,6 @@ _SIGNATURES: dict[Container, re.Pattern[bytes]] = {
 _UNREAD: dict[Container | None, str] = {
     "gzip": "a gzip file, but not SPZ; unpack it first",
     "lfs": "a Git LFS pointer, not the file itself, which 'git lfs pull' brings",
-    "html": "a web page, not the file itself: did the download ask for a login?",
 }
 _SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
 _EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
@@ -59,8 +59,14 @@ class Content:
             if path.is_dir():  # on Windows
                 raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path)) from None
             raise
-        matching = (name for name, pattern in _SIGNATURES.items() if pattern.match(self.head))
-        self.container: Container | None = next(matching, None)
+        self.container = _container(self.head)
+        self.member: str | None = None
+        """The name of the only file with splats in a zip archive; the content is then that of this file."""
+        if self.container == "zip" and (found := _only_member(path)) is not None:
+            self.member = found
+            with self.open() as inner:
+                self.head = inner.read(4096)
+            self.container = _container(self.head)
 
     @cached_property
     def ply_header(self) -> PlyHeader:
@@ -71,7 +77,7 @@ class Content:
     @cached_property
     def is_gzipped_ply(self) -> bool:
         """Whether the file is a gzipped PLY file."""
-        if self.container != "gzip":
+        if self.container != "gzip" or self.member is not None:
             return False
         try:
             return _SIGNATURES["ply"].match(zlib.decompressobj(31).decompress(self.head, 64)) is not None
@@ -79,7 +85,9 @@ class Content:
             return False
 
     def open(self) -> BinaryIO:
-        """The opened file; a gzipped PLY file is unpacked while it is read."""
+        """The opened file; a gzipped PLY file, and one in a zip archive, is unpacked while it is read."""
+        if self.member is not None:
+            return cast(BinaryIO, ZippedFile(self.path, self.member))
         return cast(BinaryIO, GzippedFile(self.path)) if self.is_gzipped_ply else open(self.path, "rb")
 
     @property
@@ -103,7 +111,7 @@ class Content:
             UnreadSplats: the kind is known, but not read.
             FileFormatError: the file is something else; the message says what, if that is clear.
         """
-        path, name = self.path, self.path.name.lower()
+        path, name = self.path, (self.member or self.path.name).lower()
         convert = f"convert it first: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
         self.refuse_empty()
         if self.container == "ply" or self.is_gzipped_ply:
@@ -112,14 +120,14 @@ class Content:
         if is_spz(self.head):
             return "spz"
         if self.container == "zip":
-            return "sog"
+            return self._zip_format()
         if self.container == "glb":
             return "gltf"
         if self.container == "json":
             return self._json_format(convert)
         if name.endswith(".ksplat"):
             raise UnreadSplats(f"{path}: .ksplat files are not read here; {convert}")
-        with open(path, "rb") as file:
+        with self.open() as file:
             if is_dot_splat(file):
                 return "splat"
         if name.endswith(".splat"):
@@ -127,12 +135,26 @@ class Content:
                 f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
                 f" (it has {path.stat().st_size:,} bytes)"
             )
+        if self.container == "html":
+            raise UnreadSplats(f"{path}: {_page(path)}")
         if self.container in _UNREAD:
             raise UnreadSplats(f"{path}: {_UNREAD[self.container]}")
+        if not self.is_obj and (what := foreign(path, self.head)):
+            raise UnreadSplats(f"{path}: {what}")
         raise FileFormatError(
             f"{path}: not a splat file of a known format, it begins with {self.head[:8]!r};"
             f" expected {_EXPECTED}"
         )
+
+    def _zip_format(self) -> SplatFormat:
+        """The format of an archive without a single file of splats: SOG, if its meta.json is there."""
+        try:
+            archive = Archive(self.path)
+        except FileFormatError:  # broken: the reader says so
+            return "sog"
+        if archive.has_meta:
+            return "sog"
+        raise archive.refusal()
 
     def _json_format(self, convert: str) -> SplatFormat:
         """The format of a JSON file by the words in it; its reader parses it."""
@@ -150,6 +172,54 @@ class Content:
         if b'"means"' in text:
             return "sog"
         raise FileFormatError(f"{self.path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
+
+
+def _container(head: bytes) -> Container | None:
+    return next((name for name, pattern in _SIGNATURES.items() if pattern.match(head)), None)
+
+
+def _only_member(path: Path) -> str | None:
+    """The only file with splats in a zip archive; None if it has none, or is of a format of its own.
+    FileFormatError if it has several."""
+    try:
+        archive = Archive(path)
+    except FileFormatError:  # broken: the reader says so
+        return None
+    if archive.has_meta:
+        return None
+    found = [name for name in archive.candidates() if _is_splats(path, name)]
+    if len(found) > 1:
+        some = ", ".join(found[:4]) + (", ..." if len(found) > 4 else "")
+        raise UnreadSplats(
+            f"{path}: {len(found)} files of splats in one archive ({some}): unpack it, and give one"
+        )
+    return found[0] if found else None
+
+
+def _is_splats(path: Path, name: str) -> bool:
+    """Whether a file in an archive is splats, or so broken that only its reader can tell."""
+    with ZippedFile(path, name) as zipped:
+        file = cast(BinaryIO, zipped)
+        head = file.read(4096)
+        file.seek(0)
+        if _container(head) != "ply":
+            return is_spz(head) or (name.lower().endswith(".splat") and is_dot_splat(file))
+        try:
+            header = read_header(file, path)
+        except FileFormatError:
+            return True
+        return is_compressed_splat(header) or is_float_splat(header)
+
+
+def _page(path: Path) -> str:
+    """What an HTML file is."""
+    with open(path, "rb") as file:
+        text = file.read(1 << 20).lower()
+    if b'name="generator" content="meshsplats' in text:
+        return "a page of 'meshsplats view', for browsers: give the file that it was made of"
+    if b"supersplat" in text or b"playcanvas" in text:
+        return "a page of SuperSplat's viewer: export the splats there as .ply or .sog"
+    return "a web page, not the file itself: did the download ask for a login?"
 
 
 def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
@@ -171,7 +241,11 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
     if content.container == "usd":
         return "mesh"
     if content.container == "zip":
-        return "mesh" if _holds_arrays(path) else "splats"
+        if _holds_arrays(path):
+            return "mesh"
+        if found is None:
+            content.splat_format()  # says what it is
+        return "splats"
     if found == "gltf":
         return "splats" if has_splats(path) else "mesh"
     if content.is_obj:
@@ -181,6 +255,8 @@ def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
     if content.is_text and content.container in ("json", "array"):
         return "cameras"
     content.refuse_empty()
+    if what := foreign(path, content.head):
+        raise FileFormatError(f"{path}: {what}")
     raise FileFormatError(
         f"{path}: neither splats, a mesh nor cameras of a known format; it begins with {content.head[:8]!r}"
     )
@@ -191,8 +267,7 @@ def _holds_arrays(path: Path) -> bool:
     if path.suffix.lower() == ".usdz":  # its reader says what to do
         return True
     try:
-        with zipfile.ZipFile(path) as archive:
-            return any(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, ValueError, OSError):
+        return any(name.endswith(".npy") for name in Archive(path).names)
+    except FileFormatError:
         # Broken: the name decides which reader says so.
         return path.suffix.lower() == ".npz"

@@ -1,0 +1,151 @@
+"""Splat files in zip archives, as downloads often come: read in place, nothing is unpacked to the disk."""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+from meshsplats._foreign import foreign_archive
+from meshsplats.errors import FileFormatError
+from meshsplats.formats._validation import Budget
+
+_SUFFIXES = (".ply", ".spz", ".splat")
+_PIECE = 1 << 20
+_MAX_TRIED = 64
+"""Of files that are named like splats, only this many are opened to see whether they are."""
+BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError)
+"""Errors of the zip reader: broken or encrypted archives, unknown methods."""
+
+
+class BoundedReader(io.BufferedReader):
+    """An archive, opened. Refuses a single read beyond 16 MiB: a zip directory of that size is an attack, and
+    what is in an archive is read piece by piece."""
+
+    _limit = 1 << 24
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+
+    def read(self, size: int | None = -1) -> bytes:
+        # BufferedReader would allocate ``size`` bytes even where the file ends earlier.
+        left = os.fstat(self.fileno()).st_size - self.tell()
+        wanted = left if size is None or size < 0 else min(size, left)
+        if wanted > self._limit:
+            raise zipfile.BadZipFile("its directory is absurdly large")
+        return super().read(max(wanted, 0))
+
+
+class Archive:
+    """A zip archive and the names of the files in it, without those that macOS adds."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with BoundedReader(path) as file, zipfile.ZipFile(file) as archive:
+                infos = archive.infolist()
+        except BROKEN as error:
+            raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
+        named = [info.filename for info in infos if not info.filename.endswith("/")]
+        self.names = [name for name in named if not _is_hidden(name)]
+
+    @property
+    def has_meta(self) -> bool:
+        """Whether it may be a SOG file."""
+        return any(name.rsplit("/", 1)[-1] == "meta.json" for name in self.names)
+
+    def candidates(self) -> list[str]:
+        """The files in it whose names are those of splats."""
+        return [name for name in self.names if name.lower().endswith(_SUFFIXES)][:_MAX_TRIED]
+
+    def refusal(self) -> FileFormatError:
+        """Why nothing in it is read."""
+        if what := foreign_archive(self.path, self.names):
+            return FileFormatError(f"{self.path}: {what}")
+        listed = ", ".join(sorted(self.names)[:5])[:200] or "nothing"
+        return FileFormatError(
+            f"{self.path}: a zip archive without meta.json is no SOG file, and no .ply, .spz or .splat is in"
+            f" it (it holds {listed})"
+        )
+
+
+def _is_hidden(name: str) -> bool:
+    return any(part == "__MACOSX" or (part.startswith(".") and part != "..") for part in name.split("/"))
+
+
+class ZippedFile(io.RawIOBase):
+    """The unpacked bytes of a file in an archive, to be read mainly from the front to the back.
+
+    Decompression bombs are refused by the size that the archive states, beyond which nothing is unpacked.
+    """
+
+    def __init__(self, path: Path, name: str) -> None:
+        self._where = f"{path}: {name[:200]!r}"
+        self._at_end = False
+        self._raw = BoundedReader(path)
+        try:
+            self._archive = zipfile.ZipFile(self._raw)
+            info = self._archive.getinfo(name)
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                # LZMA may claim gigabytes for its dictionary.
+                raise NotImplementedError(f"it is compressed by method {info.compress_type}, not by deflate")
+            self._file: Any = self._archive.open(info)
+            self._length = info.file_size
+            Budget(path).spend(self._length, f"{name[:200]!r} in it")
+        except FileFormatError:
+            self._raw.close()
+            raise
+        except (KeyError, *BROKEN) as error:
+            self._raw.close()
+            raise FileFormatError(f"{self._where} cannot be unpacked: {str(error)[:120]}") from None
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._length if self._at_end else self._file.tell()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        place = {io.SEEK_SET: 0, io.SEEK_CUR: self.tell(), io.SEEK_END: self._length}[whence] + offset
+        self._at_end = place == self._length  # where readers go for the length alone: nothing is unpacked
+        if self._at_end:
+            return place
+        if place < self._file.tell():
+            self._guarded(self._file.seek, 0)
+        while (left := place - self._file.tell()) > 0 and self._guarded(self._file.read, min(left, _PIECE)):
+            pass
+        return self._file.tell()
+
+    def read(self, size: int | None = -1) -> bytes:
+        left = self._length - self.tell()
+        left = left if size is None or size < 0 else min(size, left)
+        pieces = []
+        while left > 0 and (piece := self._guarded(self._file.read, min(left, _PIECE))):
+            pieces.append(piece)
+            left -= len(piece)
+        return b"".join(pieces)
+
+    def readinto(self, buffer: Any) -> int:
+        if self._at_end:
+            return 0
+        view = memoryview(buffer).cast("B")
+        return self._guarded(self._file.readinto, view[: min(len(view), _PIECE)])
+
+    def close(self) -> None:
+        if not self.closed:
+            self._file.close()
+            self._archive.close()
+            self._raw.close()
+        super().close()
+
+    def _guarded(self, read: Any, argument: Any) -> Any:
+        try:
+            return read(argument)
+        except BROKEN as error:
+            raise FileFormatError(f"{self._where} cannot be unpacked: {str(error)[:120]}") from None
