@@ -115,6 +115,12 @@ def test_large_splats_are_read_piece_by_piece(tmp_path, monkeypatch):
             assert file.read() == data
             assert file.seek(0, io.SEEK_END) == len(data)
             assert file.read(1) == b""
+            assert file.readinto(bytearray(1)) == 0
+            file.seek(0)
+            buffer = bytearray(len(data))
+            count = file.readinto(buffer)
+            assert count > 0
+            assert buffer[:count] == data[:count]
             assert file.seek(-5, io.SEEK_END) == file.tell() == len(data) - 5
             assert file.read() == data[-5:]
 
