@@ -28,11 +28,35 @@ MAX_VIEWS = 8
 """Maximum number of photographs, evenly spread, that the candidates are compared on."""
 UNRELATED_PSNR = 12.0
 """dB below which images do not show the content of the photographs: a uniform grey reaches nearly as much."""
+ALIKE = 0.65
+"""Correlation of coarse images above which they show the same from the same place, however far apart their
+colours are. Trained splats in their own frame, but too bright or too faint, have 0.74 or more; turned, moved
+or scaled until less than ``UNRELATED_PSNR`` is left, at most 0.59 (tests/evaluation/test_frames.py)."""
+SPARSE, IN_VIEW = 0.06, 0.1
+"""Share of the images below which a scene hardly covers them; share of its points from which on it is in
+view."""
 WARNING_GAIN = 0.1
 """dB by which another background must be better for a warning."""
 _MAX_BYTES = 1 << 20
 
+_BLOCKS = 24
+"""Blocks along the shorter side of coarse images."""
+_MAX_POINTS = 20_000
+"""Points of a scene that are looked for in the images."""
+
 Reason = Literal["given", "model folder", "usual", "best for"]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What images of a scene show of the photographs; means over some of the views."""
+
+    coverage: float
+    """Share of the image that the scene covers: its mean alpha."""
+    in_view: float
+    """Share of its splats or vertices that lie in the image."""
+    likeness: float
+    """Correlation of the brightness of coarse images, -1 to 1, over the better background."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +72,8 @@ class Background:
     """Name of the scene that was scored first."""
     psnr: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Mean PSNR in dB on some of the photographs, by scene and by background, its name or ``#rrggbb``."""
+    shown: Shown | None = None
+    """What the scene that was scored first shows; None if none was."""
 
     @property
     def name(self) -> str:
@@ -119,11 +145,13 @@ def find_background(
             chosen, reason = WHITE, "usual"
     if chosen is not None:
         candidates[color_name(_rgb(chosen))] = _rgb(chosen)
-    scores = {name: _scores(scene, views, candidates, threads) for name, scene in scenes.items()}
+    scored = {name: _scores(scene, views, candidates, threads) for name, scene in scenes.items()}
+    scores = {name: psnrs for name, (psnrs, _) in scored.items()}
     judge = next(iter(scenes), "")
     if chosen is None:
         chosen, reason = candidates[max(CANDIDATES, key=lambda name: scores[judge][name])], "best for"
-    found = Background(_rgb(chosen), reason, judge, scores)
+    shown = scored[judge][1] if scored else None
+    found = Background(_rgb(chosen), reason, judge, scores, shown)
     for name, psnrs in scores.items():
         best = max(psnrs, key=lambda color: psnrs[color])
         if psnrs[best] > psnrs[found.name] + WARNING_GAIN:
@@ -138,13 +166,27 @@ def find_background(
 
 
 def warn_of_other_worlds(found: Background) -> None:
-    """Issues a DataWarning if the scene that was scored shows almost nothing of the photographs."""
+    """Issues a DataWarning if the scene that was scored shows almost nothing of the photographs, with the
+    likely reason: another frame, a scene that is nearly empty or tiny, or other colours."""
     scores = found.psnr.get(found.judge)
     if scores and max(scores.values()) < UNRELATED_PSNR:
+        reason = (
+            "cameras and the scene seem to be in different frames, moved, rotated or scaled;"
+            " docs/datasets.md, 'One world', has the usual reasons"
+        )
+        if found.shown is not None and found.shown.likeness >= ALIKE:
+            reason = (
+                "frames of cameras and scene agree, as coarse images are alike"
+                f" (correlation {found.shown.likeness:.2f}): exposure, colours or opacities differ"
+            )
+        elif found.shown is not None and found.shown.coverage < SPARSE and found.shown.in_view >= IN_VIEW:
+            reason = (
+                f"scene covers {found.shown.coverage:.1%} of the images, though {found.shown.in_view:.0%} of"
+                " it lies in view: it is nearly empty or faint, or much smaller than what photographs show"
+            )
         warnings.warn(
             f"the {found.judge} shows almost nothing of the photographs ({max(scores.values()):.1f} dB): the"
-            " cameras and the scene seem to be in different frames, moved, rotated or scaled;"
-            " docs/datasets.md, 'One world', has the usual reasons",
+            f" {reason}",
             DataWarning,
             stacklevel=2,
         )
@@ -195,12 +237,15 @@ def _scores(
     views: Sequence[View],
     colors: Mapping[str, tuple[float, float, float]],
     threads: int | None,
-) -> dict[str, float]:
-    """Mean PSNR of ``scene`` on ``views`` in dB, by background."""
+) -> tuple[dict[str, float], Shown]:
+    """Mean PSNR of ``scene`` on ``views`` in dB, by background, and what it shows."""
     from meshsplats.rendering import render, render_splats
 
     linear = isinstance(scene, SplatMesh) and scene.blending == "linear"
     found: dict[str, list[float]] = {name: [] for name in colors}
+    alike: dict[str, list[float]] = {name: [] for name in colors}
+    coverage, in_view = [], []
+    points = subsample(scene.means if isinstance(scene, GaussianCloud) else scene.vertices, _MAX_POINTS)
     for view in views:
         mask = view.mask
         if mask is not None and not mask.any():
@@ -208,10 +253,36 @@ def _scores(
         draw: Any = render_splats if isinstance(scene, GaussianCloud) else render
         rendered = draw(scene, view.camera, background=BLACK, threads=threads)
         transmittance = 1 - rendered.alpha[..., None]
+        coverage.append(float(rendered.alpha.mean()))
+        in_view.append(float(view.camera.sees(points).mean()) if len(points) else 0.0)
         for name, color in colors.items():
             display = np.asarray(color, np.float32)
             image = rendered.color + transmittance * (srgb_to_linear(display) if linear else display)
             image = np.clip(linear_to_srgb(image) if linear else image, 0, 1)
             target = np.clip(view.load().over(color), 0, 1)
             found[name].append(min(psnr(image, target, mask=mask), 200.0))
-    return {name: float(np.mean(values)) if values else 0.0 for name, values in found.items()}
+            alike[name].append(_likeness(image, target, mask))
+    means = {name: float(np.mean(values)) if values else 0.0 for name, values in found.items()}
+    best = alike[max(means, key=lambda name: means[name])] if means else []
+    return means, Shown(*(float(np.mean(values)) if values else 0.0 for values in (coverage, in_view, best)))
+
+
+def _likeness(image: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> float:
+    """Correlation of the brightness of two images (h, w, 3) in coarse blocks; 0 where one is uniform."""
+    weight = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
+    shares = _coarse(weight)
+    counted = shares > 0.5
+    one, other = (
+        _coarse(pixels.mean(axis=2) * weight)[counted] / shares[counted] for pixels in (image, target)
+    )
+    if len(one) < 2 or one.std() < 1e-4 or other.std() < 1e-4:
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def _coarse(values: np.ndarray) -> np.ndarray:
+    """Means of ``values`` (h, w) in square blocks; what is left over at the right and below is cut."""
+    height, width = values.shape
+    side = max(1, min(height, width) // _BLOCKS)
+    rows, columns = height // side, width // side
+    return values[: rows * side, : columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))
