@@ -99,8 +99,8 @@ class ViewOptions:
     look_around: Count = None
     """N views from the middle of the scene, such as a room, in one full turn."""
     cameras: File = None
-    """Camera file: a JSON list of cameras, a cameras.json of a 3DGS trainer or camera_path.json of nerfstudio,
-    or the model folder that has one."""
+    """Camera file: a JSON list, a cameras.json of a 3DGS trainer, a camera_path.json of nerfstudio; or the
+    model folder that has one."""
     data: Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): the cameras of its test views."""
     downscale: int = 1
