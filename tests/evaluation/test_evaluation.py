@@ -200,6 +200,7 @@ def test_images_by_name_and_by_order(tmp_path):
     at = image_folder(tmp_path, cameras)
     assert at(cameras[0], (1, 1, 1))[0][0, 0] == pytest.approx([0.2] * 3)
     assert at(cameras[1], (1, 1, 1))[0][0, 0] == pytest.approx([0.4] * 3)
+    (tmp_path / "._r_2.png").write_bytes(b"\0")  # as macOS leaves it
     unnamed = [replace(CAMERA, name=f"other_{i}") for i in range(2)]
     at = image_folder(tmp_path, unnamed)
     assert at(unnamed[0], (1, 1, 1))[0][0, 0] == pytest.approx([0.2] * 3)  # 2 before 10

@@ -58,7 +58,7 @@ def inside(folder: Path, name: str, where: str) -> Path:
     parts = PurePosixPath(clean).parts
     if not clean or len(clean) > MAX_NAME or "\0" in clean:
         raise FileFormatError(f"{where}: a file name must have 1 to {MAX_NAME} characters, got {name[:60]!r}")
-    if clean.startswith("/") or PureWindowsPath(clean).drive or ".." in parts:
+    if leads_out(clean):
         raise FileFormatError(
             f"{where}: names the file {name[:200]!r}; only files inside the data set's folder are read, named"
             " relative to it"
@@ -95,6 +95,12 @@ def is_hidden(name: str) -> bool:
     return name.startswith(".") or name.casefold() in ("thumbs.db", "desktop.ini", "__macosx")
 
 
+def leads_out(name: str) -> bool:
+    """Whether the path ``name`` is absolute, or goes up by ``..``."""
+    clean = name.replace("\\", "/")
+    return clean.startswith("/") or bool(PureWindowsPath(clean).drive) or ".." in PurePosixPath(clean).parts
+
+
 class Shelf:
     """The images below a folder, found by what people take for the same name: in letters of another case,
     with accents composed otherwise, or with another suffix of images."""
@@ -105,8 +111,7 @@ class Shelf:
         self._folders: dict[PurePosixPath, dict[str, list[str]]] = {}
 
     def alike(self, name: str) -> list[str]:
-        """The files, relative to the folder, that may be meant by ``name``, sorted. Those in the folders that
-        it names, else those of its last part in the folder itself."""
+        """The files, relative to the folder, that may be meant by the path ``name`` in it, sorted."""
         parts = PurePosixPath(name.replace("\\", "/")).parts
         if not parts or len(name) > MAX_NAME or ".." in parts or parts[0] == "/":
             return []
@@ -115,10 +120,17 @@ class Shelf:
             key = _fold(part)
             places = [place / found for place in places for found in self._listed(place)[1].get(key, ())]
         stem = _stem_of(parts[-1])
-        found = [str(place / file) for place in places for file in self._listed(place)[0].get(stem, ())]
-        if not found and len(parts) > 1:
-            found = list(self._listed(PurePosixPath())[0].get(stem, ()))
-        return sorted(found)
+        return sorted(str(place / file) for place in places for file in self._listed(place)[0].get(stem, ()))
+
+    def by_last_parts(self, name: str, images: str = "") -> list[str]:
+        """As ``alike``, for the last parts of ``name``, as many as lead to a file; the last alone is looked
+        for in the folder ``images``."""
+        parts = PurePosixPath(name.replace("\\", "/")).parts
+        tails = ["/".join(parts[i:]) for i in range(len(parts))]
+        for tail in (*tails[:-1], *(f"{images}/{last}" if images else last for last in tails[-1:])):
+            if found := self.alike(tail):
+                return found
+        return []
 
     def images(self) -> list[str]:
         """The names of the readable images in the folder itself, sorted."""
@@ -305,10 +317,9 @@ class Album:
         return found
 
     def alike(self, name: str) -> list[str]:
-        """The files in the data set that may be meant by ``name``, which is not there."""
-        base = f"{self.images}/" if self.images else ""
-        found = self._shelf.alike(name)
-        return found or self._shelf.alike(base + PurePosixPath(name.replace("\\", "/")).name)
+        """The files in the data set that may be meant by ``name``, which is not there: by its last parts, as
+        many as possible, or by the last one in the folder of the images."""
+        return self._shelf.by_last_parts(name, self.images)
 
     def _smaller(self, name: str, where: str) -> Path | None:
         """The copy in ``images_<downscale>/``, if there is such a folder."""

@@ -34,6 +34,8 @@ class Layout(NamedTuple):
     """COLMAP and LLFF: the folder of the images, relative to ``root``; empty: ``root`` itself."""
     before: tuple[str, ...] = ()
     """COLMAP: models with lower numbers, and their images, which are fewer than those of this one."""
+    has_images: bool = True
+    """COLMAP: whether some of its images are there, or smaller copies of them."""
 
 
 def find_layout(path: Path) -> Layout | None:
@@ -53,13 +55,13 @@ def find_layout(path: Path) -> Layout | None:
     if (path / "transforms_train.json").is_file():
         return Layout("NeRF-synthetic", path / "transforms_train.json", path)
     usual = _best(_models(path, "sparse", path))
-    if usual is not None and _has_images(usual):
+    if usual is not None and usual.has_images:
         return usual
     if (path / "transforms.json").is_file():
         return Layout("nerfstudio", path / "transforms.json", path)
     others = [usual] if usual is not None else []
     for found in _unusual(path):
-        if _has_images(found):
+        if found.has_images:
             return found
         others.append(found)
     if (path / POSES_BOUNDS).is_file():
@@ -111,7 +113,9 @@ def _candidates(root: Path, models: Sequence[Path]) -> list[Layout]:
             folders.append(model.relative_to(root).as_posix())
         names = _sample(model)
         holding = next((folder for folder in folders if _holds(root, folder, names)), None)
-        result.append(Layout("COLMAP", model, root, "images" if holding is None else holding))
+        found = holding is not None or any(name.startswith("images_") for name in _folders(root))
+        images = "images" if holding is None else holding
+        result.append(Layout("COLMAP", model, root, images, has_images=found))
     return result
 
 
@@ -119,17 +123,11 @@ def _best(models: Sequence[Layout]) -> Layout | None:
     """The one with the most images of those whose images are there, else of all."""
     if not models:
         return None
-    there = [found for found in models if len(models) > 1 and _has_images(found)] or list(models)
+    there = [found for found in models if found.has_images] or list(models)
     sizes = [len(_names(found.source)) if len(there) > 1 else 0 for found in there]
     best = sizes.index(max(sizes))
     before = tuple(f"{there[i].source} ({sizes[i]})" for i in range(best))
     return there[best]._replace(before=before)
-
-
-def _has_images(layout: Layout) -> bool:
-    """Whether some of its images are there, or copies of them for a downscale."""
-    smaller = any(name.startswith(f"{layout.images}_") for name in _folders(layout.root))
-    return (smaller and layout.images != "") or _holds(layout.root, layout.images, _sample(layout.source))
 
 
 def _holds(root: Path, folder: str, names: Sequence[str] | None) -> bool:
@@ -141,7 +139,7 @@ def _holds(root: Path, folder: str, names: Sequence[str] | None) -> bool:
     if names is None:
         return True
     shelf = Shelf(place)
-    return any(shelf.alike(name) for name in names)
+    return any(shelf.alike(name) or shelf.alike(name.replace("\\", "/").split("/")[-1]) for name in names)
 
 
 def _sample(model: Path) -> Sequence[str] | None:

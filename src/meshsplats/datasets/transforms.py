@@ -6,18 +6,19 @@ docs.nerf.studio/quickstart/data_conventions.html and the files of the NeRF-synt
 
 from __future__ import annotations
 
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from meshsplats._json import read_json
 from meshsplats.camera import MAX_SIDE
-from meshsplats.datasets.image_files import Frame, Shelf, find, inside, is_readable
+from meshsplats.datasets.image_files import Frame, Shelf, find, inside, is_readable, leads_out
 from meshsplats.datasets.lens import Lens
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.images.reading import read_header
 
 MAX_FRAMES = 200_000
@@ -61,7 +62,16 @@ def read_transforms(path: Path) -> Transforms:
             splits[key.removesuffix("_filenames")] = set(names)
     common = {key: value for key, value in content.items() if key != "frames"}
     shelf = Shelf(path.parent)
-    return Transforms([_frame(path, shelf, common, f, i) for i, f in enumerate(frames)], splits)
+    found = [_frame(path, shelf, common, f, i) for i, f in enumerate(frames)]
+    moved = [f"{f.name}: {f.file}" for f in found if leads_out(f.name) and not leads_out(f.file)]
+    if moved:
+        warnings.warn(
+            f"{path}: {len(moved)} images have paths of another place, and are taken from this folder by the"
+            f" last parts of these ({moved[0][:200]})",
+            DataWarning,
+            stacklevel=2,
+        )
+    return Transforms(found, splits)
 
 
 def points_file(path: Path) -> str | None:
@@ -88,12 +98,24 @@ def _frame(path: Path, shelf: Shelf, common: dict[str, Any], frame: object, i: i
         raise FileFormatError(f"{where}: needs a 'file_path'")
     if mask is not None and not isinstance(mask, str):
         raise FileFormatError(f"{where}: 'mask_path' must be a file name")
+    name, file = file.removeprefix("./"), _here(path.parent, file)
     where = f"{where} ({file[:60]!r})"
     # Some writers name what they do not know, with null.
     values = common | {key: value for key, value in frame.items() if value is not None}
     values = {key: value for key, value in values.items() if value is not None}
     lens = _lens(shelf, values, file, where)
-    return Frame(file.removeprefix("./"), file, lens, _world_to_camera(frame, where), mask)
+    return Frame(name, file, lens, _world_to_camera(frame, where), mask)
+
+
+def _here(folder: Path, file: str) -> str:
+    """``file``, or for a path that leads out of ``folder`` the last parts of it, as many as possible, that
+    are those of a file there."""
+    if leads_out(file):
+        parts = PurePosixPath(file.replace("\\", "/")).parts
+        for i in range(1, len(parts)):
+            if ".." not in parts[i:] and folder.joinpath(*parts[i:]).is_file():
+                return "/".join(parts[i:])
+    return file
 
 
 def _lens(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> Lens | None:
@@ -146,7 +168,7 @@ def _size(shelf: Shelf, values: dict[str, Any], file: str, where: str) -> tuple[
             )
         return int(sides[0]), int(sides[1])
     found = find(shelf.folder, file, where)
-    alike = [name for name in shelf.alike(file) if is_readable(name)] if found is None else []
+    alike = [name for name in shelf.by_last_parts(file) if is_readable(name)] if found is None else []
     if len(alike) == 1:
         found = inside(shelf.folder, alike[0], where)
     if found is None:

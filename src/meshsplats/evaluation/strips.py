@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from meshsplats.camera import Camera
+from meshsplats.datasets.image_files import is_hidden
 from meshsplats.evaluation.report import ImageAt, Report, ScoredView
 from meshsplats.images.writing import amplified_error, strip
 
@@ -68,7 +69,9 @@ def image_folder(folder: str | os.PathLike[str], cameras: Sequence[Camera]) -> I
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"no folder of images at {folder}")
-    files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+    files = [
+        p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file() and not is_hidden(p.name)
+    ]
     by_name = {p.stem: p for p in files}
     stems = [Path(camera.name).stem for camera in cameras]
     if all(stem in by_name for stem in stems):
