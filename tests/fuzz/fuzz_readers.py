@@ -1,5 +1,5 @@
-"""Mutated files against the readers: each gives splats or a mesh, a FileFormatError or an OSError, soon and
-in little memory.
+"""Mutated files against the readers: each gives splats, a mesh or cameras, a FileFormatError or an OSError,
+soon and in little memory.
 
     python tests/fuzz/fuzz_readers.py [--format ply ...] [--count 20000] [--seed 0] [--keep DIR]
 
@@ -24,13 +24,14 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from fuzz.data_seeds import DATA_SEEDS
 from fuzz.mesh_seeds import MESH_SEEDS
 from fuzz.seeds import SEEDS as SPLAT_SEEDS
 from fuzz.seeds import Seed
 
 from meshsplats import FileFormatError
 
-SEEDS = [*SPLAT_SEEDS, *MESH_SEEDS]
+SEEDS = [*SPLAT_SEEDS, *MESH_SEEDS, *DATA_SEEDS]
 MEMORY = 512 << 20
 SECONDS = 10
 KINDS = np.array([4, 3, 3, 1, 1, 1, 1, 3, 3]) / 20

@@ -16,6 +16,7 @@ from meshsplats.camera import MAX_SIDE
 from meshsplats.datasets.image_files import Frame, Shelf
 from meshsplats.datasets.lens import Lens
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.npz import read_npy_header
 
 MAX_BYTES = 32 << 20
 """Longer files are refused."""
@@ -44,18 +45,19 @@ def read_poses_bounds(path: Path, images: str) -> list[Frame]:
 
 
 def _rows(path: Path) -> np.ndarray:
-    if path.stat().st_size > MAX_BYTES:
+    size = path.stat().st_size
+    if size > MAX_BYTES:
         raise FileFormatError(f"{path}: larger than {MAX_BYTES >> 20} MiB, the limit for such a file")
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise FileFormatError(f"{path}: no NumPy array ({str(error)[:120]})") from None
-    if not isinstance(rows, np.ndarray):
-        raise FileFormatError(f"{path}: an archive, not an array")
-    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
-        shown = f"{rows.dtype} {rows.shape}"
-        raise FileFormatError(f"{path}: must hold rows of 17 numbers, one for each image; it has {shown}")
-    rows = rows.astype(np.float64)
+    with open(path, "rb") as file:
+        shape, dtype, fortran, start = read_npy_header(file, path.name, f"{path}: the array")
+        if len(shape) != 2 or shape[1] != 17:
+            raise FileFormatError(
+                f"{path}: must hold rows of 17 numbers, one for each image; its shape is {shape}"
+            )
+        if start + dtype.itemsize * 17 * shape[0] != size:
+            raise FileFormatError(f"{path}: {shape[0]} rows do not fit its {size:,} bytes (truncated?)")
+        values = np.frombuffer(file.read(), dtype)
+    rows = values.reshape(shape, order="F" if fortran else "C").astype(np.float64)
     if not np.isfinite(rows).all():
         raise FileFormatError(f"{path}: has values that are not finite")
     return rows

@@ -17,6 +17,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -132,23 +133,29 @@ def _parse_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str, pa
         # LZMA may claim gigabytes for its dictionary.
         raise FileFormatError(f"{at} is compressed by method {info.compress_type}, which NumPy never uses")
     with archive.open(info) as file:
-        magic = file.read(8)
-        if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\0", b"\x02\0"):
-            raise FileFormatError(f"{at} is not in .npy format 1 or 2")
-        width = 2 if magic[6] == 1 else 4
-        raw = file.read(width)
-        length = int.from_bytes(raw, "little")
-        text = file.read(length) if length <= _MAX_HEADER else b""
-        if len(raw) < width or len(text) < length:
-            raise FileFormatError(f"{at} has a broken header")
-    shape, dtype, fortran = _parse_header(text, name, at)
-    size = 8 + width + length + dtype.itemsize * _product(shape)
+        shape, dtype, fortran, start = read_npy_header(file, name, at)
+    size = start + dtype.itemsize * _product(shape)
     if size != info.file_size:
         raise FileFormatError(
             f"{at} of shape {shape} and type {dtype} should take {size:,} bytes,"
             f" the archive holds {info.file_size:,}"
         )
-    return _Member(info, shape, dtype, fortran, 8 + width + length)
+    return _Member(info, shape, dtype, fortran, start)
+
+
+def read_npy_header(file: IO[bytes], name: str, at: str) -> tuple[tuple[int, ...], np.dtype, bool, int]:
+    """Shape, type, whether the first index runs fastest, and where the values begin, of the array ``name`` in
+    an opened .npy file. Nothing is allocated for it. FileFormatError, which begins with ``at``."""
+    magic = file.read(8)
+    if magic[:6] != b"\x93NUMPY" or magic[6:] not in (b"\x01\0", b"\x02\0"):
+        raise FileFormatError(f"{at} is not in .npy format 1 or 2")
+    width = 2 if magic[6] == 1 else 4
+    raw = file.read(width)
+    length = int.from_bytes(raw, "little")
+    text = file.read(length) if length <= _MAX_HEADER else b""
+    if len(raw) < width or len(text) < length:
+        raise FileFormatError(f"{at} has a broken header")
+    return (*_parse_header(text, name, at), 8 + width + length)
 
 
 def _parse_header(text: bytes, name: str, at: str) -> tuple[tuple[int, ...], np.dtype, bool]:
