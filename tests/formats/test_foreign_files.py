@@ -6,6 +6,7 @@ import gzip
 import io
 import os
 import pickle
+import re
 import shlex
 import subprocess
 import sys
@@ -335,13 +336,15 @@ def test_a_page_of_ours_is_known(tmp_path):
         (["._a.ply", ".DS_Store", "Thumbs.db"], "a folder without splats"),
     ],
 )
-def test_folders_without_splats_are_named(tmp_path, files, message):
+def test_folders_without_splats_are_named(tmp_path, capsys, files, message):
     for name in files:
         (tmp_path / name).write_bytes(b"x")
     for read in (load_gaussians, ms.stream_gaussians):
         with pytest.raises(FileFormatError, match=message):
             read(tmp_path)
-    assert main(["convert", str(tmp_path), "-o", str(tmp_path / "out"), "--formats", "glb"]) == 1
+    for output in (["out", "--formats", "glb"], ["out.glb"]):  # the second would be one file for several
+        assert main(["convert", str(tmp_path), "-o", str(tmp_path / output[0]), *output[1:]]) == 1
+        assert re.search(message, capsys.readouterr().err)
 
 
 def test_a_data_set_given_as_cameras_is_told_so(tmp_path):

@@ -171,8 +171,9 @@ def sources(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_batch(paths: Sequence[Path]) -> bool:
-    """Whether ``paths`` may name more than one input."""
-    return len(paths) > 1 or any(path.is_dir() and not _is_splats(path) for path in paths)
+    """Whether ``paths`` may name more than one input. FileFormatError for a folder without any."""
+    folders = [path for path in paths if path.is_dir() and not _is_splats(path)]
+    return any([_inside(folder) for folder in folders]) or len(paths) > 1
 
 
 def jobs(

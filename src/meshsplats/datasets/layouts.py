@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from meshsplats._foreign import what_it_is
 from meshsplats.datasets.cameras_of_others import cameras_of_others
 from meshsplats.datasets.colmap import MODEL_FILES, find_model, image_names
-from meshsplats.datasets.image_files import Shelf, is_hidden
+from meshsplats.datasets.image_files import Shelf, is_hidden, is_readable
 from meshsplats.errors import FileFormatError
 
 POSES_BOUNDS = "poses_bounds.npy"
@@ -199,6 +200,9 @@ def what_is_there(path: Path) -> str:
         return "a trained model, not the photographs it was trained on"
     if path.name.casefold() in IMAGE_FOLDERS and _looks_like_one(path.absolute().parent):
         return f"the images alone; give the folder above it, {path.absolute().parent}, which has the cameras"
+    kinds = ((name, what_it_is(path / name)) for name in names[:_SAMPLE] if (path / name).is_file())
+    if known := next(((name, what) for name, what in kinds if what and not is_readable(name)), None):
+        return f"{wanted}; {known[0]} in it is {known[1]}"
     return f"{wanted}; it holds {', '.join(names[:6]) or 'nothing'}"
 
 
