@@ -488,6 +488,9 @@ def test_train_does_not_estimate_cameras_where_some_lie(tmp_path, capsys, monkey
     with pytest.raises(ZeroDivisionError):
         main([*command, "--estimate-cameras"])
     assert len(calls) == 1
+    read = simple_colmap(tmp_path / "read", 3)
+    assert main(["train", str(read), "-o", str(tmp_path / "mesh.npz"), "--estimate-cameras"]) == 2
+    assert "--estimate-cameras has no effect: " in capsys.readouterr().err
     # The photographs alone of a data set that has cameras.
     inner = simple_colmap(tmp_path / "good", 3) / "images"
     assert main(["train", str(inner), "-o", str(tmp_path / "mesh.npz")]) == 1

@@ -108,8 +108,10 @@ class Train(TrainingCommand):
         super().check()
 
     def plan(self, config: FinetuneConfig, earlier: Checkpoint | None, setup: Setup) -> Plan:
+        from meshsplats.datasets.layouts import find_layout
         from meshsplats.datasets.points import load_points
         from meshsplats.training.reconstruction import (
+            CAMERAS,
             bare_photographs,
             find_cameras,
             refuse_unread_cameras,
@@ -120,6 +122,10 @@ class Train(TrainingCommand):
             if not self.target.estimate_cameras:
                 refuse_unread_cameras(self.input)
             find_cameras(self.input, say)
+        elif self.target.estimate_cameras:
+            found = find_layout(self.input)
+            if found is not None and found.source != self.input / CAMERAS:  # those of an earlier run
+                raise UsageError(f"--estimate-cameras has no effect: {found.source} has cameras")
         dataset, background = self._dataset(config)
         points = load_points(self.input)
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
