@@ -550,7 +550,7 @@ def set_(*keys, value):
         (set_("root", "children", value=3), "children of a tile"),
         (set_("root", "extras", "triangles", value=1.5), "count of triangles"),
     ],
-    ids=str,
+    ids=lambda value: getattr(value, "__name__", str(value)),  # not the address of a function
 )
 def test_broken_tilesets_are_refused(tileset, tmp_path, change, message):
     with pytest.raises(FileFormatError, match=message):
