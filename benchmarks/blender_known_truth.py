@@ -2,12 +2,11 @@
 
     blender-env/bin/python benchmarks/blender_known_truth.py --data ../shared/data
 
-Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the
-data folder): clean, noisy, with floaters and holes, and fine-tuned against the texture. They are drawn on
-the ground under sun and sky, as ``meshsplats blender --lit`` draws them and, for comparison, with a plain
-diffuse material. Prints a Markdown table, below Blender's own output, and writes a strip of the images
-(-o). Shadow overlap is intersection over union of those pixels of the ground that are darker than 0.8 of
-the bare ground.
+Splats are sampled on Spot, a textured cow (Keenan Crane, public domain; meshes/spot_textured/spot in the data
+folder): clean, noisy, with floaters and holes, and fine-tuned against the texture. They are drawn on the
+ground under sun and sky, as ``meshsplats blender --lit`` draws them and, for comparison, with a plain diffuse
+material. The table comes below Blender's own output; -o writes a strip of the images. Shadow overlap is
+intersection over union of those pixels of the ground that are darker than 0.8 of the bare ground.
 
 ``--frames 40`` draws an orbit of that many frames instead, a degree apart, denoised, and prints how much a
 pixel of the cow flickers: the RMS of half the difference between a frame and the mean of its neighbours, in
@@ -22,12 +21,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from _common import Report, arguments
 from PIL import Image
 
 from meshsplats import Dataset, GaussianCloud, SplatMesh, View, convert, dome, finetune, orbit, render
 from meshsplats.blender import LightOptions, SceneOptions, subject
-from meshsplats.blender.inside import meshes, rendering, scene, stage, versions
-from meshsplats.blender.inside.host import bpy
 from meshsplats.blender.linear import linear_colors
 from meshsplats.colors import linear_to_srgb
 from meshsplats.datasets.views import ViewImage
@@ -134,6 +132,9 @@ def fine_tuned(mesh: SplatMesh, obj, texture: np.ndarray) -> SplatMesh:
 
 def add_truth(obj, texture: Path, like) -> None:
     """The textured mesh, smooth, where the splat object ``like`` is."""
+    from meshsplats.blender.inside import meshes, versions
+    from meshsplats.blender.inside.host import bpy
+
     points, coordinates, faces, texture_faces = obj
     data = meshes.make_plain("Truth", points, faces)
     data.update(calc_edges=True)
@@ -156,6 +157,8 @@ def add_truth(obj, texture: Path, like) -> None:
 
 def shot(made) -> np.ndarray:
     """The linear image of the scene's camera."""
+    from meshsplats.blender.inside import rendering
+
     with tempfile.TemporaryDirectory() as scratch:
         rendering.render_to(made.scene, Path(scratch) / "image.exr")
         return rendering.read_pixels(Path(scratch) / "image.exr")[..., :3]
@@ -165,9 +168,11 @@ def display(image: np.ndarray) -> np.ndarray:
     return linear_to_srgb(np.clip(image, 0, 1))
 
 
-def print_flicker(
-    obj, texture: np.ndarray, folder: Path, asked: argparse.Namespace, options: SceneOptions
+def flicker(
+    report: Report, obj, texture: np.ndarray, folder: Path, asked: argparse.Namespace, options: SceneOptions
 ) -> None:
+    from meshsplats.blender.inside import scene, stage
+
     mesh = fine_tuned(replace(convert(sample(obj, texture, "clean"), mode="flat"), up=UP), obj, texture)
     size = {"width": asked.width, "height": asked.width * 3 // 4, "distance": 1.3}
     views = [orbit(mesh, 1, elevation=25, azimuth=215 + i, **size)[0] for i in range(asked.frames)]
@@ -190,18 +195,17 @@ def print_flicker(
     drawn["splats, unlit"] = np.stack([render(mesh, view, samples=4).color for view in views])
     cow = np.stack([render(mesh, view).alpha > 0.98 for view in views])
     inside = cow[1:-1] & cow[:-2] & cow[2:]
-    print("\n| | flicker of the cow |\n|---|---|")
+    report.table("", "flicker of the cow")
     for name, frames in drawn.items():
         change = (frames[1:-1] - (frames[:-2] + frames[2:]) / 2) / 2
-        print(f"| {name} | {255 * np.sqrt(np.square(change[inside]).mean()):.2f} |")
+        report.row(name, f"{255 * np.sqrt(np.square(change[inside]).mean()):.2f}")
     if asked.output is not None:
         shown = [frames[0] for frames in drawn.values()]
         save_image(asked.output, strip(shown, list(drawn)))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Lit splats against a known surface.")
-    parser.add_argument("--data", type=Path, required=True, help="folder with meshes/spot_textured/spot")
+    parser = arguments(__doc__, data=True)
     parser.add_argument("--width", type=int, default=320)
     parser.add_argument("--samples", type=int, default=48)
     parser.add_argument("-o", "--output", type=Path, help="image of all: a .png")
@@ -211,20 +215,24 @@ def main() -> None:
     obj = read_obj(folder / "spot_triangulated.obj")
     texture = np.asarray(Image.open(folder / "spot_texture.png").convert("RGB"))
     light = LightOptions(sun=(130, 40))
-    if asked.frames:
-        print_flicker(
-            obj, texture, folder, asked, SceneOptions(light=light, samples=asked.samples, denoise=True)
-        )
-        return
-    options = SceneOptions(light=light, samples=asked.samples)
+    with Report(asked) as report:
+        if asked.frames:
+            options = SceneOptions(light=light, samples=asked.samples, denoise=True)
+            flicker(report, obj, texture, folder, asked, options)
+        else:
+            compare(report, obj, texture, folder, asked, SceneOptions(light=light, samples=asked.samples))
+
+
+def compare(
+    report: Report, obj, texture: np.ndarray, folder: Path, asked: argparse.Namespace, options: SceneOptions
+) -> None:
+    from meshsplats.blender.inside import scene
+    from meshsplats.blender.inside.host import bpy
+
     height = asked.width * 3 // 4
     view = None
     shown, captions = [], []
-
-    rows = [
-        "| splats | material | PSNR, image | PSNR, cow alone | shadow overlap | light, of the mesh's |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     target = ground = None
     for kind in KINDS:
         mesh = replace(convert(sample(obj, texture, kind), mode="flat"), up=UP)
@@ -264,15 +272,23 @@ def main() -> None:
             dark = (drawn.mean(axis=2) < 0.8 * ground.mean(axis=2)) & floor
             cow = covered > 0.98
             rows.append(
-                f"| {kind} | {material} | {psnr(display(drawn), display(target)):.1f} dB |"
-                f" {psnr(display(drawn), display(target), mask=cow):.1f} dB |"
-                f" {(dark & shade).sum() / max((dark | shade).sum(), 1):.2f} |"
-                f" {drawn[cow].mean() / target[cow].mean():.2f} |"
+                (
+                    kind,
+                    material,
+                    f"{psnr(display(drawn), display(target)):.1f} dB",
+                    f"{psnr(display(drawn), display(target), mask=cow):.1f} dB",
+                    f"{(dark & shade).sum() / max((dark | shade).sum(), 1):.2f}",
+                    f"{drawn[cow].mean() / target[cow].mean():.2f}",
+                )
             )
             shown.append(display(drawn))
             captions.append(f"{kind}, {material}")
-    print(f"\nBlender {bpy.app.version_string}, {asked.width} x {height}, {asked.samples} samples\n")
-    print("\n".join(rows))
+    report.say(f"Blender {bpy.app.version_string}, {asked.width} x {height}, {asked.samples} samples")
+    report.table(
+        "splats", "material", "PSNR, image", "PSNR, cow alone", "shadow overlap", "light, of the mesh's"
+    )
+    for row in rows:
+        report.row(*row)
     if asked.output is not None:
         save_image(asked.output, strip(shown, captions))
 

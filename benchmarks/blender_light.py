@@ -3,21 +3,21 @@
     blender-env/bin/python benchmarks/blender_light.py ../shared/data/splats/guitar_sh0.ply [more files]
 
 Under white light from everywhere, a lit image should be the unlit one, up to soft darkening in hollows. For
-each file, prints a row of a Markdown table: PSNR of the display values on the object's pixels, after one gain
-that makes the means of linear light equal; that gain; the share of blotches, solid pixels whose light (lit by
-unlit, means of 3 x 3 pixels) differs by a fifth and more from its mean over 16 x 16 pixels; most layers
-behind each other; processor seconds of all threads, from the mesh to the image. ``-o`` writes the unlit image
-beside those under even light, sun and studio.
+each file: PSNR of the display values on the object's pixels, after one gain that makes the means of linear
+light equal; that gain; the share of blotches, solid pixels whose light (lit by unlit, means of 3 x 3 pixels)
+differs by a fifth and more from its mean over 16 x 16 pixels; most layers behind each other; processor
+seconds of all threads, from the mesh to the image. ``-o`` writes the unlit image beside those under even
+light, sun and studio.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
+from _common import Report, Stopwatch, arguments
 from PIL import Image
 
 from meshsplats import convert, load_gaussians, orbit, psnr, render
@@ -66,7 +66,7 @@ def blotches(lit: np.ndarray, unlit: np.ndarray, seen: np.ndarray) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Even light on splats.")
+    parser = arguments(__doc__)
     parser.add_argument("files", type=Path, nargs="+", help="splats")
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--height", type=int, help="as wide by default")
@@ -74,38 +74,42 @@ def main() -> None:
     parser.add_argument("--threads", type=int)
     parser.add_argument("-o", "--output", type=Path, help="folder for images")
     asked = parser.parse_args()
-    print("| splats | PSNR | gain | blotches | layers | processor time |\n|---|---|---|---|---|---|")
-    for file in asked.files:
-        mesh = convert(load_gaussians(file), mode="flat")
-        height = asked.height or asked.width
-        view = orbit(mesh, 1, elevation=15, azimuth=20, width=asked.width, height=height)[0]
-        drawn = render(mesh, view, samples=2)
-        unlit, seen = np.clip(drawn.color, 0, 1), drawn.alpha > COVERED
-        images = [unlit]
-        lights = {"even": EVEN}
-        if asked.output is not None:
-            lights |= {"sun": LIGHTS["sun"], "studio": LIGHTS["studio"]}
-        for name, light in lights.items():
-            options = SceneOptions(light=light, samples=asked.samples, denoise=True, threads=asked.threads)
-            with tempfile.TemporaryDirectory() as folder:
-                target = Path(folder) / "lit.png"
-                start = time.process_time()
-                made = draw(mesh, [view], images=[target], options=options)
-                seconds = time.process_time() - start
-                seconds += made["build_processor_seconds"] + sum(made["image_processor_seconds"])
-                images.append(np.asarray(Image.open(target).convert("RGB"), np.float32) / 255)
-            if name == "even":
-                fitted, gain = with_gain(images[-1], unlit, seen)
-                error = psnr(fitted, unlit, mask=seen)
-                print(
-                    f"| {subject_name(file)} | {error:.1f} dB | {gain:.2f} |"
-                    f" {blotches(fitted, unlit, drawn.alpha > SOLID):.1%} |"
-                    f" {made['layers']} | {seconds:.0f} s |",
-                    flush=True,
-                )
-        if asked.output is not None:
-            asked.output.mkdir(exist_ok=True)
-            save_image(asked.output / f"{subject_name(file)}.png", strip(images, ["unlit", *lights]))
+    with Report(asked) as report:
+        report.table("splats", "PSNR", "gain", "blotches", "layers", "processor time")
+        for file in asked.files:
+            measure(report, file, asked)
+
+
+def measure(report: Report, file: Path, asked: argparse.Namespace) -> None:
+    mesh = convert(load_gaussians(file), mode="flat")
+    height = asked.height or asked.width
+    view = orbit(mesh, 1, elevation=15, azimuth=20, width=asked.width, height=height)[0]
+    drawn = render(mesh, view, samples=2)
+    unlit, seen = np.clip(drawn.color, 0, 1), drawn.alpha > COVERED
+    images = [unlit]
+    lights = {"even": EVEN}
+    if asked.output is not None:
+        lights |= {"sun": LIGHTS["sun"], "studio": LIGHTS["studio"]}
+    for name, light in lights.items():
+        options = SceneOptions(light=light, samples=asked.samples, denoise=True, threads=asked.threads)
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder) / "lit.png"
+            watch = Stopwatch()
+            made = draw(mesh, [view], images=[target], options=options)
+            seconds = watch.processor
+            seconds += made["build_processor_seconds"] + sum(made["image_processor_seconds"])
+            images.append(np.asarray(Image.open(target).convert("RGB"), np.float32) / 255)
+        if name == "even":
+            fitted, gain = with_gain(images[-1], unlit, seen)
+            error = psnr(fitted, unlit, mask=seen)
+            share = blotches(fitted, unlit, drawn.alpha > SOLID)
+            report.row(
+                *(subject_name(file), f"{error:.1f} dB", f"{gain:.2f}", f"{share:.1%}"),
+                *(made["layers"], f"{seconds:.0f} s"),
+            )
+    if asked.output is not None:
+        asked.output.mkdir(exist_ok=True)
+        save_image(asked.output / f"{subject_name(file)}.png", strip(images, ["unlit", *lights]))
 
 
 if __name__ == "__main__":

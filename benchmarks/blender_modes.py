@@ -3,22 +3,20 @@
     blender-env/bin/python benchmarks/blender_modes.py [--size 96] [--samples 32]
 
 A grey ball of 3000 splats, twice as long as wide and half as thick, tilted and moved at random, is lit by sun
-and sky. Prints a Markdown table: the radiance of the ball's centre, and how far it deviates from a smooth
-image (a polynomial of degree 4), which is what looks mottled or speckled.
+and sky. The table has the radiance of the ball's centre, and how far it deviates from a smooth image (a
+polynomial of degree 4), which is what looks mottled or speckled.
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from _common import Report, arguments
 
 from meshsplats import GaussianCloud, convert
 from meshsplats.blender import LightOptions, SceneOptions, draw
-from meshsplats.blender.inside.host import bpy
-from meshsplats.blender.inside.rendering import read_pixels
 from meshsplats.cameras.trajectories import look_at
 
 COUNT = 3000
@@ -49,7 +47,7 @@ def ball() -> GaussianCloud:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Light on flat, crossed and three ellipses a splat.")
+    parser = arguments(__doc__)
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--samples", type=int, default=32)
     asked = parser.parse_args()
@@ -59,15 +57,20 @@ def main() -> None:
     middle = rows**2 + columns**2 < 0.45**2
     terms = [columns[middle] ** i * rows[middle] ** j for i in range(5) for j in range(5 - i)]
     smooth = np.stack(terms, axis=1)
-    print(f"Blender {bpy.app.version_string}\n\n| mode | triangles | light | deviation |\n|---|---|---|---|")
-    for mode in ("flat", "crossed", "3d"):
-        mesh = convert(ball(), mode=mode)
-        with tempfile.TemporaryDirectory() as folder:
-            draw(mesh, [view], images=[Path(folder) / "ball.exr"], options=options)
-            light = read_pixels(Path(folder) / "ball.exr")[..., 1][middle]
-        rest = light - smooth @ np.linalg.lstsq(smooth, light, rcond=None)[0]
-        share = rest.std() / light.mean()
-        print(f"| {mode} | {len(mesh.faces):,} | {light.mean():.3f} | {share:.1%} |", flush=True)
+    from meshsplats.blender.inside.host import bpy
+    from meshsplats.blender.inside.rendering import read_pixels
+
+    with Report(asked) as report:
+        report.say(f"Blender {bpy.app.version_string}")
+        report.table("mode", "triangles", "light", "deviation")
+        for mode in ("flat", "crossed", "3d"):
+            mesh = convert(ball(), mode=mode)
+            with tempfile.TemporaryDirectory() as folder:
+                draw(mesh, [view], images=[Path(folder) / "ball.exr"], options=options)
+                light = read_pixels(Path(folder) / "ball.exr")[..., 1][middle]
+            rest = light - smooth @ np.linalg.lstsq(smooth, light, rcond=None)[0]
+            share = rest.std() / light.mean()
+            report.row(mode, f"{len(mesh.faces):,}", f"{light.mean():.3f}", f"{share:.1%}")
 
 
 if __name__ == "__main__":

@@ -3,20 +3,19 @@
     python benchmarks/cells.py [--splats 60000] [--cell-splats 16000] [--steps 300] [--views 100]
         [--width 200]
 
-Makes a city and prints the held-out PSNR of the mesh before, tuned as a whole, and tuned in cells. A pixel is
+Makes a city and judges the held-out PSNR of the mesh before, tuned as a whole, and tuned in cells. A pixel is
 near a border if most of it shows splats that lie within one scene unit of another cell.
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from _common import Report, Stopwatch, arguments
 
 import meshsplats as ms
 from meshsplats.cluster import Shared
@@ -54,7 +53,7 @@ def scores(mesh: ms.SplatMesh, views: Sequence[ms.View], marked: np.ndarray) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__doc__)
     for name, value in (("splats", 60_000), ("cell-splats", 16_000), ("steps", 300), ("views", 100)):
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--width", type=int, default=200)
@@ -65,20 +64,21 @@ def main() -> None:
     marked = near_borders(divide(cloud.means, given.cell_splats), cloud.means)
     start = ms.starting_mesh(cloud, [view.camera for view in dataset.train])
 
-    def show(name: str, mesh: ms.SplatMesh, begun: float) -> None:
-        decibels = ", ".join(f"{value:.2f}" for value in scores(mesh, dataset.test, marked))
-        print(f"{name}: {decibels} dB in all, near borders, elsewhere; {begun:.0f} processor s", flush=True)
+    def show(name: str, mesh: ms.SplatMesh, seconds: float) -> None:
+        decibels = (f"{value:.2f}" for value in scores(mesh, dataset.test, marked))
+        report.row(name, *decibels, f"{seconds:.0f}")
 
-    show("before", start, 0.0)
-    begun = time.process_time()
-    whole = ms.finetune(start, dataset, config, run=ms.RunOptions(report_every=0))
-    show("whole", whole, time.process_time() - begun)
-    with tempfile.TemporaryDirectory() as folder:
-        begun = time.process_time()
+    with Report(given) as report, tempfile.TemporaryDirectory() as folder:
+        report.table("", "all, dB", "near borders", "elsewhere", "processor s")
+        show("before", start, 0.0)
+        watch = Stopwatch()
+        whole = ms.finetune(start, dataset, config, run=ms.RunOptions(report_every=0))
+        show("whole", whole, watch.processor)
+        watch = Stopwatch()
         scene = Shared(lambda: CellScene(cloud, dataset))
         options, run = CellOptions(given.cell_splats), ms.RunOptions(folder=Path(folder) / "run")
         mesh = finetune_cells(scene, config, options, run).mesh()
-        show("cells", mesh, time.process_time() - begun)
+        show("cells", mesh, watch.processor)
 
 
 if __name__ == "__main__":

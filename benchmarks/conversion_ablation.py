@@ -4,17 +4,14 @@
     python benchmarks/conversion_ablation.py --data FOLDER                on guitar, truck and playbot
     python benchmarks/conversion_ablation.py --scene SPLATS CAMERAS...    on other splats, with camera files
 
-FOLDER holds ``splats`` and ``cameras``. Every mesh is converted once, for the first set of cameras (close),
+Every mesh is converted once, for the first set of cameras (close),
 and drawn from all of them with 2 x 2 samples per pixel on white; the splats are drawn the 3DGS way. Both have
-the splats' display colour of degree 0, in [0, 1]. Prints Markdown tables.
+the splats' display colour of degree 0, in [0, 1].
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -22,23 +19,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from _common import DISTANCES, SCENES, Report, Stopwatch, arguments, images, mean_psnr
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
-from meshsplats.evaluation.metrics import psnr
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.gaussians import SH_C0, GaussianCloud
-from meshsplats.rendering import render, render_splats
+from meshsplats.rendering import render_splats
 
-STANDARD = {
-    "guitar": "guitar_sh0.ply",
-    "truck": "tt_truck_sh0.ply",
-    "playbot": "playbot_lod3_31k_sh2.ply",
-}
-DISTANCES = ("close", "mid", "far")
 _WITHOUT_CAMERAS = ("none", "framing")
 
 PRESETS: list[tuple[str, dict]] = [
@@ -89,8 +80,8 @@ def make(name: str, cloud: GaussianCloud, cameras: dict[str, list[Camera]], view
     # What a mesh can hold: one colour a splat, in [0, 1].
     cloud = replace(cloud, sh=((cloud.colors - 0.5) / np.float32(SH_C0))[:, None])
     shown = {where: some[:: max(1, len(some) // views)][:views] for where, some in cameras.items()}
-    images = {where: [render_splats(cloud, c).color for c in some] for where, some in shown.items()}
-    return Scene(name, cloud, cameras, images)
+    truths = {where: [render_splats(cloud, c).color for c in some] for where, some in shown.items()}
+    return Scene(name, cloud, cameras, truths)
 
 
 def load_scenes(args: argparse.Namespace) -> list[Scene]:
@@ -101,12 +92,12 @@ def load_scenes(args: argparse.Namespace) -> list[Scene]:
     if args.data:
         return [
             make(
-                name,
-                load_gaussians(args.data / "splats" / file),
-                {d: load_cameras(args.data / "cameras" / f"{name}_{d}.json") for d in DISTANCES},
+                scene.name,
+                scene.cloud(args.data),
+                {distance: scene.cameras(args.data, distance) for distance in DISTANCES},
                 args.views,
             )
-            for name, file in STANDARD.items()
+            for scene in SCENES.values()
         ]
     cloud = make_scene()
     cameras = {
@@ -137,28 +128,25 @@ def measure(scene: Scene, options: dict) -> Measured:
         options["max_triangles"] = 4 * len(scene.cloud)
     seconds = np.inf
     for _ in range(2):
-        start = time.perf_counter()
+        watch = Stopwatch()
         mesh = convert(scene.cloud, **options)
-        seconds = min(seconds, time.perf_counter() - start)
+        seconds = min(seconds, watch.wall)
     quality = []
     for where in distances:
-        images = scene.images[where]
-        shown = scene.cameras[where][:: max(1, len(scene.cameras[where]) // len(images))]
-        pairs = zip(shown, images, strict=False)
-        quality.append(float(np.mean([psnr(render(mesh, c, samples=2).color, p) for c, p in pairs])))
+        truths = scene.images[where]
+        shown = scene.cameras[where][:: max(1, len(scene.cameras[where]) // len(truths))][: len(truths)]
+        quality.append(mean_psnr(images(mesh, shown, samples=2), truths))
     arrays = (mesh.vertices, mesh.faces, mesh.colors, mesh.face_splat)
     size = sum(array.nbytes for array in arrays if array is not None)
     return Measured(quality, len(mesh.faces), len(mesh.vertices), size, float(seconds))
 
 
-def print_table(title: str, scenes: Sequence[Scene], rows: list[tuple[str, dict]]) -> None:
+def print_table(report: Report, title: str, scenes: Sequence[Scene], rows: list[tuple[str, dict]]) -> None:
     distances = " / ".join(scenes[0].cameras)
+    report.say(f"\n{title}. PSNR in dB, {distances}:")
+    means = ["mean"] if len(scenes) > 1 else []
     names = [scene.name for scene in scenes]
-    print(f"\n### {title}\n\nPSNR in dB, {distances}.\n")
-    heads = ["conversion", "triangles a splat", "vertices a splat", "MB", "s", *names]
-    heads += ["mean"] if len(scenes) > 1 else []
-    print("| " + " | ".join(heads) + " |")
-    print("|---" * len(heads) + "|")
+    report.table("conversion", "triangles a splat", "vertices a splat", "MB", "s", *names, *means)
     splats = sum(len(scene.cloud) for scene in scenes)
     for label, options in rows:
         found = [measure(scene, options) for scene in scenes]
@@ -170,35 +158,35 @@ def print_table(title: str, scenes: Sequence[Scene], rows: list[tuple[str, dict]
         cells += [" / ".join(f"{q:.2f}" for q in f.quality) for f in found]
         if len(scenes) > 1:
             cells.append(" / ".join(f"{q:.2f}" for q in np.mean([f.quality for f in found], axis=0)))
-        print("| " + " | ".join(cells) + " |", flush=True)
+        report.row(*cells)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, help="folder of real data")
+    parser = arguments(__doc__)
+    parser.add_argument("--data", type=Path, help="folder of real data, for three scenes of it")
     parser.add_argument("--scene", nargs="+", metavar="FILE", help="a splat file and its camera files")
     parser.add_argument("--views", type=int, default=8, help="views a distance, 1 to 8")
     parser.add_argument("--quick", action="store_true", help="the presets alone")
     args = parser.parse_args()
     if args.scene and len(args.scene) < 2:
         parser.error("--scene needs a splat file and at least one camera file")
-
     scenes = load_scenes(args)
-    counts = ", ".join(f"{scene.name} ({len(scene.cloud):,} splats)" for scene in scenes)
-    print(f"Scenes: {counts}. {args.views} views a distance.")
-    print(f"MB and s: arrays of the meshes, conversion; {os.cpu_count()} cores, {platform.machine()}.")
-    print_table("Presets", scenes, PRESETS)
-    if args.quick:
-        return
-    print_table("Flat, crossed, 3d", scenes, MODES)
-    print_table("The default with one obj changed", scenes, VARIATIONS)
-    grid = []
-    for radius, sides, rim, footprint in product(*GRID.values()):
-        options = dict(preset="paper", rim_radius=radius, sides=sides, rim_opacity=rim, footprint=footprint)
-        grid.append((f"{radius} / {sides} / {rim} / {footprint}", options))
-    print_table("Flat fans of the paper: rim_radius / sides / rim_opacity / footprint", scenes, grid)
+    with Report(args) as report:
+        counts = ", ".join(f"{scene.name} ({len(scene.cloud):,} splats)" for scene in scenes)
+        report.say(f"{counts}. {args.views} views a distance. MB: arrays of the meshes; s: conversion.")
+        print_table(report, "Presets", scenes, PRESETS)
+        if args.quick:
+            return
+        print_table(report, "Flat, crossed, 3d", scenes, MODES)
+        print_table(report, "The default with one option changed", scenes, VARIATIONS)
+        grid = []
+        for radius, sides, rim, footprint in product(*GRID.values()):
+            options = dict(
+                preset="paper", rim_radius=radius, sides=sides, rim_opacity=rim, footprint=footprint
+            )
+            grid.append((f"{radius} / {sides} / {rim} / {footprint}", options))
+        title = "Flat fans of the paper: rim_radius / sides / rim_opacity / footprint"
+        print_table(report, title, scenes, grid)
 
 
 if __name__ == "__main__":

@@ -2,20 +2,14 @@
 
     python benchmarks/conversion_speed.py [--splats 1000000] [--repeat 3]
 
-Prints a Markdown table: least time of the repeats, by the clock and of the processor, and the peak of the
-process's memory beyond what it held before. Each row runs in a process of its own.
+Least time of the repeats, by the clock and of the processor, and the peak of the process's memory beyond what
+it held before. Each row runs in a process of its own.
 """
 
 from __future__ import annotations
 
-import argparse
-import platform
-import resource
-import subprocess
-import sys
-import time
-
 import numpy as np
+from _common import Report, Stopwatch, alone, arguments, peak_bytes
 
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import convert
@@ -46,60 +40,35 @@ def random_cloud(n: int, coefficients: int) -> GaussianCloud:
     )
 
 
-def peak() -> int:
-    unit = 1 if platform.system() == "Darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
-def run(label: str, splats: int, repeat: int) -> None:
+def measure(label: str, splats: int, repeat: int) -> list[str]:
     options = dict(ROWS[label])
     cloud = random_cloud(splats, 16 if "colors" in options else 1)
     if "cameras" in options:
         options["cameras"] = orbit(cloud, options["cameras"], width=800, height=800)
     convert(cloud.select(np.arange(10)), **options)
-    before, best, busy, mesh = peak(), np.inf, np.inf, None
+    before, best, busy, mesh = peak_bytes(), np.inf, np.inf, None
     for _ in range(repeat):
         mesh = None  # only one at a time
-        start, start_busy = time.perf_counter(), time.process_time()
+        watch = Stopwatch()
         mesh = convert(cloud, **options)
-        best = min(best, time.perf_counter() - start)
-        busy = min(busy, time.process_time() - start_busy)
+        best, busy = min(best, watch.wall), min(busy, watch.processor)
     assert mesh is not None
     size = mesh.vertices.nbytes + mesh.faces.nbytes + mesh.colors.nbytes + 4 * len(mesh.faces)
-    count = f"{len(mesh.vertices):,} | {len(mesh.faces):,}"
-    print(
-        f"| {label} | {best:.2f} | {busy:.2f} | {count} | {size / 1e6:.0f} | {(peak() - before) / 1e6:.0f} |",
-        flush=True,
-    )
+    return [
+        *(label, f"{best:.2f}", f"{busy:.2f}", f"{len(mesh.vertices):,}", f"{len(mesh.faces):,}"),
+        *(f"{size / 1e6:.0f}", f"{(peak_bytes() - before) / 1e6:.0f}"),
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--splats", type=int, default=1_000_000)
     parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--row", choices=list(ROWS), help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.row:
-        run(args.row, args.splats, args.repeat)
-        return
-    print(
-        "| conversion | s | processor s | vertices | triangles | mesh MB | peak MB |\n" + "|---" * 7 + "|",
-        flush=True,
-    )
-    for label in ROWS:
-        call = [
-            sys.executable,
-            __file__,
-            "--splats",
-            str(args.splats),
-            "--repeat",
-            str(args.repeat),
-            "--row",
-            label,
-        ]
-        subprocess.run(call, check=True)
+    asked = parser.parse_args()
+    with Report(asked) as report:
+        report.table("conversion", "s", "processor s", "vertices", "triangles", "mesh MB", "peak MB")
+        for label in ROWS:
+            report.row(*alone(measure, label, asked.splats, asked.repeat))
 
 
 if __name__ == "__main__":

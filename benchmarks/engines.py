@@ -10,27 +10,16 @@ benchmarks/viewers/viewers.py --mesh draws the meshes of FOLDER with three.js an
 
 from __future__ import annotations
 
-import argparse
-import time
 from pathlib import Path
 
-import numpy as np
+from _common import DISTANCES, SCENES, Report, Stopwatch, areas, arguments, images, mean_psnr
 
 import meshsplats as ms
 from meshsplats.mesh import solid_faces
 
-SCENES = {
-    "playbot": "splats/playbot_lod3_31k_sh2.ply",
-    "guitar": "splats/guitar_sh0.ply",
-    "truck": "splats/tt_truck_sh0.ply",
-}
-
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, required=True)
+    parser = arguments(__doc__, data=True)
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=[*SCENES])
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--views", type=int, default=100)
@@ -55,31 +44,28 @@ def main() -> None:
         position_rate=args.position_rate,
         anneal_share=args.anneal_share,
     )
-    print("| scene | triangles | opaque, blended | cameras | 1 x 1 | 2 x 2 | 4 x 4 | processor s |")
-    print("|---|---|---|---|---|---|---|---|")
-    for name in args.scenes:
-        start = time.process_time()
-        cloud = ms.load_gaussians(args.data / SCENES[name])
-        dataset = ms.splat_dataset(cloud, train=args.views, test=0, sh_degree=0)
-        cameras = [view.camera for view in dataset.train]
-        mesh = ms.starting_mesh(cloud, cameras, max_triangles=args.max_triangles)
-        tuned = ms.finetune(mesh, dataset, config, run=ms.RunOptions(report_every=0, threads=args.threads))
-        seconds = time.process_time() - start
-        if args.output:
-            args.output.mkdir(exist_ok=True)
-            ms.save_mesh(tuned, args.output / f"{name}.npz")
-        solid = int(solid_faces(tuned).sum())
-        sizes = f"{len(mesh.faces):,} | {solid:,}, {len(tuned.faces) - solid:,}"
-        for distance in ("close", "mid", "far"):
-            cameras = ms.load_cameras(args.data / "cameras" / f"{name}_{distance}.json")
-            truths = [ms.draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras]
-            scores = []
-            for samples in (1, 2, 4):
-                images = [ms.render(tuned, camera, samples=samples).color for camera in cameras]
-                pairs = zip(images, truths, strict=True)
-                scores.append(np.mean([ms.psnr(a.clip(0, 1), b.clip(0, 1)) for a, b in pairs]))
-            figures = " | ".join(f"{score:.2f}" for score in scores)
-            print(f"| {name} | {sizes} | {distance} | {figures} | {seconds:.0f} |", flush=True)
+    with Report(args) as report:
+        heads = ("triangles", "opaque, blended", "cameras", "1 x 1", "2 x 2", "4 x 4", "processor s")
+        report.table("scene", *heads)
+        for name in args.scenes:
+            watch = Stopwatch()
+            cloud = SCENES[name].cloud(args.data)
+            dataset = ms.splat_dataset(cloud, train=args.views, test=0, sh_degree=0)
+            cameras = [view.camera for view in dataset.train]
+            mesh = ms.starting_mesh(cloud, cameras, max_triangles=args.max_triangles)
+            run = ms.RunOptions(report_every=0, threads=args.threads)
+            tuned = ms.finetune(mesh, dataset, config, run=run)
+            seconds = watch.processor
+            if args.output:
+                args.output.mkdir(exist_ok=True)
+                ms.save_mesh(tuned, args.output / f"{name}.npz")
+            solid = int(solid_faces(tuned).sum())
+            sizes = (f"{len(mesh.faces):,}", f"{solid:,}, {len(tuned.faces) - solid:,}")
+            for distance in DISTANCES:
+                cameras = SCENES[name].cameras(args.data, distance)
+                truths = areas(cloud, cameras, sh_degree=0)
+                scores = [mean_psnr(images(tuned, cameras, samples=side), truths) for side in (1, 2, 4)]
+                report.row(name, *sizes, distance, *(f"{score:.2f}" for score in scores), f"{seconds:.0f}")
 
 
 if __name__ == "__main__":

@@ -14,14 +14,13 @@ several runs, in turns.
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from _common import Report, areas, arguments, images, in_turns, mean_psnr
 
 from meshsplats import (
     Camera,
@@ -31,9 +30,7 @@ from meshsplats import (
     convert,
     load_gaussians,
     orbit,
-    psnr,
     render,
-    render_splats,
 )
 from meshsplats.rendering.backward import TapedRendering
 
@@ -48,21 +45,9 @@ def views(cloud: GaussianCloud) -> dict[str, list[Camera]]:
     return found | {"near": [replace(camera, fx=2 * camera.fx, fy=2 * camera.fy) for camera in cameras]}
 
 
-def score(mesh: SplatMesh, cameras: list[Camera], targets: list[np.ndarray]) -> float:
-    drawn = [np.clip(render(mesh, camera).color, 0, 1) for camera in cameras]
-    return float(np.mean([psnr(a, b) for a, b in zip(drawn, targets, strict=True)]))
-
-
 def costs(works: Sequence[Callable[[], object]], repeat: int) -> list[float]:
-    """Least processor milliseconds of each, in turns, after a first time."""
-    least = [float("inf")] * len(works)
-    for turn in range(repeat + 1):
-        for i, work in enumerate(works):
-            start = time.process_time()
-            work()
-            if turn:
-                least[i] = min(least[i], 1000 * (time.process_time() - start))
-    return least
+    """Least processor milliseconds of each, in turns."""
+    return [1e3 * min(times.processor) for times in in_turns(works, repeat)]
 
 
 def forward_and_backward(mesh: SplatMesh, camera: Camera, filter_px2: float) -> None:
@@ -72,15 +57,18 @@ def forward_and_backward(mesh: SplatMesh, camera: Camera, filter_px2: float) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--repeat", type=int, default=25)
     asked = parser.parse_args()
     clouds = {path.stem: load_gaussians(path) for path in asked.files}
-    print("| | triangles | pixels | image | with a filter | and backward | with a filter |")
-    print("|---|---|---|---|---|---|---|")
+    with Report(asked) as report:
+        time_filter(report, clouds, asked.repeat)
+        score_filter(report, clouds)
+
+
+def time_filter(report: Report, clouds: dict[str, GaussianCloud], repeat: int) -> None:
+    report.table("", "triangles", "pixels", "image", "with a filter", "and backward", "with a filter")
     for name, cloud in clouds.items():
         mesh = convert(cloud, footprint="none")
         for side in (400, 800):
@@ -90,14 +78,16 @@ def main() -> None:
                 for function in (partial(render, threads=1), forward_and_backward)
                 for px2 in (0, TINY)
             ]
-            cells = " | ".join(f"{milliseconds:.1f}" for milliseconds in costs(works, asked.repeat))
-            print(f"| {name} | {len(mesh.faces):,} | {side} | {cells} |", flush=True)
-    print(f"\n| | | {' | '.join(map(str, SIZES))} | near |\n|---|---|---|---|---|---|---|")
+            cells = (f"{milliseconds:.1f}" for milliseconds in costs(works, repeat))
+            report.row(name, f"{len(mesh.faces):,}", side, *cells)
+
+
+def score_filter(report: Report, clouds: dict[str, GaussianCloud]) -> None:
+    report.table("", "", *SIZES, "near")
     for name, cloud in clouds.items():
         views_of = views(cloud)
         targets = {
-            size: [np.clip(render_splats(cloud, camera, sh_degree=0).color, 0, 1) for camera in cameras]
-            for size, cameras in views_of.items()
+            size: areas(cloud, cameras, look="splats", sh_degree=0) for size, cameras in views_of.items()
         }
         filtered = convert(cloud, footprint="filter")
         for kind, mesh in {
@@ -107,8 +97,8 @@ def main() -> None:
             "filter, flat": convert(cloud, footprint="filter", mode="flat"),
             "filter, baked for 800": bake_filter(filtered, views_of["800"]),
         }.items():
-            scores = [score(mesh, cameras, targets[size]) for size, cameras in views_of.items()]
-            print(f"| {name} | {kind} | {' | '.join(f'{s:.1f}' for s in scores)} |", flush=True)
+            scores = (mean_psnr(images(mesh, cameras), targets[size]) for size, cameras in views_of.items())
+            report.row(name, kind, *(f"{score:.1f}" for score in scores))
 
 
 if __name__ == "__main__":

@@ -15,12 +15,10 @@ the wall: for machines that do other work at the same time.
 from __future__ import annotations
 
 import argparse
-import time
-from dataclasses import dataclass
-from pathlib import Path
+
+from _common import PHOTOGRAPHED, SCENES, Report, Stopwatch, arguments
 
 import meshsplats as ms
-from meshsplats.cli.targets import TargetOptions
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.evaluation.report import evaluate
 from meshsplats.finetuning import (
@@ -33,34 +31,12 @@ from meshsplats.finetuning import (
 )
 from meshsplats.finetuning.config import worthwhile_zooms
 
-
-@dataclass(frozen=True)
-class Scene:
-    splats: str
-    cameras: str = ""
-    photographs: str = ""
-    downscale: int = 1
-    background: tuple[float, float, float] = (1, 1, 1)
-
-
-SCENES = {
-    "guitar": Scene("splats/guitar_sh0.ply", "cameras/guitar_mid.json"),
-    "playbot": Scene("splats/playbot_lod3_31k_sh2.ply", "cameras/playbot_mid.json"),
-    "truck": Scene("splats/tt_truck_sh0.ply", "cameras/truck_mid.json"),
-    "lego": Scene("splats/trained/lego_60k_sh0.ply", photographs="photos/lego"),
-    "lego-sh3": Scene("splats/trained/lego_60k_sh3.ply", photographs="photos/lego"),
-    "snowmiku": Scene(
-        "splats/trained/miku_58k_sh0.ply", photographs="photos/snowmiku", downscale=2, background=(0, 0, 0)
-    ),
-}
+ALL = SCENES | PHOTOGRAPHED
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, required=True, help="folder of the real data")
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES))
+    parser = arguments(__doc__, data=True)
+    parser.add_argument("--scenes", nargs="+", default=list(ALL), choices=list(ALL))
     parser.add_argument("--presets", nargs="+", default=["default", "paper"])
     parser.add_argument("--minutes", type=float, default=2.0)
     parser.add_argument("--steps", type=int, help="steps, instead of a time")
@@ -72,41 +48,34 @@ def main() -> None:
     parser.add_argument("--exposure", action="store_true", help="fit gains and offsets of the photographs")
     parser.add_argument("--test-views", type=int, default=40, help="most views to score")
     options = parser.parse_args()
-    print("| scene | preset | triangles | steps | seconds | splats | converted | tuned |")
-    print("|---|---|---|---|---|---|---|---|")
-    for name in options.scenes:
-        for preset in options.presets:
-            print(row(name, preset, options), flush=True)
+    with Report(options) as report:
+        report.table("scene", "preset", "triangles", "steps", "seconds", "splats", "converted", "tuned")
+        for name in options.scenes:
+            for preset in options.presets:
+                report.row(*row(name, preset, options))
 
 
-def row(name: str, preset: str, options: argparse.Namespace) -> str:
-    scene = SCENES[name]
-    clock = time.perf_counter if options.clock == "wall" else time.process_time
-    share = 1 if options.clock == "wall" else options.processors
-
-    def seconds() -> float:
-        return (clock() - start) / share
-
+def row(name: str, preset: str, options: argparse.Namespace) -> tuple[object, ...]:
+    scene = ALL[name]
     length = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
     config = make_config(preset, **length, exposure=bool(scene.photographs and options.exposure))
-    start = clock()
-    cloud = ms.load_gaussians(options.data / scene.splats)
+    watch = Stopwatch()
+
+    def seconds() -> float:
+        return watch.wall if options.clock == "wall" else watch.idle(options.processors)
+
+    cloud = scene.cloud(options.data)
     if scene.photographs:
         data = ms.load_dataset(
             options.data / scene.photographs, downscale=scene.downscale, background=scene.background
         )
         judged = ms.Dataset((), data.test[:: -(-len(data.test) // options.test_views)])
     else:
-        source = options.data / scene.splats
-        target = TargetOptions(sh_degree=options.sh_degree, held_out=1, look=options.look)
+        drawn = {"look": options.look, "sh_degree": options.sh_degree}
+        zooms = worthwhile_zooms(config, options.look, preset == "default" and cloud.kernel == "3dgs")
         count = worthwhile_views(config)
-        zooms = worthwhile_zooms(
-            config, target.look_for(preset), preset == "default" and cloud.kernel == "3dgs"
-        )
-        data = target.make(cloud, source, (1, 1, 1), options.threads, count, preset, zooms)
-        cameras = ms.load_cameras(options.data / scene.cameras)
-        views = splat_views(cloud, cameras, look=options.look, sh_degree=options.sh_degree)
-        judged = ms.Dataset((), views, look=options.look)
+        data = ms.splat_dataset(cloud, train=count, test=1, zooms=zooms, threads=options.threads, **drawn)
+        judged = ms.Dataset((), splat_views(cloud, scene.cameras(options.data), **drawn), look=options.look)
     cameras = [view.camera for view in data.train]
     of_images = None if scene.photographs else config
     mesh = starting_mesh(cloud, cameras, preset=preset, config=of_images, look=data.look)
@@ -132,7 +101,7 @@ def row(name: str, preset: str, options: argparse.Namespace) -> str:
     splats = psnr(None, cloud) if scene.photographs else ""
     label = f"{preset}, exposure" if config.exposure else preset
     cells = (name, label, f"{len(tuned.faces):,}", steps, f"{used:.0f}", splats, psnr(mesh), psnr(tuned))
-    return f"| {' | '.join(map(str, cells))} |"
+    return cells
 
 
 def by_processor_time(mesh, data, config: FinetuneConfig, options, seconds) -> tuple[ms.SplatMesh, int]:

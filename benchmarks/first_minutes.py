@@ -12,33 +12,33 @@ processes that do nothing but compute.
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
+from subprocess import CalledProcessError
+
+from _common import Report, arguments, run
 
 
 def main() -> None:
     own, _, more = " ".join(sys.argv[1:]).partition(" -- ")
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", nargs="+", type=Path)
     parser.add_argument("--minutes", nargs="+", type=float, default=[1.0])
     parser.add_argument("--busy", type=int, default=0, metavar="N")
     options = parser.parse_args(own.split())
-    print("| scene | minutes | seconds | steps | triangles | MB | converted, dB | written, dB |")
-    print("|---|---|---|---|---|---|---|---|")
     beside = [multiprocessing.Process(target=compute, daemon=True) for _ in range(options.busy)]
     for process in beside:
         process.start()
-    for splats in options.splats:
-        for minutes in options.minutes:
-            print(f"| {' | '.join(row(splats, minutes, more.split()))} |", flush=True)
+    with Report(options) as report:
+        report.table(
+            *("scene", "minutes", "seconds", "steps", "triangles", "MB", "converted, dB", "written, dB")
+        )
+        for splats in options.splats:
+            for minutes in options.minutes:
+                report.row(*row(splats, minutes, more.split()))
     for process in beside:
         process.kill()
 
@@ -52,14 +52,13 @@ def row(splats: Path, minutes: float, more: list[str]) -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "tuned.glb"
         words = ["finetune", str(splats), "-o", str(out), "--minutes", f"{minutes:g}", "--json", *more]
-        began = time.perf_counter()
-        done = subprocess.run(
-            [sys.executable, "-m", "meshsplats", *words], capture_output=True, text=True, check=False
-        )
-        seconds = time.perf_counter() - began
-        if done.returncode:
-            return [splats.name, f"{minutes:g}", f"{seconds:.0f}", done.stderr.strip().splitlines()[-1]]
-        result = json.loads(done.stdout)
+        log = Path(folder) / "log.txt"
+        try:
+            with open(log, "w") as messages:
+                used = run([sys.executable, "-m", "meshsplats", *words], stderr=messages)
+        except CalledProcessError:
+            return [splats.name, f"{minutes:g}", log.read_text().strip().splitlines()[-1], *[""] * 5]
+        result = json.loads(used.output)
         megabytes = out.stat().st_size / 1e6
     scores = result["psnr_by_width"]
     before = "/".join(f"{value:.1f}" for value in scores["converted"].values())
@@ -67,7 +66,7 @@ def row(splats: Path, minutes: float, more: list[str]) -> list[str]:
     if result["written"] == "converted":
         after = f"the conversion; tuned {after}"
     name = splats.stem if splats.name != "meta.json" else splats.parent.name
-    figures = (f"{minutes:g}", f"{seconds:.0f}", f"{result['steps']:,}", f"{result['triangles']:,}")
+    figures = (f"{minutes:g}", f"{used.wall:.0f}", f"{result['steps']:,}", f"{result['triangles']:,}")
     return [name, *figures, f"{megabytes:.0f}", before, after]
 
 

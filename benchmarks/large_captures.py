@@ -18,21 +18,17 @@ import argparse
 import base64
 import json
 import multiprocessing
-import os
 import shlex
 import shutil
 import struct
-import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from _common import Report, areas, arguments, images, mean_psnr, run
 
 import meshsplats as ms
 from meshsplats.rendering.viewers import viewer_images
@@ -62,21 +58,8 @@ PURPOSES = {
 """Commands by purpose."""
 
 
-@dataclass(frozen=True)
-class Used:
-    """What a command took."""
-
-    processor: float
-    clock: float
-    others: float
-    """Share of the processors that other programs took."""
-    memory: int
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", type=Path, nargs="+")
     parser.add_argument("--copies", type=int, default=1)
     parser.add_argument("--purposes", nargs="+", choices=list(PURPOSES), default=list(PURPOSES))
@@ -84,13 +67,14 @@ def main() -> None:
     parser.add_argument("--blender", default=sys.executable, metavar="PYTHON")
     parser.add_argument("--folder", type=Path, help="where clouds and results stay; default: nowhere")
     args = parser.parse_args()
-    print("| command | processor s | clock s, others | peak GB | triangles | MB | dB: sorted, viewer |")
-    print("|---|---|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory() as scratch:
+    with Report(args) as report, tempfile.TemporaryDirectory() as scratch:
+        report.table(
+            *("command", "processor s", "clock s, others", "peak GB", "triangles", "MB", "dB: sorted, viewer")
+        )
         for path in args.splats:
             folder = (args.folder or Path(scratch)) / name_of(path, args.copies)
             folder.mkdir(parents=True, exist_ok=True)
-            measure(path.resolve(), folder, args)
+            measure(report, path.resolve(), folder, args)
             if args.folder is None:
                 shutil.rmtree(folder)
 
@@ -100,7 +84,7 @@ def name_of(path: Path, copies: int) -> str:
     return name if copies == 1 else f"{name}_{copies}"
 
 
-def measure(path: Path, folder: Path, args: argparse.Namespace) -> None:
+def measure(report: Report, path: Path, folder: Path, args: argparse.Namespace) -> None:
     """The rows of one file. Clouds and meshes are loaded in a process of their own: what a command's process
     is forked from counts as its peak memory."""
     spawn = multiprocessing.get_context("spawn")
@@ -110,45 +94,29 @@ def measure(path: Path, folder: Path, args: argparse.Namespace) -> None:
             if not whole.exists():
                 worker.submit(save_copies, path, whole, args.copies).result()
             path = whole
-        print(f"| **{folder.name}, {worker.submit(splats_of, path).result():,} splats** |||||||", flush=True)
+        count = worker.submit(splats_of, path).result()
+        report.row(f"**{folder.name}, {count:,} splats**", *[""] * 6)
         for purpose in args.purposes:
             for words in PURPOSES[purpose]:
                 words = words.format(input=shlex.quote(str(path)), minutes=args.minutes)
                 command = shlex.split(words)
                 result = folder / command[command.index("-o") + 1]
                 python = args.blender if command[0] == "blender" else sys.executable
-                used = run([python, "-m", "meshsplats", *command, "--force"], folder)
+                with open(folder / "log.txt", "a") as log:
+                    call = [python, "-m", "meshsplats", *command, "--force"]
+                    used = run(call, cwd=folder, stdout=log, stderr=log)
                 triangles, scores = worker.submit(scored, path, result).result()
                 shown = words.replace(str(path), path.name if path.suffix != ".json" else "SPLATS")
                 cells = [
                     f"`{shown}`",
                     f"{used.processor:.0f}",
-                    f"{used.clock:.0f}, {used.others:.0%}",
+                    f"{used.wall:.0f}, {used.others:.0%}",
                     f"{used.memory / 1e9:.2f}",
                     f"{triangles:,}" if triangles else "",
                     f"{size(result) / 1e6:.1f}",
                     ", ".join(f"{score:.1f}" for score in scores),
                 ]
-                print(f"| {' | '.join(cells)} |", flush=True)
-
-
-def run(command: list[str], folder: Path) -> Used:
-    before, start = busy_seconds(), time.perf_counter()
-    with open(folder / "log.txt", "a") as log:
-        process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
-        _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        sys.exit(f"{shlex.join(command)} ended with {process.returncode}: see {folder / 'log.txt'}")
-    clock, own = time.perf_counter() - start, used.ru_utime + used.ru_stime
-    others = (busy_seconds() - before - own) / (clock * (os.cpu_count() or 1))
-    return Used(own, clock, max(others, 0), used.ru_maxrss * 1024)
-
-
-def busy_seconds() -> float:
-    """Processor seconds of all programs since the start; Linux."""
-    user, nice, system, _, _, irq, soft, *_ = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
-    return sum(map(int, (user, nice, system, irq, soft))) / os.sysconf("SC_CLK_TCK")
+                report.row(*cells)
 
 
 def size(path: Path) -> int:
@@ -195,7 +163,7 @@ def save_copies(path: Path, target: Path, count: int) -> None:
 def truth(path: Path) -> tuple[list[ms.Camera], list[np.ndarray]]:
     cloud = ms.load_gaussians(path)
     cameras = ms.orbit(cloud, VIEWS, width=SIDE, height=SIDE)
-    return cameras, [ms.draw_splats(cloud, camera, "area").color for camera in cameras]
+    return cameras, areas(cloud, cameras)
 
 
 def scored(path: Path, result: Path) -> tuple[int, list[float]]:
@@ -203,23 +171,19 @@ def scored(path: Path, result: Path) -> tuple[int, list[float]]:
     if result.suffix == ".png":
         return 0, []
     cameras, truths = truth(path)
-
-    def score(images: Iterable[np.ndarray]) -> float:
-        pairs = zip(images, truths, strict=True)
-        return float(np.mean([ms.psnr(a.clip(0, 1), b.clip(0, 1)) for a, b in pairs]))
-
     if result.is_dir():
         tileset = ms.Tileset(result)
         tiles = (ms.render_tiles(tileset, camera, max_error=1.0, samples=2) for camera in cameras)
-        return 0, [score(image.color for image in tiles)]
+        return 0, [mean_psnr((image.color for image in tiles), truths)]
     if result.suffix == ".ply":
         cloud = ms.load_gaussians(result)
-        return 0, [score(ms.draw_splats(cloud, camera, "area").color for camera in cameras)]
+        return 0, [mean_psnr(areas(cloud, cameras), truths)]
     mesh = page_mesh(result) if result.suffix == ".html" else ms.load_mesh(result)
     samples = ms.needed_samples(mesh, cameras)
-    scores = [score(ms.render(mesh, camera, samples=samples).color for camera in cameras)]
+    scores = [mean_psnr(images(mesh, cameras, samples=samples), truths)]
     if result.suffix == ".glb" and (cutoffs := drawn_cutoffs(result)):
-        scores.append(score(viewer_images(mesh, camera, cutoffs)[0] for camera in cameras))
+        shown = [viewer_images(mesh, camera, cutoffs)[0] for camera in cameras]
+        scores.append(mean_psnr(shown, truths))
     return len(mesh.faces), scores
 
 

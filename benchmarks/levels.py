@@ -9,10 +9,12 @@ command instead, with the views that it scores.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
-import time
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
+
+from _common import Report, Stopwatch, arguments
 
 import meshsplats as ms
 from meshsplats.evaluation.viewers import choose_alpha
@@ -28,40 +30,48 @@ from meshsplats.levels import (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", type=Path, nargs="+")
     parser.add_argument("--times", action="store_true")
     args = parser.parse_args()
-    for path in args.splats:
-        cloud = ms.load_gaussians(path)
-        print(f"{path.stem}, {len(cloud):,} splats", flush=True)
-        source = cloud
-        for level in plan_levels(len(cloud), 4):
-            clock = [time.process_time()]
-            targets = level_targets(cloud, level, sh_degree=0)
-            cameras = [view.camera for view in targets.test]
-            splats = merged(source, level, cameras)
-            source = splats if merges_further(level) else source
-            clock.append(time.process_time())
-            mesh = make_level(splats, level, targets)
-            clock.append(time.process_time())
-            if not args.times:
-                plain = ms.convert(cloud, cameras=cameras, max_splats=level.splats)
-                scores = [likeness(each, cloud, cameras, sh_degree=0) for each in (plain, mesh)]
-                print(f"{level.width} px: plain {scores[0]:.2f}, now {scores[1]:.2f} dB", flush=True)
-                continue
-            choice = choose_alpha(mesh, cameras)
-            clock.append(time.process_time())
-            with tempfile.TemporaryDirectory() as folder:
-                ms.save_mesh(mesh, Path(folder) / "level.glb", **choice.options)
-            clock.append(time.process_time())
-            score = likeness(mesh, cloud, cameras[: views_to_score(len(mesh.faces), len(cloud))])
-            clock.append(time.process_time())
-            names = ("merge", "make", "choose alpha", "save", "score")
-            parts = [f"{name} {b - a:.1f}" for name, a, b in zip(names, clock, clock[1:], strict=False)]
-            print(f"{level.width} px: {', '.join(parts)} s; {score:.2f} dB", flush=True)
+    with Report(args) as report:
+        if args.times:
+            report.table(
+                *("scene", "pixels", "merge, s", "make", "choose alpha", "save", "score", "of the level, dB")
+            )
+        else:
+            report.table("scene", "pixels", "plain, dB", "now, dB")
+        for path in args.splats:
+            for row in rows(ms.load_gaussians(path), args.times):
+                report.row(path.stem, *row)
+
+
+def rows(cloud: ms.GaussianCloud, times: bool) -> Iterator[list[str]]:
+    source = cloud
+    for level in plan_levels(len(cloud), 4):
+        watch = Stopwatch()
+        marks = [0.0]
+        targets = level_targets(cloud, level, sh_degree=0)
+        cameras = [view.camera for view in targets.test]
+        splats = merged(source, level, cameras)
+        source = splats if merges_further(level) else source
+        marks.append(watch.processor)
+        mesh = make_level(splats, level, targets)
+        marks.append(watch.processor)
+        if not times:
+            plain = ms.convert(cloud, cameras=cameras, max_splats=level.splats)
+            scores = (likeness(each, cloud, cameras, sh_degree=0) for each in (plain, mesh))
+            yield [str(level.width), *(f"{score:.2f}" for score in scores)]
+            continue
+        choice = choose_alpha(mesh, cameras)
+        marks.append(watch.processor)
+        with tempfile.TemporaryDirectory() as folder:
+            ms.save_mesh(mesh, Path(folder) / "level.glb", **choice.options)
+        marks.append(watch.processor)
+        score = likeness(mesh, cloud, cameras[: views_to_score(len(mesh.faces), len(cloud))])
+        marks.append(watch.processor)
+        parts = (f"{after - before:.1f}" for before, after in pairwise(marks))
+        yield [str(level.width), *parts, f"{score:.2f}"]
 
 
 if __name__ == "__main__":

@@ -5,52 +5,50 @@
 
 The loss is 0.6 L1 + 0.4 (1 - SSIM) of images (size, size, 3), with its gradient. The step is Adam on
 positions (v, 3) and colours (v, 4), where a view reached a share of the splats of nine vertices each. Rows
-take turns and medians are printed, so that other work on the machine disturbs all of them alike; processor
-time is that of all threads together. Needs torch.
+take turns; processor time is that of all threads together. Needs torch.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
-import platform
-import time
+import statistics
 import warnings
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch.nn import functional
+from _common import Report, arguments, in_turns
 
-from meshsplats._core.library import load_core
 from meshsplats.finetuning.adam import RowAdam
-from meshsplats.finetuning.losses import photometric_loss
+
+if TYPE_CHECKING:
+    import torch
 
 VERTICES = 9  # of a splat
 SHARES = (1, 0.3, 0.03)
 
 
 def medians(rows: dict[str, Callable[[], object]], repeat: int) -> dict[str, tuple[float, float]]:
-    """Milliseconds on the clock and of the processors, the rows taking turns."""
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in rows}
-    for turn in range(repeat + 1):
-        for name, work in rows.items():
-            start, processor = time.perf_counter(), time.process_time()
-            work()
-            if turn:  # the first is a warm-up
-                times[name].append((time.perf_counter() - start, time.process_time() - processor))
-    result = {name: 1e3 * np.median(values, axis=0) for name, values in times.items()}
-    return {name: (float(clock), float(processor)) for name, (clock, processor) in result.items()}
+    """Milliseconds by the clock and of the processors, the rows taking turns."""
+    found = in_turns(list(rows.values()), repeat)
+    return {
+        name: (1e3 * statistics.median(times.wall), 1e3 * statistics.median(times.processor))
+        for name, times in zip(rows, found, strict=True)
+    }
 
 
 def gaussian() -> torch.Tensor:
+    import torch
+
     line = torch.exp(-0.5 * (torch.arange(-5, 6, dtype=torch.float32) / 1.5) ** 2)
     return line / line.sum()
 
 
 def torch_loss(image: torch.Tensor, target: torch.Tensor, separable: bool) -> torch.Tensor:
     """The same loss in torch alone: five means under the window, each with one or with two convolutions."""
+    import torch
+    from torch.nn import functional
+
     line = gaussian()
     x, y = (p.permute(2, 0, 1)[None] for p in (image, target))
 
@@ -66,7 +64,11 @@ def torch_loss(image: torch.Tensor, target: torch.Tensor, separable: bool) -> to
     return 0.6 * (x - y).abs().mean() + 0.4 * (1 - values.mean())
 
 
-def losses(size: int, repeat: int) -> None:
+def losses(report: Report, size: int, repeat: int) -> None:
+    import torch
+
+    from meshsplats.finetuning.losses import photometric_loss
+
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(size, size, 3, generator=generator)
     image = (target + 0.05 * torch.randn(target.shape, generator=generator)).clamp(0, 1)
@@ -90,19 +92,16 @@ def losses(size: int, repeat: int) -> None:
     found = rows["meshsplats"]()
     assert float((found - expected).norm() / expected.norm()) < 1e-3
     times = medians(rows, repeat)
-    print(f"| loss and gradient, {size} x {size} x 3 | ms | processor ms |\n|---|---|---|")
+    report.table(f"loss and gradient, {size} x {size} x 3", "ms", "processor ms")
     for name, (clock, processor) in times.items():
-        print(f"| {name} | {clock:.0f} | {processor:.0f} |")
+        report.row(name, f"{clock:.0f}", f"{processor:.0f}")
 
 
-def steps(rows: int, repeat: int) -> None:
+def steps(report: Report, rows: int, repeat: int) -> None:
+    import torch
+
     splats = rows // VERTICES
     rows = splats * VERTICES
-    print(
-        "| Adam, ms / processor ms | "
-        + " | ".join(f"{share:.0%} reached" for share in SHARES)
-        + " |\n|---|---|---|---|"
-    )
     table: dict[str, list[tuple[float, float]]] = {}
     for share in SHARES:
         generator = np.random.default_rng(0)
@@ -138,25 +137,24 @@ def steps(rows: int, repeat: int) -> None:
         together = {name: lambda both=both: [step() for step in both] for name, both in work.items()}
         for name, value in medians(together, repeat).items():
             table.setdefault(name, []).append(value)
+    report.table("Adam, ms / processor ms", *(f"{share:.0%} reached" for share in SHARES))
     for name, values in table.items():
-        print(f"| {name} | " + " | ".join(f"{a:.1f} / {b:.1f}" for a, b in values) + " |")
+        report.row(name, *(f"{a:.1f} / {b:.1f}" for a, b in values))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--size", type=int, default=800)
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--repeat", type=int, default=9)
-    args = parser.parse_args()
+    asked = parser.parse_args()
+    import torch
+
     warnings.filterwarnings("ignore", message="Sparse invariant checks")
-    machine = f"{platform.machine()}, {len(os.sched_getaffinity(0))} processors"
-    core = f"core {load_core().ms_variant().decode()}"
-    print(f"{machine}, {core}, torch {torch.__version__} with {torch.get_num_threads()} threads\n")
-    losses(args.size, args.repeat)
-    print()
-    steps(args.rows, args.repeat)
+    with Report(asked) as report:
+        report.say(f"torch {torch.__version__} with {torch.get_num_threads()} threads")
+        losses(report, asked.size, asked.repeat)
+        steps(report, asked.rows, asked.repeat)
 
 
 if __name__ == "__main__":

@@ -12,13 +12,10 @@ processor time of the steps alone.
 
 from __future__ import annotations
 
-import argparse
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import torch
+from _common import PHOTOGRAPHED, Report, Stopwatch, arguments
 
 import meshsplats as ms
 from meshsplats.finetuning import make_config, starting_mesh
@@ -27,7 +24,6 @@ from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, loss_of, make_step, target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
 from meshsplats.prior import bind, prior_config
-from meshsplats.rendering.autograd import rasterize
 
 FORMS = (
     "layers=1",
@@ -44,51 +40,46 @@ FORMS = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, required=True, help="folder of the real data")
+    parser = arguments(__doc__, data=True)
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--test-every", type=int, default=1, help="judge by every n-th test view only")
     parser.add_argument("--only", nargs="+", help="forms such as 'triangles=4 layers=2'; baseline; fans")
     options = parser.parse_args()
-    torch.set_num_threads(1)
-    data = ms.load_dataset(options.data / "photos/lego")
+    lego = PHOTOGRAPHED["lego"]
+    data = ms.load_dataset(options.data / lego.photographs)
     judged = ms.Dataset((), data.test[:: options.test_every])
     base = load_base(options.data / "meshes/lego_visual_hull_40k_vertexcolor.ply")
     config = prior_config(steps=options.steps)
 
-    def row(name: str, mesh: ms.SplatMesh, steps: int, seconds: float) -> None:
-        scores = ms.evaluate(mesh, judged, threads=options.threads).methods[0]
-        psnr, ssim = scores.mean("psnr"), scores.mean("ssim")
-        print(
-            f"| {name} | {len(mesh.faces):,} | {steps} | {seconds:.0f} | {psnr:.2f} | {ssim:.4f} |",
-            flush=True,
-        )
-
     wanted = options.only or ["baseline", *FORMS, "fans"]
-    print("| form | triangles | steps | processor s | PSNR | SSIM |\n|---|---|---|---|---|---|", flush=True)
-    if "baseline" in wanted:
-        opaque = ms.SplatMesh(base.vertices, base.faces, base.colors)
-        row("base, opaque, its own colours", opaque, 0, 0)
-        for name, loss in (
-            ("", config),
-            (", loss of 3DGS", make_config(steps=options.steps, color_rate=0.05)),
-        ):
-            tuned, seconds = opaque_colors(opaque, data, loss, options.threads)
-            row(f"base, opaque, vertex colours optimised{name}", tuned, options.steps, seconds)
-    for form in wanted:
-        if "=" in form:
-            laid = {
-                k: float(v) if "." in v else int(v) for k, v in (part.split("=") for part in form.split())
-            }
-            mesh = bind(base, views=data.train, threads=options.threads, **laid).mesh
-            row(f"prior, {form}", *trained(mesh, data, config, options.threads))
-    if "fans" in wanted:
-        cloud = ms.load_gaussians(options.data / "splats/trained/lego_60k_sh0.ply")
-        mesh = starting_mesh(cloud, [view.camera for view in data.train])
-        row("fans of 60,000 splats", *trained(mesh, data, make_config(steps=options.steps), options.threads))
+    with Report(options) as report:
+        report.table("form", "triangles", "steps", "processor s", "PSNR", "SSIM")
+
+        def row(name: str, mesh: ms.SplatMesh, steps: int, seconds: float) -> None:
+            scores = ms.evaluate(mesh, judged, threads=options.threads).methods[0]
+            psnr, ssim = f"{scores.mean('psnr'):.2f}", f"{scores.mean('ssim'):.4f}"
+            report.row(name, f"{len(mesh.faces):,}", steps, f"{seconds:.0f}", psnr, ssim)
+
+        if "baseline" in wanted:
+            opaque = ms.SplatMesh(base.vertices, base.faces, base.colors)
+            row("base, opaque, its own colours", opaque, 0, 0)
+            for name, loss in (
+                ("", config),
+                (", loss of 3DGS", make_config(steps=options.steps, color_rate=0.05)),
+            ):
+                tuned, seconds = opaque_colors(opaque, data, loss, options.threads)
+                row(f"base, opaque, vertex colours optimised{name}", tuned, options.steps, seconds)
+        for form in wanted:
+            if "=" in form:
+                parts = (part.split("=") for part in form.split())
+                laid = {name: float(value) if "." in value else int(value) for name, value in parts}
+                mesh = bind(base, views=data.train, threads=options.threads, **laid).mesh
+                row(f"prior, {form}", *trained(mesh, data, config, options.threads))
+        if "fans" in wanted:
+            mesh = starting_mesh(lego.cloud(options.data), [view.camera for view in data.train])
+            plain = make_config(steps=options.steps)
+            row("fans of 60,000 splats", *trained(mesh, data, plain, options.threads))
 
 
 def trained(
@@ -97,24 +88,29 @@ def trained(
     """``mesh`` after all steps, their count, and their processor time."""
     state = State.begin(mesh, len(data.train), config, threads)
     steps, interval = config.total_steps(len(data.train)) or 0, config.prune_interval(len(data.train))
-    start = time.process_time()
+    watch = Stopwatch()
     for step in range(steps):
         make_step(state, data.train, step, step / steps)
         if interval and (step + 1) % interval == 0 and step + 1 < steps:
             state = state.prune(kept_faces(state, data.train))
-    return state.result(), steps, time.process_time() - start
+    return state.result(), steps, watch.processor
 
 
 def opaque_colors(
     mesh: ms.SplatMesh, data: ms.Dataset, config: FinetuneConfig, threads: int
 ) -> tuple[ms.SplatMesh, float]:
     """``mesh`` with its vertex colours optimised, all of it opaque and where it was."""
+    import torch
+
+    from meshsplats.rendering.autograd import rasterize
+
+    torch.set_num_threads(1)
     vertices = torch.from_numpy(mesh.vertices.copy())
     colors = torch.from_numpy(mesh.colors[:, :3].copy()).requires_grad_(True)
     ones = torch.ones(len(colors), 1)
     adam = torch.optim.Adam([colors], betas=(config.beta1, config.beta2), eps=config.epsilon)
     steps = config.total_steps(len(data.train)) or 0
-    start = time.process_time()
+    watch = Stopwatch()
     for step in range(steps):
         view = data.train[view_of_step(config, step, len(data.train))]
         target = target_of(view, config, step)
@@ -129,7 +125,7 @@ def opaque_colors(
         adam.step()
         with torch.no_grad():
             colors.clamp_(0, 1)
-    seconds = time.process_time() - start
+    seconds = watch.processor
     rgba = np.concatenate([colors.detach().numpy(), np.ones((len(colors), 1), np.float32)], axis=1)
     return replace(mesh, colors=rgba), seconds
 

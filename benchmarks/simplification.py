@@ -17,22 +17,17 @@ against the mean of splats drawn four times as large.
 
 from __future__ import annotations
 
-import argparse
-import resource
-import time
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 
-import numpy as np
+from _common import Report, Stopwatch, areas, arguments, images, mean_psnr, peak_bytes
 
 from meshsplats import (
     convert,
     finetune,
     load_cameras,
     load_gaussians,
-    psnr,
-    render,
-    render_splats,
     simplify,
     splat_dataset,
 )
@@ -40,32 +35,23 @@ from meshsplats.conversion.selection import choose_splats
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import make_config, starting_mesh
 
-LARGER = 4
-
 
 class Truth:
     def __init__(self, cloud, cameras):
         self.cloud, self.cameras = cloud, cameras
-        self.same = [render_splats(cloud, c).color.clip(0, 1) for c in cameras]
+        self.same = areas(cloud, cameras, look="splats")
 
     @cached_property
     def mean(self):
-        means = []
-        for camera in self.cameras:
-            large = render_splats(self.cloud, camera.scaled(LARGER)).color.clip(0, 1)
-            shape = (camera.height, LARGER, camera.width, LARGER, 3)
-            means.append(large.reshape(shape).mean(axis=(1, 3)))
-        return means
+        return areas(self.cloud, self.cameras)
 
     def of_splats(self, cloud):
-        images = [render_splats(cloud, c).color.clip(0, 1) for c in self.cameras]
-        return np.mean([psnr(a, b) for a, b in zip(images, self.same, strict=True)])
+        return f"{mean_psnr(areas(cloud, self.cameras, look='splats'), self.same):.2f}"
 
     def of_mesh(self, mesh):
-        scores = []
-        for samples, truth in ((1, self.same), (2, self.mean)):
-            images = [render(mesh, c, samples=samples).color.clip(0, 1) for c in self.cameras]
-            scores.append(np.mean([psnr(a, b) for a, b in zip(images, truth, strict=True)]))
+        """(i) and (ii)."""
+        pairs = ((1, self.same), (2, self.mean))
+        scores = (mean_psnr(images(mesh, self.cameras, samples=side), truth) for side, truth in pairs)
         return "{:.2f} / {:.2f}".format(*scores)
 
 
@@ -74,40 +60,39 @@ def flat_colored(path):
     return replace(cloud, sh=cloud.sh[:, :1])
 
 
-def splats(arguments):
-    cloud, cameras = flat_colored(arguments.splats), load_cameras(arguments.cameras)
+def splats(report, asked):
+    cloud, cameras = flat_colored(asked.splats), load_cameras(asked.cameras)
     truth = Truth(cloud, cameras)
-    for share in arguments.shares:
+    report.table("kept", "way", "dB", "processor s")
+    for share in asked.shares:
         count = round(share * len(cloud))
-        dropped = truth.of_splats(choose_splats(cloud, max_splats=count))
-        print(f"{count:,} of {len(cloud):,}: dropped {dropped:.2f} dB", flush=True)
+        kept = f"{count:,} of {len(cloud):,}"
+        report.row(kept, "dropped", truth.of_splats(choose_splats(cloud, max_splats=count)), "")
         for name, options in (("cameras known", {"cameras": cameras}), ("not known", {})):
-            start = time.process_time()
+            watch = Stopwatch()
             merged = simplify(cloud, count, **options)
-            seconds = time.process_time() - start
-            print(f"  merged, {name}: {truth.of_splats(merged):.2f} dB, {seconds:.1f} s", flush=True)
-    for path in arguments.other:
+            report.row(kept, f"merged, {name}", truth.of_splats(merged), f"{watch.processor:.1f}")
+    for path in asked.other:
         other = flat_colored(path)
-        print(f"{path}: {len(other):,} splats, {truth.of_splats(other):.2f} dB", flush=True)
+        report.row(f"{len(other):,} of {len(cloud):,}", Path(path).name, truth.of_splats(other), "")
 
 
-def meshes(arguments):
-    cloud, cameras = flat_colored(arguments.splats), load_cameras(arguments.cameras)
-    truth = Truth(cloud, cameras)
-    look = arguments.look
+def meshes(report, asked):
+    cloud, cameras = flat_colored(asked.splats), load_cameras(asked.cameras)
+    truth, look = Truth(cloud, cameras), asked.look
     data = splat_dataset(cloud, train=200, test=8, look=look)
     seen_from = [view.camera for view in data.train]
+    report.table("splats", "way", "triangles", "(i) / (ii), dB", f"after {asked.steps} steps")
     whole = starting_mesh(cloud, seen_from, look=look)
-    print(f"all {len(cloud):,}: {truth.of_mesh(whole)} dB (i) / (ii)", flush=True)
-    for share in arguments.shares:
+    report.row(f"{len(cloud):,}", "all", f"{len(whole.faces):,}", truth.of_mesh(whole), "")
+    for share in asked.shares:
         count = round(share * len(cloud))
         for budget in ("drop", "merge"):
             mesh = starting_mesh(cloud, seen_from, look=look, max_splats=count, budget=budget)
-            line = f"{count:,} {budget}: {len(mesh.faces):,} triangles, {truth.of_mesh(mesh)} dB"
-            if arguments.steps:
-                tuned = finetune(mesh, data, make_config("default", steps=arguments.steps))
-                line += f"; after {arguments.steps} steps {truth.of_mesh(tuned)}"
-            print(line, flush=True)
+            found, tuned = truth.of_mesh(mesh), ""
+            if asked.steps:
+                tuned = truth.of_mesh(finetune(mesh, data, make_config("default", steps=asked.steps)))
+            report.row(f"{count:,}", budget, f"{len(mesh.faces):,}", found, tuned)
 
 
 WAYS = {
@@ -120,30 +105,30 @@ WAYS = {
 }
 
 
-def triangles(arguments):
-    cloud, cameras = flat_colored(arguments.splats), load_cameras(arguments.cameras)
+def triangles(report, asked):
+    cloud, cameras = flat_colored(asked.splats), load_cameras(asked.cameras)
     truth = Truth(cloud, cameras)
-    for budget in arguments.budgets:
+    report.table("triangles", "way", "splats", "(i) / (ii), dB")
+    for budget in asked.budgets:
         most = int(budget * len(cloud))
-        print(f"{budget:g} triangles a splat, {most:,}", flush=True)
         for name, options in WAYS.items():
             mesh = convert(cloud, cameras=cameras, max_triangles=most, **options)
-            print(f"  {name}: {mesh.splat_count:,} splats, {truth.of_mesh(mesh)} dB", flush=True)
+            report.row(f"{most:,}", name, f"{mesh.splat_count:,}", truth.of_mesh(mesh))
 
 
-def speed(arguments):
-    cloud = make_scene(arguments.count)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    start, busy = time.perf_counter(), time.process_time()
+def speed(report, asked):
+    cloud = make_scene(asked.count)
+    before, watch = peak_bytes(), Stopwatch()
     merged = simplify(cloud, len(cloud) // 4)
-    seconds, busy = time.perf_counter() - start, time.process_time() - busy
-    more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
-    print(f"{len(cloud):,} splats to {len(merged):,}: {seconds:.1f} s, of the processor {busy:.1f} s")
-    print(f"{more / len(cloud):.0f} bytes a splat")
+    wall, processor = watch.wall, watch.processor
+    memory = (peak_bytes() - before) / len(cloud)
+    report.table("splats", "merged to", "s", "processor s", "bytes a splat")
+    counts = (f"{len(cloud):,}", f"{len(merged):,}")
+    report.row(*counts, f"{wall:.1f}", f"{processor:.1f}", f"{memory:.0f}")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = arguments(__doc__)
     commands = parser.add_subparsers(required=True)
     for task in (splats, meshes, triangles):
         command = commands.add_parser(task.__name__)
@@ -160,8 +145,9 @@ def main():
     command = commands.add_parser("speed")
     command.set_defaults(task=speed)
     command.add_argument("count", type=int)
-    arguments = parser.parse_args()
-    arguments.task(arguments)
+    asked = parser.parse_args()
+    with Report(asked) as report:
+        asked.task(report, asked)
 
 
 if __name__ == "__main__":

@@ -16,14 +16,13 @@ its own has to be, and tuned on means over areas.
 from __future__ import annotations
 
 import argparse
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from _common import Report, Stopwatch, areas, arguments, images, mean_psnr
 
 import meshsplats as ms
-from meshsplats.cli.targets import TargetOptions
 from meshsplats.demo_scene import make_scene
 from meshsplats.finetuning import RunOptions, make_config, starting_mesh, worthwhile_views
 from meshsplats.finetuning.config import worthwhile_zooms
@@ -33,9 +32,7 @@ SAMPLES = {"area": 2, "splats": 1}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", nargs="+")
     parser.add_argument("--mesh", type=Path, help="a mesh to score instead of those made here")
     parser.add_argument("--minutes", type=float, default=2.0, help="0: convert only")
@@ -44,28 +41,22 @@ def main() -> None:
     parser.add_argument("--looks", nargs="+", choices=["area", "splats"], default=["area", "splats"])
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--max-triangles", type=int)
-    parser.add_argument("--save", type=Path, help="folder for the tuned meshes")
+    parser.add_argument("-o", "--output", type=Path, help="folder for the tuned meshes")
     parser.add_argument("--image", type=Path)
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
-    print("| scene | mesh | triangles | look | " + " | ".join(SIZES) + " |")
-    print("|---|---|---|---|" + "---|" * len(SIZES))
-    for name in options.splats:
-        cloud = make_scene() if name == "demo" else ms.load_gaussians(name)
-        cloud = replace(cloud, sh=cloud.sh[:, :1])
-        if options.image:
-            image(cloud, options)
-            continue
-        for label, mesh in meshes(cloud, name, options):
-            for look in options.looks:
-                cells = (
-                    Path(name).stem,
-                    label,
-                    f"{len(mesh.faces):,}",
-                    look,
-                    *scores(cloud, mesh, look, options),
-                )
-                print(f"| {' | '.join(cells)} |", flush=True)
+    with Report(options) as report:
+        report.table("scene", "mesh", "triangles", "look", *SIZES)
+        for name in options.splats:
+            cloud = make_scene() if name == "demo" else ms.load_gaussians(name)
+            cloud = replace(cloud, sh=cloud.sh[:, :1])
+            if options.image:
+                image(cloud, options)
+                continue
+            for label, mesh in meshes(cloud, name, options):
+                for look in options.looks:
+                    figures = scores(cloud, mesh, look, options)
+                    report.row(Path(name).stem, label, f"{len(mesh.faces):,}", look, *figures)
 
 
 def meshes(cloud: ms.GaussianCloud, name: str, options: argparse.Namespace):
@@ -80,9 +71,9 @@ def meshes(cloud: ms.GaussianCloud, name: str, options: argparse.Namespace):
         yield "converted, filter", ms.convert(cloud, footprint="filter", **limit)
     if options.minutes or options.steps:
         tuned, description = tune(cloud, options, look=options.look, **limit)
-        if options.save:
-            options.save.mkdir(exist_ok=True)
-            ms.save_mesh(tuned, options.save / f"{Path(name).stem}_{options.look}.npz")
+        if options.output:
+            options.output.mkdir(exist_ok=True)
+            ms.save_mesh(tuned, options.output / f"{Path(name).stem}_{options.look}.npz")
         yield f"tuned, look {options.look}, {description}", tuned
 
 
@@ -90,23 +81,18 @@ def tune(
     cloud: ms.GaussianCloud, options: argparse.Namespace, *, look: str, zooms=None, samples=None, **start
 ):
     """As ``meshsplats finetune --look LOOK`` does it."""
-    began = time.perf_counter()
+    watch = Stopwatch()
     length = {"steps": options.steps} if options.steps else {"minutes": options.minutes}
     config = make_config("default", **length, samples=samples)
     if zooms is None:
-        target = TargetOptions(look=look)  # type: ignore[arg-type]
-        views = worthwhile_views(config)
         zooms = worthwhile_zooms(config, look, cloud.kernel == "3dgs")
-        data = target.make(cloud, Path("splats.ply"), (1, 1, 1), options.threads, views, zooms=zooms)
-    else:
-        count = worthwhile_views(config)
-        data = ms.splat_dataset(cloud, train=count, look=look, zooms=zooms, threads=options.threads)
+    count = worthwhile_views(config)
+    data = ms.splat_dataset(cloud, train=count, look=look, zooms=zooms, threads=options.threads)
     mesh = starting_mesh(cloud, [view.camera for view in data.train], config=config, look=look, **start)
     steps = []
-    spent = time.perf_counter() - began
-    run = RunOptions(threads=options.threads, report_every=0, spent=spent)
+    run = RunOptions(threads=options.threads, report_every=0, spent=watch.wall)
     tuned = ms.finetune(mesh, data, config, run=run, on_progress=lambda progress: steps.append(progress.step))
-    return tuned, f"{steps[-1]} steps, {time.perf_counter() - began:.0f} s"
+    return tuned, f"{steps[-1]} steps, {watch.wall:.0f} s"
 
 
 def cameras(cloud: ms.GaussianCloud, count: int, side: int, zoom: int) -> list[ms.Camera]:
@@ -119,12 +105,10 @@ def scores(cloud: ms.GaussianCloud, mesh: ms.SplatMesh, look: str, options: argp
     """Mean PSNR at each size."""
     found = []
     for side, zoom in SIZES.values():
-        decibels = []
-        for camera in cameras(cloud, options.views, side, zoom):
-            target_image = ms.draw_splats(cloud, camera, look, threads=options.threads).color
-            drawn = ms.render(mesh, camera, samples=SAMPLES[look], threads=options.threads).color
-            decibels.append(ms.psnr(np.clip(drawn, 0, 1), np.clip(target_image, 0, 1)))
-        found.append(f"{np.mean(decibels):.2f}")
+        places = cameras(cloud, options.views, side, zoom)
+        truths = areas(cloud, places, look=look, threads=options.threads)
+        drawn = images(mesh, places, samples=SAMPLES[look], threads=options.threads)
+        found.append(f"{mean_psnr(drawn, truths):.2f}")
     return found
 
 

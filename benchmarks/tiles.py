@@ -2,20 +2,17 @@
 
     python benchmarks/tiles.py --folder FOLDER [--count 1000000] [--degree 0] [--keep]
 
-Writes a city of splats and its tileset into FOLDER, draws the tileset from afar and from near, and prints a
-line for each step: splats, processor seconds, seconds, greatest memory in use (MB). Each step is a process of
-its own. FOLDER needs 400 bytes a splat.
+Writes a city of splats and its tileset into FOLDER, draws the tileset from afar and from near, each step in a
+process of its own. FOLDER needs 400 bytes a splat.
 """
 
 from __future__ import annotations
 
-import argparse
-import os
 import shutil
-import subprocess
 import sys
-import time
 from pathlib import Path
+
+from _common import Report, arguments, run
 
 CITY = "from meshsplats.demo_scene.city import main; main({arguments!r})"
 TILES = """
@@ -35,24 +32,8 @@ save_image({image!r}, render_tiles(tileset, camera, samples=2).color)
 """
 
 
-def measure(name: str, code: str, count: int) -> None:
-    start = time.perf_counter()
-    process = subprocess.Popen([sys.executable, "-c", code])
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        raise SystemExit(f"{name} failed")
-    seconds = usage.ru_utime + usage.ru_stime
-    print(
-        f"{name:<10}{count:>12,}{seconds:>9.1f} s{seconds / count * 1e6:>9.2f} s/M"
-        f"{time.perf_counter() - start:>9.1f} s elapsed{usage.ru_maxrss / 1024:>9.0f} MB",
-        flush=True,
-    )
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--count", type=int, default=1_000_000)
     parser.add_argument("--degree", type=int, default=0, choices=(0, 1, 2, 3))
@@ -60,13 +41,22 @@ def main() -> None:
     args = parser.parse_args()
     name = f"city_{args.count}_{args.degree}"
     splats, tileset = args.folder / f"{name}.ply", args.folder / name
-    arguments = [str(splats), str(args.count), str(args.degree)]
-    measure("city", CITY.format(arguments=arguments), args.count)
-    measure("tiles", TILES.format(splats=str(splats), tileset=str(tileset)), args.count)
+    steps = {
+        "city": CITY.format(arguments=[str(splats), str(args.count), str(args.degree)]),
+        "tiles": TILES.format(splats=str(splats), tileset=str(tileset)),
+    }
     for view, distance in (("far", 1.0), ("near", 0.1)):
         image = args.folder / f"{name}_{view}.png"
-        draw = DRAW.format(tileset=str(tileset), distance=distance, image=str(image))
-        measure(view, draw, args.count)
+        steps[view] = DRAW.format(tileset=str(tileset), distance=distance, image=str(image))
+    with Report(args) as report:
+        report.table("step", "splats", "processor s", "s a million", "elapsed s", "MB", "")
+        for step, code in steps.items():
+            used = run([sys.executable, "-c", code])
+            report.row(
+                *(step, f"{args.count:,}", f"{used.processor:.1f}"),
+                *(f"{used.processor / args.count * 1e6:.2f}", f"{used.wall:.1f}", f"{used.memory / 1e6:.0f}"),
+                " ".join(used.output.split()),
+            )
     if not args.keep:
         splats.unlink()
         shutil.rmtree(tileset)

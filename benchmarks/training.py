@@ -14,21 +14,20 @@ are, with photographs that are not what they should be, and with gains from 0.6 
 from __future__ import annotations
 
 import argparse
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _common import PHOTOGRAPHED, Report, Stopwatch, arguments
 
 import meshsplats as ms
 from meshsplats.datasets.views import ViewImage
 from meshsplats.demo_scene import make_scene
 from meshsplats.demo_scene.city import city_blocks
 
-DOWNSCALES = {"lego": 1, "snowmiku": 2}
+SCENES = {name: PHOTOGRAPHED[name] for name in ("lego", "snowmiku")}
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "no growth": {"growth_events": 0},
@@ -48,12 +47,9 @@ HELD_OUT = 8
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", type=Path, help="folder with photos/")
+    parser = arguments(__doc__, data=True)
     parser.add_argument("--own", action="store_true", help="our own scenes, in place of those of --data")
-    parser.add_argument("--scenes", nargs="+", choices=DOWNSCALES, default=list(DOWNSCALES))
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--steps", type=int, required=True)
     parser.add_argument("--downscale", type=int, default=1, help="further factor of the images' sides")
     parser.add_argument("--max-splats", type=int, default=100_000)
@@ -62,22 +58,20 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--processors", type=int, default=2, help="that processor time is divided by")
     options = parser.parse_args()
-    if options.own:
-        own_scenes(options)
-        return
-    if options.data is None:
-        parser.error("--data or --own is needed")
-    print("| scene | variant | fans | seconds | PSNR (median) | exposure fitted |")
-    print("|---|---|---|---|---|---|")
-    for name in options.scenes:
-        for variant in VARIANTS if options.vary else ("default",):
-            print(row(name, variant, options), flush=True)
+    with Report(options) as report:
+        if options.own:
+            own_scenes(report, options)
+            return
+        report.table("scene", "variant", "fans", "seconds", "PSNR (median)", "exposure fitted")
+        for name in options.scenes:
+            for variant in VARIANTS if options.vary else ("default",):
+                report.row(*row(name, variant, options))
 
 
-def row(name: str, variant: str, options: argparse.Namespace) -> str:
-    start = time.process_time()
-    folder = options.data / "photos" / name
-    data = ms.load_dataset(folder, downscale=DOWNSCALES[name] * options.downscale)
+def row(name: str, variant: str, options: argparse.Namespace) -> tuple[str, ...]:
+    watch = Stopwatch()
+    folder = options.data / SCENES[name].photographs
+    data = ms.load_dataset(folder, downscale=SCENES[name].downscale * options.downscale)
     if data.train[0].alpha is None:
         data = data.over((0, 0, 0))
     fans_allowed = {"max_splats": options.max_splats, "start_splats": options.start_splats}
@@ -85,19 +79,19 @@ def row(name: str, variant: str, options: argparse.Namespace) -> str:
     config = ms.train_config(steps=options.steps, **changes)
     run = ms.RunOptions(threads=options.threads)
     mesh = ms.train(ms.Dataset(data.train), config, points=ms.load_points(folder), run=run)
-    seconds = (time.process_time() - start) / options.processors
+    seconds = watch.idle(options.processors)
     method = ms.evaluate(mesh, data, fit_exposure=True, threads=options.threads).method("mesh")
     fans = len(mesh.vertices) // (1 + config.sides)
     psnr = f"{method.mean('psnr'):.2f} ({method.median('psnr'):.2f})"
-    return f"| {name} | {variant} | {fans:,} | {seconds:.0f} | {psnr} | {method.mean('psnr_exposure'):.2f} |"
+    return name, variant, f"{fans:,}", f"{seconds:.0f}", psnr, f"{method.mean('psnr_exposure'):.2f}"
 
 
 # ---- Our own scenes
 
 
-def own_scenes(options: argparse.Namespace) -> None:
-    print("| scene | photographs | exposure fit | seconds | PSNR (median) | exposure fitted | named |")
-    print("|---|---|---|---|---|---|---|")
+def own_scenes(report: Report, options: argparse.Namespace) -> None:
+    heads = ("photographs", "exposure fit", "seconds", "PSNR (median)", "exposure fitted", "named")
+    report.table("scene", *heads)
     for name, views in (("inside a room", room_views()), ("outdoors", street_views())):
         clean = [view for i, view in enumerate(views) if i % HELD_OUT]
         test = tuple(views[::HELD_OUT])
@@ -113,17 +107,16 @@ def own_scenes(options: argparse.Namespace) -> None:
             config = ms.train_config(
                 steps=options.steps, start_splats=OWN_FANS // 2, max_splats=OWN_FANS, exposure=exposure
             )
-            start = time.process_time()
+            watch = Stopwatch()
             with warnings.catch_warnings(record=True) as said:
                 warnings.simplefilter("always")
                 mesh = ms.train(data, config, run=ms.RunOptions(threads=options.threads))
-            seconds = (time.process_time() - start) / options.processors
+            seconds = watch.idle(options.processors)
             method = ms.evaluate(mesh, data, fit_exposure=True, threads=options.threads).method("mesh")
             psnr = f"{method.mean('psnr'):.2f} ({method.median('psnr'):.2f})"
             named = "; ".join(str(w.message).split(". Their")[0] for w in said)
             fitted = f"{method.mean('psnr_exposure'):.2f}"
-            row = (name, kind, exposure, f"{seconds:.0f}", psnr, fitted, named)
-            print("| " + " | ".join(map(str, row)) + " |", flush=True)
+            report.row(name, kind, exposure, f"{seconds:.0f}", psnr, fitted, named)
 
 
 def room_views() -> list[ms.View]:

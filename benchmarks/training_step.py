@@ -5,7 +5,7 @@
     python benchmarks/training_step.py --beside               beside torch and, where installed, Mitsuba 3
 
 A step draws an image, takes 0.6 L1 + 0.4 (1 - SSIM) and its gradient back to positions and colours, and
-moves all vertices by Adam; scenes are those of benchmarks/rendering.py. Medians of wall time in milliseconds;
+moves all vertices by Adam; scenes are the random fans of _common.py. Medians of wall time in milliseconds;
 parts are timed within the same steps. --beside takes an image and the gradients of its colours of one small
 scene: by this program, by the float64 reference in torch, and by Mitsuba's path integrator with automatic
 differentiation (llvm_ad_rgb, which needs an LLVM library), one sample per pixel. Mitsuba draws the same
@@ -15,28 +15,17 @@ blending. --beside needs torch.
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Callable
 
 import numpy as np
-from rendering import SCENES, clocked, random_fans
+from _common import FANS, Report, Stopwatch, arguments, median_ms, random_fans
 
 from meshsplats._core.kernels import compare_images
-from meshsplats._core.library import available_variants
 from meshsplats.camera import Camera
 from meshsplats.finetuning.adam import RowAdam
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 from meshsplats.rendering.backward import TapedRendering
-
-
-def table(heads: list[str]) -> None:
-    print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
-
-
-def row(*cells: str) -> None:
-    print("| " + " | ".join(cells) + " |", flush=True)
 
 
 class Step:
@@ -57,21 +46,21 @@ class Step:
         return TapedRendering(triangles, self.camera, threads=self.threads)
 
     def __call__(self) -> list[float]:
-        times = [time.perf_counter()]
+        watch, times = Stopwatch(), [0.0]
         image = self.draw()
-        times.append(time.perf_counter())
+        times.append(watch.wall)
         rates = dict(l1_rate=0.6 / self.target.size, ssim_rate=-0.4 / self.target.size)
         compared = compare_images(
             image.color[None], self.target, gradient=True, threads=self.threads, **rates
         )
         assert compared.gradient is not None
-        times.append(time.perf_counter())
+        times.append(watch.wall)
         gradients = [np.zeros_like(values) for values in (self.vertices, self.colors)]
         image.backward(compared.gradient[0], None, None, vertices=gradients[0], colors=gradients[1])
-        times.append(time.perf_counter())
+        times.append(watch.wall)
         for optimizer, gradient in zip(self.optimizers, gradients, strict=True):
             optimizer.step(gradient)
-        times.append(time.perf_counter())
+        times.append(watch.wall)
         return list(np.diff(times))
 
 
@@ -80,22 +69,22 @@ def timed(step: Step, repeat: int) -> list[float]:
     return list(1e3 * np.median([step() for _ in range(repeat)], axis=0))
 
 
-def steps(scenes: list[str], threads: list[int], repeat: int) -> None:
-    table(["triangles", "image", "threads", *Step.parts, "step"])
+def steps(report: Report, scenes: list[str], threads: list[int], repeat: int) -> None:
+    report.table("triangles", "image", "threads", *Step.parts, "step")
     for name in scenes:
-        mesh, camera = random_fans(*SCENES[name])
+        mesh, camera = random_fans(*FANS[name])
         for count in threads:
             times = timed(Step(mesh, camera, count), repeat)
             size = f"{camera.width} x {camera.height}"
-            row(f"{len(mesh.faces):,}", size, f"{count}", *(f"{t:.0f}" for t in (*times, sum(times))))
+            report.row(f"{len(mesh.faces):,}", size, count, *(f"{t:.0f}" for t in (*times, sum(times))))
 
 
-def growth(repeat: int) -> None:
+def growth(report: Report, repeat: int) -> None:
     """From a scene of 160k triangles, each of triangles, pixels and layers grows by itself."""
-    table(
-        ["what grows", "triangles", "image", "fragments per pixel", "forward", "backward", "ns per fragment"]
+    report.table(
+        *("what grows", "triangles", "image", "fragments a pixel", "forward", "backward", "ns a fragment")
     )
-    fans, radius, opacity, side = SCENES["160k"]
+    fans, radius, opacity, side = FANS["160k"]
     cases = []
     for by in (0.25, 1, 4):
         # The same number of fragments, of smaller triangles.
@@ -107,10 +96,9 @@ def growth(repeat: int) -> None:
         cases.append(("layers", int(fans * by), radius, opacity / by, side))
     for what, *scene in cases:
         mesh, camera = random_fans(*scene)
-        step = Step(mesh, camera, 2)
-        draw, _, back, _ = timed(step, repeat)
+        draw, _, back, _ = timed(Step(mesh, camera, 2), repeat)
         fragments = render(mesh, camera).fragments
-        row(
+        report.row(
             what,
             f"{len(mesh.faces):,}",
             f"{camera.width} x {camera.height}",
@@ -179,54 +167,53 @@ def mitsuba_image(mesh: SplatMesh, camera: Camera) -> tuple[str, Callable[[], ob
     return mi.variant(), work
 
 
-def beside(fans: int, repeat: int) -> None:
+def beside(report: Report, fans: int, repeat: int) -> None:
     import torch
 
     from meshsplats.rendering import reference_autograd
     from meshsplats.rendering.autograd import rasterize
 
-    print(f"torch {torch.__version__}.\n")
-    radius, opacity, side = 0.12, 0.05, 100
-    mesh, camera = random_fans(fans, radius, opacity, side)
+    side = 100
+    mesh, camera = random_fans(fans, 0.12, 0.05, side)
     torch.set_num_threads(2)
     vertices = torch.from_numpy(mesh.vertices.copy())
     colors = torch.from_numpy(mesh.colors.copy()).requires_grad_()
     given = {"face_splat": mesh.face_splat, "threads": 2}
     draw = lambda: rasterize(vertices, mesh.faces, colors, camera, **given)  # noqa: E731
-    fragments = render(mesh, camera).fragments
-    layers = fragments / side**2
-    print(f"{len(mesh.faces):,} triangles, {side} x {side}, {layers:.1f} fragments a pixel, 2 threads.\n")
-    ours = clocked(lambda: draw().color.mean().backward(), 20 * repeat)
-    found: dict[str, float] = {"meshsplats": ours}
+    layers = render(mesh, camera).fragments / side**2
+    report.say(
+        f"{len(mesh.faces):,} triangles, {side} x {side}, {layers:.1f} fragments a pixel, 2 threads,"
+        f" torch {torch.__version__}."
+    )
+    ours = median_ms(lambda: draw().color.mean().backward(), 20 * repeat)
+    found = {"meshsplats": ours}
     reference = reference_autograd.rasterize(vertices, mesh.faces, colors, camera).color.mean()
-    order = clocked(lambda: reference_autograd.rasterize(vertices, mesh.faces, colors, camera), 1)
-    found["torch, float64 reference"] = clocked(lambda: reference.backward(retain_graph=True), 1) + order
+    order = median_ms(lambda: reference_autograd.rasterize(vertices, mesh.faces, colors, camera), 1)
+    found["torch, float64 reference"] = median_ms(lambda: reference.backward(retain_graph=True), 1) + order
     other = mitsuba_image(mesh, camera)
     if other:
-        found[f"Mitsuba 3, {other[0]}"] = clocked(other[1], repeat)
-    table(["image and gradients of colours", "ms", "of ours"])
+        found[f"Mitsuba 3, {other[0]}"] = median_ms(other[1], repeat)
+    report.table("image and gradients of colours", "ms", "of ours")
     for name, taken in found.items():
-        row(name, f"{1e3 * taken:.1f}", f"{taken / ours:.1f}")
+        report.row(name, f"{taken:.1f}", f"{taken / ours:.1f}")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--scenes", nargs="+", choices=FANS, default=list(FANS))
     parser.add_argument("--growth", action="store_true")
     parser.add_argument("--beside", action="store_true")
     parser.add_argument("--fans", type=int, default=1250, help="of the scene of --beside")
-    args = parser.parse_args()
-    print(f"Core: {available_variants()[0]}.\n")
-    if args.growth:
-        growth(args.repeat)
-    elif args.beside:
-        beside(args.fans, args.repeat)
-    else:
-        steps(args.scenes, args.threads, args.repeat)
+    asked = parser.parse_args()
+    with Report(asked) as report:
+        if asked.growth:
+            growth(report, asked.repeat)
+        elif asked.beside:
+            beside(report, asked.fans, asked.repeat)
+        else:
+            steps(report, asked.scenes, asked.threads, asked.repeat)
 
 
 if __name__ == "__main__":

@@ -13,90 +13,88 @@ the page without WebGPU.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
+from _common import Report, Stopwatch, arguments, run
 
 import meshsplats as ms
 from meshsplats.viewer.page import Page, make_page
 
 SIDES = (400, 800)
+OFF = ("levels off, at most", "pixels by more than 1", "pixels at all", "PSNR")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", type=Path, nargs="+")
     parser.add_argument("--cameras", type=Path, nargs="+")
     parser.add_argument("--command", action="store_true")
     parser.add_argument("--chromium", type=int, metavar="SIDE")
     args = parser.parse_args()
-    if args.command:
-        print("| file | splats | merged to | 400 px, dB | triangles | processor s | memory, GB | page, MB |")
-        print("|---|---|---|---|---|---|---|---|")
-        for path in args.splats:
-            by_command(path, args.chromium)
-        return
-    if args.cameras is None:
+    if not args.command and args.cameras is None:
         parser.error("give --cameras or --command")
-    sides = " | ".join(f"{side} px: largest, pixels > 0.5, PSNR" for side in SIDES)
-    print(f"| scene | triangles | bytes a triangle | page, MB | positions, radii | s | {sides} |")
-    print("|---|---|---|---|---|---|" + "---|" * len(SIDES))
+    with Report(args) as report:
+        if args.command:
+            by_command(report, args.splats, args.chromium)
+        else:
+            by_page(report, args.splats, args.cameras, args.chromium)
+
+
+def by_page(report: Report, splats: list[Path], cameras: list[Path], chromium: int | None) -> None:
+    sides = (f"{side} px: largest, pixels > 0.5, PSNR" for side in SIDES)
+    report.table("scene", "triangles", "bytes a triangle", "page, MB", "positions, radii", "s", *sides)
     pages = []
-    for path, cameras in zip(args.splats, args.cameras, strict=True):
+    for path, places in zip(splats, cameras, strict=True):
         cloud = ms.load_gaussians(path)
-        mesh, views = ms.convert(cloud), ms.load_cameras(cameras)
-        start = time.process_time()
+        mesh, views = ms.convert(cloud), ms.load_cameras(places)
+        watch = Stopwatch()
         page = make_page(mesh, splats=cloud, cameras=views)
-        seconds = time.process_time() - start
         cells = [
             path.stem,
             f"{len(mesh.faces):,}",
             f"{page.mesh.bytes_a_triangle:.2f}",
             f"{len(page.html) / 1e6:.2f}",
             f"{page.mesh.relative_error:.1e}",
-            f"{seconds:.1f}",
+            f"{watch.processor:.1f}",
         ]
         for side in SIDES:
             camera = views[0].scaled(side / views[0].width)
             one, other = (ms.render(each, camera).color for each in (mesh, page.mesh.decoded))
             off = 255 * np.abs(one - other).max(axis=-1)
             cells.append(f"{off.max():.2f}, {(off > 0.5).sum()}, {ms.psnr(one, other):.1f}")
-        print(f"| {' | '.join(cells)} |", flush=True)
+        report.row(*cells)
         pages.append((path.stem, mesh, views[0], page))
-    if args.chromium:
+    if chromium:
+        report.table("scene", "renderer", "first picture, s", "exact frame", *OFF)
         for name, mesh, camera, page in pages:
-            in_chromium(name, mesh, camera.scaled(args.chromium / camera.width), page)
+            report.row(*in_chromium(name, mesh, camera.scaled(chromium / camera.width), page))
 
 
-def by_command(path: Path, side: int | None) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "page.html"
-        command = [sys.executable, "-m", "meshsplats", "view", str(path), "-o", str(file), "--json"]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert process.stdout is not None
-        found = json.loads(process.stdout.read())
-        _, _, used = os.wait4(process.pid, 0)
-        print(
-            f"| {path.stem} | {found.get('merged_from', found['splats']):,} | {found['splats']:,}"
-            f" | {found.get('merging_psnr', '-')} | {found['triangles']:,} + {found['coarse_triangles']:,}"
-            f" | {used.ru_utime + used.ru_stime:.1f} | {used.ru_maxrss / 1e6:.2f}"
-            f" | {found['bytes'] / 1e6:.1f} |",
-            flush=True,
-        )
-        if side:
-            without_webgpu(path.stem, file, side)
+def by_command(report: Report, splats: list[Path], chromium: int | None) -> None:
+    shown = ("first picture, processor s", "at rest", "triangles at rest") if chromium else ()
+    report.table(
+        *("file", "splats", "merged to", "400 px, dB", "triangles", "processor s", "memory, GB", "page, MB"),
+        *shown,
+    )
+    for path in splats:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "page.html"
+            used = run([sys.executable, "-m", "meshsplats", "view", path, "-o", file, "--json"])
+            found = json.loads(used.output)
+            report.row(
+                *(path.stem, f"{found.get('merged_from', found['splats']):,}", f"{found['splats']:,}"),
+                *(found.get("merging_psnr", "-"), f"{found['triangles']:,} + {found['coarse_triangles']:,}"),
+                *(f"{used.processor:.1f}", f"{used.memory / 1e9:.2f}", f"{found['bytes'] / 1e6:.1f}"),
+                *(without_webgpu(file, chromium) if chromium else ()),
+            )
 
 
-def without_webgpu(name: str, file: Path, side: int) -> None:
+def without_webgpu(file: Path, side: int) -> tuple[str, str, str]:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "viewer"))
     from _browser import WEBGL, Browser
 
@@ -108,11 +106,7 @@ def without_webgpu(name: str, file: Path, side: int) -> None:
         first = processor_seconds(browser.pid)
         shown.still(3000)
         found = shown.statistics()["triangles"]
-        print(
-            f"{name}, {side} x {side}, WebGL: first picture after {first:.1f} s of processor time of all"
-            f" processes, {found} triangles at rest after {processor_seconds(browser.pid):.1f} s",
-            flush=True,
-        )
+        return f"{first:.1f}", f"{processor_seconds(browser.pid):.1f}", str(found)
     finally:
         browser.close()
 
@@ -129,7 +123,7 @@ def processor_seconds(group: int) -> float:
     return total / os.sysconf("SC_CLK_TCK")
 
 
-def in_chromium(name: str, mesh: ms.SplatMesh, camera: ms.Camera, page: Page) -> None:
+def in_chromium(name: str, mesh: ms.SplatMesh, camera: ms.Camera, page: Page) -> tuple[str, ...]:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "viewer"))
     from _browser import Browser
 
@@ -151,11 +145,10 @@ def in_chromium(name: str, mesh: ms.SplatMesh, camera: ms.Camera, page: Page) ->
         finally:
             browser.close()
     off = np.abs(image - expected).max(axis=-1)
-    print(
-        f"{name}, {camera.width} x {camera.height}, {renderer}: first picture after {first:.1f} s,"
-        f" exact frame {frame};"
-        f" at most {off.max()} levels off, {(off > 1).sum()} pixels by more than 1,"
-        f" {(off > 0).mean():.2%} at all; {ms.psnr(image / 255, expected / 255):.1f} dB"
+    return (
+        *(name, renderer, f"{first:.1f}", str(frame)),
+        *(f"{off.max()}", f"{(off > 1).sum()}", f"{(off > 0).mean():.2%}"),
+        f"{ms.psnr(image / 255, expected / 255):.1f}",
     )
 
 

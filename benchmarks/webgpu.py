@@ -1,11 +1,11 @@
-"""Work and time of the GPU on the random fans of rendering.py, beside the core.
+"""Work and time of the GPU on random fans, beside the core.
 
     python benchmarks/webgpu.py [--scenes 160k 1M 4M] [--mesh FILE --side 400] [--repeat 3] [--gradients]
 
-Prints a Markdown table: difference from the core (PSNR, pixels off by more than 1e-3), tests of a triangle at
-a sample per blended fragment, walks through a tile list per tile, samples whose first queue was too short,
-dispatches of a frame, megabytes of buffers, and medians of wall time and processor time in milliseconds.
-Times on a software adapter (named in the first line) say nothing about a GPU.
+Difference from the core (PSNR, pixels off by more than 1e-3), tests of a triangle at a sample per blended
+fragment, walks through a tile list per tile, samples whose first queue was too short, dispatches of a frame,
+megabytes of buffers, and medians of wall time and processor time in milliseconds. Times on a software adapter
+(named in the first line) say nothing about a GPU.
 
 With --gradients, the backward pass of a random gradient: ||g - g_core|| / ||g_core|| of positions, RGB and
 opacities, windows of the image, fragments on the tape and triangles in tiles, dispatches of a window,
@@ -15,16 +15,11 @@ the core.
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent))
-from rendering import SCENES, random_fans
+from _common import FANS, Report, Stopwatch, arguments, random_fans
 
 from meshsplats import Camera, SplatMesh, load_mesh, orbit, psnr, render
 from meshsplats.rendering.backward import TapedRendering
@@ -36,22 +31,22 @@ from meshsplats.webgpu.gradients import gradient_renderer
 from meshsplats.webgpu.renderer import draw
 
 
-def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> str:
+def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> tuple[str, ...]:
     settings = DrawSettings(filter_px2=mesh.filter_px2)
     drawn = draw(mesh, view, settings)  # compiles
     walls, processors, cores = [], [], []
     for _ in range(repeat):
-        start, cpu = time.perf_counter(), time.process_time()
+        watch = Stopwatch()
         drawn = draw(mesh, view, settings)
-        walls.append(1000 * (time.perf_counter() - start))
-        processors.append(1000 * (time.process_time() - cpu))
-        start = time.perf_counter()
+        walls.append(1000 * watch.wall)
+        processors.append(1000 * watch.processor)
+        watch = Stopwatch()
         expected = render(mesh, view, background=(0, 0, 0))
-        cores.append(1000 * (time.perf_counter() - start))
+        cores.append(1000 * watch.wall)
     error = np.abs(drawn.color - expected.color).max(axis=2)
     likeness = psnr(drawn.color, expected.color)
     work = drawn.work
-    values = (
+    return (
         name,
         f"{len(mesh.faces):,}",
         f"{view.width} x {view.height}",
@@ -66,20 +61,19 @@ def measure(name: str, mesh: SplatMesh, view: Camera, repeat: int) -> str:
         f"{statistics.median(processors):.0f}",
         f"{statistics.median(cores):.0f}",
     )
-    return "| " + " | ".join(values) + " |"
 
 
-def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> str:
+def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> tuple[str, ...]:
     rng = np.random.default_rng(0)
     gradient = rng.normal(size=(view.height, view.width, 3)).astype(np.float32)
     found, times = [], []
     for kind in (GpuRendering, GpuRendering, TapedRendering):  # the first compiles
         vertices, colors = np.zeros_like(mesh.vertices), np.zeros_like(mesh.colors)
-        start = time.process_time()
+        watch = Stopwatch()
         rendering = kind(mesh.triangles, view, min_transmittance=1e-3)
-        middle = time.process_time()
+        times.append(watch.processor)
         rendering.backward(gradient, None, None, vertices=vertices, colors=colors)
-        times += [middle - start, time.process_time() - middle]
+        times.append(watch.processor - times[-1])
         if isinstance(rendering, GpuRendering):
             forward = rendering.forward
         found.append((vertices, colors[:, :3], colors[:, 3]))
@@ -91,7 +85,7 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> str:
     steps = [*kernels.list_steps(), *kernels.mark_steps(), *kernels.place_steps(), *kernels.gradient_steps(0)]
     skipped = ("fans",) * (not mesh.filter_px2) + ("groups",) * (mesh.depth_group is None)
     same = all(np.array_equal(a, b) for a, b in zip(found[0], found[1], strict=True))
-    values = (
+    return (
         name,
         f"{len(mesh.faces):,}",
         f"{view.width} x {view.height}",
@@ -104,41 +98,40 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> str:
         f"{renderer.bytes / 1e6:.0f}",
         *(f"{1000 * seconds:.0f}" for seconds in (times[2], times[3], times[4] + times[5])),
     )
-    return "| " + " | ".join(values) + " |"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--scenes", nargs="*", default=["160k", "1M"], choices=list(SCENES))
+    parser = arguments(__doc__)
+    parser.add_argument("--scenes", nargs="*", default=["160k", "1M"], choices=list(FANS))
     parser.add_argument("--mesh", type=Path, nargs="*", default=[])
     parser.add_argument("--side", type=int, default=400)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--gradients", action="store_true")
-    options = parser.parse_args()
-    print(f"{open_device().name}\n", flush=True)
+    asked = parser.parse_args()
     columns: tuple[str, ...] = (
         *("scene", "triangles", "image", "dB", "> 1e-3", "tests a fragment", "walks a tile", "overflowed"),
         *("dispatches", "MB", "ms", "processor ms", "core ms"),
     )
-    if options.gradients:
+    if asked.gradients:
         columns = (
             *("scene", "triangles", "image", "positions", "RGB", "opacities", "same bits", "windows"),
             *("fragments", "triangles in tiles", "dispatches", "MB", "image ms", "backward ms", "core ms"),
         )
-    print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns), flush=True)
+    with Report(asked) as report:
+        report.say(open_device().name)
+        report.table(*columns)
 
-    def show(name: str, mesh: SplatMesh, view: Camera) -> None:
-        gradients = options.gradients
-        line = measure_gradients(name, mesh, view) if gradients else measure(name, mesh, view, options.repeat)
-        print(line, flush=True)
+        def show(name: str, mesh: SplatMesh, view: Camera) -> None:
+            if asked.gradients:
+                report.row(*measure_gradients(name, mesh, view))
+            else:
+                report.row(*measure(name, mesh, view, asked.repeat))
 
-    for name in options.scenes:
-        show(name, *random_fans(*SCENES[name]))
-    for path in options.mesh:
-        mesh = load_mesh(path)
-        show(path.stem, mesh, orbit(mesh, 4, width=options.side, height=options.side)[1])
+        for name in asked.scenes:
+            show(name, *random_fans(*FANS[name]))
+        for path in asked.mesh:
+            mesh = load_mesh(path)
+            show(path.stem, mesh, orbit(mesh, 4, width=asked.side, height=asked.side)[1])
 
 
 if __name__ == "__main__":

@@ -37,6 +37,8 @@ NAVIGATION = {
     "The project": ["CHANGELOG", "CONTRIBUTING", "docs/releasing", "license"],
 }
 """Pages by section. Documents that are not listed come last in "Using it"."""
+RESULTS = "benchmarks/results/"
+"""Pages below that of the benchmarks."""
 REFERENCE = {
     "Splats and meshes": [
         *("GaussianCloud", "SplatMesh", "load_gaussians", "save_gaussians", "load_mesh", "save_mesh"),
@@ -118,6 +120,7 @@ def navigation(pages: list[str]) -> str:
     sections = {title: list(names) for title, names in NAVIGATION.items()}
     sections["Python"] = list(reference_pages())
     listed = {name for names in sections.values() for name in names}
+    listed |= {page for page in pages if page.startswith(RESULTS)}
     sections["Using it"] += sorted(set(pages) - listed - {"index"})
     tables = [
         "```{{toctree}}\n:hidden:\n:caption: {}\n\n{}\n```\n".format(title, "\n".join(names))
@@ -146,13 +149,17 @@ def moved_links(text: str, here: str) -> str:
 def write_sources(folder: Path) -> None:
     """All that Sphinx reads."""
     documents = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
-    documents += sorted((ROOT / "benchmarks").glob("*.md"))
+    documents += sorted((ROOT / "benchmarks").rglob("*.md"))
     texts = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in documents}
     texts = {place: moved_links(text, place) for place, text in texts.items()}
     texts |= {f"{name}.md": text for name, text in reference_pages().items()}
     texts["examples.md"] = examples_page()
     license_text = (ROOT / "LICENSE").read_text(encoding="utf-8").rstrip()
     texts["license.md"] = f"# Licence\n\n```text\n{license_text}\n```\n"
+    below = "\n".join(place.removesuffix(".md") for place in texts if place.startswith(RESULTS))
+    texts["benchmarks/RESULTS.md"] += (
+        f"\n```{{toctree}}\n:hidden:\n\n{below.replace(RESULTS, 'results/')}\n```\n"
+    )
     index = texts.pop("README.md")
     texts["index.md"] = index + navigation([place.removesuffix(".md") for place in [*texts, "index.md"]])
     for place, text in texts.items():

@@ -12,15 +12,15 @@ conversion with it.
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import subprocess
+import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from _node import draw_jobs, drawn_images
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # _common.py
+from _common import Report, Stopwatch, areas, arguments, images, mean_psnr
 
 import meshsplats as ms
 from meshsplats.evaluation.viewers import choose_alpha
@@ -28,9 +28,7 @@ from meshsplats.rendering.viewers import viewer_images
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", type=Path, nargs="+")
     parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
     parser.add_argument("--max-triangles", type=int, help="merge similar splats to this size")
@@ -39,22 +37,25 @@ def main() -> None:
     parser.add_argument("--elevation", type=float, default=20)
     parser.add_argument("--azimuth", type=float, default=0)
     args = parser.parse_args()
-    print("| scene | triangles | three.js: blend | mask 0.2 | default | taken | simulated | share of time |")
-    print("|---|---|---|---|---|---|---|---|")
-    for path in args.splats:
-        with tempfile.TemporaryDirectory() as scratch:
-            measure(path, args, Path(scratch))
+    with Report(args) as report:
+        report.table(
+            *("scene", "triangles", "three.js: blend", "mask 0.2", "default", "taken", "simulated"),
+            "share of time",
+        )
+        for path in args.splats:
+            with tempfile.TemporaryDirectory() as scratch:
+                report.row(*measure(path, args, Path(scratch)))
 
 
-def measure(path: Path, args: argparse.Namespace, folder: Path) -> None:
-    times = [time.process_time()]
+def measure(path: Path, args: argparse.Namespace, folder: Path) -> list[str]:
+    watch, times = Stopwatch(), [0.0]
     cloud = ms.load_gaussians(path)
     mesh = ms.convert(cloud, max_triangles=args.max_triangles)
-    times.append(time.process_time())
+    times.append(watch.processor)
     choice = choose_alpha(mesh)
-    times.append(time.process_time())
+    times.append(watch.processor)
     ms.save_mesh(mesh, folder / "default.glb", **choice.options)
-    times.append(time.process_time())
+    times.append(watch.processor)
     for alpha in ("blend", "mask"):
         ms.save_mesh(mesh, folder / f"{alpha}.glb", alpha=alpha)
     around = {"elevation": args.elevation, "azimuth": args.azimuth, "width": args.side, "height": args.side}
@@ -74,37 +75,19 @@ def measure(path: Path, args: argparse.Namespace, folder: Path) -> None:
         }
         for name in ("blend", "mask", "default")
     ]
-    (folder / "jobs.json").write_text(json.dumps(jobs))
-    subprocess.run(
-        ["node", Path(__file__).with_name("viewers.mjs").resolve(), folder / "jobs.json"],
-        cwd=args.node_folder,
-        env=os.environ,
-        stdout=subprocess.DEVNULL,
-        check=True,
-    )
-    sorted_, truths = [], []
-    simulated: list[np.ndarray] = []
-    for camera in cameras:
-        sorted_.append(ms.render(mesh, camera, samples=2).color)
-        truths.append(ms.draw_splats(cloud, camera, "area", sh_degree=0).color)
-        simulated.append(viewer_images(mesh, camera, [None, 0.2]))
+    draw_jobs(jobs, folder, args.node_folder)
+    sorted_ = images(mesh, cameras, samples=2)
+    truths = areas(cloud, cameras, sh_degree=0)
+    simulated = [viewer_images(mesh, camera, [None, 0.2]) for camera in cameras]
     cells = [path.stem if path.is_file() else path.name, f"{len(mesh.faces):,}"]
     for name in ("blend", "mask", "default"):
-        images = [load(folder / name / f"{i}.png") for i in range(len(cameras))]
-        cells.append(f"{score(images, sorted_):.1f} / {score(images, truths):.1f}")
+        shown = drawn_images(folder / name, len(cameras))
+        cells.append(f"{mean_psnr(shown, sorted_):.1f} / {mean_psnr(shown, truths):.1f}")
     cells.append(choice.alpha + (f" {choice.cutoff:g}" if choice.alpha == "mask" else ""))
     ways = zip(*simulated, strict=True)
-    cells.append(" / ".join(f"{score(images, sorted_):.1f}" for images in ways))
+    cells.append(" / ".join(f"{mean_psnr(shown, sorted_):.1f}" for shown in ways))
     cells.append(f"{(times[2] - times[1]) / (times[3] - times[0]):.0%} of {times[3] - times[0]:.1f} s")
-    print(f"| {' | '.join(cells)} |", flush=True)
-
-
-def score(images, truths) -> float:
-    return float(np.mean([ms.psnr(a.clip(0, 1), b.clip(0, 1)) for a, b in zip(images, truths, strict=True)]))
-
-
-def load(path: Path) -> np.ndarray:
-    return np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
+    return cells
 
 
 if __name__ == "__main__":

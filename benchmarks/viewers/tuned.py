@@ -11,24 +11,22 @@ renderer with 2 x 2 samples.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
-import os
-import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from _node import draw_jobs, drawn_images
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # _common.py
+from _common import Report, areas, arguments, images, mean_psnr
 
 import meshsplats as ms
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", type=Path)
     parser.add_argument("tuned", type=Path, help="the fine-tuned mesh")
     parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
@@ -63,35 +61,18 @@ def main() -> None:
                         "far": reach * 2,
                     }
                 )
-        (folder / "jobs.json").write_text(json.dumps(jobs))
-        done = subprocess.run(
-            ["node", Path(__file__).with_name("viewers.mjs").resolve(), folder / "jobs.json"],
-            cwd=args.node_folder,
-            env=os.environ,
-            stdout=subprocess.PIPE,
-            text=True,
-            check=True,
-        )
-        program = done.stdout.splitlines()[0].partition("=")[2]
-        print(f"{args.splats.name}, dB")
-        print(f"| mesh | side | {program}, MSAA | {program}, pixel ratio 2 | ours, 2 x 2 |")
-        print("|---|---|---|---|---|")
-        for (name, mesh), side in itertools.product(meshes.items(), args.sizes):
-            truths = [ms.draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras[side]]
-            columns = [
-                [_load(folder / f"{name} {side} 1" / f"{i}.png") for i in range(args.views)],
-                [_halved(_load(folder / f"{name} {side} 2" / f"{i}.png")) for i in range(args.views)],
-                [ms.render(mesh, camera, samples=2).color.clip(0, 1) for camera in cameras[side]],
-            ]
-            scores = [
-                np.mean([ms.psnr(a, b.clip(0, 1)) for a, b in zip(images, truths, strict=True)])
-                for images in columns
-            ]
-            print(f"| {name} | {side} | {' | '.join(f'{score:.1f}' for score in scores)} |")
-
-
-def _load(path: Path) -> np.ndarray:
-    return np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
+        program = draw_jobs(jobs, folder, args.node_folder)[0].partition("=")[2]
+        with Report(args) as report:
+            report.say(f"{args.splats.name}, dB")
+            report.table("mesh", "side", f"{program}, MSAA", f"{program}, pixel ratio 2", "ours, 2 x 2")
+            for (name, mesh), side in itertools.product(meshes.items(), args.sizes):
+                truths = areas(cloud, cameras[side], sh_degree=0)
+                columns = [
+                    drawn_images(folder / f"{name} {side} 1", args.views),
+                    [_halved(image) for image in drawn_images(folder / f"{name} {side} 2", args.views)],
+                    images(mesh, cameras[side], samples=2),
+                ]
+                report.row(name, side, *(f"{mean_psnr(shown, truths):.1f}" for shown in columns))
 
 
 def _halved(image: np.ndarray) -> np.ndarray:

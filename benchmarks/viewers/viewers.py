@@ -3,35 +3,25 @@
     npm install three babylonjs babylonjs-loaders puppeteer-core    (in some folder; Chromium installed)
     python benchmarks/viewers/viewers.py SPLATS CAMERAS --node-folder FOLDER [--mesh MESH] [--views 4]
 
-Prints a table: each way of writing opacity, in each viewer, against the sorted mesh and against the splats
-it was made from. With --mesh, a mesh of `finetune --opacity cutoff`, with and without MSAA, against our image
-with 2 x 2 samples a pixel, and against the splats' means over pixels. The tables of docs/viewers.md come from
-here.
+The table: each way of writing opacity, in each viewer, against the sorted mesh and against the splats it was
+made from. With --mesh, a mesh of `finetune --opacity cutoff`, with and without MSAA, against our image with 2
+x 2 samples a pixel, and against the splats' means over pixels. The tables of docs/viewers.md come from here.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from _node import draw_jobs, drawn_images
 
-from meshsplats import (
-    convert,
-    draw_splats,
-    load_cameras,
-    load_gaussians,
-    load_mesh,
-    psnr,
-    render,
-    render_splats,
-    save_mesh,
-)
+sys.path.insert(0, str(Path(__file__).parents[1]))  # _common.py
+from _common import Report, areas, arguments, images, mean_psnr
+
+from meshsplats import convert, load_cameras, load_gaussians, load_mesh, save_mesh
 
 WAYS = {
     "three": {"blend": {"alpha": "blend"}, "blend, alphaHash on": {"alpha": "blend", "hash": True}},
@@ -46,9 +36,7 @@ for _ways in WAYS.values():
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("splats", type=Path)
     parser.add_argument("cameras", type=Path)
     parser.add_argument("--node-folder", type=Path, required=True, help="where node_modules lies")
@@ -62,11 +50,8 @@ def main() -> None:
     cloud = load_gaussians(args.splats)
     mesh = load_mesh(args.mesh) if args.mesh else convert(cloud)
     cameras = load_cameras(args.cameras)[: args.views]
-    exact = [render(mesh, camera, samples=2 if args.mesh else 1).color for camera in cameras]
-    if args.mesh:
-        splats = [draw_splats(cloud, camera, "area", sh_degree=0).color for camera in cameras]
-    else:
-        splats = [render_splats(cloud, camera, sh_degree=0).color for camera in cameras]
+    exact = images(mesh, cameras, samples=2 if args.mesh else 1)
+    splats = areas(cloud, cameras, look="area" if args.mesh else "splats", sh_degree=0)
     reach = np.linalg.norm(mesh.vertices, axis=1).max() + max(
         np.linalg.norm(np.linalg.inv(c.world_to_camera)[:3, 3]) for c in cameras
     )
@@ -94,29 +79,16 @@ def main() -> None:
                         "far": float(reach) * 2,
                     }
                 )
-        (folder / "jobs.json").write_text(json.dumps(jobs))
-        done = subprocess.run(
-            ["node", Path(__file__).with_name("viewers.mjs").resolve(), (folder / "jobs.json").resolve()],
-            cwd=args.node_folder,
-            env=os.environ,
-            stdout=subprocess.PIPE,
-            text=True,
-            check=True,
-        )
-        titles = dict(line.split("=") for line in done.stdout.splitlines() if "=" in line)
-        print(f"{args.splats.name}: {mesh.splat_count or 0:,} splats, {len(mesh.faces):,} triangles")
-        print("| viewer | alpha | against the exact mesh, dB | against the splats, dB |\n|---|---|---|---|")
-        for job in jobs:
-            images = [
-                np.asarray(Image.open(Path(job["out"]) / f"{i}.png").convert("RGB"), np.float32) / 255
-                for i in range(len(cameras))
-            ]
-            figures = [
-                np.mean([psnr(a, b) for a, b in zip(images, truth, strict=True)]) for truth in (exact, splats)
-            ]
-            print(f"| {titles[job['viewer']]} | {job['name']} | {figures[0]:.1f} | {figures[1]:.1f} |")
-        best = np.mean([psnr(a, b) for a, b in zip(exact, splats, strict=True)])
-        print(f"| exact renderer | sorted | - | {best:.1f} |")
+        lines = draw_jobs(jobs, folder, args.node_folder)
+        titles = dict(line.split("=") for line in lines if "=" in line)
+        with Report(args) as report:
+            report.say(f"{args.splats.name}: {mesh.splat_count or 0:,} splats, {len(mesh.faces):,} triangles")
+            report.table("viewer", "alpha", "against the exact mesh, dB", "against the splats, dB")
+            for job in jobs:
+                shown = drawn_images(Path(job["out"]), len(cameras))
+                figures = (f"{mean_psnr(shown, truth):.1f}" for truth in (exact, splats))
+                report.row(titles[job["viewer"]], job["name"], *figures)
+            report.row("exact renderer", "sorted", "-", f"{mean_psnr(exact, splats):.1f}")
 
 
 if __name__ == "__main__":

@@ -78,7 +78,7 @@ def test_named_lights_and_what_is_said_instead():
     ],
 )
 def test_the_estimate(layers, options, seconds):
-    from meshsplats.cli.blender import estimated_seconds
+    from meshsplats.blender.options import estimated_seconds
 
     ahead = {"mean_layers": layers, "samples": 10, "pixels": 10**6, "triangles": 0}
     assert estimated_seconds(ahead, options) == (None if seconds is None else pytest.approx(seconds))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from meshsplats.blender.levels import Chain, LevelMeshes, is_chain, read_chain
-from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions
+from meshsplats.blender.options import LIGHTS, LightOptions, SceneOptions, estimated_seconds
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cli.arguments import Command, as_cli_options
@@ -306,24 +306,6 @@ def _plan(ahead: dict[str, Any], options: SceneOptions, images: int) -> str:
     text += ", denoised" if options.denoise else ""
     seconds = estimated_seconds(ahead, options)
     return text + ("" if seconds is None else f"; about {_duration(seconds)} on {_processors(options)}")
-
-
-def estimated_seconds(ahead: dict[str, Any], options: SceneOptions) -> float | None:
-    """Estimated time with Cycles, from the plan of ``draw``; None for EEVEE. Measured with Blender 4.2 on
-    scenes of 4 to 16 layers per pixel (docs/blender.md): a ray that meets m layers costs 1.1 m microseconds,
-    and lit one more for the ground. Before a lit image come the stand-in, colours and baked light."""
-    if options.engine != "cycles":
-        return None
-    from meshsplats._core.library import processors
-
-    layers = ahead["mean_layers"]
-    lit = options.light is not None
-    ray = 1.1e-6 * layers + (1e-6 if lit else 0)
-    pixel = ray * ahead["samples"] + (20e-6 if options.denoise else 0)
-    busy = pixel * ahead["pixels"] + 2e-6 * ahead["triangles"]
-    if lit:
-        busy += 8 + 35e-6 * ahead["triangles"]
-    return busy / (options.threads or processors())
 
 
 def _processors(options: SceneOptions) -> str:

@@ -103,7 +103,7 @@ def simplify_in_blocks(
     cloud's.
 
     Blocks of at most ``block`` splats, cut at medians, keep equal shares of their visible splats, and pairs
-    across their borders are not merged: images are as good (benchmarks/RESULTS.md#the-viewer). Splats are
+    across their borders are not merged: images are as good (benchmarks/results/viewer.md). Splats are
     ordered by block.
     """
     if len(cloud) <= block or count >= len(cloud):
