@@ -240,14 +240,14 @@ def arguments(doc: str | None, *, data: bool = False) -> argparse.ArgumentParser
 
 def machine() -> str:
     """Processor, their number and load, and the core in use."""
-    from meshsplats._core.library import available_variants, processors
+    from meshsplats._core.library import load_core, processors
 
     name = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").exists():
         found = re.search(r"model name\s*:\s*(.*)", Path("/proc/cpuinfo").read_text())
         name = found[1].strip() if found else name
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-    return f"{name}, {processors()} processors{load}, core {available_variants()[0]}"
+    return f"{name}, {processors()} processors{load}, core {load_core().ms_variant().decode()}"
 
 
 def commit() -> str:
