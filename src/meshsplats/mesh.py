@@ -114,7 +114,7 @@ class SplatMesh:
         length = float(np.linalg.norm(self.up))
         if length == 0:
             raise ValueError("up must not be the zero vector")
-        # Kept where it differs by rounding only, so that a saved mesh is loaded bit for bit.
+        # Not rescaled within 1e-6 of unit length: files round-trip bit for bit.
         set_("up", self.up if abs(length - 1) <= 1e-6 else self.up / np.float32(length))
         if self.blending not in get_args(Blending):
             known = ", ".join(get_args(Blending))

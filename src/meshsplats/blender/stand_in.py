@@ -1,8 +1,8 @@
 """A clean surface in place of the splats, for light: it casts shadows, occludes and reflects bounced light.
 
-Translucent layers that shade each other are lit by chance. The surface is the one that ``meshsplats base``
-makes, from depth images of the same mesh, with one vertex for each voxel that it crosses (surface nets;
-Gibson 1998). Each splat takes the light at its foot, the nearest point of the surface. Splats that the
+Translucent layers that shade each other receive light arbitrarily. The surface is the one that ``meshsplats
+base`` makes, from depth images of the same mesh, with one vertex for each voxel that it crosses (surface
+nets; Gibson 1998). Each splat takes the light at its foot, the nearest point of the surface. Splats that the
 surface lacks, such as hair, leaves and wires, keep their own places and cast their own shadows; floaters cast
 none.
 """

@@ -46,7 +46,7 @@ _CHUNK = 1 << 14
 
 
 def origin_step(count: int) -> int:
-    """Of ``count`` splats, every so many-th decides the origin."""
+    """Step of the sample of ``count`` splats whose mean is the origin."""
     return max(1, count // 1000)
 
 

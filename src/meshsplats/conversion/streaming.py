@@ -1,7 +1,7 @@
 """Conversion of splats that do not fit into memory: in blocks, after passes over all of them.
 
-The size of a pixel at a splat depends on the whole scene. The passes gather what it needs: every so many-th
-splat, from which cameras are placed, and the median pixel for splats that none of them sees.
+The size of a pixel at a splat depends on the whole scene. The passes gather what it needs: a sample of
+splats, around which cameras are placed, and the median pixel for splats that none of them sees.
 """
 
 from __future__ import annotations

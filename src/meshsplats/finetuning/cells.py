@@ -4,9 +4,9 @@ The splats are divided into boxes of equal count. Besides its own splats, a cell
 within a margin, and all others merged to a few, so that its images are complete. It is trained on the windows
 of the views that show it. The result takes each splat from the cell that owns it.
 
-Seams come from two cells that correct the same error. So no two neighbours are tuned at a time: of a
-neighbour that is done, the margin is drawn as it was tuned, and frozen. Of one that comes later, it is tuned
-along, and dropped. What stands for the rest of the scene is frozen.
+Seams come from two cells that correct the same error. So no two neighbours are tuned at the same time. A
+finished neighbour's margin is drawn, frozen. A later neighbour's margin is tuned with the cell and then
+discarded. What stands for the rest of the scene is frozen.
 """
 
 from __future__ import annotations

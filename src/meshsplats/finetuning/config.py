@@ -30,7 +30,7 @@ LONG_MINUTES, LONG_STEPS = 10.0, 2000
 AREA_ZOOMS = (1,) * 5 + (2,)
 """Zooms of the training views in the look 'area' (``splat_dataset``). Windows of larger images add detail for
 large images: in two minutes, playbot gains 0.4 dB at 800 and 1600 pixels and loses 0.1 at 400; the guitar
-gains 0.8 to 1.5 and 0.3 to 1.1. Not a multiple of four zooms: see ``ZOOMS``."""
+gains 0.8 to 1.5 and 0.3 to 1.1. Never a multiple of four entries (reason: ``ZOOMS``)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class FinetuneConfig:
     color_step_decay: float = 1.0
     """Additional decay of the colour learning rate: its factor per step, whatever the length of the run."""
     beta1: float = 0.5
-    """Adam's decay rate of the first moment. Low: consecutive views see other vertices, or from elsewhere."""
+    """Adam's decay rate of the first moment. Low: successive views show other vertices, or other sides."""
     beta2: float = 0.9
     """Adam's decay rate of the second moment. Low: a vertex is seen tens of times, not thousands."""
     epsilon: float = 1e-15

@@ -51,10 +51,10 @@ def with_soft_splats(
     that fail most.
 
     A splat is scored by the sum over the pixels of ``views`` of T a (1 - a) e, with the opacity a of its
-    fragments and the transmittance T in front of them: what is lost if a fragment is drawn solid by a chance
-    of a has this factor. e is the squared error of ``core`` less that of ``start``. Of the splats with
-    positive scores, those with the highest score per triangle take up to ``share`` times as many triangles as
-    ``start`` has.
+    fragments and the transmittance T in front of them: the expected loss of drawing a fragment opaque with
+    probability a has this factor. e is the squared error of ``core`` less that of ``start``. Of the splats
+    with positive scores, those with the highest score per triangle take up to ``share`` times as many
+    triangles as ``start`` has.
 
     Returns:
         A mesh whose opaque triangles have three corners of opacity 1, and its blended ones none.

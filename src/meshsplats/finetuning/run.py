@@ -91,9 +91,9 @@ class RunOptions:
     device: Device = "cpu"
     """Where images are rendered, and gradients computed: 'cpu' or 'gpu'. Opacity 'cutoff' needs 'cpu'."""
     spent: float = 0.0
-    """Seconds already used, which count if the length is given in minutes."""
+    """Seconds already spent. They count towards ``minutes``."""
     reserve: float = 0.0
-    """Seconds that the caller needs afterwards, which count likewise."""
+    """Seconds that the caller needs afterwards. They count, too."""
     cache_bytes: int = CACHE_BYTES
     """Limit of the data set's image cache, for the memory estimate."""
 

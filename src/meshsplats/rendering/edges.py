@@ -101,7 +101,7 @@ def edge_gradients(
         mesh, camera, cutoff, background: as in ``render(..., cutoff=cutoff)``; the mesh has no filter.
         gradient: (h, w, 3) float32 gradient of the loss with respect to the image, whose pixels are means
             over their area.
-        beyond: ``corners_beyond(mesh.faces)``, for who has it already.
+        beyond: ``corners_beyond(mesh.faces)``, precomputed, if you have it.
     """
     fine = camera.scaled(EDGE_SAMPLES)
     front = front_faces(mesh, fine, cutoff, background=background, threads=threads)

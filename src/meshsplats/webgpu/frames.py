@@ -61,7 +61,7 @@ class Work:
     dispatches: int = 0
     """Of the last frame."""
     bytes: int = 0
-    """Of all buffers."""
+    """Bytes of all buffers."""
     tiles: int = 0
     pairs: int = 0
     """Pairs of a run and a tile in its box."""
