@@ -22,11 +22,14 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 import meshsplats as ms
+
+if TYPE_CHECKING:
+    from meshsplats.finetuning.state import State
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -124,6 +127,22 @@ def mean_psnr(found: Iterable[np.ndarray], truths: Iterable[np.ndarray]) -> floa
     """Mean PSNR in dB of images, clipped to [0, 1]."""
     pairs = zip(found, truths, strict=True)
     return float(np.mean([ms.psnr(image.clip(0, 1), truth.clip(0, 1)) for image, truth in pairs]))
+
+
+def take_steps(
+    state: State, views: Sequence[ms.View], config: ms.FinetuneConfig, fraction: Callable[[int], float]
+) -> tuple[ms.SplatMesh, int]:
+    """The mesh after steps of fine-tuning, and their number, until ``fraction``, which takes the number of
+    steps so far, is 1: for clocks that ``finetune`` does not have."""
+    from meshsplats.finetuning.step import kept_faces, make_step
+
+    step, interval = 0, config.prune_interval(len(views))
+    while (done := fraction(step)) < 1:
+        make_step(state, views, step, done)
+        step += 1
+        if interval and step % interval == 0 and fraction(step) < 1:
+            state = state.prune(kept_faces(state, views))
+    return state.result(), step
 
 
 # ---- Time and memory

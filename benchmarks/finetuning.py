@@ -16,20 +16,14 @@ from __future__ import annotations
 
 import argparse
 
-from _common import PHOTOGRAPHED, SCENES, Report, Stopwatch, arguments
+from _common import PHOTOGRAPHED, SCENES, Report, Stopwatch, arguments, take_steps
 
 import meshsplats as ms
 from meshsplats.datasets.splat_targets import splat_views
 from meshsplats.evaluation.report import evaluate
-from meshsplats.finetuning import (
-    FinetuneConfig,
-    RunOptions,
-    finetune,
-    make_config,
-    starting_mesh,
-    worthwhile_views,
-)
+from meshsplats.finetuning import RunOptions, finetune, make_config, starting_mesh, worthwhile_views
 from meshsplats.finetuning.config import worthwhile_zooms
+from meshsplats.finetuning.state import State
 
 ALL = SCENES | PHOTOGRAPHED
 
@@ -85,7 +79,9 @@ def row(name: str, preset: str, options: argparse.Namespace) -> tuple[object, ..
         tuned = finetune(mesh, ms.Dataset(data.train), config, run=run, on_progress=reports.append)
         steps = reports[-1].step
     else:
-        tuned, steps = by_processor_time(mesh, data, config, options, seconds)
+        state = State.begin(mesh, len(data.train), config, options.threads)
+        length = 60 * options.minutes
+        tuned, steps = take_steps(state, data.train, config, lambda step: seconds() / length)
     used = seconds()
 
     def psnr(mesh: ms.SplatMesh | None, splats: ms.GaussianCloud | None = None) -> str:
@@ -102,21 +98,6 @@ def row(name: str, preset: str, options: argparse.Namespace) -> tuple[object, ..
     label = f"{preset}, exposure" if config.exposure else preset
     cells = (name, label, f"{len(tuned.faces):,}", steps, f"{used:.0f}", splats, psnr(mesh), psnr(tuned))
     return cells
-
-
-def by_processor_time(mesh, data, config: FinetuneConfig, options, seconds) -> tuple[ms.SplatMesh, int]:
-    """The same loop with rates and end by processor time."""
-    from meshsplats.finetuning.state import State
-    from meshsplats.finetuning.step import kept_faces, make_step
-
-    state = State.begin(mesh, len(data.train), config, options.threads)
-    step, interval = 0, config.prune_interval(len(data.train))
-    while (fraction := seconds() / (options.minutes * 60)) < 1:
-        make_step(state, data.train, step, fraction)
-        step += 1
-        if interval and step % interval == 0:
-            state = state.prune(kept_faces(state, data.train))
-    return state.result(), step
 
 
 if __name__ == "__main__":

@@ -15,13 +15,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from _common import PHOTOGRAPHED, Report, Stopwatch, arguments
+from _common import PHOTOGRAPHED, Report, Stopwatch, arguments, take_steps
 
 import meshsplats as ms
 from meshsplats.finetuning import make_config, starting_mesh
 from meshsplats.finetuning.config import FinetuneConfig, learning_rates
 from meshsplats.finetuning.state import State
-from meshsplats.finetuning.step import kept_faces, loss_of, make_step, target_of, view_of_step
+from meshsplats.finetuning.step import loss_of, target_of, view_of_step
 from meshsplats.formats.base_meshes import load_base
 from meshsplats.prior import bind, prior_config
 
@@ -87,13 +87,9 @@ def trained(
 ) -> tuple[ms.SplatMesh, int, float]:
     """``mesh`` after all steps, their count, and their processor time."""
     state = State.begin(mesh, len(data.train), config, threads)
-    steps, interval = config.total_steps(len(data.train)) or 0, config.prune_interval(len(data.train))
+    total = config.total_steps(len(data.train)) or 0
     watch = Stopwatch()
-    for step in range(steps):
-        make_step(state, data.train, step, step / steps)
-        if interval and (step + 1) % interval == 0 and step + 1 < steps:
-            state = state.prune(kept_faces(state, data.train))
-    return state.result(), steps, watch.processor
+    return *take_steps(state, data.train, config, lambda step: step / total), watch.processor
 
 
 def opaque_colors(

@@ -20,6 +20,13 @@ def draw_jobs(jobs: list[dict[str, Any]], folder: Path, node_folder: Path) -> li
     return done.stdout.splitlines()
 
 
+def job(viewer: str, glb: Path, cameras: Path, out: Path, reach: float, **more: Any) -> dict[str, Any]:
+    """A job of ``draw_jobs`` for a scene within ``reach`` of the origin."""
+    places = {"glb": glb, "cameras": cameras, "out": out}
+    lens = {"near": reach / 1000, "far": reach * 2}
+    return {"viewer": viewer, **{name: str(path.resolve()) for name, path in places.items()}, **lens, **more}
+
+
 def drawn_images(folder: Path, count: int) -> list[np.ndarray]:
     """The images (h, w, 3) that a job wrote into its folder ``out``."""
     files = (Image.open(folder / f"{i}.png").convert("RGB") for i in range(count))

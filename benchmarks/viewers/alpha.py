@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from _node import draw_jobs, drawn_images
+from _node import draw_jobs, drawn_images, job
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # _common.py
 from _common import Report, Stopwatch, areas, arguments, images, mean_psnr
@@ -63,16 +63,17 @@ def measure(path: Path, args: argparse.Namespace, folder: Path) -> list[str]:
     ms.save_cameras(cameras, folder / "cameras.json")
     away = max(float(np.linalg.norm(camera.center)) for camera in cameras)
     reach = away + float(np.linalg.norm(mesh.vertices, axis=1).max())
+    near = max(cameras[0].near, reach / 1e5)
     jobs = [
-        {
-            "viewer": "three",
-            "glb": str(folder / f"{name}.glb"),
-            "cameras": str(folder / "cameras.json"),
-            "out": str(folder / name),
-            "antialias": True,
-            "near": max(cameras[0].near, reach / 1e5),
-            "far": 2 * reach,
-        }
+        job(
+            "three",
+            folder / f"{name}.glb",
+            folder / "cameras.json",
+            folder / name,
+            reach,
+            antialias=True,
+            near=near,
+        )
         for name in ("blend", "mask", "default")
     ]
     draw_jobs(jobs, folder, args.node_folder)

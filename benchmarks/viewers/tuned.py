@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from _node import draw_jobs, drawn_images
+from _node import draw_jobs, drawn_images, job
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # _common.py
 from _common import Report, areas, arguments, images, mean_psnr
@@ -48,19 +48,12 @@ def main() -> None:
             cameras[side] = ms.orbit(cloud, args.views, elevation=20, width=side, height=side)
             ms.save_cameras([c.scaled(ratio) for c in cameras[side]], folder / f"{side} {ratio}.json")
             for name in meshes:
-                jobs.append(
-                    {
-                        "viewer": "three",
-                        "glb": str(folder / f"{name}.glb"),
-                        "cameras": str(folder / f"{side} {ratio}.json"),
-                        "out": str(folder / f"{name} {side} {ratio}"),
-                        "hash": False,
-                        "sorted": True,
-                        "antialias": ratio == 1,
-                        "near": reach / 1000,
-                        "far": reach * 2,
-                    }
+                places = (
+                    folder / f"{name}.glb",
+                    folder / f"{side} {ratio}.json",
+                    folder / f"{name} {side} {ratio}",
                 )
+                jobs.append(job("three", *places, reach, sorted=True, antialias=ratio == 1))
         program = draw_jobs(jobs, folder, args.node_folder)[0].partition("=")[2]
         with Report(args) as report:
             report.say(f"{args.splats.name}, dB")

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from _node import draw_jobs, drawn_images
+from _node import draw_jobs, drawn_images, job
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # _common.py
 from _common import Report, areas, arguments, images, mean_psnr
@@ -66,28 +66,22 @@ def main() -> None:
                 glb = folder / f"{way['alpha']}.glb"
                 if not glb.exists():
                     save_mesh(mesh, glb, alpha=way["alpha"])
-                jobs.append(
-                    {
-                        "viewer": viewer,
-                        "name": name,
-                        "glb": str(glb.resolve()),
-                        "cameras": str((folder / "cameras.json").resolve()),
-                        "out": str((folder / f"{viewer} {name}").resolve()),
-                        "hash": way.get("hash", False),
-                        "antialias": way.get("antialias", False),
-                        "near": float(reach) / 1000,
-                        "far": float(reach) * 2,
-                    }
-                )
+                more = {
+                    "name": name,
+                    "hash": way.get("hash", False),
+                    "antialias": way.get("antialias", False),
+                }
+                places = (glb, folder / "cameras.json", folder / f"{viewer} {name}")
+                jobs.append(job(viewer, *places, float(reach), **more))
         lines = draw_jobs(jobs, folder, args.node_folder)
         titles = dict(line.split("=") for line in lines if "=" in line)
         with Report(args) as report:
             report.say(f"{args.splats.name}: {mesh.splat_count or 0:,} splats, {len(mesh.faces):,} triangles")
             report.table("viewer", "alpha", "against the exact mesh, dB", "against the splats, dB")
-            for job in jobs:
-                shown = drawn_images(Path(job["out"]), len(cameras))
+            for drawn in jobs:
+                shown = drawn_images(Path(drawn["out"]), len(cameras))
                 figures = (f"{mean_psnr(shown, truth):.1f}" for truth in (exact, splats))
-                report.row(titles[job["viewer"]], job["name"], *figures)
+                report.row(titles[drawn["viewer"]], drawn["name"], *figures)
             report.row("exact renderer", "sorted", "-", f"{mean_psnr(exact, splats):.1f}")
 
 
