@@ -18,7 +18,8 @@ CITY = "from meshsplats.demo_scene.city import main; main({arguments!r})"
 TILES = """
 import meshsplats
 from meshsplats.tiles.building import build_tiles
-print(build_tiles(meshsplats.stream_gaussians({splats!r}), {tileset!r}, replace_old=True))
+made = build_tiles(meshsplats.stream_gaussians({splats!r}), {tileset!r}, replace_old=True)
+print(f"{{made.tiles}} tiles on {{made.levels}} levels, {{made.bytes / 1e6:.0f}} MB")
 """
 DRAW = """
 from meshsplats import orbit, save_image
@@ -55,7 +56,7 @@ def main() -> None:
             report.row(
                 *(step, f"{args.count:,}", f"{used.processor:.1f}"),
                 *(f"{used.processor / args.count * 1e6:.2f}", f"{used.wall:.1f}", f"{used.memory / 1e6:.0f}"),
-                " ".join(used.output.split()),
+                "" if step == "city" else used.output.strip(),
             )
     if not args.keep:
         splats.unlink()

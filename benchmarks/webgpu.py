@@ -95,7 +95,7 @@ def measure_gradients(name: str, mesh: SplatMesh, view: Camera) -> tuple[str, ..
         f"{sum(window.fragments for window in forward.windows):,}",
         f"{sum(window.sums for window in forward.windows):,}",
         f"{sum('kernel' in step and step.get('if') not in skipped for step in steps)}",
-        f"{renderer.bytes / 1e6:.0f}",
+        f"{renderer.frames.bytes / 1e6:.0f}",
         *(f"{1000 * seconds:.0f}" for seconds in (times[2], times[3], times[4] + times[5])),
     )
 
