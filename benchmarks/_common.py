@@ -306,6 +306,8 @@ class Report:
         words = sys.argv if words is None else words
         self._save = asked.save
         self.command = command_line(words)
+        # Of the start: source may change meanwhile, and the run itself is load.
+        self._about = f"{time.strftime('%Y-%m-%d')}, {commit()}, {machine()}" if asked.save else ""
         script = Path(words[0]).resolve()
         folder = script.parent.name + "_" if script.parent.name != "benchmarks" else ""
         self.path = RESULTS / f"{folder}{script.stem}.md"
@@ -338,11 +340,12 @@ class Report:
         self.say("| " + " | ".join(map(str, cells)) + " |")
 
     def save(self) -> None:
-        header = f"`{self.command}`: {time.strftime('%Y-%m-%d')}, {commit()}, {machine()}."
         text = self.path.read_text("utf-8") if self.path.exists() else f"# {self.path.stem}\n"
         body = "\n".join(self._lines).strip()
         self.path.parent.mkdir(exist_ok=True)
-        self.path.write_text(recorded(text, self.command, f"{header}\n\n{body}"), "utf-8")
+        self.path.write_text(
+            recorded(text, self.command, f"`{self.command}`: {self._about}.\n\n{body}"), "utf-8"
+        )
         print(f"recorded in {self.path.relative_to(ROOT)}" if self.path.is_relative_to(ROOT) else self.path)
 
 

@@ -155,7 +155,7 @@ class Binding:
     def _same_place(self) -> np.ndarray:
         """(n,) index of a place for each vertex of the base: vertices that a seam has split share one.
 
-        Found in the stored base, as vertices of a moved one could meet by chance.
+        Found in the stored base, as vertices of a moved one may coincide by chance.
         """
         points = self.base_vertices + np.float32(0)  # 0 and -0 are one place
         order = np.lexsort(points.T)

@@ -1,6 +1,6 @@
 """Shading normals of splat meshes: smooth, and pointing outwards.
 
-The layers of a splat mesh are tilted by chance, and crossed ones stand upright on the surface; lit by their
+The layers of a splat mesh are tilted at random, and crossed ones stand upright on the surface; lit by their
 own normals they look mottled. Here each splat takes the normal of the surface that it and its neighbours
 form: their centres lie in it, and the largest of their discs lie along it. The outer side is the one from
 which cameras around the scene see the splat; of a sheet that is seen from both sides, such as a street, the

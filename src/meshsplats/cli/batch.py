@@ -45,7 +45,7 @@ class Job:
         """Within the block no other process does this job, unless with ``force``. FileExistsError if one is
         at it."""
         first = self.outputs[0]
-        if force or not os.access(first.absolute().parent, os.W_OK):  # which is told with the other errors
+        if force or not os.access(first.absolute().parent, os.W_OK):  # reported with the other errors
             yield
             return
         with locked(lock_of(first)) as ours:

@@ -102,8 +102,8 @@ def _binary(path: Path) -> ScenePoints:
 
 
 def _starts(block: bytes, most: int) -> tuple[list[int], int]:
-    """Where points start in ``block``, those that lie in it but for their images, ``most`` at most; and where
-    the next one starts, which may lie beyond."""
+    """Where at most ``most`` points start in ``block``, whose records, without their images, lie inside; and
+    where the next one starts, which may lie beyond."""
     starts: list[int] = []
     at, last = 0, len(block) - _POINT.itemsize
     size, fixed, track = _TRACK_BYTES, _POINT.itemsize, _TRACK.unpack_from

@@ -113,8 +113,8 @@ class FinetuneConfig:
     """opacity 'cutoff': opacities turn from blended to cut over this initial fraction of the run."""
     expected_share: float = 0.5
     """opacity 'cutoff': share of the loss, from the end of the annealing on, that is l2_weight times the
-    expected square error of images in which each fragment is opaque or not by chance. It makes layers agree
-    with the target one by one, not only in their mean."""
+    expected square error of images in which each fragment is opaque with its opacity as probability. It makes
+    layers agree with the target one by one, not only in their mean."""
     settle_share: float | None = None
     """opacity 'cutoff': before this last fraction of the run, triangles that the training views do not show
     are removed. None: 0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""

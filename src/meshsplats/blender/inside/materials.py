@@ -69,7 +69,7 @@ def lit(
 
     Many translucent layers form one surface, so each is shaded by the smoothed normal of that surface
     (attribute ``splat_normal``; ``smooth`` False: by the triangle's own). Rays that start on a layer ignore
-    layers within ``self_shadow`` (scene units), which would shade half of it by chance. Shadows of objects
+    layers within ``self_shadow`` (scene units), which would shade half of it at random. Shadows of objects
     farther away stay.
     """
     material = bpy.data.materials.new(name)

@@ -72,7 +72,7 @@ def lit_settings(
     cycles.use_denoising = denoise
     # The light tree skips lights behind a triangle, though its smoothed normal may face them.
     cycles.use_light_tree = False
-    # Denoised, rays that have lost most of their light may end by chance: in half of the time.
+    # Denoised, rays that have lost most of their light may end at random, which halves the time.
     _layers(scene, limit, least=_FEW if denoise else limit)
     scene.eevee.taa_render_samples = samples
     scene.render.filter_size = 1.5
@@ -80,7 +80,7 @@ def lit_settings(
 
 
 def _layers(scene: Any, limit: int, least: int | None = None) -> None:
-    # A ray that passes more layers than the limit turns black. Beyond the minimum, it may end by chance.
+    # A ray that passes more layers than the limit turns black. Beyond the minimum, it may end at random.
     scene.cycles.transparent_max_bounces = limit
     scene.cycles.min_transparent_bounces = limit if least is None else min(least, limit)
 

@@ -174,7 +174,7 @@ def _side_by_side(header: _Header, streams: dict[str, Any], where: object) -> It
 
 
 class _Inflater:
-    """A gzip stream in a file from some point on: unpacks as much as is read."""
+    """A gzip stream that begins somewhere in a file: unpacks as much as is read."""
 
     def __init__(self, file: BinaryIO, decompressor: Any, rest: bytes = b"") -> None:
         self._file, self._decompressor, self._rest = file, decompressor, rest
