@@ -22,6 +22,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -341,10 +342,11 @@ class Report:
 
     def save(self) -> None:
         text = self.path.read_text("utf-8") if self.path.exists() else f"# {self.path.stem}\n"
-        body = "\n".join(self._lines).strip()
+        lines = (line if line.startswith("|") else fill(line, 120) for line in self._lines)
+        body = "\n".join(lines).strip()
         self.path.parent.mkdir(exist_ok=True)
         self.path.write_text(
-            recorded(text, self.command, f"`{self.command}`: {self._about}.\n\n{body}"), "utf-8"
+            recorded(text, self.command, f"`{self.command}`:\n{self._about}.\n\n{body}"), "utf-8"
         )
         print(f"recorded in {self.path.relative_to(ROOT)}" if self.path.is_relative_to(ROOT) else self.path)
 

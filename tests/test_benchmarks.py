@@ -83,7 +83,7 @@ def test_a_saved_run_replaces_its_own_figures_alone(results):
     assert text.count("| small | 201 |") == text.count("| small | 395 |") == 1
     assert text.index("201") < text.index("395")
     assert text.count(common.BEGIN) == text.count(common.END) == 2
-    assert "`python benchmarks/rendering.py --repeat 7`: 20" in text
+    assert "\n`python benchmarks/rendering.py --repeat 7`:\n20" in text
     assert common.machine().split(",")[0] in text
 
 
@@ -138,7 +138,7 @@ def test_recorded_files_belong_to_scripts_and_are_linked_from_the_first_screen()
         assert path.name in names, f"{path.name} belongs to no script"
         assert f"](results/{path.name}" in first, f"RESULTS.md does not lead to {path.name}"
         text = path.read_text("utf-8")
-        commands = re.findall(f"{common.BEGIN}\n`(python benchmarks/.*?)`: ", text)
+        commands = re.findall(f"{common.BEGIN}\n`(python benchmarks/.*?)`:\\s", text)
         assert len(commands) == text.count(common.BEGIN) == text.count(common.END), path.name
         assert max(Counter(commands).values(), default=1) == 1, f"{path.name} has figures twice"
         for command in commands:
