@@ -429,15 +429,6 @@ def test_gltf_joins_the_splats_of_all_nodes(tmp_path):
     np.testing.assert_allclose(cloud.sh, np.tile(one["sh"], (2, 1, 1)), rtol=1e-5)
 
 
-def test_gltf_in_linear_colours_says_so(tmp_path):
-    properties = {"colorSpace": "lin_rec709_display"}
-    (tmp_path / "a.glb").write_bytes(
-        encode.gltf(encode.splat_accessors(some_splats()), properties=properties)
-    )
-    with pytest.warns(DataWarning, match="linear colours"):
-        load_gaussians(tmp_path / "a.glb")
-
-
 # -- what is not read
 
 

@@ -64,28 +64,61 @@ class SplatOptions:
     axes: Literal["auto", "y-down", "y-up"] = "auto"
     """Direction of the y axis in the file; auto: as its format prescribes. After reading, y points down. Some
     programs write SPZ with y down: if the image is upside down, give y-down."""
+    kernel: Literal["auto", "3dgs", "antialiased", "2dgs"] = "auto"
+    """Kernel that the splats were trained with; auto: as the file says."""
+    time: Number = None
+    """Splats that move in time: the instant to show, in the file's unit. Default: one in the middle."""
+    activated: Annotated[
+        tuple[Literal["scales", "opacities", "colors"], ...], tyro.conf.arg(help_behavior_hint="")
+    ] = ()
+    """Values that a .ply stores as they are, where logarithms, logits and harmonics belong."""
     strict: bool = False
     """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
-    def load(self, path: Path) -> GaussianCloud:
+    def load(self, path: Path, *, up: str | None = None, quiet: bool = False) -> GaussianCloud:
+        """The splats of a file. Says what its header names, unless ``quiet``; ``up``: the option that counts
+        in its place."""
         from meshsplats.formats.gaussians import load_gaussians
 
         try:
-            return load_gaussians(path, strict=self.strict, axes=self.axes)
+            cloud = load_gaussians(path, **self._arguments)
         except FileFormatError:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
+        if quiet:
+            return cloud
+        if up is None and cloud.up is not None:
+            say(f"up: {direction_in_words(cloud.up)}, from the file's header")
+        if self.kernel == "auto" and cloud.kernel != "3dgs":
+            say(f"kernel: {cloud.kernel}, from the file")
+        return cloud
 
-    def stream(self, path: Path | Sequence[Path]) -> SplatStream:
-        """The splats of a file, or of several, in blocks."""
+    def stream(self, path: Path | Sequence[Path], *, up: str | None = None) -> SplatStream:
+        """The splats of a file, or of several, in blocks. ``up`` as for ``load``."""
         from meshsplats.formats.gaussians import stream_gaussians
 
-        return stream_gaussians(path, strict=self.strict, axes=self.axes)
+        stream = stream_gaussians(path, **self._arguments)
+        if up is None and (told := stream.up) is not None:
+            say(f"up: {direction_in_words(told)}, from the files' headers")
+        return stream
+
+    @property
+    def _arguments(self) -> dict[str, Any]:
+        return {
+            "strict": self.strict,
+            "axes": self.axes,
+            "kernel": None if self.kernel == "auto" else self.kernel,
+            "time": self.time,
+            "activated": self.activated,
+        }
 
     def again(self) -> list[str]:
-        """The words with which another command reads the file with the same axes."""
-        return ["--axes", self.axes] if self.axes != "auto" else []
+        """The words with which another command reads the file in the same way."""
+        words = ["--axes", self.axes] if self.axes != "auto" else []
+        words += ["--kernel", self.kernel] if self.kernel != "auto" else []
+        words += ["--time", f"{self.time:g}"] if self.time is not None else []
+        return words + (["--activated", *self.activated] if self.activated else [])
 
 
 @dataclass(frozen=True)
@@ -122,7 +155,7 @@ class ViewOptions:
     wide. In place of --fov."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
-    folder, of the mesh, else -y, as in COLMAP's scenes."""
+    folder, of the file, else -y, as in COLMAP's scenes."""
     width: Count = None
     """Image width in pixels. With --cameras or --data, images are scaled to this width."""
     height: Count = None
@@ -298,13 +331,13 @@ class ClusterOptions:
             yield found
 
 
-def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:
-    """The splats or the mesh at ``path``."""
+def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> GaussianCloud | SplatMesh:
+    """The splats or the mesh at ``path``; ``up`` as for ``SplatOptions.load``."""
     kind = identify(path)
     if kind == "cameras":
         raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
     if kind == "splats":
-        return reading.load(path)
+        return reading.load(path, up=up)
     from meshsplats.formats.meshes import load_mesh
 
     return load_mesh(path)
@@ -356,6 +389,14 @@ def parse_up(text: str) -> np.ndarray:
     if numbers is None or not any(numbers):
         raise ValueError(f"--up must be an axis such as -y or z, or three numbers x,y,z, got {text!r}")
     return np.array(numbers)
+
+
+def direction_in_words(direction: np.ndarray) -> str:
+    """An axis, or three numbers, as ``parse_up`` takes them."""
+    axis = int(np.abs(direction).argmax())
+    if abs(direction[axis]) > 1 - 1e-6:
+        return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
+    return ",".join(f"{value:.4g}" for value in direction)
 
 
 def parse_color(text: str) -> tuple[float, float, float]:

@@ -179,7 +179,7 @@ class View(Command):
             parse_up(self.up)
 
     def _scene(self) -> GaussianCloud | SplatMesh:
-        scene = self.part.of(load_scene(self.input, self.reading))
+        scene = self.part.of(load_scene(self.input, self.reading, up=self.up))
         if isinstance(scene, SplatMesh):
             if self.max_triangles is not None or self.whole:
                 given = "--whole" if self.whole else "--max-triangles"

@@ -41,6 +41,12 @@ class SplatReader:
     """The file, for messages."""
     chunks: Iterator[tuple[int, Fill]]
     """Count of the splats of each chunk, and what reads them."""
+    up: np.ndarray | None = None
+    """(3,) direction that points up in the axes of the file, where it says so."""
+    linear: bool = False
+    """Whether its colours are linear, not display values."""
+    instant: float | None = None
+    """The time at which they are shown, of splats that move."""
 
     def read(self, *, strict: bool) -> GaussianCloud:
         """All splats; errors and warnings as ``load_gaussians``, which must be the caller."""
