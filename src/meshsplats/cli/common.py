@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
+from meshsplats._arrays import subsample
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import guess_up
@@ -503,12 +504,16 @@ def plural(count: int, noun: str) -> str:
 PREVIEW_TRIANGLES = 1_000_000
 """Triangles of a mesh above which its preview is half as wide, with the fewest samples. Of 2 to 17 million
 triangles, it is 36 to 39 dB from one with all samples, in a sixth of the time."""
+PREVIEW_FRAGMENTS = 1e9
+"""Fragments above which a preview is made smaller, or not at all: some 10 s of one processor. Of real scenes,
+previews have 1e7 to 4e8."""
 
 
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None) -> None:
     """Saves an image of ``scene`` from ``camera``; by default from the front and a little to the side."""
     from meshsplats.images.writing import save_image
     from meshsplats.rendering import render_splats
+    from meshsplats.rendering.layers import affordable, layers
     from meshsplats.rendering.looks import image_of
     from meshsplats.rendering.samples import FEWEST, needed_samples
 
@@ -519,9 +524,42 @@ def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | 
             samples = needed_samples(scene, [camera])
         else:
             camera, samples = camera.scaled(0.5), 1 if scene.filter_px2 else FEWEST
-        save_image(path, image_of(scene, camera, (1, 1, 1), samples=samples)[0])
     else:
-        save_image(path, render_splats(scene, camera).color)
+        samples = 1
+    small = affordable(scene, camera, samples, PREVIEW_FRAGMENTS)
+    if small is None:
+        count = layers(scene, camera)
+        say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
+        return
+    if isinstance(scene, SplatMesh):
+        save_image(path, image_of(scene, small, (1, 1, 1), samples=samples)[0])
+    else:
+        save_image(path, render_splats(scene, small).color)
+
+
+LONG_SECONDS = 60
+"""Images that take longer than this, as far as can be estimated, are announced."""
+
+
+def announce_cost(
+    scene: SplatMesh | GaussianCloud, cameras: Sequence[Camera], samples: int, threads: int | None
+) -> None:
+    """Says before the work how long images may take, where layers upon layers make it long."""
+    from meshsplats.rendering.layers import FRAGMENTS_A_SECOND, fragments, layers
+
+    some = subsample(cameras, 8)
+    each = float(np.mean([fragments(scene, camera, samples) for camera in some]))
+    seconds = each * len(cameras) / FRAGMENTS_A_SECOND / (threads or os.cpu_count() or 1)
+    count = layers(scene, some[0])
+    if seconds > LONG_SECONDS and count > MANY_LAYERS:
+        say(
+            f"about {count:,.0f} layers lie over each other at each pixel: this may take about"
+            f" {max(1, round(seconds / 60))} min"
+        )
+
+
+MANY_LAYERS = 1000
+"""More layers than real scenes have: 4 to 70 of triangles, up to 230 of splats."""
 
 
 def alpha_for_viewers(mesh: SplatMesh, path: Path, threads: int | None = None) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     ViewOptions,
+    announce_cost,
     check_outputs,
     chosen_background,
     load_scene,
@@ -257,6 +258,8 @@ class Render(Command):
                 samples = samples_for(scene, cameras, most)
             else:
                 samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
+        if not isinstance(scene, Tileset):
+            announce_cost(scene, cameras, samples, self.draw.threads)
         shared = Shared(self.load)
         shared.hold(scene)
         with self.cluster.workers(self.draw.threads) as workers:
