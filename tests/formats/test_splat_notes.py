@@ -192,6 +192,19 @@ def test_the_kernel_can_be_named(tmp_path, capsys):
     assert re.search(r"^kernel +3dgs$", told.out, re.MULTILINE)
 
 
+def test_third_scales_of_2dgs_splats_mean_nothing(tmp_path):
+    """splat-transform and others write three, and name the kernel; a viewer ignores the third."""
+    path = file_with(tmp_path, "SplatRenderMode: 2dgs")
+    cloud = load_gaussians(path)
+    assert cloud.kernel == "2dgs"
+    assert not cloud.scales[:, 2].any()
+    assert not any(block.scales[:, 2].any() for block in stream_gaussians(path, block=16))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        save_gaussians(cloud, tmp_path / "b.ply")
+    assert load_gaussians(tmp_path / "b.ply").kernel == "2dgs"
+
+
 # -- colour space
 
 
