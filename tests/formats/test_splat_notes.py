@@ -192,6 +192,17 @@ def test_the_kernel_can_be_named(tmp_path, capsys):
     assert re.search(r"^kernel +3dgs$", told.out, re.MULTILINE)
 
 
+@pytest.mark.parametrize("words", [["--kernel", "2dgs"], ["--time", "1"], ["--activated", "scales"]])
+def test_options_for_splats_are_refused_for_meshes(tmp_path, capsys, words):
+    mesh = tmp_path / "m.npz"
+    assert main(["convert", str(file_with(tmp_path)), "-o", str(mesh), "--no-sidecar"]) == 0
+    outputs = [["info", str(mesh)], ["convert", str(mesh), "-o", str(tmp_path / "n.npz")]]
+    outputs += [["render", str(mesh), "-o", str(tmp_path / "m.png")]]
+    for command in outputs:
+        assert main([*command, *words]) == 2
+        assert f"holds no splats: {words[0]} would have no effect" in capsys.readouterr().err
+
+
 def test_third_scales_of_2dgs_splats_mean_nothing(tmp_path):
     """splat-transform and others write three, and name the kernel; a viewer ignores the third."""
     path = file_with(tmp_path, "SplatRenderMode: 2dgs")

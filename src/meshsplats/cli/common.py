@@ -21,7 +21,7 @@ from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome, look_around, orbit
-from meshsplats.cli.messages import UsageError, flag, one_line, say
+from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
@@ -103,6 +103,17 @@ class SplatOptions:
         if up is None and (told := stream.up) is not None:
             say(f"up: {direction_in_words(told)}, from the files' headers")
         return stream
+
+    def refuse_for(self, path: Path) -> None:
+        """UsageError for options that have no effect on ``path``, which is not a file of splats."""
+        given = [name for name in ("kernel", "time", "activated") if name in self._changed]
+        if given:
+            flags = ", ".join(map(flag, given))
+            raise UsageError(f"{shown_path(path)} holds no splats: {flags} would have no effect")
+
+    @property
+    def _changed(self) -> set[str]:
+        return {f.name for f in fields(self) if getattr(self, f.name) != f.default}
 
     @property
     def _arguments(self) -> dict[str, Any]:
@@ -339,6 +350,7 @@ def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> G
         raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
     if kind == "splats":
         return reading.load(path, up=up)
+    reading.refuse_for(path)
     from meshsplats.formats.meshes import load_mesh
 
     return load_mesh(path)
@@ -537,7 +549,7 @@ def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | 
         save_image(path, render_splats(scene, small).color)
 
 
-LONG_SECONDS = 60
+LONG_SECONDS = 10
 """Images that take longer than this, as far as can be estimated, are announced."""
 
 
@@ -552,10 +564,8 @@ def announce_cost(
     seconds = each * len(cameras) / FRAGMENTS_A_SECOND / (threads or os.cpu_count() or 1)
     count = layers(scene, some[0])
     if seconds > LONG_SECONDS and count > MANY_LAYERS:
-        say(
-            f"about {count:,.0f} layers lie over each other at each pixel: this may take about"
-            f" {max(1, round(seconds / 60))} min"
-        )
+        long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
 
 
 MANY_LAYERS = 1000

@@ -509,6 +509,7 @@ class Convert(Command):
         if idle:
             flags = ", ".join(map(flag, idle))
             raise UsageError(f"{job.shown} is a mesh: {flags} would have no effect, as they are for splats")
+        self.reading.refuse_for(job.source)
         times = [time.perf_counter()]
         mesh = load_mesh(job.source)
         if self.up is not None:

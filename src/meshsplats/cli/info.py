@@ -62,6 +62,8 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
         return {"path": shown_path(path), "kind": "tileset", **_tileset(path)}
     layout = _layout(path)
     kind = "data set" if layout is not None else identify(path)
+    if kind != "splats":
+        reading.refuse_for(path)
     found: dict[str, Any] = {"path": shown_path(path), "kind": kind}
     if path.is_file():
         found["bytes"] = path.stat().st_size
