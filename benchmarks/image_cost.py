@@ -1,9 +1,9 @@
-"""Estimated and actual cost of images: fragments of an image by ``rendering.layers``, and processor seconds.
+"""Estimated and actual cost of images: fragments by ``rendering.layers``, and processor seconds.
 
     python benchmarks/image_cost.py SPLATS... [--side 400]
 
-The last line is a scene of 20,000 splats as large as the scene, drawn smaller: files that hold scales where their
-logarithms belong are read so.
+The last line is a scene of 20,000 splats as large as the scene, drawn smaller: files that hold scales where
+their logarithms belong are read so.
 """
 
 from __future__ import annotations
