@@ -11,7 +11,7 @@ TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0]], "<f4")
 
 def gltf(arrays, *, primitive=None, **more):
     """A glTF document around ``arrays`` (name, array, type, normalized): accessor i holds array i."""
-    components = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125, "i2": 5122}
+    components = {"f4": 5126, "i1": 5120, "u1": 5121, "u2": 5123, "u4": 5125, "i2": 5122}
     blob, views, accessors = b"", [], []
     for array, kind, normalized in arrays:
         views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": array.nbytes})

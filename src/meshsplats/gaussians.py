@@ -39,6 +39,8 @@ class GaussianCloud:
     """Kernel that the splats were trained with: '3dgs' (0.3 px^2 added to the projected covariance),
     'antialiased' (the same with the opacity lowered to keep its integral) or '2dgs' (flat splats intersected
     by the ray)."""
+    up: np.ndarray | None = None
+    """(3,) unit direction that points up in the world frame, where the file says so."""
 
     def __post_init__(self) -> None:
         means = checked_array("means", self.means, np.float32, (None, 3))
@@ -64,6 +66,11 @@ class GaussianCloud:
                 )
         if self.kernel not in get_args(Kernel):
             raise ValueError(f"kernel must be one of {', '.join(get_args(Kernel))}, got {self.kernel!r}")
+        if self.up is not None:
+            up = checked_array("up", self.up, np.float32, (3,)).astype(np.float64)
+            if not up.any():
+                raise ValueError("up must be a direction, got a vector of length 0")
+            object.__setattr__(self, "up", (up / np.linalg.norm(up)).astype(np.float32))
         for name, value in [
             ("means", means),
             ("quaternions", quaternions),
@@ -107,7 +114,8 @@ class GaussianCloud:
 
 
 def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
-    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one."""
+    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one, and up
+    is None."""
     if len(clouds) == 1:
         return clouds[0]
     sh = np.zeros((sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds), 3), np.float32)
@@ -123,4 +131,13 @@ def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
         opacities=np.concatenate([cloud.opacities for cloud in clouds]),
         sh=sh,
         kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
+        up=shared_up([cloud.up for cloud in clouds]),
     )
+
+
+def shared_up(ups: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """The direction that all of ``ups`` name, None if they differ or one is None."""
+    first = ups[0] if ups else None
+    if first is None or any(up is None or np.abs(up - first).max() > 1e-6 for up in ups):
+        return None
+    return first

@@ -13,6 +13,7 @@ from _splat_files import random_splats
 from conftest import shared_data
 
 from meshsplats import DataWarning, FileFormatError, load_mesh, save_mesh
+from meshsplats.colors import linear_to_srgb
 from meshsplats.formats.sniff import identify
 
 
@@ -491,3 +492,40 @@ def test_trimesh_writes_what_we_read(tmp_path):
         np.testing.assert_array_equal(got.faces, mesh.faces)
         if name != "c.glb":
             np.testing.assert_allclose(got.colors, colors / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("flag", [False, True])
+@pytest.mark.parametrize("dtype", ["<u2", "u1"])
+def test_integer_colours_are_fractions_with_or_without_the_flag(tmp_path, dtype, flag):
+    """Blender 2.91 and others leave the flag out; the specification allows integers only with it."""
+    most = np.iinfo(dtype).max
+    linear = np.array([0.5, 0.25, 0.1, 1])
+    colors = np.tile(np.round(linear * most), (3, 1)).astype(dtype)
+    document = gltf(
+        [(TRIANGLE, "VEC3", False), (colors, "VEC4", flag)],
+        primitive={"attributes": {"POSITION": 0, "COLOR_0": 1}},
+    )
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        mesh = load(tmp_path, document)
+    np.testing.assert_allclose(mesh.colors[0, :3], linear_to_srgb(linear[:3]), atol=1 / most)
+    told = [str(w.message) for w in found]
+    if flag:
+        assert told == []
+    else:
+        assert len(told) == 1
+        assert "COLOR_0 has integers without the flag 'normalized'" in told[0]
+
+
+@pytest.mark.parametrize("flag", [False, True])
+def test_integer_normals_are_fractions(tmp_path, flag):
+    normals = np.tile(np.array([0, 0, 127], "i1"), (3, 1))
+    document = gltf(
+        [(TRIANGLE, "VEC3", False), (normals, "VEC3", flag)],
+        primitive={"attributes": {"POSITION": 0, "NORMAL": 1}},
+    )
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        mesh = load(tmp_path, document)
+    np.testing.assert_allclose(mesh.normals, [[0, 0, 1]] * 3, atol=1e-6)
+    assert any("NORMAL has integers without the flag" in str(w.message) for w in found) != flag

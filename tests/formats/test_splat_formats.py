@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from _splat_files import assert_same_cloud, expected_cloud, random_splats, splat_table, write_ply
 
-from meshsplats import DataWarning, FileFormatError, load_gaussians
+from meshsplats import DataWarning, FileFormatError, load_gaussians, stream_gaussians
 from meshsplats.formats.gaussians import splat_format
 from meshsplats.formats.sniff import identify
 
@@ -67,6 +67,38 @@ def test_compressed_ply(tmp_path, degree, order, n):
         dc=max(np.ptp(values[f"f_dc_{c}"]) for c in range(3)) * HALF_BYTE,
         rest=1 / 32,
     )
+
+
+def test_compressed_ply_with_an_empty_element_of_harmonics(tmp_path):
+    """gsplat's exporter names the element at degree 0, too, without properties."""
+    data = encode.compressed_ply(some_splats(degree=0))
+    (tmp_path / "a.ply").write_bytes(data)
+    (tmp_path / "b.ply").write_bytes(data.replace(b"end_header", b"element sh 9\nend_header"))
+    plain, named = load_gaussians(tmp_path / "a.ply"), load_gaussians(tmp_path / "b.ply")
+    assert named.sh_degree == 0
+    for name in ("means", "quaternions", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(named, name), getattr(plain, name))
+    (block,) = stream_gaussians(tmp_path / "b.ply")
+    np.testing.assert_array_equal(block.means, plain.means)
+
+
+@pytest.mark.parametrize("name", ["ROTATION", "OPACITY"])
+def test_gltf_integers_are_fractions_without_the_flag(tmp_path, name):
+    values = some_splats(degree=0)
+    accessors = encode.splat_accessors(values)
+    key = f"KHR_gaussian_splatting:{name}"
+    dtype = "<i2" if name == "ROTATION" else "<u2"
+    accessors[key] = np.round(accessors[key] * np.iinfo(dtype).max).astype(dtype)
+    data = encode.gltf(accessors)
+    (tmp_path / "a.glb").write_bytes(data)
+    flag = b'"normalized": true'
+    assert flag in data
+    (tmp_path / "b.glb").write_bytes(data.replace(flag, b'"normalizes": true'))
+    with pytest.warns(DataWarning, match=f"{name} has integers without the flag"):
+        cloud = load_gaussians(tmp_path / "b.glb", axes="y-down")
+    plain = load_gaussians(tmp_path / "a.glb", axes="y-down")
+    np.testing.assert_array_equal(cloud.quaternions, plain.quaternions)
+    np.testing.assert_array_equal(cloud.opacities, plain.opacities)
 
 
 def test_compressed_ply_without_colour_ranges(tmp_path):
@@ -429,15 +461,6 @@ def test_gltf_joins_the_splats_of_all_nodes(tmp_path):
     np.testing.assert_allclose(cloud.sh, np.tile(one["sh"], (2, 1, 1)), rtol=1e-5)
 
 
-def test_gltf_in_linear_colours_says_so(tmp_path):
-    properties = {"colorSpace": "lin_rec709_display"}
-    (tmp_path / "a.glb").write_bytes(
-        encode.gltf(encode.splat_accessors(some_splats()), properties=properties)
-    )
-    with pytest.warns(DataWarning, match="linear colours"):
-        load_gaussians(tmp_path / "a.glb")
-
-
 # -- what is not read
 
 
@@ -446,6 +469,7 @@ def test_gltf_in_linear_colours_says_so(tmp_path):
     [
         ("a.ksplat", b"\0\1" + bytes(5000), "splat-transform a.ksplat a.ply"),
         ("a.lcc", b'{"version": "5.0", "splats": 10, "totalLevel": 3}', "splat-transform a.lcc a.ply"),
+        ("a.splatv", b"\x4b\x67\0\0\x02\0\0\0{}" + bytes(64), "splats that move, are not read here"),
         ("cut.splat", bytes(33), "not records of 32 bytes"),
         ("a.ply.gz", b"\x1f\x8b\x08" + bytes(40), "a gzip file, but not SPZ; unpack it first"),
         ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "git lfs pull"),

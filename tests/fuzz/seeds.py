@@ -44,6 +44,17 @@ def _ply(name: str, encoding: str, degree: int, tables: bool) -> Seed:
         return Seed(name, {"a.ply": path.read_bytes()}, "a.ply")
 
 
+def _moving_ply(name: str, *columns: str) -> Seed:
+    """Splats that move, with what a header may say of them besides."""
+    values = random_splats(40, degree=0)
+    values |= {column: values["x"] for column in columns}
+    notes = [Table(note, [("uchar", note)], [[1]]) for note in ("up_axis", "chirality", "color_space")]
+    comments = ["Exported from Brush", "Vertical axis: 0 -0.6 0.8", "SplatRenderMode: mip"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_ply(Path(folder) / "a.ply", [splat_table(values), *notes], comments=comments)
+        return Seed(name, {"a.ply": path.read_bytes()}, "a.ply")
+
+
 def _in_gzip(data: bytes, change: Change) -> bytes:
     return gzip.compress(change(gzip.decompress(data)), mtime=0)
 
@@ -84,6 +95,11 @@ SEEDS = [
     _ply("ply", "binary_little_endian", 1, False),
     _ply("ply-lists", "binary_big_endian", 0, True),
     _ply("ply-ascii", "ascii", 0, True),
+    _moving_ply(
+        "ply-spacetime",
+        *("trbf_center", "trbf_scale", *(f"motion_{i}" for i in range(9)), *(f"omega_{i}" for i in range(4))),
+    ),
+    _moving_ply("ply-4d", "t", "scale_t_0", *(f"rot_r_{i}" for i in range(4))),
     Seed("compressed-ply", {"a.ply": encode.compressed_ply(_VALUES)}, "a.ply"),
     Seed("splat", {"a.splat": encode.dot_splat(_VALUES)}, "a.splat"),
     *(Seed(f"spz-{version}", {"a.spz": data}, "a.spz", _in_gzip) for version, data in _SPZ.items()),

@@ -137,9 +137,23 @@ def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = N
     """(3,) float64 unit direction that points up in the world frame.
 
     That of ``cameras`` if there are any and they agree (people hold cameras upright); else the ``up`` of a
-    mesh; else ``DEFAULT_UP``, as in scenes trained from COLMAP cameras. The points themselves do not count:
-    they cannot distinguish an upright vase from a hanging lamp.
+    mesh, or of splats whose file names it; else ``DEFAULT_UP``, as in scenes trained from COLMAP cameras. A
+    file's ``up`` that is within 45 degrees of that of the cameras is the better one: those lean. The points
+    themselves do not count: they cannot distinguish an upright vase from a hanging lamp.
     """
+    held = _up_of_cameras(cameras) if cameras else None
+    told = scene.up.astype(np.float64) if isinstance(scene, GaussianCloud) and scene.up is not None else None
+    if told is not None and (held is None or told @ held > np.sqrt(0.5)):
+        return told
+    if held is not None:
+        return held
+    if isinstance(scene, SplatMesh):
+        return scene.up.astype(np.float64)
+    return np.array(DEFAULT_UP)
+
+
+def _up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """(3,) unit direction, None if the cameras do not agree."""
     if cameras:
         rotations = np.array([camera.world_to_camera[:3, :3] for camera in cameras])
         mean = -rotations[:, 1].mean(axis=0)
@@ -149,9 +163,7 @@ def guess_up(scene: Framable | None = None, cameras: Sequence[Camera] | None = N
             if level is None or abs(level @ mean) < LEVEL_AGREES * length:
                 return mean / length
             return level if level @ mean > 0 else -level
-    if isinstance(scene, SplatMesh):
-        return scene.up.astype(np.float64)
-    return np.array(DEFAULT_UP)
+    return None
 
 
 def _across(rights: np.ndarray) -> np.ndarray | None:

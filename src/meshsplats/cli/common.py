@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import numpy as np
 import tyro
 
+from meshsplats._arrays import subsample
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import guess_up
 from meshsplats.cameras.trajectories import dome, look_around, orbit
-from meshsplats.cli.messages import UsageError, flag, one_line, say
+from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
@@ -64,28 +65,72 @@ class SplatOptions:
     axes: Literal["auto", "y-down", "y-up"] = "auto"
     """Direction of the y axis in the file; auto: as its format prescribes. After reading, y points down. Some
     programs write SPZ with y down: if the image is upside down, give y-down."""
+    kernel: Literal["auto", "3dgs", "antialiased", "2dgs"] = "auto"
+    """Kernel that the splats were trained with; auto: as the file says."""
+    time: Number = None
+    """Splats that move in time: the instant to show, in the file's unit. Default: one in the middle."""
+    activated: Annotated[
+        tuple[Literal["scales", "opacities", "colors"], ...], tyro.conf.arg(help_behavior_hint="")
+    ] = ()
+    """Values that a .ply stores as they are, where logarithms, logits and harmonics belong."""
     strict: bool = False
     """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
-    def load(self, path: Path) -> GaussianCloud:
+    def load(self, path: Path, *, up: str | None = None, quiet: bool = False) -> GaussianCloud:
+        """The splats of a file. Says what its header names, unless ``quiet``; ``up``: the option that counts
+        in its place."""
         from meshsplats.formats.gaussians import load_gaussians
 
         try:
-            return load_gaussians(path, strict=self.strict, axes=self.axes)
+            cloud = load_gaussians(path, **self._arguments)
         except FileFormatError:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
+        if quiet:
+            return cloud
+        if up is None and cloud.up is not None:
+            say(f"up: {direction_in_words(cloud.up)}, from the file's header")
+        if self.kernel == "auto" and cloud.kernel != "3dgs":
+            say(f"kernel: {cloud.kernel}, from the file")
+        return cloud
 
-    def stream(self, path: Path | Sequence[Path]) -> SplatStream:
-        """The splats of a file, or of several, in blocks."""
+    def stream(self, path: Path | Sequence[Path], *, up: str | None = None) -> SplatStream:
+        """The splats of a file, or of several, in blocks. ``up`` as for ``load``."""
         from meshsplats.formats.gaussians import stream_gaussians
 
-        return stream_gaussians(path, strict=self.strict, axes=self.axes)
+        stream = stream_gaussians(path, **self._arguments)
+        if up is None and (told := stream.up) is not None:
+            say(f"up: {direction_in_words(told)}, from the files' headers")
+        return stream
+
+    def refuse_for(self, path: Path) -> None:
+        """UsageError for options that have no effect on ``path``, which is not a file of splats."""
+        given = [name for name in ("kernel", "time", "activated") if name in self._changed]
+        if given:
+            flags = ", ".join(map(flag, given))
+            raise UsageError(f"{shown_path(path)} holds no splats: {flags} would have no effect")
+
+    @property
+    def _changed(self) -> set[str]:
+        return {f.name for f in fields(self) if getattr(self, f.name) != f.default}
+
+    @property
+    def _arguments(self) -> dict[str, Any]:
+        return {
+            "strict": self.strict,
+            "axes": self.axes,
+            "kernel": None if self.kernel == "auto" else self.kernel,
+            "time": self.time,
+            "activated": self.activated,
+        }
 
     def again(self) -> list[str]:
-        """The words with which another command reads the file with the same axes."""
-        return ["--axes", self.axes] if self.axes != "auto" else []
+        """The words with which another command reads the file in the same way."""
+        words = ["--axes", self.axes] if self.axes != "auto" else []
+        words += ["--kernel", self.kernel] if self.kernel != "auto" else []
+        words += ["--time", f"{self.time:g}"] if self.time is not None else []
+        return words + (["--activated", *self.activated] if self.activated else [])
 
 
 @dataclass(frozen=True)
@@ -122,7 +167,7 @@ class ViewOptions:
     wide. In place of --fov."""
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras in a model
-    folder, of the mesh, else -y, as in COLMAP's scenes."""
+    folder, of the file, else -y, as in COLMAP's scenes."""
     width: Count = None
     """Image width in pixels. With --cameras or --data, images are scaled to this width."""
     height: Count = None
@@ -298,13 +343,14 @@ class ClusterOptions:
             yield found
 
 
-def load_scene(path: Path, reading: SplatOptions) -> GaussianCloud | SplatMesh:
-    """The splats or the mesh at ``path``."""
+def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> GaussianCloud | SplatMesh:
+    """The splats or the mesh at ``path``; ``up`` as for ``SplatOptions.load``."""
     kind = identify(path)
     if kind == "cameras":
         raise FileFormatError(f"{path}: a JSON file; expected splats or a mesh (--cameras takes cameras)")
     if kind == "splats":
-        return reading.load(path)
+        return reading.load(path, up=up)
+    reading.refuse_for(path)
     from meshsplats.formats.meshes import load_mesh
 
     return load_mesh(path)
@@ -356,6 +402,14 @@ def parse_up(text: str) -> np.ndarray:
     if numbers is None or not any(numbers):
         raise ValueError(f"--up must be an axis such as -y or z, or three numbers x,y,z, got {text!r}")
     return np.array(numbers)
+
+
+def direction_in_words(direction: np.ndarray) -> str:
+    """An axis, or three numbers, as ``parse_up`` takes them."""
+    axis = int(np.abs(direction).argmax())
+    if abs(direction[axis]) > 1 - 1e-6:
+        return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
+    return ",".join(f"{value:.4g}" for value in direction)
 
 
 def parse_color(text: str) -> tuple[float, float, float]:
@@ -462,12 +516,16 @@ def plural(count: int, noun: str) -> str:
 PREVIEW_TRIANGLES = 1_000_000
 """Triangles of a mesh above which its preview is half as wide, with the fewest samples. Of 2 to 17 million
 triangles, it is 36 to 39 dB from one with all samples, in a sixth of the time."""
+PREVIEW_FRAGMENTS = 1e9
+"""Fragments above which a preview is made smaller, or not at all: some 10 s of one processor. Of real scenes,
+previews have 1e7 to 4e8."""
 
 
 def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | None = None) -> None:
     """Saves an image of ``scene`` from ``camera``; by default from the front and a little to the side."""
     from meshsplats.images.writing import save_image
     from meshsplats.rendering import render_splats
+    from meshsplats.rendering.layers import affordable, layers
     from meshsplats.rendering.looks import image_of
     from meshsplats.rendering.samples import FEWEST, needed_samples
 
@@ -478,9 +536,40 @@ def draw_preview(scene: SplatMesh | GaussianCloud, path: Path, camera: Camera | 
             samples = needed_samples(scene, [camera])
         else:
             camera, samples = camera.scaled(0.5), 1 if scene.filter_px2 else FEWEST
-        save_image(path, image_of(scene, camera, (1, 1, 1), samples=samples)[0])
     else:
-        save_image(path, render_splats(scene, camera).color)
+        samples = 1
+    small = affordable(scene, camera, samples, PREVIEW_FRAGMENTS)
+    if small is None:
+        count = layers(scene, camera)
+        say(f"no preview: about {count:,.0f} layers would lie over each other at each of its pixels")
+        return
+    if isinstance(scene, SplatMesh):
+        save_image(path, image_of(scene, small, (1, 1, 1), samples=samples)[0])
+    else:
+        save_image(path, render_splats(scene, small).color)
+
+
+LONG_SECONDS = 10
+"""Images that take longer than this, as far as can be estimated, are announced."""
+
+
+def announce_cost(
+    scene: SplatMesh | GaussianCloud, cameras: Sequence[Camera], samples: int, threads: int | None
+) -> None:
+    """Says before the work how long images may take, where layers upon layers make it long."""
+    from meshsplats.rendering.layers import FRAGMENTS_A_SECOND, fragments, layers
+
+    some = subsample(cameras, 8)
+    each = float(np.mean([fragments(scene, camera, samples) for camera in some]))
+    seconds = each * len(cameras) / FRAGMENTS_A_SECOND / (threads or os.cpu_count() or 1)
+    count = layers(scene, some[0])
+    if seconds > LONG_SECONDS and count > MANY_LAYERS:
+        long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+        say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
+
+
+MANY_LAYERS = 1000
+"""More layers than real scenes have: 4 to 70 of triangles, up to 230 of splats."""
 
 
 def alpha_for_viewers(mesh: SplatMesh, path: Path, threads: int | None = None) -> dict[str, Any]:

@@ -128,7 +128,8 @@ class Convert(Command):
     missing: Literal["error", "skip"] = "error"
     """With --data: images that are missing are an error, or their views are left out."""
     up: Text = None
-    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else -y."""
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
+    file, else -y."""
     lit: bool = False
     """.glb, .usd: a material that takes light and shadow, not one that shows the colours as they are."""
     smooth: bool = False
@@ -345,7 +346,7 @@ class Convert(Command):
                 " --opacity cutoff --soft-share makes"
             )
         times = [time.perf_counter()]
-        cloud = self.reading.load(job.source)
+        cloud = self.reading.load(job.source, up=self.up)
         if cameras is None:
             cameras = cameras_beside(job.source) or []
         times.append(time.perf_counter())
@@ -390,7 +391,7 @@ class Convert(Command):
         if cameras is None:
             cameras = cameras_beside(job.source) or []
         up = None if self.up is None else parse_up(self.up)
-        source = _Counted(self.reading.stream(job.source))
+        source = _Counted(self.reading.stream(job.source, up=self.up))
         parts = convert_blocks(source, self.conversion, preset=self.preset, cameras=cameras, up=up)
         with self._recorded(job):
             vertices, triangles, converted = save_mesh_blocks(parts, job.outputs[0])
@@ -410,7 +411,8 @@ class Convert(Command):
         from meshsplats.formats.gaussians import save_gaussian_blocks
 
         start = time.perf_counter()
-        source = _Counted(self.reading.stream(job.source))
+        stream = self.reading.stream(job.source)
+        source = _Counted(stream)
         count, degree, kernels = 0, 0, set()
         for block in source:
             count += len(worth_drawing(block, self.conversion))
@@ -421,7 +423,7 @@ class Convert(Command):
         kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
         kept = (block.select(worth_drawing(block, self.conversion)) for block in source)
         with self._recorded(job):
-            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel)
+            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=stream.up)
         seconds = round(time.perf_counter() - start, 4)
         return {"read": source.count, "written": count, "seconds": seconds}
 
@@ -507,6 +509,7 @@ class Convert(Command):
         if idle:
             flags = ", ".join(map(flag, idle))
             raise UsageError(f"{job.shown} is a mesh: {flags} would have no effect, as they are for splats")
+        self.reading.refuse_for(job.source)
         times = [time.perf_counter()]
         mesh = load_mesh(job.source)
         if self.up is not None:

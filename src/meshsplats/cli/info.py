@@ -25,7 +25,7 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.datasets.layouts import Layout, find_layout
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.gaussians import splat_file, splat_format
+from meshsplats.formats.gaussians import moving_splats, splat_file, splat_format
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -62,13 +62,15 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
         return {"path": shown_path(path), "kind": "tileset", **_tileset(path)}
     layout = _layout(path)
     kind = "data set" if layout is not None else identify(path)
+    if kind != "splats":
+        reading.refuse_for(path)
     found: dict[str, Any] = {"path": shown_path(path), "kind": kind}
     if path.is_file():
         found["bytes"] = path.stat().st_size
     if layout is not None:
         found |= _photographs(path, layout)
     elif kind == "splats":
-        found |= {"format": splat_format(path)} | _splats(reading.load(path))
+        found |= {"format": splat_format(path)} | _in_time(path) | _splats(reading.load(path, quiet=True))
         if cameras := cameras_beside(path):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
     elif kind == "mesh":
@@ -125,6 +127,12 @@ def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
     return found
 
 
+def _in_time(path: Path) -> dict[str, Any]:
+    """What is known of splats that move; nothing of others."""
+    motion = moving_splats(path)
+    return {} if motion is None else {"moves": motion[0], "times": _rounded(np.array(motion[1:]))}
+
+
 def _splats(cloud: GaussianCloud) -> dict[str, Any]:
     from meshsplats.conversion import convert
 
@@ -140,6 +148,7 @@ def _splats(cloud: GaussianCloud) -> dict[str, Any]:
         "splats": len(cloud),
         "sh_degree": cloud.sh_degree,
         "kernel": cloud.kernel,
+        **({} if cloud.up is None else {"up": _rounded(cloud.up)}),
         **_extent(cloud.means, scene_bounds(cloud)),
         "opacity_5_50_95_percent": _quantiles(cloud.opacities),
         "faint_splats": int((cloud.opacities < 1 / 255).sum()),

@@ -99,7 +99,8 @@ class Levels(Command):
     sh_degree: Count = None
     """Render the splats with spherical harmonics up to this degree. Default: all that are stored."""
     up: Text = None
-    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: -y."""
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
+    file, else -y."""
     resume: bool = False
     """Continue an interrupted run of the same command, from the levels in FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
@@ -115,7 +116,7 @@ class Levels(Command):
         self._check_output()
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
-        cloud = self.reading.load(self.input)
+        cloud = self.reading.load(self.input, up=self.up)
         most = len(cloud) if self.max_splats is None else min(self.max_splats, len(cloud))
         chain = plan_levels(most, self.levels, factor=self.factor, width=self.width)
         folder = self._partial()

@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     ViewOptions,
+    announce_cost,
     check_outputs,
     chosen_background,
     load_scene,
@@ -116,7 +117,11 @@ class Render(Command):
         start = time.perf_counter()
         tileset = open_tileset(self.input, self.part, self.max_error)
         # The coarsest tile says where a tileset is.
-        scene = tileset.root.load() if tileset else self.part.of(load_scene(self.input, self.reading))
+        scene = (
+            tileset.root.load()
+            if tileset
+            else self.part.of(load_scene(self.input, self.reading, up=self.views.up))
+        )
         self._check_scene(scene)
         photographs = self.views.photographs()
         count = 1 if single else 60
@@ -226,7 +231,7 @@ class Render(Command):
     def load(self) -> GaussianCloud | SplatMesh | Tileset:
         """The scene of the images, from the input."""
         tileset = open_tileset(self.input, self.part, self.max_error)
-        return tileset or self._drawable(self.part.of(load_scene(self.input, self.reading)))
+        return tileset or self._drawable(self.part.of(load_scene(self.input, self.reading, up=self.views.up)))
 
     def _draw(
         self,
@@ -253,6 +258,8 @@ class Render(Command):
                 samples = samples_for(scene, cameras, most)
             else:
                 samples = 1 if isinstance(scene, GaussianCloud) else needed_samples(scene, cameras)
+        if not isinstance(scene, Tileset):
+            announce_cost(scene, cameras, samples, self.draw.threads)
         shared = Shared(self.load)
         shared.hold(scene)
         with self.cluster.workers(self.draw.threads) as workers:

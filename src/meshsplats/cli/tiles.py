@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from meshsplats.cameras.framing import DEFAULT_UP
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Box,
@@ -66,7 +65,8 @@ class Tiles(Command):
     crop: Box = None
     """Only splats with their centre in this box, in the coordinates of the file."""
     up: Text = None
-    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: -y."""
+    """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
+    files, else -y."""
     lit: bool = False
     """A material that takes light and shadow, not one that shows the colours as they are."""
     alpha: Literal["auto", "blend", "mask", "opaque"] = "auto"
@@ -91,7 +91,7 @@ class Tiles(Command):
         config = beside(self.output, CONFIGURATION)
         check_outputs([config], self.force or self.resume)
         start = time.perf_counter()
-        source = self.reading.stream(self.input)
+        source = self.reading.stream(self.input, up=self.up)
         try:
             with self.cluster.workers(self.threads) as workers, _progress() as show:
                 found = build_tiles(
@@ -136,8 +136,11 @@ class Tiles(Command):
         if self.resume and self.force:
             raise UsageError("--resume continues, --force starts again: give one of them")
         conversion = ConversionOptions(look=self.look, min_opacity=self.min_opacity, crop=self.crop)
-        x, y, z = DEFAULT_UP if self.up is None else (float(u) for u in parse_up(self.up))
-        options = TileOptions(self.max_triangles, self.preset, conversion, (x, y, z), self.lit, self.alpha)
+        up = None
+        if self.up is not None:
+            x, y, z = (float(u) for u in parse_up(self.up))
+            up = (x, y, z)
+        options = TileOptions(self.max_triangles, self.preset, conversion, up, self.lit, self.alpha)
         options.resolved()
         return options
 

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 SIDE = 400
 """Largest side of the image by which the errors of merging and quantisation are measured."""
+MEASURED_FRAGMENTS = 1e9
+"""Largest number of its fragments: of a scene that has more, the image is smaller."""
 
 TRIANGLES = 4_000_000
 """Default of --max-triangles: more take seconds to sort and draw, and pages of more than 40 MB."""
@@ -179,7 +181,7 @@ class View(Command):
             parse_up(self.up)
 
     def _scene(self) -> GaussianCloud | SplatMesh:
-        scene = self.part.of(load_scene(self.input, self.reading))
+        scene = self.part.of(load_scene(self.input, self.reading, up=self.up))
         if isinstance(scene, SplatMesh):
             if self.max_triangles is not None or self.whole:
                 given = "--whole" if self.whole else "--max-triangles"
@@ -259,9 +261,11 @@ class View(Command):
     def _measured(self, content: _Content, page: Page, cameras: list[Camera]) -> dict[str, Any]:
         """Sizes, and the errors that merging and quantisation make."""
         from meshsplats.rendering import render
+        from meshsplats.rendering.layers import SMALLEST, affordable
 
         mesh, packed = content.mesh, page.mesh
         camera = _camera(mesh, cameras)
+        camera = affordable(mesh, camera, 2, MEASURED_FRAGMENTS) or camera.scaled(SMALLEST)
         images = [render(each, camera, samples=2).color for each in (mesh, packed.decoded)]
         merged: dict[str, Any] = {}
         if content.merging is not None:

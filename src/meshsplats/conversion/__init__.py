@@ -80,7 +80,8 @@ def convert(
         cameras: where the mesh will be seen from. They give the size of a pixel at each splat
             (``footprint``), the mean colour if asked for (``colors``) and what is up. Without them, images
             of the whole subject are assumed.
-        up: direction that points up, world frame; that of the cameras by default, else (0, -1, 0).
+        up: direction that points up, world frame; by default that of the cameras, of the file (``cloud.up``),
+            or (0, -1, 0).
         threads: maximum number of threads for the images of ``detail='cameras'``; all processors by default.
         on_image: called after each of these images, with how many are rendered and how many there will be;
             if it returns False, those so far have to do, but at least 6.
@@ -104,7 +105,7 @@ def convert(
     given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
     filter_px2 = filter_of(cloud.kernel, chosen)
-    direction = guess_up(None, cameras) if up is None else unit_up(up)
+    direction = guess_up(cloud, cameras) if up is None else unit_up(up)
     rows = _worth_drawing(cloud, chosen)
     part = cloud
     if chosen.colors == "degree0" and cloud.sh_degree:

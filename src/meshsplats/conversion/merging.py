@@ -220,7 +220,7 @@ def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> n
     px2 = 0.5 if cloud.kernel == "2dgs" else FILTER_PX2
     source = ConversionOptions(footprint="cameras" if cameras else "framing")
     coverage = CameraCoverage(cloud.means, cameras) if cameras else None
-    pixel = pixel_sizes(cloud, source, coverage, guess_up(None, cameras))
+    pixel = pixel_sizes(cloud, source, coverage, guess_up(cloud, cameras))
     assert pixel is not None
     return np.sqrt(px2) * pixel
 

@@ -197,8 +197,8 @@ def convert_blocks(
     given = make_options(options, **changes)
     chosen = given.resolved(preset, has_cameras=bool(cameras))
     refuse_whole(chosen)
-    direction = guess_up(None, cameras) if up is None else unit_up(up)
     scene = survey(source, chosen)
+    direction = guess_up(scene.sample, cameras) if up is None else unit_up(up)
     filter_px2 = filter_of(scene.kernel, chosen)
     pixels = ScenePixels(scene, chosen, cameras, direction)
     if pixels.has_unseen:

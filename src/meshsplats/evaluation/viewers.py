@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +12,12 @@ import numpy as np
 from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
+from meshsplats.errors import DataWarning
 from meshsplats.formats.cutting import CUTOFF
 from meshsplats.formats.gltf.writer import Alpha
 from meshsplats.mesh import SplatMesh, solid_faces
 from meshsplats.rendering.api import render
+from meshsplats.rendering.layers import affordable, layers
 from meshsplats.rendering.viewers import viewer_images
 
 CUTOFFS = (0.1, CUTOFF, 0.3)
@@ -31,9 +34,13 @@ VIEWS = 4
 TRIANGLES = 3_000_000
 CLEAR = 2.0
 """Two images suffice where they differ by this much, dB."""
+FRAGMENTS = 1e9
+"""Largest number of fragments of an image: of a scene that has more, it is smaller."""
 SOLID = 0.5
 """Share of solid triangles above which a mesh is one of solid triangles with a few soft ones."""
 _MOST = 200.0
+_SAMPLES = 4
+"""Side of the grid of samples of one image that costs as much as those of a view together."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,7 @@ class AlphaChoice:
 
     alpha: Alpha
     """'blend' or 'mask'; 'opaque' for a solid mesh and 'hybrid' for one that is mostly solid, without
-    measurement."""
+    measurement; 'blend', too, where images would have too many layers."""
     cutoff: float | None = None
     """The cutoff of 'mask' that was compared: the best one."""
     blend: float | None = None
@@ -92,6 +99,16 @@ def choose_alpha(
     if not views:
         around = orbit(mesh, count, elevation=20, width=SIDE, height=SIDE)
         views = [*around[::2], *around[1::2]]  # the second from the other side
+    cheap = [small for view in views if (small := affordable(mesh, view, _SAMPLES, FRAGMENTS))]
+    if not cheap:
+        warnings.warn(
+            f"the alpha mode is not measured but 'blend': about {layers(mesh, views[0]):,.0f} layers would"
+            " lie over each other at each pixel of the images",
+            DataWarning,
+            stacklevel=2,
+        )
+        return AlphaChoice("blend")
+    views = cheap
     return choose_by_views(((mesh, view) for view in views), threads=threads)
 
 

@@ -23,8 +23,8 @@ def transformed(cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud:
     """``cloud`` after the affine map ``matrix``, (3, 3) or (4, 4), from the file's frame to the world's.
 
     Concretely, a splat of covariance C and mean m gets covariance A C A^T and mean A m + t. Its colour seen
-    from direction d becomes its earlier colour seen from U^T d, where U is the orthogonal factor of A.
-    Mirrors are allowed.
+    from direction d becomes its earlier colour seen from U^T d, where U is the orthogonal factor of A, and
+    ``up`` turns by U. Mirrors are allowed.
 
     Raises:
         ValueError: the matrix is not finite or is singular.
@@ -54,6 +54,7 @@ def _mirrored(cloud: GaussianCloud, signs: np.ndarray) -> GaussianCloud:
         means=cloud.means * signs.astype(np.float32),
         quaternions=cloud.quaternions * np.array(turn, np.float32),
         sh=cloud.sh * harmonics,
+        up=None if cloud.up is None else cloud.up * signs.astype(np.float32),
     )
 
 
@@ -77,7 +78,8 @@ def _mapped(cloud: GaussianCloud, a: np.ndarray) -> GaussianCloud:
     if sh.shape[1] > 1:
         sh = np.concatenate([sh[:, :1], harmonics_map(orthogonal, cloud.sh_degree) @ sh[:, 1:]], axis=1)
     means = cloud.means.astype(np.float64) @ a.T
-    return replace(cloud, means=means, quaternions=quaternions, scales=scales, sh=sh)
+    up = None if cloud.up is None else orthogonal @ cloud.up
+    return replace(cloud, means=means, quaternions=quaternions, scales=scales, sh=sh, up=up)
 
 
 def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:

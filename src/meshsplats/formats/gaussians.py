@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Literal, get_args
 
@@ -13,18 +14,22 @@ import numpy as np
 from meshsplats._foreign import IMAGE_SUFFIXES
 from meshsplats._kinds import described, each, need, need_path, require_path
 from meshsplats.errors import FileFormatError
+from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.splats import read_splat_gltf
+from meshsplats.formats.ply.activated import Activated, checked_activated
 from meshsplats.formats.ply.compressed_splats import read_compressed_ply
-from meshsplats.formats.ply.splats import read_float_ply, write_float_blocks, write_float_ply
+from meshsplats.formats.ply.motion import VISIBLE
+from meshsplats.formats.ply.notes import up_of
+from meshsplats.formats.ply.splats import motion_in, read_float_ply, write_float_blocks, write_float_ply
 from meshsplats.formats.sniff import Content, SplatFormat, UnreadSplats, identify
 from meshsplats.formats.splats._cloud_builder import SplatReader
 from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
 from meshsplats.formats.splats.spz import open_spz, read_spz
 from meshsplats.formats.splats.streamed_sog import read_streamed_sog, streamed_parts
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.gaussians import GaussianCloud, Kernel, shared_up
 
 Axes = Literal["auto", "y-down", "y-up"]
 SPLAT_SUFFIXES = (".ply", ".ply.gz", ".splat", ".spz", ".sog", ".glb", ".gltf")
@@ -40,7 +45,13 @@ _DOUBLE_SUFFIXES = (".compressed.ply", ".compressed.ply.gz", ".ply.gz")
 
 
 def load_gaussians(
-    path: str | os.PathLike[str], *, strict: bool = False, axes: Axes = "auto"
+    path: str | os.PathLike[str],
+    *,
+    strict: bool = False,
+    axes: Axes = "auto",
+    kernel: Kernel | None = None,
+    time: float | None = None,
+    activated: Iterable[Activated] = (),
 ) -> GaussianCloud:
     """Splats of a file or folder, after activation.
 
@@ -55,7 +66,9 @@ def load_gaussians(
 
     The cloud has y down and z forward, as float .ply files have. Splats with values that are not finite after
     activation (an infinite opacity logit gives 0 or 1, which is finite) or with a zero quaternion are left
-    out, with a DataWarning that counts them.
+    out, with a DataWarning that counts them. What the file says besides its splats counts: the kernel, which
+    direction is up (``GaussianCloud.up``), and whether colours are linear; these are converted, with a
+    DataWarning.
 
     Args:
         path: the file or folder.
@@ -63,45 +76,98 @@ def load_gaussians(
         axes: the axes of the file. 'auto' follows its format ('y-up' for SPZ and glTF, 'y-down' for the
             others). Some programs write SPZ with y down, which the file does not say. A 'y-up' file is
             rotated by half a turn, about z if it is glTF, about x otherwise.
+        kernel: that the splats were trained with, in place of the one that the file names. Third scales of
+            '2dgs' splats are 0.
+        time: of splats that move in time (Spacetime Gaussians and 4D Gaussian Splatting in a .ply): the
+            instant to show, in the file's unit. None: one in the middle, which a DataWarning names.
+        activated: of a float .ply: which of 'scales', 'opacities' and 'colors' it stores as they are, not as
+            logarithms, logits and harmonics. A DataWarning says where values look so.
 
     Raises:
         FileNotFoundError: there is no such file.
         FileFormatError: the file is broken, of another kind, or without a single usable splat; the message
             says what is wrong and where.
+        ValueError: ``time`` or ``activated`` for a file that has no use for it.
         MissingDependencyError: SPZ 4 without Zstandard.
     """
     need_path(path=path)
-    _check_axes(axes)
+    reading = _Reading(strict, axes, kernel, time, activated)
     found = splat_file(Path(path))
     content = Content(found)
     kind, stored = content.splat_format(), None
     with content.open() as file:
-        reader = _reader(content, kind, file, found)
+        reader = reading.reader(content, kind, file, found)
         if reader is not None:
-            cloud = reader.read(strict=strict)
+            cloud = reading.finished(reader.read(strict=strict), reader)
+            if not len(cloud):
+                raise FileFormatError(f"{found}: none of its splats is visible at time {reader.instant:.6g}")
         elif kind == "spz":
             cloud, stored = read_spz(file.read(), found, Budget(found), strict=strict)
         elif kind == "streamed sog":
             cloud = read_streamed_sog(found, strict=strict)
         else:
             cloud = read_splat_gltf(found, strict=strict)
-    return transformed(cloud, _to_y_down(kind, axes, stored))
+    return transformed(reading.of_kernel(cloud), _to_y_down(kind, axes, stored))
 
 
-def _check_axes(axes: Axes) -> None:
-    if axes not in get_args(Axes):
-        raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+class _Reading:
+    """How files are read: checked arguments of ``load_gaussians``."""
 
+    def __init__(
+        self,
+        strict: bool,
+        axes: Axes,
+        kernel: Kernel | None,
+        time: float | None,
+        activated: Iterable[Activated],
+    ) -> None:
+        if axes not in get_args(Axes):
+            raise ValueError(f"axes must be one of {', '.join(get_args(Axes))}, got {axes!r}")
+        if kernel is not None and kernel not in get_args(Kernel):
+            raise ValueError(f"kernel must be one of {', '.join(get_args(Kernel))}, got {kernel!r}")
+        if time is not None and not np.isfinite(time):
+            raise ValueError(f"time must be a finite number, got {time!r}")
+        self.strict, self.axes, self.kernel = strict, axes, kernel
+        self.time = None if time is None else float(time)
+        self.activated = checked_activated(activated)
 
-def _reader(content: Content, kind: SplatFormat, file: BinaryIO, path: Path) -> SplatReader | None:
-    """The reader of the formats that are read in the same way as a whole and in blocks."""
-    if kind == "ply":
-        return read_float_ply(file, content.ply_header, path)
-    if kind == "compressed.ply":
-        return read_compressed_ply(file, content.ply_header, path)
-    if kind == "splat":
-        return read_dot_splat(file, path)
-    return read_sog(path, Budget(path)) if kind == "sog" else None
+    def reader(self, content: Content, kind: SplatFormat, file: BinaryIO, path: Path) -> SplatReader | None:
+        """The reader of the formats that are read in the same way as a whole and in blocks."""
+        if kind == "ply":
+            reader = read_float_ply(file, content.ply_header, path, time=self.time, activated=self.activated)
+            if self.time is not None and reader.instant is None:
+                raise ValueError(f"{path}: its splats do not move: time is for those that do")
+            if reader.linear:
+                say_converted(path)
+            return reader
+        if self.activated or self.time is not None:
+            given = "activated" if self.activated else "time"
+            raise ValueError(f"{path}: {given} is for float .ply files, this is {kind}")
+        if kind == "compressed.ply":
+            reader = read_compressed_ply(file, content.ply_header, path)
+            if reader.linear:
+                say_converted(path)
+            return reader
+        if kind == "splat":
+            return read_dot_splat(file, path)
+        return read_sog(path, Budget(path)) if kind == "sog" else None
+
+    def finished(self, cloud: GaussianCloud, reader: SplatReader) -> GaussianCloud:
+        """Splats of ``reader`` with display colours and up, those that are visible at the instant."""
+        if reader.instant is not None:
+            cloud = cloud.select(cloud.opacities >= VISIBLE)
+        if reader.linear:
+            cloud = display_cloud(cloud)
+        return cloud if reader.up is None else replace(cloud, up=reader.up)
+
+    def of_kernel(self, cloud: GaussianCloud) -> GaussianCloud:
+        """``cloud`` with the kernel that is asked for."""
+        if self.kernel is None or self.kernel == cloud.kernel:
+            return cloud
+        scales = cloud.scales
+        if self.kernel == "2dgs":
+            scales = scales * np.array([1, 1, 0], np.float32)
+        return replace(cloud, kernel=self.kernel, scales=scales)
 
 
 def _to_y_down(kind: SplatFormat, axes: Axes, stored: np.ndarray | None) -> np.ndarray:
@@ -129,8 +195,11 @@ class SplatStream:
         block: int = 1 << 16,
         strict: bool = False,
         axes: Axes = "auto",
+        kernel: Kernel | None = None,
+        time: float | None = None,
+        activated: Iterable[Activated] = (),
     ) -> None:
-        _check_axes(axes)
+        self._reading = _Reading(strict, axes, kernel, time, activated)
         if isinstance(paths, (str, os.PathLike)):
             what = described(paths)
             raise TypeError(f"paths must be a list of paths, got {what}: stream_gaussians(path) opens one")
@@ -147,10 +216,10 @@ class SplatStream:
             yield from self._of(path)
 
     def _of(self, path: Path) -> Iterator[GaussianCloud]:
-        content = Content(path)
+        content, reading = Content(path), self._reading
         kind, stored = content.splat_format(), None
         with content.open() as file:
-            reader = _reader(content, kind, file, path)
+            reader = reading.reader(content, kind, file, path)
             whole: GaussianCloud | None = None
             if kind == "spz" and content.member is not None:  # its streams are not apart there
                 whole, stored = read_spz(file.read(), path, Budget(path), strict=self.strict)
@@ -162,13 +231,29 @@ class SplatStream:
             to_y_down = _to_y_down(kind, self.axes, stored)
             for reader in readers:
                 for block in reader.blocks(self.block, strict=self.strict):
-                    yield transformed(block, to_y_down)
+                    block = reading.of_kernel(reading.finished(block, reader))
+                    if len(block):
+                        yield transformed(block, to_y_down)
         if kind == "gltf":
             whole = read_splat_gltf(path, strict=self.strict)
         if whole is not None:
             for start in range(0, len(whole), self.block):
                 part = np.arange(start, min(start + self.block, len(whole)))
-                yield transformed(whole.select(part), to_y_down)
+                yield transformed(reading.of_kernel(whole.select(part)), to_y_down)
+
+    @property
+    def up(self) -> np.ndarray | None:
+        """(3,) unit direction that points up, where all of the files say so, and the same."""
+        return shared_up([self._up(path) for path in self.paths])
+
+    def _up(self, path: Path) -> np.ndarray | None:
+        content = Content(path)
+        kind = content.splat_format()
+        if kind not in ("ply", "compressed.ply"):
+            return None
+        with content.open() as file:
+            up = up_of(file, content.ply_header, path)
+        return None if up is None else _to_y_down(kind, self.axes, None) @ up
 
 
 def stream_gaussians(
@@ -177,6 +262,9 @@ def stream_gaussians(
     block: int = 1 << 16,
     strict: bool = False,
     axes: Axes = "auto",
+    kernel: Kernel | None = None,
+    time: float | None = None,
+    activated: Iterable[Activated] = (),
 ) -> SplatStream:
     """Splats of files that are larger than memory, in blocks.
 
@@ -184,7 +272,7 @@ def stream_gaussians(
         path: a file or folder as for ``load_gaussians``; several of them; or a folder of splat files, which
             are read in the order of their names; meshes among them are left out.
         block: about this many splats at a time.
-        strict, axes: as for ``load_gaussians``.
+        strict, axes, kernel, time, activated: as for ``load_gaussians``.
 
     Returns:
         A stream of clouds, which can be iterated over several times. Errors and warnings of
@@ -203,7 +291,9 @@ def stream_gaussians(
     if not given:
         raise ValueError("name at least one splat file")
     files = [file for one in given for file in _splat_files(Path(one))]
-    return SplatStream(files, block=block, strict=strict, axes=axes)
+    return SplatStream(
+        files, block=block, strict=strict, axes=axes, kernel=kernel, time=time, activated=activated
+    )
 
 
 def _splat_files(path: Path) -> list[Path]:
@@ -253,6 +343,18 @@ def splat_format(path: str | os.PathLike[str]) -> SplatFormat | None:
         return None
 
 
+def moving_splats(path: str | os.PathLike[str]) -> tuple[str, float, float] | None:
+    """Name of the layout, first and last time of splats that move in time; None for splats at rest.
+
+    Raises FileFormatError for those that move by a formula that is not known.
+    """
+    content = Content(splat_file(Path(path)))
+    if content.splat_format() != "ply":
+        return None
+    with content.open() as file:
+        return motion_in(file, content.ply_header, content.path)
+
+
 def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     """Writes ``cloud`` as a float .ply in the layout of the 3D Gaussian Splatting code, whole or not at all.
 
@@ -260,7 +362,8 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     sigmoid(-30), sigmoid(20) and 1.2e-38. A '2dgs' cloud is written with its first two scales, as in 2DGS
     files, and an 'antialiased' one with the comment ``SplatRenderMode: mip``, so that both kernels are read
     back. A '2dgs' cloud whose third scales are not 0 does not fit two scales: it is written with three, with
-    a DataWarning, and is read back as '3dgs'.
+    a DataWarning, and is read back as '3dgs'. ``up`` becomes the comment ``meshsplats up X Y Z``, and
+    ``Vertical Axis: z``, too, if it is +z.
 
     Raises:
         ValueError: the suffix is not .ply, or the cloud has no splats.
@@ -282,6 +385,7 @@ def save_gaussian_blocks(
     *,
     degree: int = 0,
     kernel: Kernel = "3dgs",
+    up: np.ndarray | None = None,
 ) -> None:
     """Writes splats that come in ``blocks`` as a .ply; in memory there is one block at a time.
 
@@ -293,6 +397,7 @@ def save_gaussian_blocks(
         count: of all splats together, at least 1.
         degree: of the spherical harmonics, 0 to 3.
         kernel: of the splats. Third scales of '2dgs' splats are left out.
+        up: (3,) direction that points up, for a comment; None if it is not known.
 
     Raises:
         ValueError: the suffix is not .ply, a count or degree out of range, or blocks of another count.
@@ -304,7 +409,7 @@ def save_gaussian_blocks(
         raise ValueError(f"splats are written as .ply, got {target.name!r}: choose a name that ends in .ply")
     if count < 1 or degree not in (0, 1, 2, 3):
         raise ValueError(f"count must be at least 1 and degree 0 to 3, got {count} and {degree}")
-    write_float_blocks(blocks, target, count, (degree + 1) ** 2, kernel, flat=kernel == "2dgs")
+    write_float_blocks(blocks, target, count, (degree + 1) ** 2, kernel, flat=kernel == "2dgs", up=up)
 
 
 def subject_name(path: Path, *, ending: bool = False) -> str:

@@ -39,6 +39,7 @@ _UNREAD: dict[Container | None, str] = {
     "gzip": "a gzip file, but not SPZ; unpack it first",
     "lfs": "a Git LFS pointer, not the file itself, which 'git lfs pull' brings",
 }
+_SPLATV = b"\x4b\x67\0\0"
 _SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
 _EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
 
@@ -125,6 +126,11 @@ class Content:
             return "gltf"
         if self.container == "json":
             return self._json_format(convert)
+        if self.head[:4] == _SPLATV or name.endswith(".splatv"):
+            raise UnreadSplats(
+                f"{path}: .splatv files, of splats that move, are not read here; the .ply that they are made"
+                " of is (Spacetime Gaussians)"
+            )
         if name.endswith(".ksplat"):
             raise UnreadSplats(f"{path}: .ksplat files are not read here; {convert}")
         with self.open() as file:

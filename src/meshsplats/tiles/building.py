@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
@@ -70,8 +70,9 @@ class TileOptions:
     conversion: ConversionOptions | None = None
     """What to do otherwise than the preset does; not ``max_splats``, ``max_triangles``, ``detail='cameras'``,
     ``colors='cameras'``, and of the footprints framing, distance and none."""
-    up: tuple[float, float, float] = DEFAULT_UP
-    """Direction that points up in the world frame."""
+    up: tuple[float, float, float] | None = None
+    """Direction that points up in the world frame. None: that of the splat files, where they name it, else
+    (0, -1, 0)."""
     lit: bool = False
     """A material that scene lights shade, instead of an unlit one."""
     alpha: TilesAlpha = "auto"
@@ -156,6 +157,9 @@ def build_tiles(
     need(TileOptions, options=options, optional=True)
     need(Workers, workers=workers, optional=True)
     chosen = options or TileOptions()
+    if chosen.up is None:
+        up = DEFAULT_UP if source.up is None else source.up.astype(float).tolist()
+        chosen = replace(chosen, up=(up[0], up[1], up[2]))
     conversion = chosen.resolved()
     target = Path(folder)
     unfinished = partial_folder(target)
@@ -256,7 +260,7 @@ class _Build:
                 nodes[fields["key"]] = Node(**fields)
         leaves = [node for node in nodes.values() if not node.children]
         splats = sum(node.splats for node in leaves)
-        write_tilesets(self._out, nodes, root, unit_up(self._options.up), splats)
+        write_tilesets(self._out, nodes, root, unit_up(self._options.up or DEFAULT_UP), splats)
         alpha = self._alpha(scene, nodes)
         triangles = sum(node.triangles for node in leaves)
         size = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())
@@ -282,7 +286,12 @@ class _Build:
         """The alpha mode that suits what viewers load of the tileset, far tiles drawn before near ones."""
         tileset = Tileset(self._out)
         cameras = orbit(
-            scene.sample, VIEWS, elevation=20, width=SIDE, height=SIDE, up=unit_up(self._options.up)
+            scene.sample,
+            VIEWS,
+            elevation=20,
+            width=SIDE,
+            height=SIDE,
+            up=unit_up(self._options.up or DEFAULT_UP),
         )
 
         def views() -> Iterator[tuple[SplatMesh, Camera]]:
@@ -365,7 +374,7 @@ class _Tiles:
         self._conversion = options.resolved()
         self._work, self._out = folder / "work", folder / "tileset"
         self._most = options.max_triangles // triangles_each(self._conversion)
-        self._up = unit_up(options.up)
+        self._up = unit_up(options.up or DEFAULT_UP)
         self._frame = tile_frame(self._up)
         scene = _stored_survey(self._work / SURVEY)
         self._kernel = scene.kernel

@@ -11,13 +11,14 @@ import binascii
 import json
 import os
 import struct
+import warnings
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
 
-from meshsplats.errors import FileFormatError
+from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -61,6 +62,12 @@ class GltfDocument:
             raise self.error(f"not a glTF 2 file: its asset version is {str(version)[:20]!r}, expected '2.0'")
         self._refuse_extensions()
         self._buffers: dict[int, memoryview] = {}
+        self._unflagged: set[str] = set()
+
+    def uses(self, extension: str) -> bool:
+        """Whether the file names the extension among those that it uses."""
+        used = self.json.get("extensionsUsed", [])
+        return isinstance(used, list) and extension in used
 
     def error(self, message: str) -> FileFormatError:
         """An error about this file, for the caller to raise."""
@@ -149,15 +156,29 @@ class GltfDocument:
         strides = (step, np.dtype(dtype).itemsize)
         return np.ndarray((count, columns), dtype, data, offset if count else 0, strides)
 
-    def floats(self, index: object, what: str) -> np.ndarray:
-        """As ``accessor``, as float32; integers become fractions of their largest value where
-        ``normalized``."""
+    def floats(self, index: object, what: str, *, fractions: bool = False) -> np.ndarray:
+        """As ``accessor``, as float32; integers become fractions of their largest value where ``normalized``.
+
+        ``fractions``: integers of this attribute can mean nothing else (section 3.7.2.1 of the specification,
+        and KHR_mesh_quantization): without the flag they are fractions too, with a DataWarning.
+        """
         values = self.accessor(index, what)
         self.budget.spend(4 * values.size, what)
         result = values.astype(np.float32)
-        if values.dtype.kind in "iu" and self.item("accessors", index, what).get("normalized") is True:
+        if values.dtype.kind not in "iu":
+            return result
+        flag = self.item("accessors", index, what).get("normalized") is True
+        if flag or fractions:
             result /= np.float32(np.iinfo(values.dtype).max)
             np.maximum(result, -1, out=result)
+        if fractions and not flag and what not in self._unflagged:
+            self._unflagged.add(what)
+            warnings.warn(
+                f"{self.path}: {what} has integers without the flag 'normalized', which they need; they are"
+                f" read as fractions of {np.iinfo(values.dtype).max:,}",
+                DataWarning,
+                stacklevel=4,
+            )
         return result
 
     # -- reading

@@ -94,9 +94,10 @@ def _piece(
     factor = document.numbers(pbr_of(material).get("baseColorFactor", [1, 1, 1, 1]), 4, "baseColorFactor")
     linear = np.ones((v, 4), np.float32)
     if "COLOR_0" in attributes:
-        colors = document.floats(attributes["COLOR_0"], "COLOR_0")
-        if len(colors) != v or colors.shape[1] < 3:
-            raise document.error(f"COLOR_0 must be {v:,} RGB or RGBA colours, got shape {colors.shape}")
+        shape = document.accessor(attributes["COLOR_0"], "COLOR_0").shape
+        if shape[0] != v or shape[1] < 3:
+            raise document.error(f"COLOR_0 must be {v:,} RGB or RGBA colours, got shape {shape}")
+        colors = document.floats(attributes["COLOR_0"], "COLOR_0", fractions=True)
         linear[:, : colors.shape[1]] = colors
     if (factor != 1).any():
         linear *= factor.astype(np.float32)
@@ -104,7 +105,7 @@ def _piece(
         linear[:, 3] = 1
     normals = None
     if "NORMAL" in attributes:
-        normals = document.floats(attributes["NORMAL"], "NORMAL")
+        normals = document.floats(attributes["NORMAL"], "NORMAL", fractions=True)
     for name, values in (("POSITION", vertices), ("NORMAL", normals)):
         if values is not None and values.shape != (v, 3):
             raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")

@@ -72,7 +72,7 @@ class _Skinning:
             if name not in attributes or weights_name not in attributes:
                 break
             indices = document.accessor(attributes[name], name)
-            weights = document.floats(attributes[weights_name], weights_name)
+            weights = document.floats(attributes[weights_name], weights_name, fractions=True)
             if indices.shape != (v, 4) or weights.shape != (v, 4) or indices.dtype.kind != "u":
                 raise document.error(
                     f"{name} and {weights_name} must be {v:,} times 4 integers and weights, got shapes"
@@ -178,7 +178,8 @@ def _instances(document: GltfDocument, extension: Any) -> Iterator[np.ndarray]:
     rows: dict[str, np.ndarray] = {}
     for name, columns in (("TRANSLATION", 3), ("ROTATION", 4), ("SCALE", 3)):
         if name in attributes:
-            rows[name] = document.floats(attributes[name], name).astype(np.float64)
+            turns = name == "ROTATION"
+            rows[name] = document.floats(attributes[name], name, fractions=turns).astype(np.float64)
             if rows[name].shape[1] != columns:
                 raise document.error(
                     f"{name} of instances must have {columns} columns, got {rows[name].shape}"

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats.errors import DataWarning
+from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_Z, transformed
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.reader import objects_in
@@ -54,8 +55,7 @@ def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
 def has_splats(path: Path) -> bool:
     """Whether a glTF file names the extension; a broken file raises FileFormatError."""
     document = GltfDocument(path, also_known=_EXTENSIONS)
-    used = document.json.get("extensionsUsed", [])
-    return isinstance(used, list) and any(name in used for name in _EXTENSIONS)
+    return any(document.uses(name) for name in _EXTENSIONS)
 
 
 def _splat_primitives(document: GltfDocument, mesh: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -74,10 +74,10 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
             data, _ = document.view_bytes(view, name)
             spz = read_spz(data, document.path, document.budget, strict=strict)
             return transformed(spz.cloud, HALF_TURN_Z @ spz.to_y_down)
-    if splatting.get("colorSpace") == "lin_rec709_display":
+    if (shape := splatting.get("kernel", "ellipse")) != "ellipse":
         warnings.warn(
-            f"{document.path}: these splats were trained in linear colours, which are taken as display"
-            " colours here; images will be darker than they should",
+            f"{document.path}: splats of the kernel {str(shape)[:40]!r}, which is not known here; they are"
+            " read as Gaussians ('ellipse')",
             DataWarning,
             stacklevel=5,
         )
@@ -106,7 +106,11 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
     for i, coefficients in enumerate(sh):
         rows.sh[:, i] = coefficients
     builder.keep(rows)
-    return builder.finish("3dgs", strict=strict)
+    cloud = builder.finish("3dgs", strict=strict)
+    if splatting.get("colorSpace") != "lin_rec709_display":
+        return cloud
+    say_converted(document.path)
+    return display_cloud(cloud)
 
 
 def _attribute(
@@ -114,7 +118,8 @@ def _attribute(
 ) -> np.ndarray:
     if name not in attributes:
         raise document.error(f"splats need the attribute {name}, which a primitive lacks")
-    values = document.floats(attributes[name], name)
+    fractions = name.endswith((":ROTATION", ":OPACITY"))
+    values = document.floats(attributes[name], name, fractions=fractions)
     if values.shape[1] != columns or (count is not None and len(values) != count):
         expected = f"({'n' if count is None else count}, {columns})"
         raise document.error(f"{name} must have shape {expected}, got {values.shape}")

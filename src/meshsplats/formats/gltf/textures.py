@@ -78,7 +78,9 @@ def _coordinates(
     name = f"TEXCOORD_{chosen}"
     if name not in attributes:
         return None
-    uv = document.floats(attributes[name], name)
+    # KHR_mesh_quantization alone admits coordinates that are whole numbers.
+    quantized = document.uses("KHR_mesh_quantization")
+    uv = document.floats(attributes[name], name, fractions=not quantized)
     if uv.shape != (v, 2) or not np.isfinite(uv).all():
         raise document.error(f"{name} must be {v:,} finite pairs, got shape {uv.shape}")
     if transform:

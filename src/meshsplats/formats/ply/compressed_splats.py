@@ -15,7 +15,7 @@ import numpy as np
 
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.ply.header import Element, PlyHeader
-from meshsplats.formats.ply.splats import kernel_of_comments
+from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_of
 from meshsplats.formats.ply.table import RowReader
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
 from meshsplats.gaussians import SH_C0
@@ -56,15 +56,23 @@ def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object) -> Spl
     rest = 0
     if sh is not None:
         rest = len(sh.properties)
-        if rest not in (9, 24, 45):
-            raise FileFormatError(f"{where}: element 'sh' has {rest} properties, expected 9, 24 or 45")
+        if rest not in (0, 9, 24, 45):
+            raise FileFormatError(f"{where}: element 'sh' has {rest} properties, expected 0, 9, 24 or 45")
         _require(sh, [f"f_rest_{i}" for i in range(rest)], "u1", where)
         if sh.count != vertex.count:
             raise FileFormatError(f"{where}: {sh.count:,} rows of element 'sh' for {vertex.count:,} splats")
+    if not rest:
+        sh = None  # gsplat's exporter names the element without properties for splats of degree 0
     readers = {e.name: RowReader(file, header, e, where) for e in (vertex, chunk, sh) if e is not None}
     kernel = kernel_of_comments(header.comments)
     return SplatReader(
-        vertex.count, 1 + rest // 3, kernel, where, _chunks(readers, chunk.count, vertex.count)
+        vertex.count,
+        1 + rest // 3,
+        kernel,
+        where,
+        _chunks(readers, chunk.count, vertex.count),
+        up=up_of(file, header, where),
+        linear=is_linear(file, header, where),
     )
 
 

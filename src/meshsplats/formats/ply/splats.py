@@ -3,8 +3,8 @@
 Each row of element ``vertex`` is a splat: ``x y z``, ``f_dc_0..2`` and ``f_rest_*`` (spherical harmonics,
 channel by channel), ``opacity`` (logit), ``scale_*`` (logarithms) and ``rot_0..3`` (quaternion w x y z of any
 length). 2DGS files have two scales; the third axis is flat. Mip-Splatting files have ``filter_3D``, the width
-of a smoothing filter that applies to scales and opacities. Properties are found by name. A comment may name
-the kernel: ``SplatRenderMode: mip`` (Brush), ``antialiased 1`` (Postshot).
+of a smoothing filter that applies to scales and opacities. Properties are found by name. What comments and
+other elements say is in ``notes.py``, splats that move in ``motion.py``.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -21,10 +22,13 @@ import numpy as np
 from meshsplats._files.atomic import atomic_path
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats import _activation
+from meshsplats.formats.ply.activated import SAMPLE, Activated, harmonics_of, span_of, suspects, warn_of
 from meshsplats.formats.ply.header import Element, PlyHeader
+from meshsplats.formats.ply.motion import Motion, motion_of
+from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_of
 from meshsplats.formats.ply.table import CHUNK_BYTES, FloatTable
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
-from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
+from meshsplats.gaussians import GaussianCloud, Kernel
 
 _POSITION = ("x", "y", "z")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -40,6 +44,7 @@ class _Columns:
 
     def __init__(self, element: Element, header: PlyHeader, where: object) -> None:
         names = set(element.names)
+        self.motion = motion_of(element.names, where)
         self.scale = tuple(f"scale_{i}" for i in range(3) if f"scale_{i}" in names)
         missing = [n for n in (*_POSITION, "opacity", "scale_0", "scale_1", *_ROTATION) if n not in names]
         if not {"opacity", "scale_0", "rot_0"} & names:
@@ -79,7 +84,8 @@ class _Columns:
     @property
     def needed(self) -> tuple[str, ...]:
         """All properties that are read."""
-        return (*_POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *self.filter)
+        moving = self.motion.needed if self.motion else ()
+        return (*_POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *self.filter, *moving)
 
 
 def is_float_splat(header: PlyHeader) -> bool:
@@ -91,8 +97,16 @@ def is_float_splat(header: PlyHeader) -> bool:
     return bool(marks & set(element.names))
 
 
-def read_float_ply(file: BinaryIO, header: PlyHeader, where: object) -> SplatReader:
-    """The splats of an opened .ply whose header has been read; errors and warnings as ``load_gaussians``."""
+def read_float_ply(
+    file: BinaryIO,
+    header: PlyHeader,
+    where: object,
+    *,
+    time: float | None = None,
+    activated: Sequence[Activated] = (),
+) -> SplatReader:
+    """The splats of an opened .ply whose header has been read; arguments, errors and warnings as
+    ``load_gaussians``."""
     element = header.element("vertex")
     if element is None:
         raise FileFormatError(
@@ -104,45 +118,146 @@ def read_float_ply(file: BinaryIO, header: PlyHeader, where: object) -> SplatRea
     kernel: Kernel = "antialiased" if columns.filter else kernel_of_comments(header.comments)
     if len(columns.scale) == 2:
         kernel = "2dgs"
-    return SplatReader(element.count, columns.coefficients, kernel, where, _chunks(table, columns))
-
-
-def _chunks(table: FloatTable, columns: _Columns) -> Iterator[tuple[int, Fill]]:
+    instant = None
+    if columns.motion:
+        instant = _instant(table, columns.motion, time, where)
     index = {name: i for i, name in enumerate(table.names)}
+    spans = _spans(table, columns, activated)
+    reading = _Reading(columns, index, _Sample(element.count), tuple(activated), spans, instant)
+    return SplatReader(
+        element.count,
+        columns.coefficients,
+        kernel,
+        where,
+        _chunks(table, reading, where),
+        up=up_of(file, header, where),
+        linear=is_linear(file, header, where),
+        instant=instant,
+    )
+
+
+def motion_in(file: BinaryIO, header: PlyHeader, where: object) -> tuple[str, float, float] | None:
+    """Name of the layout, first and last time of the splats that move in a .ply; None for splats at rest."""
+    element = header.element("vertex")
+    motion = motion_of(element.names, where) if element is not None and is_float_splat(header) else None
+    if element is None or motion is None:
+        return None
+    times = _times(FloatTable(file, header, element, (motion.time,), where), motion, where)
+    return motion.name, float(times[0]), float(times[-1])
+
+
+def _times(table: FloatTable, motion: Motion, where: object) -> np.ndarray:
+    """The times of all splats that are finite, ascending."""
+    column = table.names.index(motion.time)
+    parts = [chunk[:, column].copy() for chunk in table.chunks()]
+    times = np.concatenate(parts) if parts else np.empty(0, np.float32)
+    times = np.sort(times[np.isfinite(times)])
+    if not len(times):
+        raise FileFormatError(f"{where}: none of the times ({motion.time}) of its splats is finite")
+    return times
+
+
+def _instant(table: FloatTable, motion: Motion, time: float | None, where: object) -> float:
+    """``time``, or one in the middle at which there is a splat, with a DataWarning that names it."""
+    if time is not None:
+        return time
+    times = _times(table, motion, where)
+    middle = float(times[(len(times) - 1) // 2])
+    warnings.warn(
+        f"{where}: splats that move in time ({motion.name}, times {times[0]:.4g} to {times[-1]:.4g}), shown"
+        f" at {middle:.4g}; --time T (time=T) chooses another instant",
+        DataWarning,
+        stacklevel=5,
+    )
+    return middle
+
+
+def _spans(table: FloatTable, columns: _Columns, activated: Sequence[Activated]) -> dict[Activated, int]:
+    """The greatest value that each of ``activated`` can have: opacities and colours are of 1 or of 255."""
+    names: dict[Activated, tuple[str, ...]] = {"opacities": ("opacity",), "colors": columns.color}
+    index = {name: [table.names.index(n) for n in names[name]] for name in activated if name in names}
+    spans: dict[Activated, int] = dict.fromkeys(index, 1)
+    for chunk in table.chunks() if index else ():
+        for name, at in index.items():
+            spans[name] = max(spans[name], span_of(chunk[:, at]))
+    return spans
+
+
+@dataclass
+class _Sample:
+    """Stored values of every so many-th splat."""
+
+    count: int
+    """Of all splats."""
+    seen: int = 0
+    parts: list[list[np.ndarray]] = field(default_factory=list)
+
+    def add(self, values: Sequence[np.ndarray]) -> None:
+        """``values`` of the next splats."""
+        step = -(-self.count // SAMPLE)
+        self.parts.append([array[-self.seen % step :: step].copy() for array in values])
+        self.seen += len(values[0])
+
+    def values(self) -> list[np.ndarray]:
+        arrays = [np.concatenate(column) for column in zip(*self.parts, strict=True)]
+        finite = np.logical_and.reduce([np.isfinite(a.reshape(len(a), -1)).all(axis=1) for a in arrays])
+        return [array[finite] for array in arrays]
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """How the columns of a file are read."""
+
+    columns: _Columns
+    index: dict[str, int]
+    sample: _Sample
+    activated: tuple[Activated, ...]
+    spans: dict[Activated, int]
+    """Greatest value that activated opacities and colours can have."""
+    time: float | None
+    """The instant of splats that move."""
+
+
+def _chunks(table: FloatTable, reading: _Reading, where: object) -> Iterator[tuple[int, Fill]]:
     for chunk in table.chunks():
-        yield len(chunk), partial(_fill, chunk, columns, index)
+        yield len(chunk), partial(_fill, chunk, reading)
+    found = suspects(reading.sample.count, *reading.sample.values()) if reading.sample.parts else {}
+    if reading.columns.color is _RGB or (reading.columns.motion and reading.columns.motion.plain_colors):
+        found.pop("colors", None)
+    warn_of({name: span for name, span in found.items() if name not in reading.activated}, where)
 
 
-def _fill(chunk: np.ndarray, columns: _Columns, index: dict[str, int], rows: SplatRows) -> None:
+def _fill(chunk: np.ndarray, reading: _Reading, rows: SplatRows) -> None:
+    columns, index = reading.columns, reading.index
+
     def take(names: Sequence[str], out: np.ndarray) -> None:
         np.take(chunk, [index[n] for n in names], axis=1, out=out, mode="clip")
 
     take(_POSITION, rows.means)
     take(_ROTATION, rows.quaternions)
     take(columns.sh, rows.sh.reshape(len(chunk), -1))
+    scales, opacities = chunk[:, [index[n] for n in columns.scale]], chunk[:, index["opacity"]]
+    reading.sample.add([rows.means, scales, opacities, rows.sh[:, 0]])
+    if "scales" in reading.activated:
+        with np.errstate(divide="ignore"):
+            scales = np.where(scales >= 0, np.log(np.maximum(scales, 0)), np.nan)  # no deviation is negative
+    if "opacities" in reading.activated:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.clip(opacities / np.float32(reading.spans["opacities"]), 0, 1).astype(np.float64)
+            opacities = (np.log(share) - np.log1p(-share)).astype(np.float32)
     _activate(
         rows,
-        log_scales=chunk[:, [index[n] for n in columns.scale]],
-        logits=chunk[:, index["opacity"]],
+        log_scales=scales,
+        logits=opacities,
         filter_3d=chunk[:, index[_FILTER]] if columns.filter else None,
     )
     if columns.color_span is not None:
-        rows.sh[:, 0] = (rows.sh[:, 0] / columns.color_span - np.float32(0.5)) / np.float32(SH_C0)
-
-
-def kernel_of_comments(comments: tuple[str, ...]) -> Kernel:
-    """The kernel that a .ply names in its comments; the last one counts, '3dgs' if there is none."""
-    spelt: dict[str, Kernel] = {
-        "splatrendermode mip": "antialiased",
-        "splatrendermode 2dgs": "2dgs",
-        "splatrendermode default": "3dgs",
-        "antialiased 1": "antialiased",
-        "antialiased 0": "3dgs",
-    }
-    found = [
-        spelt[words] for c in comments if (words := " ".join(c.lower().replace(":", " ").split())) in spelt
-    ]
-    return found[-1] if found else "3dgs"
+        rows.sh[:, 0] = harmonics_of(rows.sh[:, 0], columns.color_span)
+    elif "colors" in reading.activated:
+        rows.sh[:, 0] = harmonics_of(rows.sh[:, 0], reading.spans["colors"])
+    if columns.motion is not None and reading.time is not None:
+        moving = {name: chunk[:, index[name]] for name in columns.motion.needed}
+        columns.motion.apply(rows, moving, reading.time)
 
 
 def _activate(
@@ -180,7 +295,7 @@ def write_float_ply(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
             DataWarning,
             stacklevel=3,
         )
-    write_float_blocks([cloud], path, len(cloud), cloud.sh.shape[1], cloud.kernel, flat=flat)
+    write_float_blocks([cloud], path, len(cloud), cloud.sh.shape[1], cloud.kernel, flat=flat, up=cloud.up)
 
 
 def write_float_blocks(
@@ -191,6 +306,7 @@ def write_float_blocks(
     kernel: Kernel,
     *,
     flat: bool,
+    up: np.ndarray | None = None,
 ) -> None:
     """Writes ``count`` splats that come in ``blocks``.
 
@@ -201,6 +317,7 @@ def write_float_blocks(
         coefficients: of the file, 1, 4, 9 or 16 per channel: those of the blocks at most.
         kernel: of the file.
         flat: leave out the third scale.
+        up: (3,) direction that points up, None if it is not known.
 
     Raises ValueError if the blocks hold another number of splats.
     """
@@ -212,6 +329,10 @@ def write_float_blocks(
     lines = ["ply", "format binary_little_endian 1.0"]
     if kernel == "antialiased":
         lines.append("comment SplatRenderMode: mip")
+    if up is not None:
+        lines.append("comment meshsplats up " + " ".join(repr(float(u)) for u in up))
+        if (np.asarray(up) == (0, 0, 1)).all():
+            lines.append("comment Vertical Axis: z")  # as nerfstudio, which others read
     lines.append(f"element vertex {count}")
     lines += [f"property float {name}" for name in names] + ["end_header", ""]
     per_chunk = max(1, CHUNK_BYTES // (4 * len(names)))

@@ -41,10 +41,16 @@ class SplatReader:
     """The file, for messages."""
     chunks: Iterator[tuple[int, Fill]]
     """Count of the splats of each chunk, and what reads them."""
+    up: np.ndarray | None = None
+    """(3,) direction that points up in the axes of the file, where it says so."""
+    linear: bool = False
+    """Whether its colours are linear, not display values."""
+    instant: float | None = None
+    """The time at which they are shown, of splats that move."""
 
     def read(self, *, strict: bool) -> GaussianCloud:
         """All splats; errors and warnings as ``load_gaussians``, which must be the caller."""
-        builder = CloudBuilder(self.count, self.coefficients, self.where)
+        builder = CloudBuilder(self.count, self.coefficients, self.where, flat=self.kernel == "2dgs")
         for m, fill in self.chunks:
             rows = builder.next(m)
             fill(rows)
@@ -56,7 +62,13 @@ class SplatReader:
         builder: CloudBuilder | None = None
         for m, fill in self.chunks:
             if builder is None:
-                builder = CloudBuilder(self.count, self.coefficients, self.where, capacity=max(size, m))
+                builder = CloudBuilder(
+                    self.count,
+                    self.coefficients,
+                    self.where,
+                    capacity=max(size, m),
+                    flat=self.kernel == "2dgs",
+                )
             elif builder.held and builder.held + m > size:
                 yield builder.take(self.kernel)
             rows = builder.next(m)
@@ -75,13 +87,22 @@ class CloudBuilder:
 
     A row is dropped and counted if a value is not finite after activation or if its quaternion is zero. Later
     rows take its place, so that no array is copied. With a ``capacity`` of fewer rows than ``count``, kept
-    rows must be taken out before there are more.
+    rows must be taken out before there are more. The third scales of ``flat`` splats become 0: where formats
+    must have three, writers of 2DGS splats put anything there.
     """
 
-    def __init__(self, count: int, coefficients: int, where: object, capacity: int | None = None) -> None:
+    def __init__(
+        self,
+        count: int,
+        coefficients: int,
+        where: object,
+        capacity: int | None = None,
+        *,
+        flat: bool = False,
+    ) -> None:
         if count == 0:
             raise FileFormatError(f"{where}: no splats, the file declares 0 of them")
-        self._where, self._count = where, count
+        self._where, self._count, self._flat = where, count, flat
         rows = count if capacity is None else min(capacity, count)
         self._arrays = SplatRows(
             np.empty((rows, 3), np.float32),
@@ -112,6 +133,8 @@ class CloudBuilder:
     def keep(self, rows: SplatRows) -> None:
         """Keeps the rows from ``next``: normalises their quaternions and drops unusable ones."""
         m = len(rows.means)
+        if self._flat:
+            rows.scales[:, 2] = 0
         finite = np.ones(m, bool)
         for array in rows:
             # A sum is not finite if any term is not: only then check each value.

@@ -1,0 +1,51 @@
+"""Splats with linear colours, as display colours."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+
+from meshsplats.colors import linear_to_srgb
+from meshsplats.errors import DataWarning
+from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.spherical_harmonics import sh_basis
+
+_DIRECTIONS = 128
+_AT_ONCE = 1 << 14
+
+
+def display_cloud(cloud: GaussianCloud) -> GaussianCloud:
+    """``cloud``, whose colours are linear, with display colours.
+
+    Concretely, the colour of a splat of degree 0 is encoded. Of others it is encoded in directions all over
+    the sphere, and harmonics of the same degree are fitted to that. Images blend display colours, as those of
+    all splats here, where the program that made them blends linear ones: they agree where splats are opaque.
+    """
+    sh = cloud.sh
+    if cloud.sh_degree == 0:
+        linear = np.maximum(np.float32(0.5) + np.float32(SH_C0) * sh, 0)
+        return replace(cloud, sh=(linear_to_srgb(linear) - np.float32(0.5)) / np.float32(SH_C0))
+    i = np.arange(_DIRECTIONS) + 0.5  # directions on a Fibonacci spiral
+    z, angle = 1 - 2 * i / _DIRECTIONS, i * np.pi * (1 + 5**0.5)
+    r = np.sqrt(1 - z * z)
+    basis = sh_basis(np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1), cloud.sh_degree)
+    fit = np.linalg.pinv(basis).astype(np.float32)
+    basis = basis.astype(np.float32)
+    fitted = np.empty_like(sh)
+    for start in range(0, len(sh), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        linear = np.maximum(np.float32(0.5) + basis @ sh[part], 0)
+        fitted[part] = fit @ (linear_to_srgb(linear) - np.float32(0.5))
+    return replace(cloud, sh=fitted)
+
+
+def say_converted(where: object) -> None:
+    """Tells that colours were converted."""
+    warnings.warn(
+        f"{where}: its colours are linear by its header; they are read as display colours, and where splats"
+        " are translucent, images differ somewhat from those of the program that made them",
+        DataWarning,
+        stacklevel=4,
+    )

@@ -1,0 +1,78 @@
+"""How many layers an image has, without drawing it: what it would cost."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from meshsplats.camera import Camera
+from meshsplats.gaussians import GaussianCloud
+from meshsplats.mesh import SplatMesh
+
+SAMPLE = 20_000
+"""Triangles or splats that are looked at, evenly spread."""
+_REACH = 3.0
+"""Standard deviations within which a splat is drawn."""
+FRAGMENTS_A_SECOND = 1.5e8
+"""Of one thread, where layers are many. Nine scenes of 4 to 70 layers have 0.2 to 0.9 of it, a scene of
+51,000 layers 1.2."""
+SMALLEST = 1 / 8
+"""How far an image is made smaller at most, to cost less."""
+
+
+def layers(scene: SplatMesh | GaussianCloud, camera: Camera) -> float:
+    """Mean number of triangles, or of splats, that lie over each other at a pixel of an image.
+
+    It is estimated from the size on the image of some of them. Layers behind opaque ones count, too, though
+    early termination leaves many of those out.
+    """
+    if isinstance(scene, SplatMesh):
+        count = len(scene.faces)
+        corners = scene.vertices[scene.faces[:: _step(count)]]
+        reach = np.zeros(corners.shape[:2])
+    else:
+        count = len(scene)
+        corners = scene.means[:: _step(count), None]
+        # The two largest axes are what is seen on average.
+        ordered = np.sort(scene.scales[:: _step(count)].astype(np.float64), axis=1)
+        reach = _REACH * np.sqrt(ordered[:, 1:].prod(axis=1))[:, None]
+    if not count:
+        return 0.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = corners.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = np.maximum(points[..., 2], camera.near)
+        sides, at, areas = [], [], np.full(len(points), np.inf)
+        for axis, (focal, center, size) in enumerate(
+            [(camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)]
+        ):
+            middle, around = focal * points[..., axis] / depth + center, focal * reach / depth
+            at.append(middle)
+            low, high = (middle - around).min(axis=1), (middle + around).max(axis=1)
+            sides.append(np.clip(high, 0, size) - np.clip(low, 0, size))
+        if isinstance(scene, SplatMesh):
+            u, v = at
+            areas = 0.5 * np.abs(
+                (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
+            )
+        shown = (points[..., 2] > camera.near).any(axis=1)
+        covered = np.where(shown, np.fmin(areas, sides[0] * sides[1]), 0)
+    return float(covered.mean()) * count / (camera.width * camera.height)
+
+
+def fragments(scene: SplatMesh | GaussianCloud, camera: Camera, samples: int) -> float:
+    """Number of fragments of an image, with ``samples`` x ``samples`` in each pixel."""
+    return layers(scene, camera) * camera.width * camera.height * samples**2
+
+
+def affordable(scene: SplatMesh | GaussianCloud, camera: Camera, samples: int, most: float) -> Camera | None:
+    """``camera``, or the same of a half, a quarter or an eighth of the size, whose image has at most ``most``
+    fragments; None if none has."""
+    share = 1.0
+    while share >= SMALLEST:
+        if share * share * fragments(scene, camera, samples) <= most:
+            return camera if share == 1 else camera.scaled(share)
+        share /= 2
+    return None
+
+
+def _step(count: int) -> int:
+    return max(1, -(-count // SAMPLE))
