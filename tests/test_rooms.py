@@ -11,7 +11,7 @@ import meshsplats
 ROOT = Path(meshsplats.__file__).parent
 LONGEST_CHAIN = 12
 LOWEST = (
-    *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_options"),
+    *("_arrays", "_cells", "_core", "_files", "_foreign", "_geometry", "_kinds", "_options", "_origin"),
     *("colors", "errors", "face_splats", "spherical_harmonics"),
 )
 """Rooms that import no other room."""

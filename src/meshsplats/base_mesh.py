@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats._origin import in_words, relative, zero_origin
 from meshsplats.binding import check_indices
 from meshsplats.colors import linear_to_srgb, srgb_to_linear
 
@@ -68,7 +70,7 @@ class BaseMesh:
     """n vertices and m triangles. The constructor checks and converts the arrays."""
 
     vertices: np.ndarray
-    """(n, 3) float32."""
+    """(n, 3) float32 positions relative to ``origin``."""
     faces: np.ndarray
     """(m, 3) int32 vertex indices."""
     colors: np.ndarray | None = None
@@ -80,11 +82,14 @@ class BaseMesh:
     textures: tuple[Texture, ...] = field(default=())
     up: np.ndarray = field(default_factory=lambda: np.array([0, 1, 0], np.float32))
     """(3,) float32 direction that points up."""
+    origin: np.ndarray = field(default_factory=zero_origin)
+    """(3,) float64 point of the world that ``vertices`` are relative to: world = origin + vertices."""
 
     def __repr__(self) -> str:
         parts = [f"{len(self.vertices):,} vertices", f"{len(self.faces):,} faces"]
         parts += ["colours"] if self.colors is not None else []
         parts += [f"{len(self.textures)} textures"] if self.textures else []
+        parts += [f"origin {in_words(self.origin)}"] if self.origin.any() else []
         return f"BaseMesh({', '.join(parts)})"
 
     def __post_init__(self) -> None:
@@ -92,6 +97,7 @@ class BaseMesh:
         faces = checked_array("faces", self.faces, np.int32, (None, 3))
         check_indices("faces", faces, len(vertices), "vertices")
         arrays = {"vertices": vertices, "faces": faces, "up": checked_array("up", self.up, np.float32, (3,))}
+        arrays["origin"] = checked_array("origin", self.origin, np.float64, (3,))
         m = len(faces)
         if self.colors is not None:
             colors = checked_array("colors", self.colors, np.float32, (len(vertices), 4))
@@ -111,6 +117,11 @@ class BaseMesh:
             arrays["face_texture"] = index
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
+
+    def relative_to(self, origin: Sequence[float] | np.ndarray) -> BaseMesh:
+        """The same mesh in the world, with coordinates relative to ``origin`` (3,)."""
+        point = checked_array("origin", origin, np.float64, (3,))
+        return replace(self, vertices=relative(self.vertices, self.origin, point), origin=point)
 
     @property
     def textured(self) -> bool:

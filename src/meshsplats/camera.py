@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,8 @@ class Camera:
     """
 
     world_to_camera: np.ndarray
-    """(4, 4) float64 rigid transform."""
+    """(4, 4) float64 rigid transform, from the coordinates of the scene, which are relative to its
+    ``origin``."""
     fx: float
     """Focal length in pixels, horizontal."""
     fy: float
@@ -86,6 +88,16 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * x, cx=self.cx * x, fy=self.fy * y, cy=self.cy * y
         )
+
+    def relative_to(self, origin: Sequence[float] | np.ndarray) -> Camera:
+        """The same camera for coordinates relative to ``origin`` (3,), a point in those of this camera, such
+        as the ``origin`` of the scene that is to be rendered."""
+        point = checked_array("origin", origin, np.float64, (3,))
+        if not point.any():
+            return self
+        matrix = self.world_to_camera.copy()
+        matrix[:3, 3] += matrix[:3, :3] @ point
+        return replace(self, world_to_camera=matrix)
 
     def window(self, x: int, y: int, width: int, height: int) -> Camera:
         """The camera of ``width`` x ``height`` pixels of the image, from column ``x`` and row ``y`` on. They

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from meshsplats._arrays import checked_array
 from meshsplats._geometry import rotation_rows
+from meshsplats._origin import in_words, relative, shared_origin, zero_origin
 
 Kernel = Literal["3dgs", "antialiased", "2dgs"]
 
@@ -26,7 +27,7 @@ class GaussianCloud:
     """
 
     means: np.ndarray
-    """(n, 3) centres in the world frame, scene units."""
+    """(n, 3) centres relative to ``origin``, along the axes of the world frame, scene units."""
     quaternions: np.ndarray
     """(n, 4) unit quaternions w, x, y, z: rotation from the splat's own axes to the world."""
     scales: np.ndarray
@@ -41,6 +42,9 @@ class GaussianCloud:
     by the ray)."""
     up: np.ndarray | None = None
     """(3,) unit direction that points up in the world frame, where the file says so."""
+    origin: np.ndarray = field(default_factory=zero_origin)
+    """(3,) float64 point of the world that ``means`` are relative to: world = origin + means. Readers choose
+    one where float32 is too coarse for coordinates of the world; else it is zero."""
 
     def __post_init__(self) -> None:
         means = checked_array("means", self.means, np.float32, (None, 3))
@@ -77,6 +81,7 @@ class GaussianCloud:
             ("scales", scales),
             ("opacities", opacities),
             ("sh", sh),
+            ("origin", checked_array("origin", self.origin, np.float64, (3,))),
         ]:
             object.__setattr__(self, name, value)
 
@@ -84,7 +89,8 @@ class GaussianCloud:
         return len(self.means)
 
     def __repr__(self) -> str:
-        return f"GaussianCloud({len(self):,} splats of degree {self.sh_degree}, kernel {self.kernel!r})"
+        at = f", origin {in_words(self.origin)}" if self.origin.any() else ""
+        return f"GaussianCloud({len(self):,} splats of degree {self.sh_degree}, kernel {self.kernel!r}{at})"
 
     @property
     def sh_degree(self) -> int:
@@ -112,10 +118,15 @@ class GaussianCloud:
         fields = ("means", "quaternions", "scales", "opacities", "sh")
         return replace(self, **{name: np.take(getattr(self, name), rows, axis=0) for name in fields})
 
+    def relative_to(self, origin: Sequence[float] | np.ndarray) -> GaussianCloud:
+        """The same splats in the world, with coordinates relative to ``origin`` (3,)."""
+        point = checked_array("origin", origin, np.float64, (3,))
+        return replace(self, means=relative(self.means, self.origin, point), origin=point)
+
 
 def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
-    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one, and up
-    is None."""
+    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one, up is
+    None unless all have the same, and the origin is that of the first cloud whose origin is not zero."""
     if len(clouds) == 1:
         return clouds[0]
     sh = np.zeros((sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds), 3), np.float32)
@@ -124,14 +135,16 @@ def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
         sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
         start += len(cloud)
     kernels = {cloud.kernel for cloud in clouds}
+    origin = shared_origin(cloud.origin for cloud in clouds)
     return GaussianCloud(
-        means=np.concatenate([cloud.means for cloud in clouds]),
+        means=np.concatenate([relative(cloud.means, cloud.origin, origin) for cloud in clouds]),
         quaternions=np.concatenate([cloud.quaternions for cloud in clouds]),
         scales=np.concatenate([cloud.scales for cloud in clouds]),
         opacities=np.concatenate([cloud.opacities for cloud in clouds]),
         sh=sh,
         kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
         up=shared_up([cloud.up for cloud in clouds]),
+        origin=origin,
     )
 
 

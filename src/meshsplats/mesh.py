@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -11,6 +11,7 @@ from typing import ClassVar, Literal, NamedTuple, get_args
 import numpy as np
 
 from meshsplats._arrays import checked_array
+from meshsplats._origin import in_words, relative, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
 
@@ -53,7 +54,7 @@ class SplatMesh:
     """
 
     vertices: np.ndarray
-    """(v, 3) float32 positions in the world frame, scene units."""
+    """(v, 3) float32 positions relative to ``origin``, along the axes of the world frame, scene units."""
     faces: np.ndarray
     """(f, 3) int32 vertex indices. Triangles are visible from both sides."""
     colors: np.ndarray
@@ -78,6 +79,8 @@ class SplatMesh:
     each splat, as splat renderers do; 0: none. Needs ``face_splat``."""
     binding: Binding | None = None
     """For a mesh prior: where the vertices lie on the faces of its base mesh, each triangle on one face."""
+    origin: np.ndarray = field(default_factory=zero_origin)
+    """(3,) float64 point of the world that ``vertices`` are relative to: world = origin + vertices."""
 
     FIELDS: ClassVar[tuple[ArrayField, ...]] = (
         ArrayField("vertices", np.float32, "vertex", 3),
@@ -106,6 +109,7 @@ class SplatMesh:
         def set_(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
+        set_("origin", checked_array("origin", self.origin, np.float64, (3,)))
         splat, group = self.face_splat, self.depth_group
         if splat is not None and f and (splat[0] < 0 or (splat[1:] < splat[:-1]).any()):
             raise ValueError("face_splat must be ascending indices >= 0")
@@ -143,6 +147,7 @@ class SplatMesh:
         parts += [f"blending {self.blending!r}", *(f"attribute {name!r}" for name in self.attributes)]
         parts += ["normals"] if self.normals is not None else []
         parts += ["bound to a base"] if self.binding is not None else []
+        parts += [f"origin {in_words(self.origin)}"] if self.origin.any() else []
         return f"SplatMesh({', '.join(parts)})"
 
     @property
@@ -161,8 +166,8 @@ class SplatMesh:
     def arrays(self) -> dict[str, np.ndarray]:
         """The contents of the mesh by name: its fields, ``attribute.NAME`` and ``binding.NAME``.
 
-        ``blending`` (a text) and ``filter_px2`` are arrays without dimensions. Optional arrays that are None
-        and a filter of 0 are left out.
+        ``blending`` (a text) and ``filter_px2`` are arrays without dimensions. Optional arrays that are None,
+        a filter of 0 and an origin of zeros are left out.
         """
         arrays = {f.name: getattr(self, f.name) for f in self.FIELDS if not f.optional}
         arrays["blending"] = np.array(self.blending)
@@ -170,6 +175,8 @@ class SplatMesh:
         arrays |= {name: value for name, value in optional.items() if value is not None}
         if self.filter_px2:
             arrays["filter_px2"] = np.array(self.filter_px2)
+        if self.origin.any():
+            arrays["origin"] = self.origin
         arrays |= {f"attribute.{name}": value for name, value in self.attributes.items()}
         if self.binding is not None:
             arrays |= {f"binding.{name}": value for name, value in self.binding.arrays().items()}
@@ -194,6 +201,7 @@ class SplatMesh:
             **{f.name: arrays[f.name] for f in cls.FIELDS if f.name in arrays or not f.optional},
             blending=str(arrays["blending"]),  # type: ignore[arg-type]
             filter_px2=float(arrays.get("filter_px2", 0.0)),
+            origin=arrays.get("origin", zero_origin()),
             attributes={name[len(prefix) :]: a for name, a in arrays.items() if name.startswith(prefix)},
             binding=Binding.from_arrays({n: arrays[f"binding.{n}"] for n in names}) if bound else None,
         )
@@ -210,6 +218,17 @@ class SplatMesh:
         """Which triangles and vertices belong to which splat; without ``face_splat``, each triangle counts as
         one."""
         return FaceSplats(self.faces, self.face_splat, len(self.vertices))
+
+    def relative_to(self, origin: Sequence[float] | np.ndarray) -> SplatMesh:
+        """The same mesh in the world, with coordinates relative to ``origin`` (3,), also of its base."""
+        point = checked_array("origin", origin, np.float64, (3,))
+        if (point == self.origin).all():
+            return self
+        binding = self.binding
+        if binding is not None:
+            binding = binding.moved(relative(binding.base_vertices, self.origin, point), binding.lift)
+        vertices = relative(self.vertices, self.origin, point)
+        return replace(self, vertices=vertices, binding=binding, origin=point)
 
     def keep_faces(self, keep: np.ndarray) -> SplatMesh:
         """The triangles of the mask ``keep`` (f,) bool, in order, without vertices that none of them uses."""

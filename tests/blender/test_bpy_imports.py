@@ -158,3 +158,18 @@ def test_an_object_that_is_no_splat_mesh_is_refused():
     data.color_attributes.new("c", "FLOAT_COLOR", "POINT")
     with pytest.raises(ValueError, match="triangulate it first"):
         objects.dress(obj, True)
+
+
+def test_a_georeferenced_mesh_stands_near_zero_and_keeps_its_origin():
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    far = np.array([500_000.125, 4_500_000.0, 100.0])
+    mesh = replace(random_mesh(20, up=UP), origin=far)
+    obj = objects.add(objects.prepare(mesh, False), "far", bpy.context.collection)
+    assert np.abs(np.array(obj.location)).max() < 100
+    again = objects.as_splat_mesh(obj)
+    np.testing.assert_array_equal(again.origin, far)
+    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=1e-5)
+    near = objects.add(
+        objects.prepare(replace(mesh, origin=np.zeros(3)), False), "near", bpy.context.collection
+    )
+    assert not objects.as_splat_mesh(near).origin.any()

@@ -99,7 +99,8 @@ def test_polygons_places_and_winding(tmp_path):
         [[10, 0, 0], [12, 0, 0], [14, 2, 0], [12, 4, 0], [10, 2, 0], [0, 0, 0], [1, 0, 0], [0, 1, 0]],
     )
     np.testing.assert_array_equal(arrays["faces"], [[0, 1, 2], [0, 2, 3], [0, 3, 4], [7, 6, 5]])
-    assert report == {"warnings": [], "attributes": [], "blending": "display", "up": [0, 1, 0]}
+    settings = {"attributes": [], "blending": "display", "up": [0, 1, 0], "origin": [0, 0, 0]}
+    assert report == {"warnings": [], **settings}
 
 
 @needs_usd

@@ -9,6 +9,7 @@ import json
 import struct
 import tempfile
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,8 @@ from fuzz.seeds import Change, Seed
 from meshsplats import load_mesh, save_mesh
 
 
-def _saved(name: str, suffix: str, **more) -> Seed:
-    mesh = random_mesh(np.random.default_rng(0), 6, 5)
+def _saved(name: str, suffix: str, origin=(0, 0, 0), **more) -> Seed:
+    mesh = replace(random_mesh(np.random.default_rng(0), 6, 5), origin=origin)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"m{suffix}"
         save_mesh(mesh, path)
@@ -128,9 +129,13 @@ def _binary_polygons() -> Seed:
 
 _INSTANCED = instanced(TRANSLATION=[[0, 0, 0], [5, 0, 0]], SCALE=[[1, 1, 1], [1, 3, 1]])
 
+_FAR = (5e5, 4.5e6, 100)
+
 MESH_SEEDS = [
     _saved("npz", ".npz", inside=_in_archive),
     _saved("mesh-ply", ".ply"),
+    _saved("mesh-ply-origin", ".ply", origin=_FAR),
+    _saved("glb-origin", ".glb", origin=_FAR, inside=_in_json),
     _binary_polygons(),
     Seed("mesh-ply-ascii", {"m.ply": _ASCII_PLY}, "m.ply", load=load_mesh),
     _saved("glb", ".glb", inside=_in_json),

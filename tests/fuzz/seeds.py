@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import _splat_encoders as encode
+import numpy as np
 from _splat_files import Table, random_splats, splat_table, write_ply
 
 from meshsplats import load_gaussians
@@ -35,10 +36,12 @@ class Seed:
     """Fuzzed only when asked for by name."""
 
 
-def _ply(name: str, encoding: str, degree: int, tables: bool) -> Seed:
+def _ply(name: str, encoding: str, degree: int, tables: bool, away: float = 0.0) -> Seed:
     faces = [Table("face", [("uchar", "int", "v")], [[[0, 1, 2]], [[0, 1, 2, 3]], [[]]])] if tables else []
     values = random_splats(5, degree=degree)
     types = {"x": "double", "opacity": "double"} if tables else {}
+    if away:
+        values["x"], types = values["x"].astype(np.float64) + away, {"x": "double"}
     with tempfile.TemporaryDirectory() as folder:
         path = write_ply(Path(folder) / "a.ply", [*faces, splat_table(values, types)], encoding)
         return Seed(name, {"a.ply": path.read_bytes()}, "a.ply")
@@ -100,6 +103,7 @@ SEEDS = [
         *("trbf_center", "trbf_scale", *(f"motion_{i}" for i in range(9)), *(f"omega_{i}" for i in range(4))),
     ),
     _moving_ply("ply-4d", "t", "scale_t_0", *(f"rot_r_{i}" for i in range(4))),
+    _ply("ply-far", "binary_little_endian", 0, False, away=5e6),
     Seed("compressed-ply", {"a.ply": encode.compressed_ply(_VALUES)}, "a.ply"),
     Seed("splat", {"a.splat": encode.dot_splat(_VALUES)}, "a.splat"),
     *(Seed(f"spz-{version}", {"a.spz": data}, "a.spz", _in_gzip) for version, data in _SPZ.items()),

@@ -540,7 +540,7 @@ def set_(*keys, value):
         (set_("root", "geometricError", value=1e-9), "below one of"),
         (set_("root", "boundingVolume", value={"sphere": [0, 0, 0, 1]}), "bounding box must be 12"),
         (set_("root", "boundingVolume", "box", value=[1e400] * 12), "bounding box must be 12"),
-        (set_("root", "transform", value=[1] * 16), "only explicit tiles"),
+        (set_("root", "transform", value=[1] * 16), "another program has moved it"),
         (set_("root", "refine", value="ADD"), "only explicit tiles"),
         (set_("root", "content", "uri", value="../secret.glb"), "no path below its folder"),
         (set_("root", "content", "uri", value="/etc/passwd"), "no path below its folder"),

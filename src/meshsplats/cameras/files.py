@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._arrays import checked_array
 from meshsplats._files.atomic import write_text
 from meshsplats._foreign import what_it_is
 from meshsplats._json import read_json
@@ -22,8 +23,13 @@ from meshsplats.errors import FileFormatError
 MAX_CAMERAS = 20_000
 
 
-def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
+def load_cameras(
+    path: str | os.PathLike[str], *, origin: Sequence[float] | np.ndarray = (0, 0, 0)
+) -> list[Camera]:
     """Cameras of a JSON file, in file order.
+
+    They are relative to the point ``origin`` (3,) of the world, which is to be that of the scene that they
+    look at, ``GaussianCloud.origin`` or ``SplatMesh.origin``.
 
     Three forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
     4x4 matrix and OpenCV axes; ``name``, ``near``, and cx and cy (then the image's centre) may be missing.
@@ -36,6 +42,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     format, and OSError if it cannot be opened.
     """
     need_path(path=path)
+    point = checked_array("origin", origin, np.float64, (3,))
     path = Path(path)
     if path.is_dir():
         path = _file_in(path)
@@ -43,7 +50,8 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         raise FileFormatError(f"{path}: {what}; a camera file is a JSON list of cameras")
     entries = read_json(path)
     if is_camera_path(entries):
-        return cameras_of_path(entries, path, MAX_CAMERAS)
+        found = cameras_of_path(entries, path, MAX_CAMERAS)
+        return [camera.relative_to(point) for camera in found]
     if not isinstance(entries, list):
         other = isinstance(entries, dict) and "frames" in entries
         what = " with 'frames', a data set: read it with load_dataset or --data" if other else ""
@@ -56,7 +64,8 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         raise FileFormatError(
             f"{path}: {len(entries)} cameras, more than the {MAX_CAMERAS} that are accepted"
         )
-    return [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+    found = [_camera_from_json(entry, f"{path}: camera {i}") for i, entry in enumerate(entries)]
+    return [camera.relative_to(point) for camera in found]
 
 
 def _file_in(folder: Path) -> Path:
@@ -87,14 +96,23 @@ def _foreign(path: Path) -> str:
     return "" if re.match(rb"(\xef\xbb\xbf)?\s*[\[{]", head) else what_it_is(path)
 
 
-def save_cameras(cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:
-    """Writes the JSON list that ``load_cameras`` reads, to the last digit; replaces a file of that name."""
+def save_cameras(
+    cameras: Sequence[Camera],
+    path: str | os.PathLike[str],
+    *,
+    origin: Sequence[float] | np.ndarray = (0, 0, 0),
+) -> None:
+    """Writes the JSON list that ``load_cameras`` reads, to the last digit; replaces a file of that name.
+
+    Cameras that are relative to the point ``origin`` (3,) of the world are written in the world.
+    """
     need_all(Camera, cameras=cameras)
     need_path(path=path)
+    point = checked_array("origin", origin, np.float64, (3,))
     entries = [
         {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
         | {"world_to_camera": camera.world_to_camera.tolist()}
-        for camera in cameras
+        for camera in (camera.relative_to(-point) for camera in cameras)
     ]
     write_text(path, json.dumps(entries, indent=1) + "\n")
 

@@ -12,12 +12,15 @@ import tyro
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Number,
+    Origin,
     Output,
     ViewOptions,
     alpha_for_viewers,
     check_mesh_suffix,
     check_outputs,
+    placed,
     plural,
+    say_origin,
     size_of,
 )
 
@@ -43,6 +46,9 @@ class Bake(Command):
     views: ViewOptions = field(default_factory=ViewOptions)
     filter_px2: Number = None
     """Variance of the filter in square pixels, 0 to 100. Default: the mesh's own."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -65,7 +71,8 @@ class Bake(Command):
             )
         cameras = self.views.make(mesh, self.input, count=FRAMING_VIEWS, side=FRAMING_PIXELS)
         baked = bake_filter(mesh, cameras, filter_px2=px2)
-        save_mesh(baked, self.output, **alpha_for_viewers(baked, self.output))
+        say_origin(baked.origin, self.origin)
+        save_mesh(placed(baked, self.origin), self.output, **alpha_for_viewers(baked, self.output))
         seconds = time.perf_counter() - start
         if self.json:
             result = {

@@ -13,11 +13,14 @@ from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
     File,
+    Origin,
     Output,
     SplatOptions,
     check_mesh_suffix,
     check_outputs,
     load_scene,
+    placed,
+    say_origin,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, command_line
@@ -46,6 +49,9 @@ class Base(Command):
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -61,16 +67,18 @@ class Base(Command):
         if self.cameras is not None and self.views != type(self).views:
             raise UsageError("--views has no effect with --cameras")
         check_outputs([self.output], self.force, inputs=[self.input])
-        scene = load_scene(self.input, self.reading)
+        scene, given = load_scene(self.input, self.reading), self.cameras
         base = base_surface(
             scene,
             resolution=self.resolution,
             faces=self.faces,
-            cameras=self.views if self.cameras is None else load_cameras(self.cameras),
+            cameras=self.views if given is None else load_cameras(given, origin=scene.origin),
             threads=self.threads,
         )
         assert base.colors is not None
-        save_mesh(SplatMesh(base.vertices, base.faces, base.colors, up=base.up), self.output)
+        mesh = SplatMesh(base.vertices, base.faces, base.colors, up=base.up, origin=base.origin)
+        say_origin(mesh.origin, self.origin)
+        save_mesh(placed(mesh, self.origin), self.output)
         seconds = time.perf_counter() - start
         if self.json:
             result = {"mesh": str(self.output), "triangles": len(base.faces), "seconds": round(seconds, 2)}

@@ -147,9 +147,10 @@ class Blender(Command):
         files = [level.path for level in chain.levels] if chain else [self.input]
         scene: GaussianCloud | SplatMesh
         if tileset:  # the coarsest tile says where it is
-            scene, coarser = tileset.root.load(), []
+            scene, coarser = replace(tileset.root.load(), origin=tileset.origin), []
         else:
             scene, *coarser = (self.part.of(load_scene(file, self.reading)) for file in files)
+            coarser = [level.relative_to(scene.origin) for level in coarser]
         cameras = self._views().make(scene, self.input, count=1 if suffix else 60, side=800)
         if suffix in (".png", ".exr") and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one {suffix}: give -o a folder")
@@ -180,7 +181,7 @@ class Blender(Command):
                 announce=lambda ahead: say(_plan(ahead, options, len(images))),
                 progress=show,
             )
-        save_cameras(cameras, records[0])
+        save_cameras(cameras, records[0], origin=scene.origin)
         write_configuration(records[1], "blender", self)
         self._print_result(result, cameras, images, len(mesh.faces), time.perf_counter() - start)
 

@@ -18,12 +18,15 @@ from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
     Count,
+    Origin,
     Output,
     SplatOptions,
     alpha_for_viewers,
     check_mesh_suffix,
     check_outputs,
     load_scene,
+    placed,
+    say_origin,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, shown_path
@@ -72,6 +75,9 @@ class Clean(Command):
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -94,14 +100,17 @@ class Clean(Command):
         found = find(scene, rules)
         left = remove(scene, found)
         alpha = {}
+        written = placed(left, self.origin)
+        if not self.preview_only:
+            say_origin(left.origin, self.origin, splats=isinstance(left, GaussianCloud))
         if isinstance(left, SplatMesh) and not self.preview_only:
             alpha = alpha_for_viewers(left, self.output, self.threads)
         with together():
             if not self.preview_only:
-                if isinstance(left, SplatMesh):
-                    save_mesh(left, self.output, **alpha)
+                if isinstance(written, SplatMesh):
+                    save_mesh(written, self.output, **alpha)
                 else:
-                    save_gaussians(left, self.output)
+                    save_gaussians(written, self.output)
             _draw(scene, left, found, preview, self.threads)
         self._print_result(rules, found, left, preview, time.perf_counter() - start)
 
@@ -116,7 +125,8 @@ class Clean(Command):
         counts, total = found.counts(), len(found.opacities)
         places = left.means if isinstance(left, GaussianCloud) else left.vertices
         lower, upper = (
-            [round(float(v), 4) for v in side] for side in (places.min(axis=0), places.max(axis=0))
+            [round(float(v), 4) for v in side + left.origin]
+            for side in (places.min(axis=0), places.max(axis=0))
         )
         if self.json:
             result = {

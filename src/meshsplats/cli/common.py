@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 
 from meshsplats._arrays import subsample
+from meshsplats._origin import in_words, lost_detail, sampled
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import guess_up
@@ -49,6 +50,10 @@ Box = Annotated[
     tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
 ]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+Origin = Annotated[
+    Literal["keep", "local"] | tuple[float, float, float],
+    tyro.conf.arg(metavar="{keep,local,X Y Z}"),
+]
 
 NAMED_COLORS: dict[str, tuple[float, float, float]] = {
     "white": (1.0, 1.0, 1.0),
@@ -76,13 +81,20 @@ class SplatOptions:
     strict: bool = False
     """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
-    def load(self, path: Path, *, up: str | None = None, quiet: bool = False) -> GaussianCloud:
-        """The splats of a file. Says what its header names, unless ``quiet``; ``up``: the option that counts
-        in its place."""
+    def load(
+        self,
+        path: Path,
+        origin: np.ndarray | None = None,
+        *,
+        up: str | None = None,
+        quiet: bool = False,
+    ) -> GaussianCloud:
+        """The splats of a file, relative to ``origin``. Says what its header names, unless ``quiet``; ``up``:
+        the option that counts in its place."""
         from meshsplats.formats.gaussians import load_gaussians
 
         try:
-            cloud = load_gaussians(path, **self._arguments)
+            cloud = load_gaussians(path, origin=origin, **self._arguments)
         except FileFormatError:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
@@ -95,11 +107,13 @@ class SplatOptions:
             say(f"kernel: {cloud.kernel}, from the file")
         return cloud
 
-    def stream(self, path: Path | Sequence[Path], *, up: str | None = None) -> SplatStream:
-        """The splats of a file, or of several, in blocks. ``up`` as for ``load``."""
+    def stream(
+        self, path: Path | Sequence[Path], origin: Sequence[float] | None = None, *, up: str | None = None
+    ) -> SplatStream:
+        """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` as for ``load``."""
         from meshsplats.formats.gaussians import stream_gaussians
 
-        stream = stream_gaussians(path, **self._arguments)
+        stream = stream_gaussians(path, origin=origin, **self._arguments)
         if up is None and (told := stream.up) is not None:
             say(f"up: {direction_in_words(told)}, from the files' headers")
         return stream
@@ -178,13 +192,13 @@ class ViewOptions:
         """Whether the views make a turntable."""
         return self.cameras is None and self.data is None and self.dome is None
 
-    def photographs(self) -> Dataset | None:
-        """The data set of --data, or None."""
+    def photographs(self, origin: np.ndarray) -> Dataset | None:
+        """The data set of --data, relative to ``origin``, or None."""
         if self.data is None:
             return None
         from meshsplats.datasets.folder import load_dataset
 
-        return load_dataset(self.data, downscale=self.downscale, missing=self.missing)
+        return load_dataset(self.data, downscale=self.downscale, missing=self.missing, origin=origin)
 
     def make(
         self,
@@ -195,8 +209,8 @@ class ViewOptions:
         side: int,
         photographs: Dataset | None = None,
     ) -> list[Camera]:
-        """The cameras; by default ``count`` views of an orbit, ``side`` pixels wide. ``photographs``: the
-        result of ``photographs()``, if it is at hand."""
+        """The cameras, relative to the origin of ``scene``; by default ``count`` views of an orbit, ``side``
+        pixels wide. ``photographs``: the result of ``photographs()``, if it is at hand."""
         self.check()
         for name in ("width", "height"):
             value = getattr(self, name)
@@ -204,16 +218,17 @@ class ViewOptions:
                 raise ValueError(f"--{name} must be a number of pixels from 1 to {MAX_SIDE}, got {value}")
         if self.cameras is not None or self.data is not None:
             if self.data is not None:
-                dataset = photographs or self.photographs()
+                dataset = photographs or self.photographs(scene.origin)
                 assert dataset is not None
                 cameras = [view.camera for view in dataset.test or dataset.views]
             else:
                 assert self.cameras is not None
-                cameras = load_cameras(self.cameras)
+                cameras = load_cameras(self.cameras, origin=scene.origin)
             return cameras if self.width is None else [c.scaled(self.width / c.width) for c in cameras]
         width = next(v for v in (self.width, self.height, side) if v is not None)
         lens: dict[str, Any] = {"width": width, "height": width if self.height is None else self.height}
-        lens["up"] = parse_up(self.up) if self.up is not None else guess_up(scene, cameras_beside(source))
+        beside = None if self.up is not None else cameras_beside(source, scene.origin)
+        lens["up"] = guess_up(scene, beside) if self.up is None else parse_up(self.up)
         fov = self.fov
         if self.focal_length is not None:
             if not 1 <= self.focal_length <= 2000:
@@ -225,7 +240,8 @@ class ViewOptions:
             lens["fov"] = 75.0 if fov is None else fov
             return look_around(scene, self.look_around, azimuth=self.azimuth, **lens)
         lens["fov"] = 45.0 if fov is None else fov
-        lens |= {"distance": self.distance, "target": self.look_at}
+        target = None if self.look_at is None else np.subtract(self.look_at, scene.origin)
+        lens |= {"distance": self.distance, "target": target}
         if self.dome is not None:
             return dome(scene, self.dome, **lens)
         lens["elevation"] = 15.0 if self.elevation is None else self.elevation
@@ -343,6 +359,31 @@ class ClusterOptions:
             yield found
 
 
+def placed(scene: Scene, origin: Origin) -> Scene:
+    """``scene`` as --origin wants it written: with its origin, or without any. UsageError for a point that is
+    too far away for float32."""
+    if origin == "keep":
+        return scene
+    if origin != "local":
+        scene = scene.relative_to(origin)
+        places = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
+        if lost := lost_detail(sampled(places)):
+            raise UsageError(f"--origin: too far from the scene; relative to that point, {lost}")
+    return replace(scene, origin=np.zeros(3))
+
+
+def say_origin(found: np.ndarray, origin: Origin, *, splats: bool = False) -> None:
+    """Says where the output of a scene with the origin ``found`` stands in the world, and what a file of
+    ``splats`` does not tell other programs."""
+    if origin == "keep" and found.any():
+        splats_only = ", in a comment of the file: other programs see the splats around 0 0 0"
+        say(f"origin: {in_words(found)}" + (splats_only if splats else "; --origin local leaves it out"))
+    elif origin == "local" and found.any():
+        say(f"origin: left out; coordinates are relative to {in_words(found)}")
+    elif not isinstance(origin, str):
+        say(f"origin: coordinates are relative to {in_words(np.array(origin))}")
+
+
 def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> GaussianCloud | SplatMesh:
     """The splats or the mesh at ``path``; ``up`` as for ``SplatOptions.load``."""
     kind = identify(path)
@@ -356,12 +397,12 @@ def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> G
     return load_mesh(path)
 
 
-def cameras_beside(source: Path) -> list[Camera] | None:
-    """The training cameras in a model folder, or None."""
+def cameras_beside(source: Path, origin: np.ndarray) -> list[Camera] | None:
+    """The training cameras in a model folder, relative to ``origin``, or None."""
     if not (source / "cameras.json").is_file():
         return None
     try:
-        return load_cameras(source)
+        return load_cameras(source, origin=origin)
     except FileFormatError as error:
         warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
         return None

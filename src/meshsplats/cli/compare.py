@@ -80,7 +80,7 @@ class Compare(Command):
         self.views.check()
         self.draw.check_device()
         cloud = self.part.of(self.reading.load(self.splats))
-        photographs = self.views.photographs()
+        photographs = self.views.photographs(cloud.origin)
         cameras = self.views.make(cloud, self.splats, count=8, side=400, photographs=photographs)
         strips = view_names(len(cameras))
         names = (*strips, RESULTS, CAMERAS, CONFIGURATION)
@@ -94,7 +94,7 @@ class Compare(Command):
 
             if identify(self.mesh) != "mesh":
                 raise FileFormatError(f"{self.mesh}: not a mesh; give splats first, then the mesh")
-            mesh = self.part.of(load_mesh(self.mesh))
+            mesh = self.part.of(load_mesh(self.mesh, origin=cloud.origin))
         start = time.perf_counter()
         background = chosen_background(
             self.draw.background, photographs, {"splats": cloud}, self.splats, self.draw.threads
@@ -132,7 +132,7 @@ class Compare(Command):
             **comparison.to_dict(),
         }
         write_json(self.output / RESULTS, result)
-        save_cameras(cameras, self.output / CAMERAS)
+        save_cameras(cameras, self.output / CAMERAS, origin=cloud.origin)
         write_configuration(self.output / CONFIGURATION, "compare", self)
         if self.json:
             print(json.dumps(result, indent=1, allow_nan=False))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
@@ -28,6 +28,7 @@ from meshsplats.cli.common import (
     File,
     Folder,
     Number,
+    Origin,
     Output,
     SplatOptions,
     Text,
@@ -36,7 +37,9 @@ from meshsplats.cli.common import (
     cameras_beside,
     draw_preview,
     parse_up,
+    placed,
     plural,
+    say_origin,
     size_of,
     track,
     warnings_kept,
@@ -68,7 +71,7 @@ _SELECTION = ("crop", "min_opacity", "max_splats", "budget")
 """Options of the conversion that select splats: they have an effect with --as-splats."""
 _FOR_SPLATS = (
     *("input", "output", "cameras", "data", "formats", "as_splats", "stream", "no_preview", "no_sidecar"),
-    *("conversion", "reading", "json", "force", "skip_existing"),
+    *("conversion", "reading", "origin", "json", "force", "skip_existing"),
 )
 """Options of the command that have one."""
 _IDLE = ("fidelity", "no_preview", "no_sidecar", "stream")
@@ -80,6 +83,8 @@ ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
 
 
 if TYPE_CHECKING:
+    from meshsplats.formats.gaussians import SplatStream
+
     ConvertOptions = ConversionOptions
 else:
     ConvertOptions = as_cli_options(
@@ -154,6 +159,9 @@ class Convert(Command):
     stream: bool = False
     """Convert in blocks, so that memory does not grow with the file: into a .ply mesh, or with --as-splats
     into a .ply of splats, without a preview. The result is the same."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     no_preview: bool = False
     """Write no preview."""
     no_sidecar: bool = False
@@ -263,9 +271,9 @@ class Convert(Command):
         self.conversion.resolved("paper", has_cameras=False)
 
     def _cameras(self) -> list[Camera] | None:
-        """The cameras of the options; None: each input may have its own."""
+        """The cameras of the options, in the world; None: each input may have its own."""
         if self.data is not None:
-            dataset = load_dataset(self.data, missing=self.missing)
+            dataset = load_dataset(self.data, missing=self.missing, origin=(0, 0, 0))
             return [view.camera for view in dataset.train or dataset.views]
         return None if self.cameras is None else load_cameras(self.cameras)
 
@@ -347,8 +355,7 @@ class Convert(Command):
             )
         times = [time.perf_counter()]
         cloud = self.reading.load(job.source, up=self.up)
-        if cameras is None:
-            cameras = cameras_beside(job.source) or []
+        cameras = _seen_from(cameras, job.source, cloud.origin)
         times.append(time.perf_counter())
         up = None if self.up is None else parse_up(self.up)
         mesh = convert(cloud, self.conversion, preset=self.preset, cameras=cameras, up=up)
@@ -388,11 +395,12 @@ class Convert(Command):
         from meshsplats.formats.meshes import save_mesh_blocks
 
         start = time.perf_counter()
-        if cameras is None:
-            cameras = cameras_beside(job.source) or []
+        source = self._opened(job)
+        cameras = _seen_from(cameras, job.source, source.origin)
         up = None if self.up is None else parse_up(self.up)
-        source = _Counted(self.reading.stream(job.source, up=self.up))
-        parts = convert_blocks(source, self.conversion, preset=self.preset, cameras=cameras, up=up)
+        blocks = convert_blocks(source, self.conversion, preset=self.preset, cameras=cameras, up=up)
+        kept = self.origin == "keep"
+        parts = (part if kept else replace(part, origin=np.zeros(3)) for part in blocks)
         with self._recorded(job):
             vertices, triangles, converted = save_mesh_blocks(parts, job.outputs[0])
         return {
@@ -411,8 +419,7 @@ class Convert(Command):
         from meshsplats.formats.gaussians import save_gaussian_blocks
 
         start = time.perf_counter()
-        stream = self.reading.stream(job.source)
-        source = _Counted(stream)
+        source = self._opened(job)
         count, degree, kernels = 0, 0, set()
         for block in source:
             count += len(worth_drawing(block, self.conversion))
@@ -421,11 +428,21 @@ class Convert(Command):
         if not count:
             raise ValueError(f"{job.source}: none of the {source.count:,} splats is left")
         kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
-        kept = (block.select(worth_drawing(block, self.conversion)) for block in source)
+        origin = source.origin if self.origin == "keep" else np.zeros(3)
+        kept = (
+            replace(block.select(worth_drawing(block, self.conversion)), origin=origin) for block in source
+        )
         with self._recorded(job):
-            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=stream.up)
+            save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=source.up)
         seconds = round(time.perf_counter() - start, 4)
         return {"read": source.count, "written": count, "seconds": seconds}
+
+    def _opened(self, job: Job) -> _Counted:
+        """The splats of ``job`` in blocks, relative to the origin that is asked for."""
+        given = None if isinstance(self.origin, str) else self.origin
+        source = _Counted(self.reading.stream(job.source, given, up=self.up))
+        say_origin(source.origin, self.origin, splats=self.as_splats)
+        return source
 
     def _alone(self, job: Job, path: Path) -> Convert:
         """The command that writes ``path`` of ``job`` alone."""
@@ -469,6 +486,8 @@ class Convert(Command):
 
         own: dict[str, Any] = {"alpha": self.alpha if self.alpha in _GLB_ALPHA else None}  # or cut already
         own["cutoff"] = self.cutoff if self.alpha == "mask" else None
+        found, mesh = mesh.origin, placed(mesh, self.origin)
+        say_origin(found, self.origin)
         with self._recorded(job):
             for path in job.outputs:
                 glb = path.suffix.lower() == ".glb"
@@ -546,10 +565,13 @@ class Convert(Command):
             max_splats=None if merging else count,
         )
         if merging and count is not None:
-            kept = simplify(kept, count, cameras=cameras_beside(job.source) if cameras is None else cameras)
+            seen = _seen_from(cameras, job.source, kept.origin)
+            kept = simplify(kept, count, cameras=seen or None)
+        written = placed(kept, self.origin)
+        say_origin(kept.origin, self.origin, splats=True)
         with self._recorded(job):
             for path in job.outputs:
-                save_gaussians(kept, path)
+                save_gaussians(written, path)
         seconds = time.perf_counter() - start
         if job.preview:
             draw_preview(kept, job.preview)
@@ -579,7 +601,7 @@ class Convert(Command):
         if result["preview"]:
             print(f"preview: {result['preview']}")
         if result.get("converted") is not None and self.compression == "none":
-            print(f"next: {self._next(cameras or cameras_beside(job.source))}")
+            print(f"next: {self._next(_seen_from(cameras, job.source, np.zeros(3)))}")
 
     def _print_line(self, result: dict[str, Any], job: Job) -> None:
         """Prints the result of one of several inputs."""
@@ -625,11 +647,20 @@ class Convert(Command):
         return f"{command} ({ENGINE_GAIN})"
 
 
+def _seen_from(cameras: list[Camera] | None, source: Path, origin: np.ndarray) -> list[Camera]:
+    """``cameras``, which are in the world, relative to ``origin``; None: those of the model folder
+    ``source``, if it is one."""
+    if cameras is None:
+        return cameras_beside(source, origin) or []
+    return [camera.relative_to(origin) for camera in cameras]
+
+
 class _Counted:
     """A stream of splats that counts them."""
 
-    def __init__(self, stream: Iterable[GaussianCloud]) -> None:
+    def __init__(self, stream: SplatStream) -> None:
         self._stream = stream
+        self.origin, self.up = stream.origin, stream.up
         self.count = 0
 
     def __iter__(self) -> Iterator[GaussianCloud]:

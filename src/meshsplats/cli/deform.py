@@ -11,7 +11,18 @@ from typing import Annotated
 import tyro
 
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import Number, Output, check_mesh_suffix, check_outputs, plural, size_of, track
+from meshsplats.cli.common import (
+    Number,
+    Origin,
+    Output,
+    check_mesh_suffix,
+    check_outputs,
+    placed,
+    plural,
+    say_origin,
+    size_of,
+    track,
+)
 from meshsplats.cli.messages import UsageError
 from meshsplats.mesh import SplatMesh
 
@@ -34,6 +45,9 @@ class Deform(Command):
     """Distance between layers along the normals, scene units. Default: the spacing of the prior; for coplanar
     layers 0 in .npz, and 1/50000 of the base's diagonal in other formats, whose readers do not know the order
     of coplanar layers."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -50,7 +64,8 @@ class Deform(Command):
         targets = self.targets()
         check_outputs(targets, self.force, inputs=[self.input, *self.base])
         prior = load_prior(self.input)
-        bases = [load_base(path, textures=False) for path in self.base]
+        origin = prior.mesh.origin
+        bases = [load_base(path, textures=False, origin=origin) for path in self.base]
         for path, base in zip(self.base, bases, strict=True):  # all, before anything is written
             try:
                 prior.check_topology(base)
@@ -59,8 +74,9 @@ class Deform(Command):
         lift = self.lift
         if lift is None and self.output.suffix.lower() != ".npz" and not prior.lift:
             lift = prior.export_lift
+        say_origin(origin, self.origin)
         for base, target in track(list(zip(bases, targets, strict=True)), "moving", len(targets)):
-            _save(prior.pose(base.vertices, lift=lift), target)
+            _save(placed(prior.pose(base.vertices, lift=lift), self.origin), target)
         seconds = time.perf_counter() - start
         if self.json:
             files = [str(target) for target in targets]

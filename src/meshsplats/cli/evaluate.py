@@ -15,6 +15,7 @@ import numpy as np
 import tyro
 
 from meshsplats._arrays import spread_indices
+from meshsplats._origin import shared_origin
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
@@ -151,7 +152,12 @@ class Evaluate(Command):
             meshes = {name: self._load_mesh(path) for name, path in mesh_names(self.mesh).items()}
             before = None if self.before is None else self._load_mesh(self.before)
             splats = None if self.splats is None else self.reading.load(self.splats)
-            dataset = self._dataset(splats)
+            known = [each for each in (splats, *meshes.values(), before) if each is not None]
+            origin = shared_origin(each.origin for each in known)
+            splats = None if splats is None else splats.relative_to(origin)
+            before = None if before is None else before.relative_to(origin)
+            meshes = {name: mesh.relative_to(origin) for name, mesh in meshes.items()}
+            dataset = self._dataset(splats, origin if known else None)
             scenes = {"splats": splats, **meshes, "mesh before": before}
             source = self.splats or (self.mesh[0] if self.mesh else None)
             background = self._background(dataset, scenes, source)
@@ -213,13 +219,14 @@ class Evaluate(Command):
             )
         return found
 
-    def _dataset(self, splats: GaussianCloud | None) -> Dataset:
+    def _dataset(self, splats: GaussianCloud | None, origin: np.ndarray | None) -> Dataset:
         if self.data is not None:
             return load_dataset(
                 self.data,
                 downscale=self.downscale or 1,
                 test_every=self.test_every,
                 missing=self.missing,
+                origin=origin,
             )
         background = WHITE if self.background is None else parse_color(self.background)
         assert splats is not None
@@ -227,13 +234,13 @@ class Evaluate(Command):
         if self.cameras is not None:
             views = splat_views(
                 splats,
-                load_cameras(self.cameras),
+                load_cameras(self.cameras, origin=splats.origin),
                 look=self.look,
                 sh_degree=self.sh_degree,
                 background=background,
                 threads=self.threads,
             )
-            return Dataset((), views, "splats", self.look)
+            return Dataset((), views, "splats", self.look, splats.origin)
         made = TargetOptions(look=self.look, sh_degree=self.sh_degree).make(
             splats, self.splats, background, self.threads
         )

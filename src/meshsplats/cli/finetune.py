@@ -391,7 +391,8 @@ class Finetune(TrainingCommand):
 
     def save_more(self, files: RunFiles, plan: Plan, trained: Trained) -> None:
         if self.target.data is None and plan.dataset.test:
-            save_cameras([view.camera for view in plan.dataset.test], files.held_out)
+            cameras = [view.camera for view in plan.dataset.test]
+            save_cameras(cameras, files.held_out, origin=plan.dataset.origin)
 
     def next_steps(self, files: RunFiles, config: FinetuneConfig, plan: Plan) -> list[str]:
         """The command that scores the result on held-out views, or one that renders it if there are none."""

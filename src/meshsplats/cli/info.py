@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 
 from meshsplats._json import read_json
+from meshsplats._origin import choose_origin
 from meshsplats.camera import Camera
 from meshsplats.cameras.camera_path import is_camera_path
 from meshsplats.cameras.files import load_cameras
@@ -71,14 +72,14 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
         found |= _photographs(path, layout)
     elif kind == "splats":
         found |= {"format": splat_format(path)} | _in_time(path) | _splats(reading.load(path, quiet=True))
-        if cameras := cameras_beside(path):
+        if cameras := cameras_beside(path, np.zeros(3)):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
     elif kind == "mesh":
         from meshsplats.formats.meshes import load_mesh
 
         found |= _mesh(load_mesh(path))
     else:
-        found |= _cameras(load_cameras(path))
+        found |= _world_cameras(load_cameras(path))
         if is_camera_path(read_json(path)):
             found["frame"] = "nerfstudio's, that of the splats it exports"
             if (path.parent / "dataparser_transforms.json").is_file():
@@ -120,7 +121,7 @@ def _photographs(path: Path, layout: Layout) -> dict[str, Any]:
         "with_alpha": sum(photo.has_alpha for photo in photos),
         "with_masks": sum(photo.mask is not None for photo in photos),
         "bytes_in_memory": dataset.memory,
-        **_cameras([view.camera for view in dataset.views]),
+        **_cameras([view.camera for view in dataset.views], dataset.origin),
     }
     if layout.name == "COLMAP" and (points := count_points(layout.source)) is not None:
         found["points"] = points
@@ -149,7 +150,7 @@ def _splats(cloud: GaussianCloud) -> dict[str, Any]:
         "sh_degree": cloud.sh_degree,
         "kernel": cloud.kernel,
         **({} if cloud.up is None else {"up": _rounded(cloud.up)}),
-        **_extent(cloud.means, scene_bounds(cloud)),
+        **_extent(cloud.means, scene_bounds(cloud), cloud.origin),
         "opacity_5_50_95_percent": _quantiles(cloud.opacities),
         "faint_splats": int((cloud.opacities < 1 / 255).sum()),
         "scale_5_50_95_percent": _quantiles(ordered.mean(axis=1)),
@@ -164,7 +165,7 @@ def _mesh(mesh: SplatMesh) -> dict[str, Any]:
     if mesh.splat_count is not None:
         found["splats"] = mesh.splat_count
     if len(mesh.vertices):
-        found |= _extent(mesh.vertices, scene_bounds(mesh))
+        found |= _extent(mesh.vertices, scene_bounds(mesh), mesh.origin)
         found["opacity_5_50_95_percent"] = _quantiles(mesh.colors[:, 3])
     if mesh.binding is not None:
         base = f"{len(mesh.binding.base_vertices):,} vertices, {len(mesh.binding.base_faces):,} faces"
@@ -196,13 +197,14 @@ def _tileset(path: Path) -> dict[str, Any]:
         "splats": tileset.splats,
         **found,
         "geometric_error": float(f"{tileset.root.error:.6g}"),
-        "lower": _rounded(corners.min(axis=0)),
-        "upper": _rounded(corners.max(axis=0)),
+        "lower": _in_world(corners.min(axis=0), tileset.origin),
+        "upper": _in_world(corners.max(axis=0), tileset.origin),
+        **_origin(tileset.origin),
         "up": _rounded(tileset.up),
     }
 
 
-def _cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
+def _cameras(cameras: Sequence[Camera], origin: np.ndarray) -> dict[str, Any]:
     centers = np.array([camera.center for camera in cameras])
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     return {
@@ -210,19 +212,45 @@ def _cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
         "image_sizes": [list(size) for size in sizes[:8]],
         "fx": _range([camera.fx for camera in cameras]),
         "near": _range([camera.near for camera in cameras]),
-        "lower": _rounded(centers.min(axis=0)),
-        "upper": _rounded(centers.max(axis=0)),
+        "lower": _in_world(centers.min(axis=0), origin),
+        "upper": _in_world(centers.max(axis=0), origin),
+        **_origin(origin),
         "up_by_cameras": _rounded(guess_up(None, cameras)),
     }
 
 
-def _extent(points: np.ndarray, bounds: Bounds) -> dict[str, Any]:
+def _world_cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
+    """Findings about cameras that are in the world."""
+    origin = choose_origin(np.array([camera.center for camera in cameras]))
+    return _cameras([camera.relative_to(origin) for camera in cameras], origin)
+
+
+def _extent(points: np.ndarray, bounds: Bounds, origin: np.ndarray) -> dict[str, Any]:
+    """In the coordinates of the file, which are those of the world."""
     return {
-        "lower": _rounded(points.min(axis=0)),
-        "upper": _rounded(points.max(axis=0)),
-        "center": _rounded(bounds.center),
+        "lower": _in_world(points.min(axis=0), origin),
+        "upper": _in_world(points.max(axis=0), origin),
+        "center": _in_world(bounds.center, origin),
+        **_origin(origin),
         "radius_90_percent": float(f"{bounds.radius:.6g}"),
     }
+
+
+class _Place(float):
+    """A coordinate that is printed with all its digits."""
+
+
+def _in_world(local: np.ndarray, origin: np.ndarray) -> list[float]:
+    """``local`` (3,), six digits, plus the ``origin``."""
+    rounded = _rounded(local)
+    if not origin.any():
+        return rounded
+    return [_Place(f"{x + at:.12g}") for x, at in zip(rounded, origin.tolist(), strict=True)]
+
+
+def _origin(origin: np.ndarray) -> dict[str, Any]:
+    """The finding about it; none for zeros."""
+    return {"origin": [_Place(x) for x in origin.tolist()]} if origin.any() else {}
 
 
 def _quantiles(values: np.ndarray) -> list[float]:
@@ -244,6 +272,8 @@ def _in_words(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, int):
         return f"{value:,}"
+    if isinstance(value, _Place):
+        return f"{value:.12g}"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list):

@@ -18,12 +18,15 @@ from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
     Number,
+    Origin,
     Output,
     SplatOptions,
     Text,
     alpha_record,
     check_outputs,
     parse_up,
+    placed,
+    say_origin,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, flag, say
@@ -101,6 +104,9 @@ class Levels(Command):
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
     file, else -y."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     resume: bool = False
     """Continue an interrupted run of the same command, from the levels in FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
@@ -117,6 +123,7 @@ class Levels(Command):
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; levels needs a splat file or a model folder")
         cloud = self.reading.load(self.input, up=self.up)
+        say_origin(cloud.origin, self.origin)
         most = len(cloud) if self.max_splats is None else min(self.max_splats, len(cloud))
         chain = plan_levels(most, self.levels, factor=self.factor, width=self.width)
         folder = self._partial()
@@ -247,7 +254,7 @@ class Levels(Command):
         if self.alpha == "auto" and self.format == "glb":
             choice = choose_alpha(mesh, cameras, threads=self.threads)
         asked = {} if self.alpha == "auto" else {"alpha": self.alpha}
-        save_mesh(mesh, path, **(asked if choice is None else choice.options))
+        save_mesh(placed(mesh, self.origin), path, **(asked if choice is None else choice.options))
         scored = cameras if config is not None else cameras[: views_to_score(len(mesh.faces), len(cloud))]
         score = likeness(mesh, cloud, scored, sh_degree=self.sh_degree, threads=self.threads)
         row = {

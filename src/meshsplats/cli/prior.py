@@ -113,7 +113,7 @@ class Prior(TrainingCommand):
         base = load_base(self.input, texture=self.laying.texture, textures=wants_texture)
         dataset = self._dataset(base, config, earlier)
         cameras = [view.camera for view in dataset.train]
-        up = guess_up(SplatMesh(base.vertices, base.faces, _grey(base), up=base.up), cameras)
+        up = guess_up(_grey_mesh(base), cameras)
         pattern = {name: getattr(self.laying, name) for name in ("triangles", "by_area", "layers", "spacing")}
         prior = bind(
             replace(base, up=up),
@@ -146,9 +146,8 @@ class Prior(TrainingCommand):
     def _dataset(self, base: BaseMesh, config: FinetuneConfig, earlier: Checkpoint | None) -> Dataset:
         background = default_background(config)
         if self.splats is None:
-            mesh = SplatMesh(base.vertices, base.faces, _grey(base))
-            return self.target.make(mesh, self.input, background, self.threads)
-        cloud = self.reading.load(self.splats)
+            return self.target.make(_grey_mesh(base), self.input, background, self.threads)
+        cloud = self.reading.load(self.splats, base.origin)
         views = worthwhile_views(as_begun(config, earlier))
         return self.target.make(cloud, self.splats, background, self.threads, views)
 
@@ -161,5 +160,6 @@ def exported(prior: MeshPrior, path: Path) -> SplatMesh:
     return prior.pose(lift=prior.export_lift)
 
 
-def _grey(base: BaseMesh) -> np.ndarray:
-    return np.full((len(base.vertices), 4), 0.5, np.float32)
+def _grey_mesh(base: BaseMesh) -> SplatMesh:
+    grey = np.full((len(base.vertices), 4), 0.5, np.float32)
+    return SplatMesh(base.vertices, base.faces, grey, up=base.up, origin=base.origin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -117,13 +117,12 @@ class Render(Command):
         start = time.perf_counter()
         tileset = open_tileset(self.input, self.part, self.max_error)
         # The coarsest tile says where a tileset is.
-        scene = (
-            tileset.root.load()
-            if tileset
-            else self.part.of(load_scene(self.input, self.reading, up=self.views.up))
-        )
+        if tileset:
+            scene: GaussianCloud | SplatMesh = replace(tileset.root.load(), origin=tileset.origin)
+        else:
+            scene = self.part.of(load_scene(self.input, self.reading, up=self.views.up))
         self._check_scene(scene)
-        photographs = self.views.photographs()
+        photographs = self.views.photographs(scene.origin)
         count = 1 if single else 60
         cameras = self.views.make(scene, self.input, count=count, side=800, photographs=photographs)
         if single and len(cameras) > 1:
@@ -152,7 +151,7 @@ class Render(Command):
             from meshsplats.images.writing import save_animation
 
             save_animation(files.turntable, map(load_image, files.images), fps=self.fps)
-        save_cameras(cameras, files.cameras)
+        save_cameras(cameras, files.cameras, origin=scene.origin)
         write_configuration(files.config, "render", self, result)
         seconds = time.perf_counter() - start
         if self.json:

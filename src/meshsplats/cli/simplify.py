@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import tyro
 
 from meshsplats._files.atomic import together
@@ -19,11 +20,14 @@ from meshsplats.cli.common import (
     File,
     Folder,
     Number,
+    Origin,
     Output,
     SplatOptions,
     cameras_beside,
     check_outputs,
     draw_preview,
+    placed,
+    say_origin,
     size_of,
 )
 from meshsplats.cli.messages import UsageError
@@ -61,6 +65,9 @@ class Simplify(Command):
     """With --data: images that are missing are an error, or their views are left out."""
     no_preview: bool = False
     """Write no preview."""
+    origin: Origin = "keep"
+    """Of georeferenced splats. keep: the file stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
@@ -79,15 +86,17 @@ class Simplify(Command):
         check_outputs(outputs, self.force, inputs=[self.input])
         if identify(self.input) != "splats":
             raise FileFormatError(f"{self.input}: not splats; simplify needs a splat file or a model folder")
-        cameras = self._cameras()
         cloud = self.reading.load(self.input)
+        cameras = self._cameras(cloud.origin)
         start = time.perf_counter()
         count = self.count if self.share is None else max(1, round(self.share * len(cloud)))
         assert count is not None
         kept = simplify(cloud, count, cameras=cameras, threads=self.threads)
         seconds = time.perf_counter() - start
+        written = placed(kept, self.origin)
+        say_origin(kept.origin, self.origin, splats=True)
         with together():
-            save_gaussians(kept, self.output)
+            save_gaussians(written, self.output)
             write_configuration(config, "simplify", self)
             if not self.no_preview:
                 draw_preview(kept, preview)
@@ -122,10 +131,10 @@ class Simplify(Command):
         if self.missing != "error" and self.data is None:
             raise UsageError("--missing has no effect without --data")
 
-    def _cameras(self) -> list[Camera] | None:
+    def _cameras(self, origin: np.ndarray) -> list[Camera] | None:
         if self.data is not None:
-            dataset = load_dataset(self.data, missing=self.missing)
+            dataset = load_dataset(self.data, missing=self.missing, origin=origin)
             return [view.camera for view in dataset.train or dataset.views]
         if self.cameras is not None:
-            return load_cameras(self.cameras)
-        return cameras_beside(self.input)
+            return load_cameras(self.cameras, origin=origin)
+        return cameras_beside(self.input, origin)

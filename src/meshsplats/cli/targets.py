@@ -100,8 +100,8 @@ class TargetOptions:
         preset: str = "default",
         zooms: Sequence[int] = (1,),
     ) -> Dataset:
-        """The data set: by default with ``worthwhile`` views, and with the look of the ``preset``. ``zooms``:
-        of images of splats."""
+        """The data set, relative to the origin of ``scene``: by default with ``worthwhile`` views, and with
+        the look of the ``preset``. ``zooms``: of images of splats."""
         if self.data is not None:
             dataset = load_dataset(
                 self.data,
@@ -110,6 +110,7 @@ class TargetOptions:
                 background=background,
                 cache_bytes=self.cache_bytes,
                 missing=self.missing,
+                origin=scene.origin,
             )
             if not dataset.train:
                 raise ValueError(
@@ -122,9 +123,10 @@ class TargetOptions:
         from meshsplats.datasets.splat_targets import splat_dataset
 
         if self.cameras is not None:
-            cameras: list[Camera] | None = load_cameras(self.cameras)
+            cameras: list[Camera] | None = load_cameras(self.cameras, origin=scene.origin)
         else:
-            cameras = None if any(map(self._is_set, PLACING)) else cameras_beside(source)
+            given = any(map(self._is_set, PLACING))
+            cameras = None if given else cameras_beside(source, scene.origin)
         return splat_dataset(
             scene,
             placement=self.placement,

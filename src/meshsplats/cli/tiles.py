@@ -19,12 +19,14 @@ from meshsplats.cli.common import (
     ClusterOptions,
     Count,
     Number,
+    Origin,
     Output,
     SplatOptions,
     Text,
     alpha_in_words,
     check_outputs,
     parse_up,
+    say_origin,
 )
 from meshsplats.cli.messages import Terminated, UsageError, say
 from meshsplats.cli.records import CONFIGURATION, beside, write_configuration
@@ -73,6 +75,9 @@ class Tiles(Command):
     """auto: blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by a few
     images of both. blend: viewers blend true opacities; mask: they draw as solid what is at least 20 %
     opaque; opaque: solid triangles, cut there."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     resume: bool = False
     """Continue an interrupted run of the same command, from FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)
@@ -91,7 +96,8 @@ class Tiles(Command):
         config = beside(self.output, CONFIGURATION)
         check_outputs([config], self.force or self.resume)
         start = time.perf_counter()
-        source = self.reading.stream(self.input, up=self.up)
+        origin = None if isinstance(self.origin, str) else self.origin
+        source = self.reading.stream(self.input, origin, up=self.up)
         try:
             with self.cluster.workers(self.threads) as workers, _progress() as show:
                 found = build_tiles(
@@ -120,6 +126,8 @@ class Tiles(Command):
         )
         if line := alpha_in_words(asdict(found.alpha)):
             print(line)
+        if source.origin.any():
+            say_origin(source.origin, self.origin)
         print(f"{self.output / 'tileset.json'}: geometric error of the root {found.error:.3g}")
 
     def resolved(self) -> dict[str, Any]:
@@ -140,7 +148,8 @@ class Tiles(Command):
         if self.up is not None:
             x, y, z = (float(u) for u in parse_up(self.up))
             up = (x, y, z)
-        options = TileOptions(self.max_triangles, self.preset, conversion, up, self.lit, self.alpha)
+        place: Literal["world", "local"] = "world" if self.origin == "keep" else "local"
+        options = TileOptions(self.max_triangles, self.preset, conversion, up, self.lit, self.alpha, place)
         options.resolved()
         return options
 

@@ -10,7 +10,7 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cli.arguments import as_cli_options
-from meshsplats.cli.common import File, Output, check_mesh_suffix, check_outputs
+from meshsplats.cli.common import File, Output, check_mesh_suffix, check_outputs, placed, say_origin
 from meshsplats.cli.messages import UsageError, command_line, say
 from meshsplats.cli.training import (
     Plan,
@@ -127,7 +127,7 @@ class Train(TrainingCommand):
             if found is not None and found.source != self.input / CAMERAS:  # those of an earlier run
                 raise UsageError(f"--estimate-cameras has no effect: {found.source} has cameras")
         dataset, background = self._dataset(config)
-        points = load_points(self.input)
+        points = load_points(self.input, origin=dataset.origin)
         known = "no known points" if points is None else f"{len(points.positions):,} known points"
 
         def optimise(run: RunOptions, show: ShowProgress) -> Trained:
@@ -146,7 +146,9 @@ class Train(TrainingCommand):
         from meshsplats.training.as_splats import splats_of_fans
 
         if self.as_splats is not None:
-            save_gaussians(splats_of_fans(trained.saved), self.as_splats)
+            splats = placed(splats_of_fans(trained.saved), self.origin)
+            say_origin(splats.origin, "keep", splats=True)
+            save_gaussians(splats, self.as_splats)
 
     def preview_camera(self, plan: Plan) -> Camera:
         # From elsewhere, it would show what no photograph shows.

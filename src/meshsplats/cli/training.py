@@ -21,12 +21,15 @@ from meshsplats.cli.arguments import Command, as_cli_options
 from meshsplats.cli.common import (
     Count,
     Number,
+    Origin,
     Output,
     alpha_for_viewers,
     check_outputs,
     chosen_background,
     draw_preview,
+    placed,
     plural,
+    say_origin,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, flag, say
@@ -56,7 +59,7 @@ STARTUP_SECONDS = 1.0
 """Time that Python and the libraries take before the command's own clock starts."""
 _CHANGEABLE = {
     *("resume", "force", "json", "threads", "device", "report_every", "preview_every", "cache", "output"),
-    *LENGTHS,
+    *("origin", *LENGTHS),
 }
 """Options that may change when a run is resumed."""
 ShowProgress = Callable[[Progress], None]
@@ -253,6 +256,9 @@ class TrainingCommand(Command):
     """Maximum number of threads. Default: all processors."""
     device: Annotated[Literal["cpu", "gpu"], tyro.conf.arg(metavar="NAME")] = "cpu"
     """cpu, or gpu: a graphics card (extra gpu)."""
+    origin: Origin = "keep"
+    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
+    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
@@ -318,7 +324,8 @@ class TrainingCommand(Command):
         except OtherRunError as error:
             raise self._naming_options(error, files) from None
         given = {"alpha": trained.alpha} if trained.alpha else alpha_for_viewers(trained.saved, files.mesh)
-        save_mesh(trained.saved, files.mesh, **given)
+        say_origin(trained.saved.origin, self.origin)
+        save_mesh(placed(trained.saved, self.origin), files.mesh, **given)
         scored = self._scored(config, plan.dataset)
         background = {} if plan.background is None else plan.background.to_dict()
         write_configuration(files.config, self._name, self, scored | background | dict(plan.rates))

@@ -146,8 +146,8 @@ class View(Command):
             outputs = [self.output, beside(self.output, CONFIGURATION)]
             check_outputs(outputs, self.force, inputs=inputs)
         scene = self._scene()
-        photographs = self._photographs()
-        cameras = self._cameras(photographs)
+        photographs = self._photographs(scene.origin)
+        cameras = self._cameras(photographs, scene.origin)
         content = self._content(scene, cameras)
         del scene  # large, and partly copied
         self._announce(content)
@@ -195,7 +195,9 @@ class View(Command):
         """What the page will show."""
         if isinstance(scene, SplatMesh):
             _check_size(len(scene.faces), "fine-tune it with --max-triangles, or make 'meshsplats tiles'")
-            splats = None if self.splats is None else _degree_0(self.part.of(self.reading.load(self.splats)))
+            splats = None
+            if self.splats is not None:
+                splats = _degree_0(self.part.of(self.reading.load(self.splats, scene.origin)))
             return _Content(scene, splats, coarse=_coarse(scene, splats))
         from meshsplats.conversion import convert
         from meshsplats.conversion.budget import usual_triangles_each
@@ -209,19 +211,19 @@ class View(Command):
         mesh, shown = convert(splats), None if self.without_splats else splats
         return _Content(mesh, shown, len(splats), merging, _coarse(mesh, splats))
 
-    def _photographs(self) -> Dataset | None:
+    def _photographs(self, origin: np.ndarray) -> Dataset | None:
         if self.data is None:
             return None
         from meshsplats.datasets.folder import load_dataset
 
-        return load_dataset(self.data, missing=self.missing)
+        return load_dataset(self.data, missing=self.missing, origin=origin)
 
-    def _cameras(self, photographs: Dataset | None) -> list[Camera]:
+    def _cameras(self, photographs: Dataset | None, origin: np.ndarray) -> list[Camera]:
         if photographs is not None:
             return [view.camera for view in photographs.views]
         if self.cameras is not None:
-            return load_cameras(self.cameras)
-        return cameras_beside(self.input) or []
+            return load_cameras(self.cameras, origin=origin)
+        return cameras_beside(self.input, origin) or []
 
     def _announce(self, content: _Content) -> None:
         """Says what was merged, and how large the file will be, before the work of packing it."""

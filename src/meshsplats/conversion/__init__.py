@@ -138,7 +138,15 @@ def convert(
     def assembled(fans: Fans, keep: np.ndarray) -> SplatMesh:
         kept = None if keep.all() else np.flatnonzero(keep)
         vertices, faces, rgba, owners = fans.build(part, rows, colors, chosen.compensation, kept)
-        return SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction, filter_px2=filter_px2)
+        return SplatMesh(
+            vertices,
+            faces,
+            rgba,
+            face_splat=owners,
+            up=direction,
+            filter_px2=filter_px2,
+            origin=cloud.origin,
+        )
 
     mesh = assembled(fans, keep)
     if chosen.detail == "cameras":

@@ -99,7 +99,7 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
     centers, reach, opacities, owner = _splats(scene)
     gone: dict[str, np.ndarray] = {}
     if rules.crop is not None:
-        gone["crop"] = ~inside(centers, rules.crop)
+        gone["crop"] = ~inside(centers, rules.crop, scene.origin)
     if rules.min_opacity is not None:
         gone["min_opacity"] = opacities < rules.min_opacity
     if rules.max_distance is not None:
@@ -128,7 +128,7 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
 def remove(scene: Scene, found: Findings) -> Scene:
     """``scene`` without the splats that ``find`` has found."""
     if isinstance(scene, SplatMesh):
-        return scene.keep_faces(found.kept[found.owner])  # type: ignore[return-value]
+        return scene.keep_faces(found.kept[found.owner])
     return scene.select(np.flatnonzero(found.kept))
 
 

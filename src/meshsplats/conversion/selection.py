@@ -43,7 +43,7 @@ def choose_splats(
     """The splats within the limits, in their old order.
 
     Args:
-        crop: box x0 y0 z0 x1 y1 z1 in scene units that the centres must lie in.
+        crop: box x0 y0 z0 x1 y1 z1 in the world that the centres must lie in.
         min_opacity: least opacity, 0 to 1.
         max_splats: keep this many, those with the greatest opacity times mean projected area.
 
@@ -65,23 +65,24 @@ def within(cloud: GaussianCloud, crop: Sequence[float] | None, min_opacity: floa
     ``min_opacity``. None: no such limit."""
     keep = np.ones(len(cloud), bool)
     if crop is not None:
-        keep &= inside(cloud.means, crop)
+        keep &= inside(cloud.means, crop, cloud.origin)
     if min_opacity:
         keep &= cloud.opacities >= min_opacity
     return keep
 
 
-def inside(points: np.ndarray, box: Sequence[float]) -> np.ndarray:
-    """(n,) bool: ``points`` (n, 3) inside the ``box`` x0 y0 z0 x1 y1 z1, borders included."""
-    corners = np.asarray(box, np.float64)
+def inside(points: np.ndarray, box: Sequence[float], origin: np.ndarray) -> np.ndarray:
+    """(n,) bool: ``points`` (n, 3), relative to ``origin``, inside the ``box`` x0 y0 z0 x1 y1 z1 of the
+    world, borders included."""
+    corners = np.asarray(box, np.float64) - np.tile(origin, 2)
     return np.all((points >= corners[:3]) & (points <= corners[3:]), axis=1)
 
 
 def refuse_empty_box(cloud: GaussianCloud, crop: Sequence[float]) -> None:
     """Raises ValueError if no centre lies in the box ``crop``, x0 y0 z0 x1 y1 z1."""
-    if inside(cloud.means, crop).any():
+    if inside(cloud.means, crop, cloud.origin).any():
         return
-    low, high = cloud.means.min(axis=0), cloud.means.max(axis=0)
+    low, high = cloud.means.min(axis=0) + cloud.origin, cloud.means.max(axis=0) + cloud.origin
     box = np.asarray(crop, np.float64)
     raise ValueError(
         f"the crop box {_point(box[:3])} to {_point(box[3:])} holds none of the {len(cloud)} splats:"
@@ -98,4 +99,5 @@ def most_important(importance: np.ndarray, count: int) -> np.ndarray:
 
 
 def _point(values: np.ndarray) -> str:
-    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
+    digits = 4 if np.abs(values).max() < 1e4 else 9
+    return "(" + ", ".join(f"{v:.{digits}g}" for v in values) + ")"

@@ -52,10 +52,10 @@ class Survey:
     high: np.ndarray
     """(3,) float64 greatest ones."""
     sample: GaussianCloud
-    """Every ``step``-th of the kept splats, of degree 0."""
+    """Every ``step``-th of the kept splats, of degree 0; its origin is that of all splats."""
     step: int
     origin: np.ndarray
-    """(3,) float64 as ``CameraCoverage.origin`` of all of them."""
+    """(3,) float64 as ``CameraCoverage.origin`` of all of them, in their coordinates."""
 
 
 def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Survey:
@@ -219,7 +219,15 @@ def convert_blocks(
         vertices, faces, rgba, owners = piece.fans.build(
             piece.cloud, piece.rows, piece.colors, chosen.compensation
         )
-        yield SplatMesh(vertices, faces, rgba, face_splat=owners, up=direction, filter_px2=filter_px2)
+        yield SplatMesh(
+            vertices,
+            faces,
+            rgba,
+            face_splat=owners,
+            up=direction,
+            filter_px2=filter_px2,
+            origin=scene.sample.origin,
+        )
     if not done:
         raise ValueError(f"none of the {scene.kept:,} splats has a visible area")
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from meshsplats._foreign import what_it_is
 from meshsplats._kinds import need_path
+from meshsplats._origin import choose_origin
 from meshsplats.datasets.colmap import read_model
 from meshsplats.datasets.image_files import Album, Frame, Missing, Taken, split
 from meshsplats.datasets.layouts import Layout, find_layout, what_is_there
@@ -144,6 +145,7 @@ def load_dataset(
     background: Sequence[float] = WHITE,
     cache_bytes: int = CACHE_BYTES,
     missing: Missing = "error",
+    origin: Sequence[float] | np.ndarray | None = None,
 ) -> Dataset:
     """The photographs and cameras in a folder.
 
@@ -174,6 +176,9 @@ def load_dataset(
             each time.
         missing: what images that are missing mean: an ``'error'``, or that their views are left out
             (``'skip'``), with a DataWarning.
+        origin: (3,) point of the world that cameras shall be relative to, such as that of splats or a mesh of
+            the same scene. By default one that suits their positions, zero wherever float32, in which
+            everything is that is made of them, is fine enough.
 
     Raises:
         FileFormatError: a folder of no known layout, a broken file in it, a missing image, one whose shape
@@ -198,4 +203,7 @@ def load_dataset(
         raise ValueError("test_every must be 0 (no test views) or at least 2: 1 leaves nothing to train with")
     store = ImageCache(cache_bytes)
     train, test = read_folder(Path(path), int(downscale), int(test_every), store, missing)
-    return Dataset(tuple(train), tuple(test), Path(os.path.abspath(path)).name).over(color.tolist())
+    dataset = Dataset(tuple(train), tuple(test), Path(os.path.abspath(path)).name).over(color.tolist())
+    if origin is None:
+        origin = choose_origin(np.array([view.camera.center for view in dataset.views]))
+    return dataset.relative_to(origin)

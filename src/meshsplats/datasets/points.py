@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import struct
 from array import array
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._arrays import checked_array
 from meshsplats._kinds import need_path
 from meshsplats.datasets.image_files import inside
 from meshsplats.datasets.layouts import find_layout
@@ -40,34 +42,45 @@ class ScenePoints(NamedTuple):
     """Points on the surfaces of a scene."""
 
     positions: np.ndarray
-    """(n, 3) float64, world frame."""
+    """(n, 3) float64 positions relative to the origin that they were loaded for."""
     colors: np.ndarray
     """(n, 3) uint8 display RGB; 128 where the file has none."""
     views: np.ndarray
     """(n,) int64 counts of the images that show each point; ``UNKNOWN_VIEWS`` where the file has none."""
 
 
-def load_points(path: str | os.PathLike[str]) -> ScenePoints | None:
+def load_points(
+    path: str | os.PathLike[str], *, origin: Sequence[float] | np.ndarray = (0, 0, 0)
+) -> ScenePoints | None:
     """The points of the data set at ``path``, a folder as ``load_dataset`` takes it; None if it has none.
+
+    ``origin``: (3,) point of the world that positions shall be relative to, that of the data set.
 
     Raises FileFormatError for broken files, which names file and record.
     """
     need_path(path=path)
+    point = checked_array("origin", origin, np.float64, (3,))
     layout = find_layout(Path(path))
     if layout is None:
         return None
     if layout.name == "COLMAP":
-        binary, text = layout.source / "points3D.bin", layout.source / "points3D.txt"
-        if binary.is_file():
-            return _binary(binary)
-        return _text(text) if text.is_file() else None
+        found = _of_model(layout.source)
+        return None if found is None else found._replace(positions=found.positions - point)
     if layout.name == "LLFF":
         return None
     named = points_file(layout.source)
     if named is None:
         return None
-    found = inside(layout.source.parent, named, f"{layout.source}: 'ply_file_path'")
-    return _ply(found) if found.is_file() else None
+    file = inside(layout.source.parent, named, f"{layout.source}: 'ply_file_path'")
+    return _ply(file, point) if file.is_file() else None
+
+
+def _of_model(model: Path) -> ScenePoints | None:
+    """The points of a sparse model of COLMAP, in the world."""
+    binary, text = model / "points3D.bin", model / "points3D.txt"
+    if binary.is_file():
+        return _binary(binary)
+    return _text(text) if text.is_file() else None
 
 
 def _binary(path: Path) -> ScenePoints:
@@ -139,7 +152,7 @@ def _text(path: Path) -> ScenePoints:
     return _checked(table[:, :3].copy(), colors, table[:, 6].astype(np.int64), path)
 
 
-def _ply(path: Path) -> ScenePoints:
+def _ply(path: Path, origin: np.ndarray) -> ScenePoints:
     with open(path, "rb") as file:
         header = read_header(file, path)
         element = header.element("vertex")
@@ -154,6 +167,7 @@ def _ply(path: Path) -> ScenePoints:
         has_color = set(rgb) <= names
         wanted = ("x", "y", "z", *(rgb if has_color else ()))
         table = FloatTable(file, header, element, wanted, path)
+        table.origin = origin
         order = [table.names.index(name) for name in wanted]
         chunks = [chunk[:, order] for chunk in table.chunks()] if element.count else []
     rows = np.concatenate([np.empty((0, len(wanted)), np.float32), *chunks])

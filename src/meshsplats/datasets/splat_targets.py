@@ -168,7 +168,7 @@ def splat_dataset(
             (learned_from, quick, cache_bytes - cache_bytes // 8),
         )
     )
-    return Dataset(learned, held_out, "splats", look)
+    return Dataset(learned, held_out, "splats", look, cloud.origin)
 
 
 def has_surroundings(cloud: GaussianCloud) -> bool:

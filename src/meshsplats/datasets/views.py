@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
+from meshsplats._arrays import checked_array
 from meshsplats._kinds import need, need_all
+from meshsplats._origin import in_words, zero_origin
 from meshsplats.camera import Camera
 from meshsplats.rendering.looks import Look
 
@@ -122,25 +124,31 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Training views and held-out views, each sorted by name unless rendered from splats."""
+    """Training views and held-out views, each sorted by name unless rendered from splats. Cameras are
+    relative to ``origin``."""
 
     train: tuple[View, ...]
     test: tuple[View, ...] = ()
     name: str = ""
     look: Look = "area"
     """Look of the images (``rendering.looks``); photographs are means over each pixel's area."""
+    origin: np.ndarray = field(default_factory=zero_origin)
+    """(3,) float64 point of the world that cameras, and with them all that is made of the data set, are
+    relative to: world = origin + local."""
 
     def __post_init__(self) -> None:
         need_all(View, train=self.train, test=self.test)
         object.__setattr__(self, "train", tuple(self.train))
         object.__setattr__(self, "test", tuple(self.test))
+        object.__setattr__(self, "origin", checked_array("origin", self.origin, np.float64, (3,)))
 
     def __repr__(self) -> str:
         sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
         shapes = [f"{width} x {height}" for width, height in sizes[:3]] + ["..."] * (len(sizes) > 3)
         name = [repr(self.name)] if self.name else []
         counts = [f"{len(self.train)} views to train with", f"{len(self.test)} held out"]
-        return f"Dataset({', '.join([*name, *counts, *shapes])})"
+        at = [f"origin {in_words(self.origin)}"] if self.origin.any() else []
+        return f"Dataset({', '.join([*name, *counts, *shapes, *at])})"
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -151,6 +159,19 @@ class Dataset:
         """Bytes of all images together once loaded, of which at most ``cache_bytes`` are kept: 3 a pixel for
         photographs, 8 with alpha, 1 more with masks or undistorted."""
         return sum(view.source.nbytes for view in self.views)
+
+    def relative_to(self, origin: Sequence[float] | np.ndarray) -> Dataset:
+        """The same views in the world, with cameras relative to ``origin`` (3,), such as that of the mesh or
+        the splats that they show."""
+        point = checked_array("origin", origin, np.float64, (3,))
+        shift = point - self.origin
+        if not shift.any():
+            return self
+
+        def moved(views: tuple[View, ...]) -> tuple[View, ...]:
+            return tuple(replace(view, camera=view.camera.relative_to(shift)) for view in views)
+
+        return replace(self, train=moved(self.train), test=moved(self.test), origin=point)
 
     def over(self, background: Sequence[float]) -> Dataset:
         """The same views with another ``background`` for images with alpha."""

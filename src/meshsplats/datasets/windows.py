@@ -18,7 +18,9 @@ def window_of(view: View, left: int, top: int, right: int, bottom: int, store: I
     """
     part = view.camera.window(left, top, right - left, bottom - top)
     if isinstance(view.source, RenderedSplats):
-        return replace(view, camera=part, source=replace(view.source, camera=part, store=store))
+        # Its own camera, which is relative to the origin of the splats, whatever that of the view is.
+        own = view.source.camera.window(left, top, right - left, bottom - top)
+        return replace(view, camera=part, source=replace(view.source, camera=own, store=store))
     return replace(view, camera=part, source=_Part(view.source, left, top, right, bottom))
 
 

@@ -227,8 +227,8 @@ def _scene_report(
 ) -> Report:
     """Scores one scene: its name, and its mesh, splats or model folder."""
     name, source = found
-    dataset = load_dataset(data / name, downscale=factors[name], test_every=test_every)
     scene = load(source)
+    dataset = load_dataset(data / name, downscale=factors[name], test_every=test_every, origin=scene.origin)
     judge = "splats" if isinstance(scene, GaussianCloud) else "mesh"
     chosen = find_background(
         dataset, {judge: scene}, given=background, named=model_background(source), threads=threads

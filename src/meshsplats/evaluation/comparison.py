@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from meshsplats._kinds import need, need_all
+from meshsplats._origin import need_one_origin
 from meshsplats.camera import Camera
 from meshsplats.datasets.views import View
 from meshsplats.evaluation.metrics import psnr, ssim
@@ -144,6 +145,7 @@ def compare(
     """
     need(GaussianCloud, cloud=cloud)
     need(SplatMesh, mesh=mesh)
+    need_one_origin({"cloud": cloud, "mesh": mesh})
     need_all(Camera, cameras=cameras)
     if not cameras:
         raise ValueError("cameras must hold at least one camera")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, SupportsFloat
 import numpy as np
 
 from meshsplats._kinds import need
+from meshsplats._origin import need_one_origin
 from meshsplats.camera import Camera
 from meshsplats.datasets.splat_targets import RenderedSplats
 from meshsplats.datasets.views import Dataset, View
@@ -180,7 +181,7 @@ def evaluate(
 
     Raises:
         ValueError: nothing to score, no view, a view whose mask excludes all pixels, a mesh with the name of
-            another method.
+            another method, records of different origins.
     """
     if not (isinstance(mesh, Mapping) and all(isinstance(one, SplatMesh) for one in mesh.values())):
         need(SplatMesh, mesh=mesh, optional=True, instead={"dict": "one by the name of each method"})
@@ -188,6 +189,7 @@ def evaluate(
     need(SplatMesh, before=before, optional=True)
     need(GaussianCloud, splats=splats, optional=True)
     meshes = {} if mesh is None else {"mesh": mesh} if isinstance(mesh, SplatMesh) else dict(mesh)
+    need_one_origin({"dataset": dataset, **meshes, "before": before, "splats": splats})
     views = dataset.test or dataset.views
     if samples is None:
         cameras = [view.camera for view in views]

@@ -407,7 +407,7 @@ class _Tuning:
             if other == cell:
                 continue
             if not len(theirs):
-                few.append(load_gaussians(self.coarse_file(other)))
+                few.append(load_gaussians(self.coarse_file(other), origin=cloud.origin))
                 continue
             rest = np.setdiff1d(cells.own(other), theirs, assume_unique=True)
             if len(rest):
@@ -471,6 +471,7 @@ def _owners(mesh: SplatMesh) -> np.ndarray:
 
 def _joined(parts: Sequence[SplatMesh], owners: Sequence[np.ndarray]) -> SplatMesh:
     """One mesh of ``parts``, with the splats of the triangles of each; triangles in the order of these."""
+    parts = [part.relative_to(parts[0].origin) for part in parts]
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     if starts[-1] > np.iinfo(np.int32).max:
         raise ValueError(f"{starts[-1]:,} vertices are more than a mesh can number")

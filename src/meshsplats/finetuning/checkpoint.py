@@ -154,6 +154,8 @@ def mesh_fingerprint(mesh: SplatMesh, frozen: np.ndarray | None = None) -> str:
     digest = hashlib.sha256(mesh.blending.encode())
     if mesh.filter_px2:
         digest.update(repr(mesh.filter_px2).encode())
+    if mesh.origin.any():
+        digest.update(mesh.origin.tobytes())
     arrays = [mesh.vertices, mesh.faces, mesh.colors]
     if mesh.binding is not None:
         arrays += [getattr(mesh.binding, field.name) for field in mesh.binding.FIELDS]
@@ -169,6 +171,8 @@ def dataset_fingerprint(dataset: Dataset) -> str:
     """Hash of the cameras, names and backgrounds of the views, the split, and the splats that images are
     rendered from, with their options. Image files are not read."""
     digest = hashlib.sha256(repr((len(dataset.train), len(dataset.test))).encode())
+    if dataset.origin.any():
+        digest.update(dataset.origin.tobytes())
     for view in dataset.views:
         camera = view.camera
         lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height)
@@ -191,6 +195,8 @@ def cloud_digest(cloud: GaussianCloud) -> str:
 
 
 def _add_splats(digest: hashlib._Hash, splats: GaussianCloud) -> None:
+    if splats.origin.any():
+        digest.update(splats.origin.tobytes())
     for array in (splats.means, splats.quaternions, splats.scales, splats.opacities, splats.sh):
         digest.update(repr(array.shape).encode())
         digest.update(array.data)

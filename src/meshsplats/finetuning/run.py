@@ -12,6 +12,7 @@ import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
 from meshsplats._kinds import need, need_path
+from meshsplats._origin import need_one_origin
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.comparison import images_of_view
 from meshsplats.evaluation.metrics import psnr
@@ -163,7 +164,8 @@ def finetune(
 
     Raises:
         TypeError: a field that does not exist.
-        ValueError: no training view, an empty mesh, ``frozen`` of another shape.
+        ValueError: no training view, an empty mesh, ``frozen`` of another shape, mesh and views of different
+            origins.
         OtherRunError: the checkpoint is of another run.
         MemoryError: the estimated memory is not available, or the mesh does not fit on the GPU; of a run that
             starts, nothing was written.
@@ -177,6 +179,7 @@ def finetune(
     need(Dataset, dataset=dataset)
     need(FinetuneConfig, config=config, optional=True)
     need(RunOptions, run=run, optional=True)
+    need_one_origin({"mesh": mesh, "dataset": dataset})
     config, run = with_changes(config or FinetuneConfig(), **changes), run or RunOptions()
     if not dataset.train:
         raise ValueError("the data set has no training views")

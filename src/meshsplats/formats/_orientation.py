@@ -19,12 +19,18 @@ HALF_TURN_Z = np.diag([-1.0, -1.0, 1.0])
 _ODD = ["y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x"]
 
 
-def transformed(cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud:
+def transformed(cloud: GaussianCloud, matrix: np.ndarray, origin: np.ndarray | None = None) -> GaussianCloud:
     """``cloud`` after the affine map ``matrix``, (3, 3) or (4, 4), from the file's frame to the world's.
 
-    Concretely, a splat of covariance C and mean m gets covariance A C A^T and mean A m + t. Its colour seen
-    from direction d becomes its earlier colour seen from U^T d, where U is the orthogonal factor of A, and
-    ``up`` turns by U. Mirrors are allowed.
+    Concretely, a splat of covariance C and mean m in the world gets covariance A C A^T and mean A m + t. Its
+    colour seen from direction d becomes its earlier colour seen from U^T d, where U is the orthogonal factor
+    of A, and ``up`` turns by U. Mirrors are allowed.
+
+    Args:
+        cloud: the splats.
+        matrix: the map.
+        origin: (3,) float64, of the result; None: A times that of the cloud, so that ``means`` become A
+            times them plus t.
 
     Raises:
         ValueError: the matrix is not finite or is singular.
@@ -33,9 +39,15 @@ def transformed(cloud: GaussianCloud, matrix: np.ndarray) -> GaussianCloud:
     a, shift = matrix[:3, :3], matrix[:3, 3:].reshape(-1)
     reverses_axes = (np.abs(a) == np.eye(3)).all()
     moved = _mirrored(cloud, np.diag(a)) if reverses_axes else _mapped(cloud, a)
+    mapped = a @ cloud.origin + 0.0
+    if origin is not None:
+        away = mapped - origin
+        away[: len(shift)] += shift
+        means = (cloud.means.astype(np.float64) @ a.T + away).astype(np.float32)
+        return replace(moved, means=means, origin=origin)
     if shift.any():
         moved = replace(moved, means=moved.means + shift.astype(np.float32))
-    return moved
+    return replace(moved, origin=mapped) if mapped.any() else moved
 
 
 def _mirrored(cloud: GaussianCloud, signs: np.ndarray) -> GaussianCloud:

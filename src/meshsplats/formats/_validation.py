@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from meshsplats._origin import choose_origin, lost_detail, sampled
 from meshsplats.errors import DataWarning, FileFormatError, NoColorsWarning
 from meshsplats.mesh import SplatMesh
 
@@ -53,6 +54,30 @@ class Budget:
                 f"{self._path}: {what} would take the data beyond what a file of {self._file_bytes:,} bytes"
                 " may unpack to (a decompression bomb?); refused"
             )
+
+
+def local_positions(
+    positions: np.ndarray, origin: np.ndarray | None, where: object
+) -> tuple[np.ndarray, np.ndarray]:
+    """``positions`` (n, 3) of the world relative to ``origin``, by default one that suits them; and that
+    origin.
+
+    Positions that are float32 already are those of the file: a DataWarning says so where they have lost
+    detail.
+    """
+    if origin is None:
+        few = sampled(positions)
+        if positions.dtype == np.float32:
+            warn_of_lost_detail(few, where)
+        origin = choose_origin(few)
+    return (positions.astype(np.float64) - origin if origin.any() else positions), origin
+
+
+def warn_of_lost_detail(sample: np.ndarray, where: object) -> None:
+    """A DataWarning if a file that stores positions as float32, of which this is a ``sample``, has lost
+    detail."""
+    if lost := lost_detail(sample):
+        warnings.warn(f"{where}: {lost}", DataWarning, stacklevel=4)
 
 
 def straight_colors(colors: np.ndarray, path: Path) -> np.ndarray:

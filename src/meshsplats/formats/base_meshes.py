@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,7 @@ def load_base(
     *,
     texture: str | os.PathLike[str] | None = None,
     textures: bool = True,
+    origin: Sequence[float] | np.ndarray | None = None,
 ) -> BaseMesh:
     """The mesh in a file that ``load_mesh`` reads, with its vertex colours, if it has any, and textures.
 
@@ -34,6 +37,7 @@ def load_base(
         path: the mesh.
         texture: an image to use for the whole mesh instead, by its texture coordinates (`.obj`, glTF).
         textures: False leaves textures unread.
+        origin: as for ``load_mesh``.
 
     Raises:
         FileFormatError: as ``load_mesh``, for a mesh prior, and for broken images and materials.
@@ -43,7 +47,7 @@ def load_base(
     source = Path(path)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        mesh = load_mesh(source)
+        mesh = load_mesh(source, origin=origin)
     if mesh.binding is not None:
         raise FileFormatError(
             f"{source}: splats that are bound to a mesh, not the mesh that carries them: give that one"
@@ -53,7 +57,8 @@ def load_base(
         uncolored |= issubclass(warning.category, NoColorsWarning)
         if not issubclass(warning.category, (NoColorsWarning, NoTextureWarning)):
             warnings.warn(warning.message, stacklevel=2)
-    base = BaseMesh(mesh.vertices, mesh.faces, None if uncolored else _display(mesh), up=mesh.up)
+    colors = None if uncolored else _display(mesh)
+    base = BaseMesh(mesh.vertices, mesh.faces, colors, up=mesh.up, origin=mesh.origin)
     if not textures:
         return base
     override = None if texture is None else Texture(read_texture(Path(texture)))
@@ -67,7 +72,7 @@ def load_base(
         raise FileFormatError(
             f"{source}: {len(uv):,} faces with texture coordinates, {len(base.faces):,} in all"
         )
-    return BaseMesh(base.vertices, base.faces, base.colors, uv, index, images, base.up)
+    return replace(base, uv=uv, face_texture=index, textures=images)
 
 
 def read_texture(path: Path, data: bytes | None = None) -> np.ndarray:

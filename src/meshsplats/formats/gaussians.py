@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Literal, get_args
 
 import numpy as np
 
+from meshsplats._arrays import checked_array
 from meshsplats._foreign import IMAGE_SUFFIXES
 from meshsplats._kinds import described, each, need, need_path, require_path
+from meshsplats._origin import choose_origin, sampled
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
@@ -28,7 +31,7 @@ from meshsplats.formats.splats._cloud_builder import SplatReader
 from meshsplats.formats.splats.dot_splat import read_dot_splat
 from meshsplats.formats.splats.sog import read_sog
 from meshsplats.formats.splats.spz import open_spz, read_spz
-from meshsplats.formats.splats.streamed_sog import read_streamed_sog, streamed_parts
+from meshsplats.formats.splats.streamed_sog import read_streamed_sog, streamed_corners, streamed_parts
 from meshsplats.gaussians import GaussianCloud, Kernel, shared_up
 
 Axes = Literal["auto", "y-down", "y-up"]
@@ -52,6 +55,7 @@ def load_gaussians(
     kernel: Kernel | None = None,
     time: float | None = None,
     activated: Iterable[Activated] = (),
+    origin: Sequence[float] | np.ndarray | None = None,
 ) -> GaussianCloud:
     """Splats of a file or folder, after activation.
 
@@ -70,6 +74,11 @@ def load_gaussians(
     direction is up (``GaussianCloud.up``), and whether colours are linear; these are converted, with a
     DataWarning.
 
+    Where float32 is too coarse for the coordinates of the file, as for georeferenced scenes, a point near the
+    splats is subtracted from them in float64: ``GaussianCloud.origin``. Cameras and meshes of the scene must
+    be given relative to it, too: ``load_mesh(path, origin=cloud.origin)``, likewise ``load_cameras`` and
+    ``load_dataset``. A DataWarning names files that store such coordinates as float32.
+
     Args:
         path: the file or folder.
         strict: raise an error for unusable splats instead of the warning.
@@ -82,6 +91,8 @@ def load_gaussians(
             instant to show, in the file's unit. None: one in the middle, which a DataWarning names.
         activated: of a float .ply: which of 'scales', 'opacities' and 'colors' it stores as they are, not as
             logarithms, logits and harmonics. A DataWarning says where values look so.
+        origin: (3,) point of the world (with y down) that ``means`` shall be relative to; by default one that
+            suits the splats, zero wherever float32 is fine enough.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -95,19 +106,23 @@ def load_gaussians(
     found = splat_file(Path(path))
     content = Content(found)
     kind, stored = content.splat_format(), None
+    point = None if origin is None else checked_array("origin", origin, np.float64, (3,))
+    own = None if point is None else _to_y_down(kind, axes, None).T @ point
     with content.open() as file:
         reader = reading.reader(content, kind, file, found)
         if reader is not None:
-            cloud = reading.finished(reader.read(strict=strict), reader)
+            cloud = reading.finished(reader.read(strict=strict, origin=own), reader)
             if not len(cloud):
                 raise FileFormatError(f"{found}: none of its splats is visible at time {reader.instant:.6g}")
         elif kind == "spz":
             cloud, stored = read_spz(file.read(), found, Budget(found), strict=strict)
         elif kind == "streamed sog":
-            cloud = read_streamed_sog(found, strict=strict)
+            own = choose_origin(streamed_corners(found)) if own is None else own
+            cloud = read_streamed_sog(found, strict=strict, origin=own)
         else:
-            cloud = read_splat_gltf(found, strict=strict)
-    return transformed(reading.of_kernel(cloud), _to_y_down(kind, axes, stored))
+            cloud = read_splat_gltf(found, strict=strict, origin=own)
+    cloud = transformed(reading.of_kernel(cloud), _to_y_down(kind, axes, stored))
+    return cloud if point is None else cloud.relative_to(point)
 
 
 class _Reading:
@@ -185,7 +200,8 @@ class SplatStream:
     images are unpacked as a whole (24 bytes a splat; one part at a time of a streamed scene), and a glTF file
     is read before it is cut into blocks. Blocks of one file have the same degree and kernel.
 
-    Concretely, the blocks of a file together are ``load_gaussians`` of it, to the last bit.
+    Concretely, the blocks of a file together are ``load_gaussians`` of it, to the last bit. Blocks of several
+    files have one origin, which suits all of them.
     """
 
     def __init__(
@@ -198,6 +214,7 @@ class SplatStream:
         kernel: Kernel | None = None,
         time: float | None = None,
         activated: Iterable[Activated] = (),
+        origin: Sequence[float] | np.ndarray | None = None,
     ) -> None:
         self._reading = _Reading(strict, axes, kernel, time, activated)
         if isinstance(paths, (str, os.PathLike)):
@@ -210,12 +227,67 @@ class SplatStream:
         self.paths = tuple(Path(path) for path in paths)
         """The files, in their order."""
         self.block, self.strict, self.axes = int(block), strict, axes
+        self._origin = None if origin is None else checked_array("origin", origin, np.float64, (3,))
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) float64 origin of all blocks. The files are looked at when it is first needed."""
+        if self._origin is None:
+            if len(self.paths) == 1:
+                self._origin = self._own_origin(self.paths[0])
+            else:
+                samples = [self._sample(path) for path in self.paths]
+                self._origin = choose_origin(np.concatenate([np.empty((0, 3)), *samples]))
+        return self._origin
 
     def __iter__(self) -> Iterator[GaussianCloud]:
         for path in self.paths:
             yield from self._of(path)
 
+    def _own_origin(self, path: Path) -> np.ndarray:
+        return self._looked_at(path, SplatReader.chosen_origin, choose_origin)
+
+    def _sample(self, path: Path) -> np.ndarray:
+        return self._looked_at(path, SplatReader.world_sample, lambda positions: positions)
+
+    def _looked_at(
+        self,
+        path: Path,
+        of_reader: Callable[[SplatReader], np.ndarray],
+        of_sample: Callable[[np.ndarray], np.ndarray],
+    ) -> np.ndarray:
+        """A position or positions (..., 3) of the file ``path``, with y down: of its reader, or of a sample
+        where a format has none."""
+        content = Content(path)
+        kind, stored = content.splat_format(), None
+        with content.open() as file:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # those of the file come when it is read
+                reader = self._reading.reader(content, kind, file, path)
+            if kind == "spz" and content.member is not None:
+                cloud, stored = read_spz(file.read(), path, Budget(path), strict=self.strict)
+                found = cloud.origin
+                if of_reader is not SplatReader.chosen_origin:
+                    found = of_sample(sampled(cloud.means) + cloud.origin)
+            elif kind == "spz":
+                reader, stored, close = open_spz(path)
+                try:
+                    found = of_reader(reader)
+                finally:
+                    close()
+            elif reader is not None:
+                found = of_reader(reader)
+            elif kind == "streamed sog":
+                found = of_sample(streamed_corners(path))
+            else:
+                cloud = read_splat_gltf(path, strict=self.strict)
+                found = cloud.origin
+                if of_reader is not SplatReader.chosen_origin:
+                    found = of_sample(sampled(cloud.means) + cloud.origin)
+        return found @ _to_y_down(kind, self.axes, stored).T + 0.0
+
     def _of(self, path: Path) -> Iterator[GaussianCloud]:
+        origin = self.origin
         content, reading = Content(path), self._reading
         kind, stored = content.splat_format(), None
         with content.open() as file:
@@ -224,19 +296,21 @@ class SplatStream:
             if kind == "spz" and content.member is not None:  # its streams are not apart there
                 whole, stored = read_spz(file.read(), path, Budget(path), strict=self.strict)
             elif kind == "spz":
-                reader, stored = open_spz(path)
+                reader, stored, _ = open_spz(path)
             readers: Iterable[SplatReader] = () if reader is None else (reader,)
             if kind == "streamed sog":
                 readers = (part for _, part, _ in streamed_parts(path))
             to_y_down = _to_y_down(kind, self.axes, stored)
+            own = to_y_down.T @ origin
             for reader in readers:
-                for block in reader.blocks(self.block, strict=self.strict):
+                for block in reader.blocks(self.block, strict=self.strict, origin=own):
                     block = reading.of_kernel(reading.finished(block, reader))
                     if len(block):
                         yield transformed(block, to_y_down)
         if kind == "gltf":
-            whole = read_splat_gltf(path, strict=self.strict)
+            whole = read_splat_gltf(path, strict=self.strict, origin=own)
         if whole is not None:
+            whole = whole.relative_to(own)
             for start in range(0, len(whole), self.block):
                 part = np.arange(start, min(start + self.block, len(whole)))
                 yield transformed(reading.of_kernel(whole.select(part)), to_y_down)
@@ -265,6 +339,7 @@ def stream_gaussians(
     kernel: Kernel | None = None,
     time: float | None = None,
     activated: Iterable[Activated] = (),
+    origin: Sequence[float] | np.ndarray | None = None,
 ) -> SplatStream:
     """Splats of files that are larger than memory, in blocks.
 
@@ -272,7 +347,7 @@ def stream_gaussians(
         path: a file or folder as for ``load_gaussians``; several of them; or a folder of splat files, which
             are read in the order of their names; meshes among them are left out.
         block: about this many splats at a time.
-        strict, axes, kernel, time, activated: as for ``load_gaussians``.
+        strict, axes, kernel, time, activated, origin: as for ``load_gaussians``; one origin for all files.
 
     Returns:
         A stream of clouds, which can be iterated over several times. Errors and warnings of
@@ -292,7 +367,14 @@ def stream_gaussians(
         raise ValueError("name at least one splat file")
     files = [file for one in given for file in _splat_files(Path(one))]
     return SplatStream(
-        files, block=block, strict=strict, axes=axes, kernel=kernel, time=time, activated=activated
+        files,
+        block=block,
+        strict=strict,
+        axes=axes,
+        kernel=kernel,
+        time=time,
+        activated=activated,
+        origin=origin,
     )
 
 
@@ -365,6 +447,9 @@ def save_gaussians(cloud: GaussianCloud, path: str | os.PathLike[str]) -> None:
     a DataWarning, and is read back as '3dgs'. ``up`` becomes the comment ``meshsplats up X Y Z``, and
     ``Vertical Axis: z``, too, if it is +z.
 
+    Positions are written relative to the cloud's ``origin``, which a comment names: other programs see such
+    splats around (0, 0, 0), this one puts them back into the world.
+
     Raises:
         ValueError: the suffix is not .ply, or the cloud has no splats.
     """
@@ -389,7 +474,8 @@ def save_gaussian_blocks(
 ) -> None:
     """Writes splats that come in ``blocks`` as a .ply; in memory there is one block at a time.
 
-    The file is that of ``save_gaussians`` for all of them together.
+    The file is that of ``save_gaussians`` for all of them together; positions are relative to the origin of
+    the first block.
 
     Args:
         blocks: clouds whose degree is at most ``degree``; what they lack of it is 0.

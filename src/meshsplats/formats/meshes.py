@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from meshsplats._arrays import checked_array
 from meshsplats._files.atomic import atomic_path
 from meshsplats._foreign import foreign, foreign_archive
 from meshsplats._kinds import each, need, need_path
@@ -44,13 +47,25 @@ MESH_SUFFIXES = tuple(_WRITERS)
 """Suffixes that ``save_mesh`` knows."""
 
 
-def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
+def load_mesh(
+    path: str | os.PathLike[str], *, origin: Sequence[float] | np.ndarray | None = None
+) -> SplatMesh:
     """The mesh in a file: `.npz`, `.ply`, `.glb`, `.gltf`, `.usdc`, `.usda`, `.usd` or `.obj`.
 
     The content decides the format. A file that ``save_mesh`` wrote gives back its positions, faces and extra
     arrays exactly (`.obj` has no extra arrays); colours are exact from `.npz` and `.ply`, within 1e-6 from
     USD and within 1/2000 from `.glb`. From the files of other programs, triangles and vertex colours are
     read: polygons are cut into triangles, textures are left out with a DataWarning.
+
+    Where float32 is too coarse for the coordinates of the file, a point near the mesh is subtracted from them
+    in float64: ``SplatMesh.origin``; transforms of nodes are applied before. A DataWarning names files that
+    store such coordinates as float32.
+
+    Args:
+        path: the file.
+        origin: (3,) point of the world that ``vertices`` shall be relative to, such as that of splats or
+            photographs of the same scene; by default that of our files, and one that suits those of others:
+            zero wherever float32 is fine enough.
 
     Raises:
         FileNotFoundError, IsADirectoryError: ``path`` is not a file.
@@ -60,6 +75,7 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
     """
     need_path(path=path)
     source = Path(path)
+    point = None if origin is None else checked_array("origin", origin, np.float64, (3,))
     content = Content(source)
     content.refuse_empty()
     if content.member is not None:
@@ -71,15 +87,15 @@ def load_mesh(path: str | os.PathLike[str]) -> SplatMesh:
             )
         if source.suffix.lower() != ".npz" and (what := foreign_archive(source, Archive(source).names)):
             raise FileFormatError(f"{source}: {what}")
-        return read_npz(source)
+        return read_npz(source, point)
     if content.container == "ply":
-        return read_mesh_ply(source)
+        return read_mesh_ply(source, point)
     if content.container in ("glb", "json"):
-        return read_gltf(source)
+        return read_gltf(source, point)
     if content.container == "usd":
-        return read_usd(source)
+        return read_usd(source, point)
     if content.is_obj:
-        return read_obj(source)
+        return read_obj(source, point)
     if what := foreign(source, content.head):
         raise FileFormatError(f"{source}: {what}")
     raise FileFormatError(
@@ -105,6 +121,10 @@ def save_mesh(
     - `.usdc`, `.usda`, `.usd` keep linear float colours and opacity; splat indices and attributes become
       primvars. They need the extra ``usd``.
     - `.obj` keeps positions and display colours; opacity is lost, with a DataWarning.
+
+    Every format puts a mesh with an ``origin`` at its place in the world: as the translation of a node
+    (`.glb`, USD), as double or decimal coordinates (`.ply`, `.obj`), as an array of its own (`.npz`). Read
+    again, the origin and the coordinates relative to it come back exactly, but for the last digits in `.obj`.
 
     All but `.npz` and `.glb` leave out the binding of a mesh prior, with a DataWarning. All but `.obj`, and
     `.glb` with 'hybrid' or compression, keep ``filter_px2``, but other programs render without a low-pass
@@ -225,7 +245,7 @@ def expected_bytes(mesh: SplatMesh, suffix: str, *, compressed: bool = False) ->
     if suffix == ".usda":
         return 85 * v + 24 * f + 3 * held
     if suffix == ".ply":
-        return 28 * v + 13 * f + held
+        return (52 if mesh.origin.any() else 28) * v + 13 * f + held
     if suffix == ".glb":
         whole = 20 * v + (12 if v > 0xFFFF else 6) * f + held
         return whole // 5 if compressed else whole

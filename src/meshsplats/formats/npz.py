@@ -2,8 +2,9 @@
 
 Arrays: ``vertices`` (v, 3) float32, ``faces`` (f, 3) int32, ``vertex_colors`` (v, 4) float32 straight RGBA;
 where the mesh has them ``normals``, ``face_splat``, ``depth_group`` and one ``attribute_NAME`` for each
-attribute; ``up`` (3,), ``blending`` (a text) and, if it is not 0, ``filter_px2``; for a mesh prior its
-``binding_base_vertices`` (n, 3), ``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,),
+attribute; ``up`` (3,), ``blending`` (a text) and, if they are not 0, ``filter_px2`` and the float64
+``origin`` (3,) that positions are relative to; for a mesh prior its ``binding_base_vertices`` (n, 3),
+``binding_base_faces`` (m, 3), ``binding_vertex_face`` (v,),
 ``binding_weights`` (v, 3), ``binding_layers`` (v,) and ``binding_lift``, as ``Binding`` names them. The first
 three names are those of the published MeshSplats code, whose files are read as well.
 """
@@ -23,7 +24,13 @@ import numpy as np
 
 from meshsplats.binding import Binding
 from meshsplats.errors import FileFormatError
-from meshsplats.formats._validation import Budget, check_attribute_names, checked, straight_colors
+from meshsplats.formats._validation import (
+    Budget,
+    check_attribute_names,
+    checked,
+    local_positions,
+    straight_colors,
+)
 from meshsplats.formats._zipped import BoundedReader
 from meshsplats.mesh import SplatMesh
 
@@ -55,7 +62,7 @@ _NAMES = {
     _stored(name): name
     for name in (
         *(f.name for f in SplatMesh.FIELDS),
-        *("blending", "filter_px2", "binding.lift"),
+        *("blending", "filter_px2", "origin", "binding.lift"),
         *(f"binding.{f.name}" for f in Binding.FIELDS),
     )
 }
@@ -72,9 +79,10 @@ def write_npz(mesh: SplatMesh, path: Path) -> None:
                 np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def read_npz(path: Path) -> SplatMesh:
+def read_npz(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     """The mesh in an `.npz` file, ours or one of the published MeshSplats code (colours (v, 3) or (v, 4),
-    float in [0, 1] or 8-bit; without alpha the mesh is opaque). Other arrays are ignored.
+    float in [0, 1] or 8-bit; without alpha the mesh is opaque). Other arrays are ignored. Positions are
+    relative to ``origin``; by default to that of our files, or to one that suits those of others.
 
     Shapes are read, compared with each other and with the archive's own sizes before any array is allocated.
     Raises FileFormatError.
@@ -82,7 +90,7 @@ def read_npz(path: Path) -> SplatMesh:
     with BoundedReader(path) as file:
         try:
             with zipfile.ZipFile(file) as archive:
-                return _read(archive, path)
+                return _read(archive, path, origin)
         except FileFormatError:
             raise
         except _BROKEN_ZIP as error:
@@ -100,7 +108,7 @@ class _Member:
     header_bytes: int
 
 
-def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
+def _read(archive: zipfile.ZipFile, path: Path, origin: np.ndarray | None) -> SplatMesh:
     members: dict[str, _Member] = {}
     for info in archive.infolist():
         name = info.filename.removesuffix(".npy")
@@ -118,9 +126,12 @@ def _read(archive: zipfile.ZipFile, path: Path) -> SplatMesh:
         budget.spend(member.info.file_size, f"array {name!r}")
     arrays = {name: _load(archive, member, name, path) for name, member in members.items()}
     arrays["vertex_colors"] = straight_colors(arrays["vertex_colors"], path)
+    if "blending" not in arrays and "origin" not in arrays:  # of another program
+        arrays["vertices"], arrays["origin"] = local_positions(arrays["vertices"], origin, path)
     named = {_NAMES.get(name) or name.replace("_", ".", 1): array for name, array in arrays.items()}
     try:
-        return checked(path, SplatMesh.from_arrays, _DEFAULTS | named)
+        mesh = checked(path, SplatMesh.from_arrays, _DEFAULTS | named)
+        return mesh if origin is None else mesh.relative_to(origin)
     except KeyError as error:
         lost = _stored(error.args[0])
         raise FileFormatError(f"{path}: the binding to a base is not whole: {lost} is missing") from None
@@ -201,6 +212,7 @@ def _check_shapes(members: dict[str, _Member], path: Path) -> None:
         "vertex_colors": ((v, 4), (v, 3)),
         "blending": ((), (1,)),
         "filter_px2": ((),),
+        "origin": ((3,),),
         "binding_lift": ((),),
     }
     for prefix, fields in (("", SplatMesh.FIELDS), ("binding_", Binding.FIELDS)):

@@ -16,14 +16,16 @@ Layouts, from the programs' sources:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, overload
 
 import numpy as np
 
+from meshsplats._arrays import checked_array
 from meshsplats._kinds import described, need
 from meshsplats.errors import GET_TORCH, MissingDependencyError
 from meshsplats.formats import _activation
+from meshsplats.formats._validation import local_positions
 from meshsplats.formats.splats._cloud_builder import CloudBuilder
 from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
 
@@ -62,7 +64,11 @@ _LAYOUTS: dict[Layout, _Names] = {
 
 
 def gaussians_from_tensors(
-    tensors: Any, *, kernel: Kernel | None = None, strict: bool = False
+    tensors: Any,
+    *,
+    kernel: Kernel | None = None,
+    strict: bool = False,
+    origin: Sequence[float] | np.ndarray | None = None,
 ) -> GaussianCloud:
     """The splats that a training program holds, after activation.
 
@@ -75,7 +81,8 @@ def gaussians_from_tensors(
       ``_scaling``, ``_opacity``, ``_features_dc`` and ``_features_rest``;
     - nerfstudio's splatfacto: the ``gauss_params`` of its model.
 
-    Values are rounded to float32 first. Then, concretely, scales are ``exp(scales)``, opacities ``1 / (1 +
+    Values are rounded to float32 first, positions relative to an origin, which is not zero where float32 is
+    too coarse for them. Then, concretely, scales are ``exp(scales)``, opacities ``1 / (1 +
     exp(-opacities))``, quaternions are divided by their lengths, and the harmonics follow each other, as in a
     .ply file of these programs: the cloud is the one that ``load_gaussians`` reads of that, to the last bit.
 
@@ -85,6 +92,7 @@ def gaussians_from_tensors(
             'antialiased' for gsplat's ``rasterize_mode="antialiased"``. Third scales of '2dgs' splats are 0.
         strict: raise an error for unusable splats, where by default a DataWarning says how many are left out:
             those with values that are not finite after activation, or with a zero quaternion.
+        origin: as for ``load_gaussians``.
 
     Raises:
         TypeError: ``tensors`` is nothing of the kind.
@@ -92,7 +100,10 @@ def gaussians_from_tensors(
     """
     layout, take = _layout(tensors)
     names = _LAYOUTS[layout]
-    means = _part(names.means, take(names.means), "(n, 3)", lambda shape: shape[1:] == (3,))
+    given = _array(names.means, take(names.means), "(n, 3)", lambda shape: shape[1:] == (3,))
+    point = None if origin is None else checked_array("origin", origin, np.float64, (3,))
+    means, at = local_positions(given, point, f"the tensors of {layout}")
+    means = means.astype(np.float32, copy=False)
     n = len(means)
     if n == 0:
         raise ValueError(f"{names.means!r} holds no splats, its shape is {means.shape}")
@@ -110,14 +121,16 @@ def gaussians_from_tensors(
     if layout == "nerfstudio" and not rest.shape[1]:
         first = (_activation.activated_opacities(first) - np.float32(0.5)) / np.float32(SH_C0)
     stored = _Stored(means, quaternions, logs, logits, first, rest)
-    return _activated(stored, kernel, f"the tensors of {layout}", strict=strict)
+    return _activated(stored, kernel, f"the tensors of {layout}", at, strict=strict)
 
 
-def _activated(stored: _Stored, kernel: Kernel | None, where: str, *, strict: bool) -> GaussianCloud:
+def _activated(
+    stored: _Stored, kernel: Kernel | None, where: str, origin: np.ndarray, *, strict: bool
+) -> GaussianCloud:
     """The cloud of ``stored`` values; warnings are for the caller's caller."""
     means, quaternions, logs, logits, first, rest = stored
     n = len(means)
-    builder = CloudBuilder(n, 1 + rest.shape[1], where)
+    builder = CloudBuilder(n, 1 + rest.shape[1], where, origin=origin)
     rows = builder.next(n)
     rows.means[:], rows.quaternions[:] = means, quaternions
     _activation.activated_opacities(logits, out=rows.opacities)
@@ -147,7 +160,7 @@ def gaussians_to_tensors(
     exactly, the others within rounding. Opacities of 0 and 1 and scales of 0, whose logits and logarithms are
     infinite, become sigmoid(-30), sigmoid(20) and 1.2e-38, as in ``save_gaussians``. 'inria' has two scales
     for '2dgs' clouds. 'nerfstudio' keeps colours of degree 0 as logits if there are no others, so they are
-    clipped to [0, 1].
+    clipped to [0, 1]. Positions are relative to the cloud's ``origin``, which tensors have no place for.
 
     Args:
         cloud: the splats.
@@ -213,11 +226,18 @@ def _layout(tensors: Any) -> tuple[Layout, Callable[[str], Any]]:
 
 def _part(name: str, value: Any, shape: str, fits: Callable[[tuple[int, ...]], bool]) -> np.ndarray:
     """A tensor or array as a float32 array, without importing torch."""
+    return _array(name, value, shape, fits).astype(np.float32, copy=False)
+
+
+def _array(name: str, value: Any, shape: str, fits: Callable[[tuple[int, ...]], bool]) -> np.ndarray:
+    """A tensor or array as an array of float32, or of another type of NumPy."""
     if hasattr(value, "detach"):
-        value = value.detach().cpu().float().numpy()  # NumPy does not know bfloat16
+        value = value.detach().cpu()
+        doubles = str(getattr(value, "dtype", "")) == "torch.float64"
+        value = (value if doubles else value.float()).numpy()  # NumPy does not know bfloat16
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{name!r} must hold numbers, got {described(value)}")
     if array.ndim == 0 or not fits(array.shape):
         raise ValueError(f"{name!r} must have shape {shape}, got {array.shape}")
-    return array.astype(np.float32, copy=False)
+    return array

@@ -77,7 +77,8 @@ def bind(
         colors: source of the initial colours: 'texture', 'vertices' (vertex colours), 'views' (the views that
             see a point most frontally), or 'grey'. 'auto' takes the first that is available. Faces of a
             textured base without texture take vertex colours, if any.
-        views: images with cameras, for the colours of 'views' and the side of the shells.
+        views: images with cameras, for the colours of 'views' and the side of the shells; their cameras are
+            relative to the origin of the base.
         threads: maximum number of threads; all processors by default.
 
     Returns:
@@ -136,6 +137,7 @@ def bind(
         depth_group=depth_group,
         up=base.up,
         binding=binding,
+        origin=base.origin,
     )
     return MeshPrior(mesh)
 

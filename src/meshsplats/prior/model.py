@@ -74,7 +74,8 @@ class MeshPrior:
         have moved along the posed base's normals.
 
         Args:
-            vertices: (n, 3) posed positions of the base's vertices; the stored ones by default.
+            vertices: (n, 3) posed positions of the base's vertices, relative to the origin of the mesh; the
+                stored ones by default.
             lift: distance between layers in scene units. By default that of the prior, scaled with the base:
                 by the square root of the ratio of its areas. With 0 the layers are coplanar, and this
                 project's renderer blends them in their order (``depth_group``); for other programs use

@@ -101,7 +101,7 @@ def base_surface(
     points = (low + voxel * vertices).astype(np.float32)
     colors = np.ones((len(points), 4), np.float32)
     colors[:, :3] = colors_from_views(_vertex_binding(points, triangles), views, threads=threads)
-    return BaseMesh(points, triangles, colors, up=guess_up(scene))
+    return BaseMesh(points, triangles, colors, up=guess_up(scene), origin=scene.origin)
 
 
 class Grid(NamedTuple):

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -79,10 +79,13 @@ class TileOptions:
     """How viewers treat opacity, as in ``save_mesh``, the same in all tiles. auto: 'blend' or 'mask',
     whichever is nearer to the sorted image in viewers that do not sort (``choose_alpha``), by images of the
     tiles from around the scene."""
+    place: Literal["world", "local"] = "world"
+    """'world': the tileset stands at the origin of the splats, to which the transform of its root moves it;
+    'local': that transform is left out."""
 
     def resolved(self) -> ConversionOptions:
         """The checked options of the conversion. Raises ValueError."""
-        check_choices(self, {"alpha": get_args(TilesAlpha)})
+        check_choices(self, {"alpha": get_args(TilesAlpha), "place": ("world", "local")})
         chosen = (self.conversion or ConversionOptions()).resolved(self.preset, has_cameras=False)
         refuse_whole(chosen)
         if chosen.footprint == "filter":
@@ -126,10 +129,13 @@ def build_tiles(
 ) -> TilesetSummary:
     """Writes the splats of ``source`` as the tileset ``folder``, whole or not at all.
 
-    Until it is complete it lies in ``FOLDER.partial`` with a journal, so that a run that was ended at any
-    moment can be resumed. The result has the same bits with any number of threads and workers, and after any
-    number of interruptions. Memory does not grow with the scene; the disk holds 60 bytes a splat besides the
-    tiles.
+    Tiles are relative to the origin of the splats (``SplatStream.origin``), to which the transform of the
+    root moves them.
+
+    Until it is complete the tileset lies in ``FOLDER.partial`` with a journal, so that a run that was ended
+    at any moment can be resumed. The result has the same bits with any number of threads and workers, and
+    after any number of interruptions. Memory does not grow with the scene; the disk holds 60 bytes a splat
+    besides the tiles.
 
     Args:
         source: the splats.
@@ -260,7 +266,8 @@ class _Build:
                 nodes[fields["key"]] = Node(**fields)
         leaves = [node for node in nodes.values() if not node.children]
         splats = sum(node.splats for node in leaves)
-        write_tilesets(self._out, nodes, root, unit_up(self._options.up or DEFAULT_UP), splats)
+        up = unit_up(self._options.up or DEFAULT_UP)
+        write_tilesets(self._out, nodes, root, up, splats, self._origin)
         alpha = self._alpha(scene, nodes)
         triangles = sum(node.triangles for node in leaves)
         size = sum(path.stat().st_size for path in self._out.rglob("*") if path.is_file())
@@ -304,6 +311,11 @@ class _Build:
 
         return choose_by_views(views(), threads=self._threads)
 
+    @property
+    def _origin(self) -> np.ndarray:
+        """Where the tileset stands in its world."""
+        return self._source.origin if self._options.place == "world" else np.zeros(3)
+
     def _tiles(self, threads: int | None) -> Shared[_Tiles]:
         return Shared(partial(_Tiles, self._folder, self._options, threads))
 
@@ -311,7 +323,10 @@ class _Build:
         """Notes what the run is about, or refuses to resume another one."""
         files = [[str(path), os.stat(path).st_size, os.stat(path).st_mtime_ns] for path in self._source.paths]
         reading = [self._source.axes, self._source.strict]
-        facts = {"files": files, "reading": reading, "options": json.loads(json.dumps(asdict(self._options)))}
+        options = json.loads(json.dumps(asdict(self._options)))
+        facts: dict[str, Any] = {"files": files, "reading": reading, "options": options}
+        if self._source.origin.any():
+            facts["origin"] = self._source.origin.tolist()
         before = self.journal.find("start")
         if before is None:
             self.journal.add("start", **facts)

@@ -208,7 +208,7 @@ def join_tiles(tileset: Tileset, tiles: Sequence[Tile]) -> SplatMesh:
         owners[own_faces] = steps + np.int32(first_splat)
         first, first_face = first + tile.vertices, first_face + tile.triangles
         first_splat += int(steps[-1]) + 1 if len(steps) else 0
-    return SplatMesh(vertices, faces, colors, face_splat=owners, up=tileset.up)
+    return SplatMesh(vertices, faces, colors, face_splat=owners, up=tileset.up, origin=tileset.origin)
 
 
 def _halves(camera: Camera, axis: int, middle: int) -> tuple[Camera, Camera]:

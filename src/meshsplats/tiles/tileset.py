@@ -69,24 +69,46 @@ def tile_path(key: str) -> str:
     return "/".join([*_folders(key), f"{key[len(_group(key)) :] or 'root'}.glb"])
 
 
-def write_tilesets(folder: Path, nodes: dict[str, Node], root: str, up: np.ndarray, splats: int) -> None:
-    """Writes the tileset files of ``nodes`` (by key) below ``root``; that of the root last."""
-    note = {"up": [float(x) for x in up], "splats": splats}
+def write_tilesets(
+    folder: Path,
+    nodes: dict[str, Node],
+    root: str,
+    up: np.ndarray,
+    splats: int,
+    origin: np.ndarray,
+) -> None:
+    """Writes the tileset files of ``nodes`` (by key) below ``root``; that of the root last.
+
+    Tiles are relative to the point ``origin`` (3,) of the world, to which the transform of the root moves
+    them.
+    """
+    note: dict[str, Any] = {"up": [float(x) for x in up], "splats": splats}
+    if origin.any():
+        note["origin"] = origin.tolist()
     files = [key for key in sorted(nodes) if key != root and _starts_file(key, nodes, root)]
     for key in [*files, root]:
         own = "" if key == root else _group(key)
         tile = _tile(nodes[key], nodes, own)
         box = np.array(nodes[key].high) - np.array(nodes[key].low)
-        document = {
+        document: dict[str, Any] = {
             "asset": {"version": "1.1", "generator": f"MeshSplats {__version__}"},
             "geometricError": max(nodes[key].error, float(np.linalg.norm(box)) if key == root else 0.0),
             "root": {"refine": "REPLACE", **tile},
         }
         if key == root:
             document["extras"] = {"meshsplats": note}
+        if key == root and origin.any():
+            document["root"] |= {"transform": _transform(up, origin)}
         path = folder.joinpath(*_folders(own), NAME)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n")
+
+
+def _transform(up: np.ndarray, origin: np.ndarray) -> list[float]:
+    """The transform of the root, column by column: a translation to ``origin``."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = tile_frame(up) @ origin
+    return [float(x) + 0.0 for x in matrix.T.ravel()]
 
 
 def _group(key: str) -> str:
@@ -157,9 +179,9 @@ class Tile:
     """A tile as it is read."""
 
     center: np.ndarray
-    """(3,) float64 centre of its box, world frame."""
+    """(3,) float64 centre of its box, along the axes of the world, relative to the tileset's origin."""
     axes: np.ndarray
-    """(3, 3) float64 rows: half the edges of its box, world frame."""
+    """(3, 3) float64 rows: half the edges of its box, along the axes of the world."""
     error: float
     """Geometric error, scene units."""
     content: Path
@@ -172,13 +194,13 @@ class Tile:
     """Whether the content is another tileset file."""
 
     def corners(self) -> np.ndarray:
-        """(8, 3) float64 corners of its box, world frame."""
+        """(8, 3) float64 corners of its box, in the coordinates of ``center``."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         return self.center + signs @ self.axes
 
     def load(self) -> SplatMesh:
-        """The mesh of the tile in the world frame."""
-        mesh = load_mesh(self.content)
+        """The mesh of the tile, relative to the tileset's origin."""
+        mesh = load_mesh(self.content, origin=(0, 0, 0))
         if len(mesh.faces) != self.triangles or len(mesh.vertices) != self.vertices:
             raise FileFormatError(
                 f"{self.content}: {len(mesh.faces):,} triangles and {len(mesh.vertices):,} vertices, the"
@@ -209,10 +231,14 @@ class Tileset:
         """(3,) float64 unit direction that points up in the world frame."""
         self.splats = _whole(note.get("splats"), "splats", self.path)
         """Count of the splats in all leaves."""
+        self.origin = np.zeros(3)
+        """(3,) float64 point of the world that the tiles are relative to."""
+        if "origin" in note:
+            self.origin = _numbers(note["origin"], 3, "the origin", self.path)
         _error(document, self.path)
         self._to_world = tile_frame(self.up).T
         self._count = 0
-        self.root = self._tile(_object(document, "root", self.path), self.path, 0)
+        self.root = self._tile(self._root_entry(document), self.path, 0)
 
     def children(self, tile: Tile) -> list[Tile]:
         """The tiles that take the place of ``tile``; none for a leaf. A tileset file is read once."""
@@ -235,6 +261,19 @@ class Tileset:
         if root.is_file:
             raise FileFormatError(f"{tile.content}: its root must have a mesh, not another tileset")
         return root
+
+    def _root_entry(self, document: dict[str, Any]) -> dict[str, Any]:
+        """The entry of the root without its transform, which must be the one to the origin."""
+        entry = dict(_object(document, "root", self.path))
+        if "transform" in entry or self.origin.any():
+            found = _numbers(entry.pop("transform", None), 16, "the transform of the root", self.path)
+            wanted = np.array(_transform(self.up, self.origin))
+            if np.abs(found - wanted).max() > 1e-9 * max(1.0, float(np.abs(wanted).max())):
+                raise FileFormatError(
+                    f"{self.path}: the transform of the root is not the one to the tileset's origin: another"
+                    " program has moved it; only tilesets in their place are read"
+                )
+        return entry
 
     def _tile(self, entry: dict[str, Any], file: Path, depth: int) -> Tile:
         self._count += 1

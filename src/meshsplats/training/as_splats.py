@@ -41,7 +41,8 @@ def splats_of_fans(mesh: SplatMesh) -> GaussianCloud:
     sigma[:, 0] = THICKNESS * sigma[:, 1]
     rgb = (colors[:, 0, :3] + colors[:, 1:, :3].mean(axis=1)) / 2
     opacity = np.clip(colors[:, 0, 3] / profile.opacities[0], 0, 1)
-    return GaussianCloud(middle, quaternions_of(axes), sigma, opacity, (rgb[:, None] - 0.5) / SH_C0)
+    sh = (rgb[:, None] - 0.5) / SH_C0
+    return GaussianCloud(middle, quaternions_of(axes), sigma, opacity, sh, origin=mesh.origin)
 
 
 def check_fans(mesh: SplatMesh) -> None:

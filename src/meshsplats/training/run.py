@@ -156,7 +156,8 @@ def starting_fans(
     count = len(joined.points)
     chosen = np.linspace(0, count - 1, min(count, config.max_splats)).astype(int)
     mesh = fans_of(flat_splats(joined.select(chosen)), config.sides)
-    mesh = replace(mesh, up=guess_up(cameras=[view.camera for view in views]))
+    up = guess_up(cameras=[view.camera for view in views])
+    mesh = replace(mesh, up=up, origin=dataset.origin)
     if shell is None:
         return colored(mesh, views, threads)
     in_shell = np.repeat(chosen >= count - len(shell.points), 1 + config.sides)

@@ -37,6 +37,9 @@ UP = "meshsplats_up"
 """Property of the mesh data: its up direction, in its own frame."""
 ORIGIN = "meshsplats_origin"
 """Property of the mesh data: the object's origin, under the subject, in the mesh's own frame."""
+WORLD = "meshsplats_world"
+"""Property of the mesh data, where it is not zero: ``SplatMesh.origin``, the point of the world that its
+frame is relative to. Blender's places are float32, so objects stand near (0, 0, 0)."""
 LAYERS = "meshsplats_layers"
 """Property of the mesh data: most layers behind each other."""
 
@@ -158,6 +161,8 @@ def _data(prepared: dict[str, Any], name: str) -> Any:
         linear=mesh.blending == "linear",
         layers=prepared["layers"],
     )
+    if mesh.origin.any():
+        data[WORLD] = mesh.origin.tolist()
     return data
 
 
@@ -205,6 +210,7 @@ def as_splat_mesh(obj: Any) -> SplatMesh:
         face_splat=owner,
         up=up,
         blending=blending,
+        origin=np.array(data.get(WORLD, (0, 0, 0)), np.float64),
     )
     if priors.base_of(obj) is None:
         return found

@@ -6,16 +6,22 @@ meshopt decoder, such as three.js, read them; programs without it refuse the fil
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import struct
 import subprocess
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
+
+from meshsplats._origin import zero_origin
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats.cutting import CUTOFF
-from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
+from meshsplats.formats.gltf.writer import Alpha, ColorType, turned_origin, write_glb
 from meshsplats.mesh import SplatMesh
 
 Compression = Literal["meshopt"]
@@ -59,7 +65,9 @@ def write_compressed_glb(
         )
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         plain, packed = Path(folder) / "plain.glb", Path(folder) / "packed.glb"
-        write_glb(mesh, plain, lit=lit, alpha=alpha, cutoff=cutoff, extras=False)
+        # The program has float32 for transforms of nodes.
+        local = replace(mesh, origin=zero_origin())
+        write_glb(local, plain, lit=lit, alpha=alpha, cutoff=cutoff, extras=False)
         precision = ["-vp", str(_BITS), "-vc", "16", "-vn", "12"]
         done = subprocess.run(
             [program, "-i", plain, "-o", packed, "-cc", *precision, "-ke", "-km", "-kn"],
@@ -69,4 +77,21 @@ def write_compressed_glb(
         )
         if done.returncode or not packed.is_file():
             raise RuntimeError(f"gltfpack failed with status {done.returncode}: {done.stderr.strip()[-500:]}")
-        shutil.copyfile(packed, path)
+        content = packed.read_bytes()
+        path.write_bytes(moved_scene(content, turned_origin(mesh)) if mesh.origin.any() else content)
+
+
+def moved_scene(content: bytes, translation: np.ndarray) -> bytes:
+    """The `.glb` file ``content`` with the nodes of its scene below one that moves them by ``translation``
+    (3,) float64."""
+    length = struct.unpack_from("<I", content, 12)[0]
+    document = json.loads(content[20 : 20 + length])
+    for scene in document["scenes"]:
+        node = {"name": "origin", "translation": translation.tolist(), "children": scene["nodes"]}
+        scene["nodes"] = [len(document["nodes"])]
+        document["nodes"].append(node)
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    return head + text + rest

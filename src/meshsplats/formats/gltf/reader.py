@@ -11,10 +11,11 @@ from typing import Any, get_args
 
 import numpy as np
 
+from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.binding import Binding
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
-from meshsplats.formats._validation import checked, straight_colors
+from meshsplats.formats._validation import checked, straight_colors, warn_of_lost_detail
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.scene import Placed, placed_meshes, rotation_matrix
 from meshsplats.formats.gltf.writer import camel_case, up_quaternion
@@ -26,38 +27,51 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 @dataclass
 class _Piece:
-    """A primitive in the frame of the scene, as placed by a node."""
+    """A primitive, which a node places."""
 
+    place: Placed
+    attributes: dict[str, Any]
     vertices: np.ndarray
+    """In the frame of the mesh; in that of the scene after ``put``."""
     faces: np.ndarray
     linear: np.ndarray
     normals: np.ndarray | None
 
+    def put(self, document: GltfDocument, origin: np.ndarray) -> None:
+        """Puts the piece into the scene, relative to ``origin``."""
+        self.vertices, self.normals = self.place.applied(
+            document, self.attributes, self.vertices, self.normals, origin
+        )
 
-def read_gltf(path: Path) -> SplatMesh:
+
+def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     """The mesh in a `.glb` or `.gltf` file.
 
     Our own files give back positions and extra arrays exactly, and colours within their stored precision.
     From other programs' files, all triangles of the scene are joined in its y-up frame; colours are COLOR_0
     times the material's base colour, converted to display values; textures are left out with a DataWarning.
-    Buffers must be embedded or lie beside the file.
+    Buffers must be embedded or lie beside the file. Positions are relative to ``origin``; by default to that
+    of our files, or to one that suits those of others, whose nodes are applied in float64.
 
     Raises:
         FileFormatError: the file is broken, or has Draco or meshopt compression or sparse accessors.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # SplatMesh refuses values that are not finite
-        return _read(GltfDocument(path))
+        mesh = _read(GltfDocument(path), origin)
+        return mesh if origin is None else mesh.relative_to(origin)
 
 
-def _read(document: GltfDocument) -> SplatMesh:
+def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
     path = document.path
     placed = list(placed_meshes(document))
     pieces, skipped, textured = [], 0, 0
     own = placed[0].mesh if len(placed) == 1 else {}
     note = _our_note(own)
+    named: np.ndarray | None = None
     for place in placed:
         if note and _is_own_placement(place.matrix, note):
             place = place._replace(matrix=np.eye(4))
+            named = _origin_of(note)
         elif note:  # another program has moved the mesh in the scene
             note["up"] = [0.0, 1.0, 0.0]
         for primitive in objects_in(document, place.mesh.get("primitives"), "primitives of a mesh"):
@@ -76,7 +90,20 @@ def _read(document: GltfDocument) -> SplatMesh:
         warnings.warn(message, NoTextureWarning, stacklevel=3)
     if not pieces:
         raise document.error("the scene holds no triangles")
-    return _join(document, pieces, own, note)
+    if origin is None or named is not None:
+        origin = _chosen_origin(document, pieces) if named is None else named
+    for piece in pieces:
+        piece.put(document, zero_origin() if named is not None else origin)
+    return _join(document, pieces, own, note, origin)
+
+
+def _chosen_origin(document: GltfDocument, pieces: list[_Piece]) -> np.ndarray:
+    sample = np.concatenate(
+        [piece.place.sample(document, piece.attributes, piece.vertices) for piece in pieces]
+    )
+    if all((piece.place.matrix == np.eye(4)).all() for piece in pieces):
+        warn_of_lost_detail(sample, document.path)
+    return choose_origin(sample)
 
 
 def _piece(
@@ -109,8 +136,7 @@ def _piece(
     for name, values in (("POSITION", vertices), ("NORMAL", normals)):
         if values is not None and values.shape != (v, 3):
             raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")
-    vertices, normals = place.applied(document, attributes, vertices, normals)
-    return _Piece(vertices, faces, linear, normals)
+    return _Piece(place, attributes, vertices, faces, linear, normals)
 
 
 def primitive_faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:
@@ -140,7 +166,11 @@ def primitive_faces(document: GltfDocument, primitive: dict[str, Any], v: int) -
 
 
 def _join(
-    document: GltfDocument, pieces: list[_Piece], own: dict[str, Any], note: dict[str, Any]
+    document: GltfDocument,
+    pieces: list[_Piece],
+    own: dict[str, Any],
+    note: dict[str, Any],
+    origin: np.ndarray,
 ) -> SplatMesh:
     counts = np.cumsum([0, *(len(p.vertices) for p in pieces)])
     if counts[-1] > np.iinfo(np.int32).max:
@@ -160,6 +190,7 @@ def _join(
         "colors": colors,
         "normals": normals,
         "up": (0, 1, 0),
+        "origin": origin,
     }
     if note:
         arrays |= {"up": note["up"], "blending": note["blending"]}
@@ -183,15 +214,26 @@ def _our_note(mesh: dict[str, Any]) -> dict[str, Any]:
     good = (
         isinstance(up, list) and len(up) == 3 and all(isinstance(u, (int, float)) and abs(u) <= 2 for u in up)
     )
+    origin = note.get("origin", [0, 0, 0])
+    good &= isinstance(origin, list) and len(origin) == 3
+    good = good and all(isinstance(x, (int, float)) and abs(x) < 1e300 for x in origin)
     if not good or note.get("blending") not in get_args(Blending) or not any(up):  # type: ignore[arg-type]
         return {}
     return note
 
 
+def _origin_of(note: dict[str, Any]) -> np.ndarray:
+    return np.array(note.get("origin", [0, 0, 0]), np.float64)
+
+
 def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
-    """Whether the node is still ours: it rotates the mesh's up direction to +y, nothing more."""
+    """Whether the node is still ours: it turns the mesh's up direction to +y and puts the mesh at its origin,
+    nothing more."""
     wanted = rotation_matrix(up_quaternion(np.array(note["up"], np.float64)))
-    return bool(np.abs(matrix - wanted).max() < 1e-5)
+    wanted[:3, 3] = wanted[:3, :3] @ _origin_of(note)
+    rounding = 1e-12 * np.abs(wanted[:3, 3]).max()
+    turn, shift = np.abs(matrix - wanted)[:3, :3], np.abs(matrix - wanted)[:3, 3]
+    return bool(turn.max() < 1e-5 and shift.max() < max(1e-5, rounding))
 
 
 def _restore(

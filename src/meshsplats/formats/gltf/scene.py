@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from meshsplats._geometry import rotation_rows
+from meshsplats._origin import SAMPLE
 from meshsplats.formats.gltf.document import GltfDocument
 
 INSTANCING = "EXT_mesh_gpu_instancing"
@@ -34,21 +35,19 @@ class Placed(NamedTuple):
         attributes: dict[str, Any],
         vertices: np.ndarray,
         normals: np.ndarray | None,
+        origin: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Vertices and normals (v, 3) float32 of a primitive in the scene's frame."""
-        if self.joints is not None and {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
-            skinning = _Skinning(document, attributes, self.joints(), len(vertices))
-        elif (self.matrix == np.eye(4)).all():
-            return vertices, normals
-        else:
-            skinning = None
+        """Vertices and normals (v, 3) float32 of a primitive in the scene's frame, relative to ``origin``."""
+        skinning = self._skinning(document, attributes, len(vertices))
+        if skinning is None and (self.matrix == np.eye(4)).all():
+            return ((vertices - origin).astype(np.float32) if origin.any() else vertices), normals
         moved = np.empty_like(vertices)
         turned = None if normals is None else np.empty_like(normals)
         for start in range(0, len(vertices), _AT_ONCE):
             part = slice(start, start + _AT_ONCE)
             matrices = self.matrix[None] if skinning is None else skinning.of(part)
             linear = matrices[:, :3, :3]
-            moved[part] = np.einsum("nij,nj->ni", linear, vertices[part]) + matrices[:, :3, 3]
+            moved[part] = np.einsum("nij,nj->ni", linear, vertices[part]) + (matrices[:, :3, 3] - origin)
             if normals is not None and turned is not None:
                 # Normals follow the inverse transpose or, as their length does not matter, the cofactors.
                 a, b, c = np.moveaxis(linear, 2, 0)
@@ -57,6 +56,18 @@ class Placed(NamedTuple):
                 length = np.linalg.norm(sides, axis=1, keepdims=True)
                 turned[part] = sides / np.where(length > 0, length, 1)
         return moved, turned
+
+    def sample(self, document: GltfDocument, attributes: dict[str, Any], vertices: np.ndarray) -> np.ndarray:
+        """(k, 3) float64: a sample of the vertices of a primitive in the scene's frame."""
+        part = slice(None, None, max(1, len(vertices) // SAMPLE))
+        skinning = self._skinning(document, attributes, len(vertices))
+        matrices = self.matrix[None] if skinning is None else skinning.of(part)
+        return np.asarray(np.einsum("nij,nj->ni", matrices[:, :3, :3], vertices[part]) + matrices[:, :3, 3])
+
+    def _skinning(self, document: GltfDocument, attributes: dict[str, Any], v: int) -> _Skinning | None:
+        if self.joints is not None and {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
+            return _Skinning(document, attributes, self.joints(), v)
+        return None
 
 
 class _Skinning:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning
 from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_Z, transformed
@@ -34,21 +35,28 @@ _COMPRESSED = (
 _EXTENSIONS = frozenset({EXTENSION, *_COMPRESSED})
 
 
-def read_splat_gltf(path: Path, *, strict: bool) -> GaussianCloud:
-    """The splats of all nodes of a glTF scene, in its frame; errors as ``load_gaussians``."""
+def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = None) -> GaussianCloud:
+    """The splats of all nodes of a glTF scene, in its frame, relative to ``origin``, by default one that
+    suits them; errors as ``load_gaussians``."""
     document = GltfDocument(path, also_known=_EXTENSIONS)
-    clouds = []
-    for place in placed_meshes(document):
-        for primitive in _splat_primitives(document, place.mesh):
-            cloud = _cloud(document, primitive, strict=strict)
-            try:
-                clouds.append(transformed(cloud, place.matrix))
-            except ValueError as error:
-                raise document.error(f"a node's transform cannot be applied to splats: {error}") from None
-    if not clouds:
+    placed = [
+        (_cloud(document, primitive, strict=strict), place.matrix)
+        for place in placed_meshes(document)
+        for primitive in _splat_primitives(document, place.mesh)
+    ]
+    if not placed:
         raise document.error(
             f"a glTF file without splats (no primitive has {EXTENSION}); load_mesh reads meshes"
         )
+    if origin is None:
+        few = [sampled(cloud.means) @ matrix[:3, :3].T + matrix[:3, 3] for cloud, matrix in placed]
+        origin = choose_origin(np.concatenate(few))
+    clouds = []
+    for cloud, matrix in placed:
+        try:
+            clouds.append(transformed(cloud, matrix, origin if origin.any() else None))
+        except ValueError as error:
+            raise document.error(f"a node's transform cannot be applied to splats: {error}") from None
     return joined_within(clouds, document.budget)
 
 
@@ -72,7 +80,7 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
         if name in nested:
             view = _object(document, nested, name).get("bufferView")
             data, _ = document.view_bytes(view, name)
-            spz = read_spz(data, document.path, document.budget, strict=strict)
+            spz = read_spz(data, document.path, document.budget, strict=strict, origin=zero_origin())
             return transformed(spz.cloud, HALF_TURN_Z @ spz.to_y_down)
     if (shape := splatting.get("kernel", "ellipse")) != "ellipse":
         warnings.warn(

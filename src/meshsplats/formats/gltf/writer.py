@@ -2,8 +2,8 @@
 
 Specification: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. One mesh of one double-sided
 primitive, or of two where solid triangles are kept apart, coloured by COLOR_0 (linear RGBA). glTF is y-up:
-the node has a pure rotation from the mesh's own frame to a frame whose +y is the mesh's ``up``; vertices are
-stored unchanged. All else is in the mesh's ``extras.meshsplats``.
+the node turns the mesh's own frame to one whose +y is the mesh's ``up``, and puts the mesh at its ``origin``;
+vertices are stored unchanged. All else is in the mesh's ``extras.meshsplats``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from meshsplats._geometry import vertex_normals
+from meshsplats._geometry import rotation_rows, vertex_normals
 from meshsplats.binding import Binding
 from meshsplats.colors import srgb_to_linear
 from meshsplats.formats._validation import check_attribute_names
@@ -141,6 +141,10 @@ def _document(
         "blending": mesh.blending,
         "up": [float(u) for u in mesh.up],
     }
+    node: dict[str, Any] = {"name": "splats", "mesh": 0, "rotation": up_quaternion(mesh.up)}
+    if mesh.origin.any():
+        extras["origin"] = mesh.origin.tolist()
+        node["translation"] = turned_origin(mesh).tolist()
     if alpha == "hybrid":
         with_extras = False
     if mesh.filter_px2 and with_extras:
@@ -165,7 +169,7 @@ def _document(
         "asset": {"version": "2.0", "generator": f"MeshSplats {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "splats", "mesh": 0, "rotation": up_quaternion(mesh.up)}],
+        "nodes": [node],
         "meshes": [
             {
                 "name": "splats",
@@ -313,6 +317,12 @@ def up_quaternion(up: np.ndarray) -> list[float]:
     # half turn, (x, y, z) is (x, -y, -z), and (a, b, c, w) (1, 0, 0, 0) = (w, c, -b, -a).
     q = np.array([-z, 0.0, x, 1 + y]) if y >= 0 else np.array([1 - y, x, 0.0, -z])
     return [float(c) + 0.0 for c in q / np.linalg.norm(q)]  # no negative zeros
+
+
+def turned_origin(mesh: SplatMesh) -> np.ndarray:
+    """(3,) float64 place of the mesh's origin in a frame whose +y is its ``up``."""
+    x, y, z, w = up_quaternion(mesh.up)
+    return np.array(list(rotation_rows(w, x, y, z))) @ mesh.origin + 0.0
 
 
 def linear_colors(mesh: SplatMesh, color_type: ColorType) -> np.ndarray:

@@ -11,21 +11,24 @@ from typing import BinaryIO
 
 import numpy as np
 
+from meshsplats._origin import in_words, zero_origin
 from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import checked, straight_colors
+from meshsplats.formats._validation import checked, local_positions, straight_colors
 from meshsplats.formats.ply.faces import cut_polygons
 from meshsplats.mesh import SplatMesh
 
 _UP_COMMENT = "# meshsplats up"
+_ORIGIN_COMMENT = "# meshsplats origin"
 _ROWS = 1 << 14
 
 
 def write_obj(mesh: SplatMesh, path: Path) -> None:
     """Writes positions, display colours after them and triangles as text; nine digits keep float32 exactly.
 
-    The format has no opacity: a DataWarning counts translucent vertices. Positions stay in the mesh's own
-    frame; the up direction is in a comment, which ``load_mesh`` reads and other programs ignore.
+    The format has no opacity: a DataWarning counts translucent vertices. Positions are in the world, doubles
+    where the mesh has an origin; the up direction and the origin are in comments, which ``load_mesh`` reads
+    and other programs ignore.
     """
     lost = [f.name for f in mesh.extras()] + list(mesh.attributes)
     translucent = int((mesh.colors[:, 3] < 1).sum())
@@ -43,37 +46,51 @@ def write_obj(mesh: SplatMesh, path: Path) -> None:
     with open(path, "wb") as file:
         file.write(b"# x y z, then red green blue as display values\n")
         file.write(f"{_UP_COMMENT} {up}\n".encode())
-        _write_rows(file, "v %.9g %.9g %.9g %.9g %.9g %.9g\n", mesh.vertices, rgb)
+        if mesh.origin.any():
+            file.write(f"{_ORIGIN_COMMENT} {in_words(mesh.origin)}\n".encode())
+            _write_rows(file, "v %r %r %r %.9g %.9g %.9g\n", mesh.vertices, rgb, plus=mesh.origin)
+        else:
+            _write_rows(file, "v %.9g %.9g %.9g %.9g %.9g %.9g\n", mesh.vertices, rgb)
         if mesh.normals is not None:
             _write_rows(file, "vn %.9g %.9g %.9g\n", mesh.normals)
-        columns = [mesh.faces[:, k, None] for k in range(3) for _ in range(corner.count("%"))]
-        _write_rows(file, f"f {corner} {corner} {corner}\n", *columns, plus=1)
+        faces = mesh.faces + 1
+        columns = [faces[:, k, None] for k in range(3) for _ in range(corner.count("%"))]
+        _write_rows(file, f"f {corner} {corner} {corner}\n", *columns)
 
 
-def _write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: int = 0) -> None:
-    """Writes the (n, c) arrays ``columns`` side by side, ``plus`` added, each row by the pattern ``line``."""
+def _write_rows(file: BinaryIO, line: str, *columns: np.ndarray, plus: np.ndarray | None = None) -> None:
+    """Writes the (n, c) arrays ``columns`` side by side, each row by the pattern ``line``; ``plus``, float64,
+    is added to the first of them."""
     for start in range(0, len(columns[0]), _ROWS):
-        rows = np.concatenate([c[start : start + _ROWS] for c in columns], axis=1)
-        if plus:
-            rows = rows + plus
+        parts = [c[start : start + _ROWS] for c in columns]
+        if plus is not None:
+            parts[0] = parts[0] + plus
+        rows = np.concatenate(parts, axis=1)
         file.write((line * len(rows) % tuple(rows.ravel().tolist())).encode())
 
 
-def read_obj(path: Path) -> SplatMesh:
+def read_obj(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     """The polygons of all objects and groups as one opaque mesh, cut into triangles.
+
+    Positions are relative to ``origin``; by default to that of our files, or to one that suits those of
+    others.
 
     Up is +y, as usual for these files, unless a comment of ours says otherwise. Colours are those of lines
     ``v x y z r g b``, display values in [0, 1], if all vertices have them; else the mesh is grey, with a
     DataWarning. Texture coordinates, normals and materials are ignored. Raises FileFormatError that names the
     line.
     """
-    up = np.array([0.0, 1.0, 0.0])
+    up, own = np.array([0.0, 1.0, 0.0]), None
     positions, colors, lengths, corners = array("d"), array("d"), array("q"), array("q")
     with open(path, "rb") as file:
         for number, words in statements(file.read()):
             try:
                 if words[:3] == _UP_COMMENT.encode().split():
                     up = np.array([float(u) for u in words[3:6]])
+                    own = zero_origin() if own is None else own
+                elif words[:3] == _ORIGIN_COMMENT.encode().split():
+                    x, y, z = map(float, words[3:6])
+                    own = np.array([x, y, z])
                 elif words[0] == b"v":
                     x, y, z = map(float, words[1:4])
                     positions.extend((x, y, z))
@@ -89,7 +106,9 @@ def read_obj(path: Path) -> SplatMesh:
     if not lengths:
         raise FileFormatError(f"{path}: holds no faces")
     faces, _ = cut_polygons(np.array(lengths), np.array(corners), {})
-    vertices = np.array(positions).reshape(-1, 3)
+    vertices, at = local_positions(
+        np.array(positions).reshape(-1, 3), own if origin is None else origin, path
+    )
     stored = np.array(colors).reshape(-1, 3)
     return checked(
         path,
@@ -100,6 +119,7 @@ def read_obj(path: Path) -> SplatMesh:
             stored if len(stored) == len(vertices) else np.empty((len(vertices), 0)), path
         ),
         up=up,
+        origin=at,
     )
 
 

@@ -13,8 +13,9 @@ from typing import BinaryIO
 
 import numpy as np
 
+from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.ply.header import Element, PlyHeader
+from meshsplats.formats.ply.header import Element, PlyHeader, origin_of_comments
 from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_of
 from meshsplats.formats.ply.table import RowReader
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
@@ -70,13 +71,26 @@ def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object) -> Spl
         1 + rest // 3,
         kernel,
         where,
-        _chunks(readers, chunk.count, vertex.count),
+        partial(_chunks, readers, chunk.count, vertex.count),
+        partial(_corners, readers["chunk"]),
+        origin=origin_of_comments(header.comments, where),
         up=up_of(file, header, where),
         linear=is_linear(file, header, where),
     )
 
 
-def _chunks(readers: dict[str, RowReader], chunks: int, count: int) -> Iterator[tuple[int, Fill]]:
+def _corners(chunks: RowReader) -> np.ndarray:
+    """(k, 3) float64: the least and the greatest corner of every so many-th chunk."""
+    step = max(1, 2 * len(chunks) // SAMPLE)
+    starts = range(0, len(chunks), _CHUNKS_AT_ONCE)
+    parts = [chunks.rows(start, min(_CHUNKS_AT_ONCE, len(chunks) - start))[::step] for start in starts]
+    ends = [np.stack([p[f"{end}_{axis}"] for axis in "xyz"], axis=1) for p in parts for end in ("min", "max")]
+    return np.concatenate([np.empty((0, 3)), *ends])
+
+
+def _chunks(
+    readers: dict[str, RowReader], chunks: int, count: int, origin: np.ndarray
+) -> Iterator[tuple[int, Fill]]:
     for first in range(0, chunks, _CHUNKS_AT_ONCE):
         n_chunks = min(_CHUNKS_AT_ONCE, chunks - first)
         start = first * _SHARED
@@ -84,22 +98,31 @@ def _chunks(readers: dict[str, RowReader], chunks: int, count: int) -> Iterator[
         ranges = readers["chunk"].rows(first, n_chunks)
         packed = readers["vertex"].rows(start, m)
         table = readers["sh"].rows(start, m) if "sh" in readers else None
-        yield m, partial(_fill, ranges, packed, table)
+        yield m, partial(_fill, ranges, packed, table, origin)
 
 
-def _fill(ranges: np.ndarray, packed: np.ndarray, table: np.ndarray | None, rows: SplatRows) -> None:
+def _fill(
+    ranges: np.ndarray, packed: np.ndarray, table: np.ndarray | None, origin: np.ndarray, rows: SplatRows
+) -> None:
     m = len(packed)
     of_splat = np.arange(m) // _SHARED
 
+    def end(name: str, axes: str) -> np.ndarray:
+        return np.stack([ranges[name + axis] for axis in axes], axis=1).astype(np.float32)
+
+    def between(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return a[of_splat] * (1 - t) + b[of_splat] * t
+
     def lerp(low: str, axes: str, t: np.ndarray) -> np.ndarray:
-        a = np.stack([ranges["min_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
-        b = np.stack([ranges["max_" + low + axis] for axis in axes], axis=1)[of_splat].astype(np.float32)
-        return a * (1 - t) + b * t
+        return between(end("min_" + low, axes), end("max_" + low, axes), t)
 
     color = _unpacked(packed["packed_color"], (8, 8, 8, 8))
     colored = "min_r" in (ranges.dtype.names or ())
     with np.errstate(over="ignore", invalid="ignore"):
-        rows.means[:] = lerp("", "xyz", _unpacked(packed["packed_position"], (11, 10, 11)))
+        corners = end("min_", "xyz"), end("max_", "xyz")
+        if origin.any():
+            corners = corners[0] - origin, corners[1] - origin
+        rows.means[:] = between(*corners, _unpacked(packed["packed_position"], (11, 10, 11)))
         rows.scales[:] = np.exp(lerp("scale_", "xyz", _unpacked(packed["packed_scale"], (11, 10, 11))))
         rgb = lerp("", "rgb", color[:, :3]) if colored else color[:, :3]
         rows.sh[:, 0] = (rgb - np.float32(0.5)) / np.float32(SH_C0)

@@ -12,6 +12,7 @@ from typing import BinaryIO, Literal
 
 import numpy as np
 
+from meshsplats._origin import in_words
 from meshsplats.errors import FileFormatError
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
@@ -268,3 +269,23 @@ def _add_property(element: _Draft, words: list[str], at: str, encoding: Encoding
             f"{at}: element {_quote(element.name)} has more than {MAX_PROPERTIES} properties"
         )
     element.properties[new.name] = new
+
+
+def origin_comments(origin: np.ndarray) -> list[str]:
+    """The header lines that name ``origin`` (3,); none for zeros."""
+    return [f"comment meshsplats origin {in_words(origin)}"] if origin.any() else []
+
+
+def origin_of_comments(comments: tuple[str, ...], where: object) -> np.ndarray | None:
+    """The origin that a comment of ours names; None without one. Raises FileFormatError."""
+    for comment in comments:
+        words = comment.split()
+        if words[:2] == ["meshsplats", "origin"]:
+            try:
+                origin = np.array([float(word) for word in words[2:]])
+            except ValueError:
+                origin = np.empty(0)
+            if origin.shape != (3,) or not np.isfinite(origin).all():
+                raise FileFormatError(f"{where}: an origin must be 3 finite numbers: {comment[:80]}")
+            return origin
+    return None

@@ -4,7 +4,8 @@ Our own files are little endian. Element ``vertex``: float x y z, nx ny nz where
 red green blue alpha (straight, as the mesh holds them, 0 to 1), then ``attribute_NAME`` or
 ``attribute_NAME:COLUMN`` with the name in percent encoding. Element ``face``: ``list uchar int
 vertex_indices``, then int ``face_splat`` and ``depth_group`` where the mesh has them. Comments that
-begin with ``meshsplats`` hold the rest.
+begin with ``meshsplats`` hold the rest. For a mesh with an origin x y z are doubles in the world, and float
+``local_x local_y local_z`` the mesh's own coordinates, which the sums cannot give back to the last bit.
 """
 
 from __future__ import annotations
@@ -19,14 +20,31 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
+from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import Budget, check_attribute_names, checked, straight_colors
+from meshsplats.formats._validation import (
+    Budget,
+    check_attribute_names,
+    checked,
+    straight_colors,
+    warn_of_lost_detail,
+)
 from meshsplats.formats.ply.faces import read_faces
-from meshsplats.formats.ply.header import MAX_PROPERTIES, Element, PlyHeader, read_header
-from meshsplats.formats.ply.table import FloatTable
+from meshsplats.formats.ply.header import (
+    MAX_PROPERTIES,
+    Element,
+    PlyHeader,
+    origin_comments,
+    origin_of_comments,
+    read_header,
+)
+from meshsplats.formats.ply.table import POSITION, FloatTable
 from meshsplats.mesh import SplatMesh
 
 _ATTRIBUTE = "attribute_"
+_LOCAL = ("local_x", "local_y", "local_z")
+_ROUNDING = 1e-15
+"""Rounding of the sum of an origin and a local coordinate, as a share of the origin."""
 _ROWS = 1 << 15
 _COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
@@ -59,6 +77,7 @@ def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int,
     ):
         for part in parts:
             layout = layout or _Layout(part)
+            part = part.relative_to(layout.origin)
             layout.write_vertices(part, first)
             layout.write_faces(part, second, vertices)
             vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
@@ -86,10 +105,12 @@ class _Layout:
             "comment meshsplats 1",
             f"comment meshsplats up {up}",
             f"comment meshsplats blending {mesh.blending}",
+            *origin_comments(mesh.origin),
         ]
+        self.origin = mesh.origin
         if mesh.filter_px2:
             self._head.append(f"comment meshsplats filter_px2 {mesh.filter_px2!r}")
-        self._names = ["x", "y", "z"]
+        self._names = [*(_LOCAL if mesh.origin.any() else POSITION)]
         if mesh.normals is not None:
             self._names += ["nx", "ny", "nz"]
         self._names += ["red", "green", "blue", "alpha"]
@@ -105,6 +126,8 @@ class _Layout:
 
     def header(self, vertices: int, faces: int) -> bytes:
         lines = [*self._head, f"element vertex {vertices}"]
+        if self.origin.any():
+            lines += [f"property double {name}" for name in POSITION]
         lines += [f"property float {name}" for name in self._names]
         lines += [f"element face {faces}", "property list uchar int vertex_indices"]
         lines += [f"property int {name}" for name in self._numbers]
@@ -117,6 +140,10 @@ class _Layout:
         for start in range(0, len(mesh.vertices), _ROWS):
             part = slice(start, start + _ROWS)
             rows = np.concatenate([c[part] for c in columns], axis=1).astype("<f4", copy=False)
+            if self.origin.any():
+                local, own = rows, np.dtype([("world", "<f8", 3), ("rest", "<f4", rows.shape[1])])
+                rows = np.empty(len(local), own)
+                rows["world"], rows["rest"] = local[:, :3] + self.origin, local
             file.write(rows.data)
 
     def write_faces(self, mesh: SplatMesh, file: IO[bytes], first: int) -> None:
@@ -152,8 +179,11 @@ def _properties(name: str, columns: int | None) -> tuple[str, ...]:
 # -- reading
 
 
-def read_mesh_ply(path: Path) -> SplatMesh:
+def read_mesh_ply(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     """The mesh in a `.ply` file of any encoding and byte order; polygons are cut into triangles.
+
+    Positions are relative to ``origin``; by default to that of our files, or to one that suits those of
+    others.
 
     Colours: red, green, blue and alpha as floats in [0, 1] or unsigned integers; without alpha the mesh is
     opaque, without colours it is mid grey, with a DataWarning. Raises FileFormatError.
@@ -168,10 +198,18 @@ def read_mesh_ply(path: Path) -> SplatMesh:
             raise FileFormatError(f"{path}: not a mesh: no element 'vertex' with x, y and z")
         if face is None:
             raise FileFormatError(f"{path}: not a mesh but points: it has no element 'face'")
-        return _read(file, header, vertex, face, path)
+        mesh = _read(file, header, vertex, face, path, origin)
+        return mesh if origin is None else mesh.relative_to(origin)
 
 
-def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, path: Path) -> SplatMesh:
+def _read(
+    file: BinaryIO,
+    header: PlyHeader,
+    vertex: Element,
+    face: Element,
+    path: Path,
+    origin: np.ndarray | None,
+) -> SplatMesh:
     rgb = next((c for c in _COLOR_NAMES if all(n in vertex.names for n in c)), ())
     alpha = tuple(n for n in ("alpha", "diffuse_alpha", "a") if rgb and n in vertex.names)[:1]
     groups: dict[str, tuple[str, ...]] = {"vertices": ("x", "y", "z"), "colors": (*rgb, *alpha)}
@@ -183,8 +221,17 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
     attributes, settings = _notes(header, vertex, path)
     for name, (_, columns) in attributes.items():
         groups[f"attribute {name}"] = columns
+    own = "up" in settings  # written by this project
+    if own and all(n in vertex.names for n in _LOCAL):
+        groups["local"] = _LOCAL
     wanted = tuple(dict.fromkeys(n for columns in groups.values() for n in columns))
     table = FloatTable(file, header, vertex, wanted, path)
+    if own:
+        named = origin_of_comments(header.comments, path)
+        table.origin = zero_origin() if named is None else named
+    else:
+        table.origin = _chosen(table, path) if origin is None else origin
+    settings["origin"] = table.origin
     v = len(table)
     budget = Budget(path)
     budget.spend(4 * v * (sum(len(c) for c in groups.values()) + 4), "the vertices")
@@ -195,6 +242,10 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
         for key, columns in groups.items():
             arrays[key][done : done + len(chunk)] = chunk[:, [place[n] for n in columns]]
         done += len(chunk)
+    if "local" in arrays:  # unless another program has moved the vertices, and left the local ones
+        moved = np.abs(arrays["local"] - arrays["vertices"]) > _ROUNDING * np.abs(table.origin)
+        if not moved.any():
+            arrays["vertices"] = arrays["local"]
     types = {p.name: p.dtype for p in vertex.properties}
     for i, name in enumerate(groups["colors"]):
         if types[name].kind == "u":
@@ -226,6 +277,14 @@ def _read(file: BinaryIO, header: PlyHeader, vertex: Element, face: Element, pat
         **settings,
         **numbers,
     )
+
+
+def _chosen(table: FloatTable, path: Path) -> np.ndarray:
+    """The origin that suits the positions of a file of another program."""
+    sample = table.sample()
+    if table.positions_are_float32:
+        warn_of_lost_detail(sample, path)
+    return choose_origin(sample)
 
 
 def _notes(

@@ -4,7 +4,8 @@ Each row of element ``vertex`` is a splat: ``x y z``, ``f_dc_0..2`` and ``f_rest
 channel by channel), ``opacity`` (logit), ``scale_*`` (logarithms) and ``rot_0..3`` (quaternion w x y z of any
 length). 2DGS files have two scales; the third axis is flat. Mip-Splatting files have ``filter_3D``, the width
 of a smoothing filter that applies to scales and opacities. Properties are found by name. What comments and
-other elements say is in ``notes.py``, splats that move in ``motion.py``.
+other elements say is in ``notes.py``, splats that move in ``motion.py``. The comment ``meshsplats origin X Y
+Z`` is ours: positions are relative to that point of the world.
 """
 
 from __future__ import annotations
@@ -14,23 +15,24 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from meshsplats._files.atomic import atomic_path
+from meshsplats._origin import zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats import _activation
 from meshsplats.formats.ply.activated import SAMPLE, Activated, harmonics_of, span_of, suspects, warn_of
-from meshsplats.formats.ply.header import Element, PlyHeader
+from meshsplats.formats.ply.header import Element, PlyHeader, origin_comments, origin_of_comments
 from meshsplats.formats.ply.motion import Motion, motion_of
 from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_of
-from meshsplats.formats.ply.table import CHUNK_BYTES, FloatTable
+from meshsplats.formats.ply.table import CHUNK_BYTES, POSITION, FloatTable
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
 from meshsplats.gaussians import GaussianCloud, Kernel
 
-_POSITION = ("x", "y", "z")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _RGB = ("red", "green", "blue")
@@ -46,7 +48,7 @@ class _Columns:
         names = set(element.names)
         self.motion = motion_of(element.names, where)
         self.scale = tuple(f"scale_{i}" for i in range(3) if f"scale_{i}" in names)
-        missing = [n for n in (*_POSITION, "opacity", "scale_0", "scale_1", *_ROTATION) if n not in names]
+        missing = [n for n in (*POSITION, "opacity", "scale_0", "scale_1", *_ROTATION) if n not in names]
         if not {"opacity", "scale_0", "rot_0"} & names:
             faces = header.element("face")
             mesh = f"a mesh with {faces.count:,} faces" if faces and faces.count else "a plain point cloud"
@@ -85,7 +87,7 @@ class _Columns:
     def needed(self) -> tuple[str, ...]:
         """All properties that are read."""
         moving = self.motion.needed if self.motion else ()
-        return (*_POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *self.filter, *moving)
+        return (*POSITION, *_ROTATION, *self.scale, "opacity", *self.sh, *self.filter, *moving)
 
 
 def is_float_splat(header: PlyHeader) -> bool:
@@ -129,7 +131,10 @@ def read_float_ply(
         columns.coefficients,
         kernel,
         where,
-        _chunks(table, reading, where),
+        partial(_chunks, table, reading, where),
+        table.sample,
+        table.positions_are_float32,
+        origin_of_comments(header.comments, where),
         up=up_of(file, header, where),
         linear=is_linear(file, header, where),
         instant=instant,
@@ -218,7 +223,10 @@ class _Reading:
     """The instant of splats that move."""
 
 
-def _chunks(table: FloatTable, reading: _Reading, where: object) -> Iterator[tuple[int, Fill]]:
+def _chunks(
+    table: FloatTable, reading: _Reading, where: object, origin: np.ndarray
+) -> Iterator[tuple[int, Fill]]:
+    table.origin = origin
     for chunk in table.chunks():
         yield len(chunk), partial(_fill, chunk, reading)
     found = suspects(reading.sample.count, *reading.sample.values()) if reading.sample.parts else {}
@@ -233,7 +241,7 @@ def _fill(chunk: np.ndarray, reading: _Reading, rows: SplatRows) -> None:
     def take(names: Sequence[str], out: np.ndarray) -> None:
         np.take(chunk, [index[n] for n in names], axis=1, out=out, mode="clip")
 
-    take(_POSITION, rows.means)
+    take(POSITION, rows.means)
     take(_ROTATION, rows.quaternions)
     take(columns.sh, rows.sh.reshape(len(chunk), -1))
     scales, opacities = chunk[:, [index[n] for n in columns.scale]], chunk[:, index["opacity"]]
@@ -310,6 +318,8 @@ def write_float_blocks(
 ) -> None:
     """Writes ``count`` splats that come in ``blocks``.
 
+    Positions are written relative to the origin of the first block, which a comment names.
+
     Args:
         blocks: clouds; spherical harmonics that they lack are 0.
         path: the file.
@@ -324,9 +334,12 @@ def write_float_blocks(
     k = coefficients
     scale_names = [f"scale_{i}" for i in range(2 if flat else 3)]
     rest_names = [f"f_rest_{i}" for i in range(3 * (k - 1))]
-    names = [*_POSITION, "nx", "ny", "nz", *_DC, *rest_names, "opacity", *scale_names, *_ROTATION]
+    names = [*POSITION, "nx", "ny", "nz", *_DC, *rest_names, "opacity", *scale_names, *_ROTATION]
     at = {name: i for i, name in enumerate(names)}
-    lines = ["ply", "format binary_little_endian 1.0"]
+    rest_of_blocks = iter(blocks)
+    first = next(rest_of_blocks, None)
+    origin = zero_origin() if first is None else first.origin
+    lines = ["ply", "format binary_little_endian 1.0", *origin_comments(origin)]
     if kernel == "antialiased":
         lines.append("comment SplatRenderMode: mip")
     if up is not None:
@@ -339,7 +352,8 @@ def write_float_blocks(
     written = 0
     with atomic_path(path, needs=4 * len(names) * count) as temporary, Path(temporary).open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
-        for cloud in blocks:
+        for block in () if first is None else chain([first], rest_of_blocks):
+            cloud = block.relative_to(origin)
             for start in range(0, len(cloud), per_chunk):
                 part = slice(start, start + per_chunk)
                 sh = cloud.sh[part]

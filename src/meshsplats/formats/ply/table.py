@@ -8,16 +8,22 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import BinaryIO
 
 import numpy as np
 
+from meshsplats._origin import SAMPLE, zero_origin
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.ply.header import Element, PlyHeader
 
 CHUNK_BYTES = 1 << 20
 MAX_LINE_BYTES = 1 << 18
 """The longest line of ASCII data that is read."""
+POSITION = ("x", "y", "z")
+"""Names of the coordinates of positions."""
+_SAMPLE_RUN = 16
+"""Rows that lie together in a sample of positions."""
 
 
 class RowReader:
@@ -118,7 +124,8 @@ class RowReader:
 class FloatTable(RowReader):
     """The rows of an element as float32, binary or ASCII.
 
-    ``names`` are the columns of each chunk: ``wanted`` ones at least, in any order.
+    ``names`` are the columns of each chunk: ``wanted`` ones at least, in any order. Positions are relative to
+    ``origin``, (3,) float64, which is subtracted before they are rounded.
     """
 
     def __init__(
@@ -129,6 +136,50 @@ class FloatTable(RowReader):
         self._common = dtypes.pop() if len(dtypes) == 1 else None
         uniform = self._common is not None or header.encoding == "ascii"
         self.names: tuple[str, ...] = element.names if uniform else tuple(wanted)
+        self.origin = zero_origin()
+        types = {p.dtype.newbyteorder("=") for p in element.properties if p.name in POSITION}
+        self.positions_are_float32 = header.encoding != "ascii" and types == {np.dtype(np.float32)}
+        """Whether the file has no more digits of positions than float32."""
+
+    def sample(self) -> np.ndarray:
+        """(k, 3) float64: about ``SAMPLE`` positions x, y, z, evenly spread over the file."""
+        e = self._element
+        if self._header.encoding == "ascii":
+            return self._ascii_sample()
+        starts, size = [0], e.count
+        if e.count > SAMPLE:
+            size = _SAMPLE_RUN
+            starts = np.linspace(0, e.count - size, SAMPLE // size).astype(np.int64).tolist()
+        rows = [self.rows(start, size) for start in starts]
+        found = np.empty((size * len(rows), 3))
+        for i, name in enumerate(POSITION):
+            found[:, i] = np.concatenate([part[name] for part in rows])
+        return found
+
+    def _ascii_sample(self) -> np.ndarray:
+        """Lines that cannot be read are left out: ``chunks`` says what is wrong with them."""
+        e = self._element
+        before = sum(a.count for a in self._header.elements[: self._header.elements.index(e)] if a.properties)
+        lines = _data_lines(self._file, self._header, self._where)
+        columns = [e.names.index(name) for name in POSITION]
+        found = []
+        for _, line in islice(lines, before, before + e.count, max(1, e.count // SAMPLE)):
+            words = line.split()
+            try:
+                found.append([float(words[i]) for i in columns])
+            except (ValueError, IndexError):
+                continue
+        return np.array(found, np.float64).reshape(-1, 3)
+
+    def _placed(self, exact: np.ndarray, table: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        """``table``, float32, with the positions among its columns ``names`` relative to the origin.
+        ``exact``: the same columns as stored."""
+        for name, shift in zip(POSITION, self.origin, strict=True):
+            if shift and name in names:
+                i = names.index(name)
+                column = exact[name] if exact.dtype.names else exact[:, i]
+                table[:, i] = column.astype(np.float64) - shift
+        return table
 
     def chunks(self) -> Iterator[np.ndarray]:
         """(m, len(names)) float32 tables of all rows in order; each is valid until the next one is requested.
@@ -147,14 +198,14 @@ class FloatTable(RowReader):
             if self._common is not None:
                 table = np.frombuffer(buffer, self._common, m * len(self.names)).reshape(m, -1)
                 with np.errstate(over="ignore"):
-                    yield table.astype(np.float32, copy=False)
+                    yield self._placed(table, table.astype(np.float32, copy=False), self.names)
             else:
                 rows = np.frombuffer(buffer, e.row_dtype, m)
                 table = np.empty((m, len(self.names)), np.float32)
                 with np.errstate(over="ignore"):
                     for i, name in enumerate(self.names):
                         table[:, i] = rows[name]
-                yield table
+                    yield self._placed(rows, table, self.names)
 
     def _ascii_chunks(self) -> Iterator[np.ndarray]:
         e, width = self._element, len(self.names)
@@ -208,7 +259,7 @@ class FloatTable(RowReader):
                         raise FileFormatError(f"{at}: {name} is not a number: {word[:40]!r}") from None
             raise FileFormatError(f"{self._where}: line {batch[0][0]}: cannot read the rows from here on")
         with np.errstate(over="ignore"):
-            return table.astype(np.float32)
+            return self._placed(table, table.astype(np.float32), self.names)
 
 
 def _data_lines(file: BinaryIO, header: PlyHeader, where: object) -> Iterator[tuple[int, str]]:

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._validation import Budget
+from meshsplats.formats._validation import Budget, warn_of_lost_detail
 from meshsplats.gaussians import GaussianCloud, Kernel, joined
 
 
@@ -26,11 +27,17 @@ class SplatRows(NamedTuple):
 
 Fill = Callable[[SplatRows], None]
 """Writes the splats of a chunk of a file into rows that are as many."""
+Chunks = Callable[[np.ndarray], Iterator[tuple[int, Fill]]]
+"""For an origin (3,) float64, which is subtracted from positions before they are rounded: count of the splats
+of each chunk, and what reads them."""
 
 
 @dataclass(frozen=True)
 class SplatReader:
-    """The splats of an opened file, ready to be read once, as a whole or in blocks."""
+    """The splats of an opened file, ready to be read once, as a whole or in blocks.
+
+    Origins are in the frame of the file.
+    """
 
     count: int
     """Count of the splats that the file declares."""
@@ -39,8 +46,13 @@ class SplatReader:
     kernel: Kernel
     where: object
     """The file, for messages."""
-    chunks: Iterator[tuple[int, Fill]]
-    """Count of the splats of each chunk, and what reads them."""
+    chunks: Chunks
+    positions: Callable[[], np.ndarray]
+    """Gives a sample (k, 3) float64 of the positions, by which the origin is chosen."""
+    float32: bool = True
+    """Whether the file has no more digits of positions than float32."""
+    origin: np.ndarray | None = None
+    """The origin that the file names, which its positions are relative to."""
     up: np.ndarray | None = None
     """(3,) direction that points up in the axes of the file, where it says so."""
     linear: bool = False
@@ -48,27 +60,40 @@ class SplatReader:
     instant: float | None = None
     """The time at which they are shown, of splats that move."""
 
-    def read(self, *, strict: bool) -> GaussianCloud:
-        """All splats; errors and warnings as ``load_gaussians``, which must be the caller."""
-        builder = CloudBuilder(self.count, self.coefficients, self.where, flat=self.kernel == "2dgs")
-        for m, fill in self.chunks:
+    def world_sample(self) -> np.ndarray:
+        """``positions``, in the world."""
+        return self.positions() if self.origin is None else self.positions() + self.origin
+
+    def chosen_origin(self) -> np.ndarray:
+        """The origin of the file; else the one that suits its positions, with a DataWarning for a file that
+        has lost detail."""
+        if self.origin is not None:
+            return self.origin
+        if not self.count:
+            return zero_origin()
+        sample = self.positions()
+        if self.float32:
+            warn_of_lost_detail(sample, self.where)
+        return choose_origin(sample)
+
+    def read(self, *, strict: bool, origin: np.ndarray | None = None) -> GaussianCloud:
+        """All splats, relative to ``origin``, by default ``chosen_origin``; errors and warnings as
+        ``load_gaussians``, which must be the caller."""
+        origin = self.chosen_origin() if origin is None else origin
+        builder = self._builder(origin)
+        for m, fill in self.chunks(self._shift(origin)):
             rows = builder.next(m)
             fill(rows)
             builder.keep(rows)
         return builder.finish(self.kernel, strict=strict)
 
-    def blocks(self, size: int, *, strict: bool) -> Iterator[GaussianCloud]:
+    def blocks(self, size: int, *, strict: bool, origin: np.ndarray | None = None) -> Iterator[GaussianCloud]:
         """The same splats in blocks of about ``size``."""
+        origin = self.chosen_origin() if origin is None else origin
         builder: CloudBuilder | None = None
-        for m, fill in self.chunks:
+        for m, fill in self.chunks(self._shift(origin)):
             if builder is None:
-                builder = CloudBuilder(
-                    self.count,
-                    self.coefficients,
-                    self.where,
-                    capacity=max(size, m),
-                    flat=self.kernel == "2dgs",
-                )
+                builder = self._builder(origin, max(size, m))
             elif builder.held and builder.held + m > size:
                 yield builder.take(self.kernel)
             rows = builder.next(m)
@@ -76,10 +101,18 @@ class SplatReader:
             builder.keep(rows)
             if strict:
                 builder.report(strict=True)
-        builder = builder or CloudBuilder(self.count, self.coefficients, self.where)
+        builder = builder or self._builder(origin)
         builder.report(strict=strict)
         if builder.held:
             yield builder.take(self.kernel)
+
+    def _builder(self, origin: np.ndarray, capacity: int | None = None) -> CloudBuilder:
+        flat = self.kernel == "2dgs"
+        return CloudBuilder(self.count, self.coefficients, self.where, capacity, origin, flat=flat)
+
+    def _shift(self, origin: np.ndarray) -> np.ndarray:
+        """What is subtracted from the stored positions, so that they are relative to ``origin``."""
+        return origin if self.origin is None else origin - self.origin
 
 
 class CloudBuilder:
@@ -97,12 +130,14 @@ class CloudBuilder:
         coefficients: int,
         where: object,
         capacity: int | None = None,
+        origin: np.ndarray | None = None,
         *,
         flat: bool = False,
     ) -> None:
         if count == 0:
             raise FileFormatError(f"{where}: no splats, the file declares 0 of them")
         self._where, self._count, self._flat = where, count, flat
+        self._origin = zero_origin() if origin is None else origin
         rows = count if capacity is None else min(capacity, count)
         self._arrays = SplatRows(
             np.empty((rows, 3), np.float32),
@@ -124,7 +159,7 @@ class CloudBuilder:
         means, quaternions, scales, opacities, sh = (array[: self._kept].copy() for array in self._arrays)
         self._taken += self._kept
         self._kept = 0
-        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
+        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel, origin=self._origin)
 
     def next(self, m: int) -> SplatRows:
         """The next ``m`` rows, to be written."""
@@ -164,7 +199,7 @@ class CloudBuilder:
             for array in self._arrays:
                 array.resize((self._kept, *array.shape[1:]), refcheck=False)  # shrinks in place
         means, quaternions, scales, opacities, sh = self._arrays
-        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel)
+        return GaussianCloud(means, quaternions, scales, opacities, sh, kernel, origin=self._origin)
 
     def report(self, *, strict: bool) -> int:
         """Count of dropped splats; they give a DataWarning, an error if ``strict`` or if none is left."""

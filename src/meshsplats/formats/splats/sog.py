@@ -13,21 +13,23 @@ import re
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from meshsplats._json import json_object
+from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.sniff import Content
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
 from meshsplats.gaussians import Kernel
 
+T = TypeVar("T")
 _MAX_META_BYTES = 4 << 20
 _MAX_SPLATS = 1 << 28
 _AT_ONCE = 1 << 16
@@ -43,11 +45,20 @@ def read_sog(path: Path, budget: Budget, ranges: Sequence[tuple[int, int]] | Non
     Images are unpacked as a whole, 4 bytes for each splat and image. ``ranges`` selects splats by first and
     end; ranges may overlap. None selects all.
     """
+    return _opened(path, budget, lambda reader: reader.read(ranges))
+
+
+def sog_corners(path: Path) -> np.ndarray:
+    """(2, 3) float64: the least and the greatest coordinates of the splats that ``read_sog`` reads."""
+    return _opened(path, Budget(path), _Reader.corners)
+
+
+def _opened(path: Path, budget: Budget, read: Callable[[_Reader], T]) -> T:
     if Content(path).container != "zip":
-        return _Reader(_Folder(path.parent, path, budget), path, budget).read(ranges)
+        return read(_Reader(_Folder(path.parent, path, budget), path, budget))
     try:
         with zipfile.ZipFile(path) as archive:
-            return _Reader(_Archive(archive, path), path, budget).read(ranges)
+            return read(_Reader(_Archive(archive, path), path, budget))
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
 
@@ -153,8 +164,17 @@ class _Reader:
         if labels is not None:
             palette = np.concatenate([palette, np.zeros((1, *palette.shape[1:]), np.float32)])
         maps = self._maps(version)
-        chunks = self._chunks(count, pixels, labels, palette, maps)
-        return SplatReader(count, coefficients, self._kernel(), self._where, chunks)
+        chunks = partial(self._chunks, count, pixels, labels, palette, maps)
+        step = max(1, count // SAMPLE)
+        few = [image[::step] for image in pixels["means"]]
+        positions = partial(_positions, few, maps.positions)
+        return SplatReader(count, coefficients, self._kernel(), self._where, chunks, positions, float32=False)
+
+    def corners(self) -> np.ndarray:
+        """(2, 3) float64: the least and the greatest coordinates, by meta.json alone."""
+        ends = np.stack(self._range("means", 3))
+        with np.errstate(over="ignore"):
+            return np.sign(ends) * np.expm1(np.abs(ends))
 
     def _chunks(
         self,
@@ -163,6 +183,7 @@ class _Reader:
         labels: np.ndarray | None,
         palette: np.ndarray,
         maps: _Maps,
+        origin: np.ndarray,
     ) -> Iterator[tuple[int, Fill]]:
         for start in range(0, count, _AT_ONCE):
             part = slice(start, min(start + _AT_ONCE, count))
@@ -171,7 +192,7 @@ class _Reader:
             if labels is not None:
                 index = labels[part, 0] + labels[part, 1].astype(np.int32) * 256
                 np.minimum(index, len(palette) - 1, out=index)  # a label beyond the palette: no harmonics
-            yield part.stop - start, partial(_fill, own, maps, palette, index)
+            yield part.stop - start, partial(_fill, own, maps, palette, index, origin)
 
     def _maps(self, version: int | None) -> _Maps:
         """Checks and reads what the values of pixels mean."""
@@ -329,14 +350,11 @@ def _fill(
     maps: _Maps,
     palette: np.ndarray,
     index: np.ndarray | None,
+    origin: np.ndarray,
     rows: SplatRows,
 ) -> None:
-    low, high = pixels["means"]
-    steps = (low[:, :3] + high[:, :3].astype(np.uint16) * 256) / 65535
-    least, most = maps.positions
-    logs = least + (most - least) * steps
     with np.errstate(over="ignore", invalid="ignore"):
-        rows.means[:] = np.sign(logs) * np.expm1(np.abs(logs))
+        rows.means[:] = _positions(pixels["means"], maps.positions) - origin
         scales, colors = pixels["scales"][0], pixels["sh0"][0]
         if maps.ranges:
             rows.scales[:] = np.exp(_between(maps.ranges["scales"], scales[:, :3]))
@@ -354,6 +372,16 @@ def _fill(
     decode_smallest_three(rows.quaternions, small, turns[:, 3].astype(np.int32) - 252)
     if index is not None:
         rows.sh[:, 1:] = palette[index]
+
+
+def _positions(images: Sequence[np.ndarray], ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """(m, 3) float64 from the lower and upper bytes of (m, 4) pixels; ``ends``: as ``_Maps.positions``."""
+    low, high = images
+    steps = (low[:, :3] + high[:, :3].astype(np.uint16) * 256) / 65535
+    least, most = ends
+    logs = least + (most - least) * steps
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.sign(logs) * np.expm1(np.abs(logs))
 
 
 def _between(range_: tuple[np.ndarray, np.ndarray], pixels: np.ndarray) -> np.ndarray:

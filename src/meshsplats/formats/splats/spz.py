@@ -14,16 +14,23 @@ import struct
 import sys
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from meshsplats._origin import SAMPLE
 from meshsplats.errors import DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
+from meshsplats.formats.splats._cloud_builder import (
+    Chunks,
+    Fill,
+    SplatReader,
+    SplatRows,
+    decode_smallest_three,
+)
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 MAGIC = b"NGSP"
@@ -87,32 +94,47 @@ def is_spz(head: bytes) -> bool:
         return False
 
 
-def read_spz(data: bytes | memoryview, where: object, budget: Budget, *, strict: bool) -> SpzSplats:
-    """The splats of a whole SPZ file in memory; errors as ``load_gaussians``."""
+def read_spz(
+    data: bytes | memoryview,
+    where: object,
+    budget: Budget,
+    *,
+    strict: bool,
+    origin: np.ndarray | None = None,
+) -> SpzSplats:
+    """The splats of a whole SPZ file in memory, relative to ``origin``, by default one that suits them;
+    errors as ``load_gaussians``. Origins are in the axes that the arrays of the result have."""
     if bytes(data[:4]) == MAGIC:
         header, extensions, streams = _parse_streams(data, where, budget)
     else:
         header, extensions, streams = _parse_gzip(data, where, budget)
     _warn_of_degree(header, where)
 
-    def chunks() -> Iterator[tuple[int, Fill]]:
+    def chunks(origin: np.ndarray) -> Iterator[tuple[int, Fill]]:
         for start in range(0, header.splats, _AT_ONCE):
             m = min(_AT_ONCE, header.splats - start)
             part = {name: a.reshape(header.splats, -1)[start : start + m] for name, a in streams.items()}
-            yield m, partial(_fill, header, part)
+            yield m, partial(_fill, header, part, origin)
 
-    cloud = _reader(header, where, chunks()).read(strict=strict)
+    def positions() -> np.ndarray:
+        rows = streams["positions"].reshape(header.splats, -1)[:: max(1, header.splats // SAMPLE)]
+        return _positions(rows, header)
+
+    cloud = _reader(header, where, chunks, positions).read(strict=strict, origin=origin)
     return SpzSplats(cloud, _axes(extensions, where))
 
 
-def _reader(header: _Header, where: object, chunks: Iterator[tuple[int, Fill]]) -> SplatReader:
+def _reader(
+    header: _Header, where: object, chunks: Chunks, positions: Callable[[], np.ndarray]
+) -> SplatReader:
     kernel: Kernel = "antialiased" if header.flags & _ANTIALIASED else "3dgs"
-    return SplatReader(header.splats, 1 + _REST[min(header.degree, 3)], kernel, where, chunks)
+    coefficients = 1 + _REST[min(header.degree, 3)]
+    return SplatReader(header.splats, coefficients, kernel, where, chunks, positions, float32=False)
 
 
-def _fill(header: _Header, part: dict[str, np.ndarray], rows: SplatRows) -> None:
+def _fill(header: _Header, part: dict[str, np.ndarray], origin: np.ndarray, rows: SplatRows) -> None:
     """Writes m splats of ``part``, (m, bytes) of each attribute."""
-    rows.means[:] = _positions(part["positions"], header)
+    rows.means[:] = _positions(part["positions"], header) - origin
     rows.opacities[:] = part["alphas"][:, 0] / np.float32(255)
     rows.sh[:, 0] = (part["colors"] / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE)
     rows.scales[:] = np.exp(part["scales"] / np.float32(16) - np.float32(10))
@@ -128,6 +150,8 @@ class OpenedSpz(NamedTuple):
 
     reader: SplatReader
     to_y_down: np.ndarray
+    close: Callable[[], None]
+    """Closes the file, where the splats are not read."""
 
 
 def open_spz(path: Path) -> OpenedSpz:
@@ -149,11 +173,30 @@ def open_spz(path: Path) -> OpenedSpz:
     _warn_of_degree(header, path)
     if not header.degree and "sh" in streams:
         streams.pop("sh").close()
-    reader = _reader(header, path, _side_by_side(header, streams, path))
-    return OpenedSpz(reader, _axes(extensions, path))
+    again = streams["positions"].again if not plain else partial(_zstd_stream, path, *table["positions"][:2])
+    chunks = partial(_side_by_side, header, streams, path)
+    reader = _reader(header, path, chunks, partial(_sample, header, again, path))
+    return OpenedSpz(reader, _axes(extensions, path), partial(_close, streams))
 
 
-def _side_by_side(header: _Header, streams: dict[str, Any], where: object) -> Iterator[tuple[int, Fill]]:
+def _sample(header: _Header, open_positions: Callable[[], Any], where: object) -> np.ndarray:
+    """Every so many-th position, as of ``read_spz``, by a pass over the stream of positions alone."""
+    width, step = header.sizes()["positions"] // max(header.splats, 1), max(1, header.splats // SAMPLE)
+    found = [np.empty((0, width), np.uint8)]
+    stream = open_positions()
+    try:
+        for start in range(0, header.splats, _AT_ONCE):
+            m = min(_AT_ONCE, header.splats - start)
+            rows = np.frombuffer(_exactly(stream, m * width, "positions", where), np.uint8).reshape(m, width)
+            found.append(rows[-start % step :: step].copy())
+    finally:
+        stream.close()
+    return _positions(np.concatenate(found), header)
+
+
+def _side_by_side(
+    header: _Header, streams: dict[str, Any], where: object, origin: np.ndarray
+) -> Iterator[tuple[int, Fill]]:
     width = {name: size // max(header.splats, 1) for name, size in header.sizes().items()}
     try:
         for start in range(0, header.splats, _AT_ONCE):
@@ -162,7 +205,7 @@ def _side_by_side(header: _Header, streams: dict[str, Any], where: object) -> It
                 name: np.frombuffer(_exactly(stream, m * width[name], name, where), np.uint8).reshape(m, -1)
                 for name, stream in streams.items()
             }
-            yield m, partial(_fill, header, part)
+            yield m, partial(_fill, header, part, origin)
         for name, stream in streams.items():
             # At the end of a Zstandard frame stands its checksum; gzip's was checked by the first pass.
             if isinstance(stream, _Inflater):
@@ -441,13 +484,13 @@ def _unzstd(packed: bytes, size: int, name: str, where: object) -> bytes:
 
 
 def _positions(stored: np.ndarray, header: _Header) -> np.ndarray:
-    """(m, 3) from 24-bit fixed-point numbers, of version 1 from half floats."""
+    """(m, 3) float64 from 24-bit fixed-point numbers, of version 1 from half floats."""
     if header.version == 1:
-        return np.ascontiguousarray(stored).view("<f2").astype(np.float32)
+        return np.ascontiguousarray(stored).view("<f2").astype(np.float64)
     words = np.zeros((len(stored), 3, 4), np.uint8)
     words[..., 1:] = stored.reshape(-1, 3, 3)
     fixed = words.view("<i4")[..., 0] >> 8  # shifted down from the upper bytes, which extends the sign
-    return (fixed * 2.0**-header.fraction_bits).astype(np.float32)
+    return np.asarray(fixed * 2.0**-header.fraction_bits)
 
 
 def _fill_rotations(out: np.ndarray, stored: np.ndarray) -> None:

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from meshsplats._json import json_object
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.splats._cloud_builder import SplatReader, joined_within
-from meshsplats.formats.splats.sog import read_sog
+from meshsplats.formats.splats.sog import read_sog, sog_corners
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 _MAX_INDEX_BYTES = 64 << 20
@@ -23,17 +26,27 @@ _MAX_DEPTH = 64
 _PATH = re.compile(r"[^/\\:\0]{1,255}(/[^/\\:\0]{1,255}){0,7}")
 
 
-def read_streamed_sog(path: Path, *, strict: bool) -> GaussianCloud:
-    """The splats of the index ``path`` at the finest level of each leaf, and those of its environment; errors
-    as ``load_gaussians``."""
+def read_streamed_sog(path: Path, *, strict: bool, origin: np.ndarray) -> GaussianCloud:
+    """The splats of the index ``path`` at the finest level of each leaf, and those of its environment,
+    relative to ``origin``; errors as ``load_gaussians``."""
     budget = Budget(path)
     parts = []
     for name, part, own in streamed_parts(path):
-        cloud = part.read(strict=strict)
+        cloud = part.read(strict=strict, origin=origin)
         budget.extend(own.file_bytes)
         budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
         parts.append(cloud)
     return joined_within(parts, budget)
+
+
+def streamed_corners(path: Path) -> np.ndarray:
+    """(2 n, 3) float64: the least and the greatest coordinates of each of the n parts; from their meta.json,
+    so that no image is unpacked. Parts that cannot be read are left out: reading them says why."""
+    found = [np.empty((0, 3))]
+    for name in _Index(path).parts():
+        with suppress(FileFormatError, FileNotFoundError):
+            found.append(sog_corners(path.parent / name))
+    return np.concatenate(found)
 
 
 def streamed_parts(path: Path) -> Iterator[tuple[str, SplatReader, Budget]]:

@@ -1,9 +1,9 @@
 """The part of reading USD that runs in a process of its own, which ``reader`` starts.
 
-    python -m meshsplats.formats.usd.extraction FILE RESULT
+    python -m meshsplats.formats.usd.extraction FILE RESULT [X Y Z]
 
-writes the arrays of all meshes of FILE to RESULT (.npz) and prints a line of JSON: {"error": text}, or a
-report with the other contents.
+writes the arrays of all meshes of FILE to RESULT (.npz), relative to the origin X Y Z, by default one that
+suits them, and prints a line of JSON: {"error": text}, or a report with the other contents.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from meshsplats._origin import choose_origin, lost_detail, sampled, zero_origin
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.writer import up_quaternion
@@ -29,12 +30,12 @@ _FACTOR = 256
 """Limit of address space: that at the start, ``_LIBRARY_BYTES``, and ``_FACTOR`` times the file's size."""
 
 
-def main(file: Path, result: Path) -> None:
+def main(file: Path, result: Path, origin: np.ndarray | None) -> None:
     import pxr.UsdGeom  # noqa: F401  (loaded before memory is limited)
 
     _limit_memory(file.stat().st_size)
     try:
-        report = extract(file, result)
+        report = extract(file, result, origin)
     except FileFormatError as error:
         report = {"error": str(error).removeprefix(f"{file}: ")}
     except MemoryError:
@@ -60,11 +61,11 @@ def _limit_memory(file_bytes: int) -> None:
         return
 
 
-def extract(file: Path, result: Path) -> dict[str, Any]:
-    """Writes the arrays; returns warnings, up direction, blending and names of attributes. Raises
+def extract(file: Path, result: Path, origin: np.ndarray | None = None) -> dict[str, Any]:
+    """Writes the arrays; returns warnings, up direction, origin, blending and names of attributes. Raises
     FileFormatError."""
     try:
-        return _extract(file, result)
+        return _extract(file, result, origin)
     except RuntimeError as error:  # including the library's own errors
         try:
             lines = str(error).split("\n")
@@ -76,7 +77,7 @@ def extract(file: Path, result: Path) -> dict[str, Any]:
         raise FileFormatError("not readable as USD: it holds text that is not UTF-8") from None
 
 
-def _extract(file: Path, result: Path) -> dict[str, Any]:
+def _extract(file: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
     from pxr import Sdf, Usd, UsdGeom
 
     layer = Sdf.Layer.OpenAsAnonymous(str(file))  # this file alone, without its references
@@ -95,13 +96,21 @@ def _extract(file: Path, result: Path) -> dict[str, Any]:
     budget = Budget(file)
     note = _our_note(shapes[0]) if len(shapes) == 1 else {}
     places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
-    pieces = []
+    matrices, own = [], False
     for shape in shapes:
         matrix = np.array(places.GetLocalToWorldTransform(shape.GetPrim()))
-        if note and np.abs(matrix - _own_placement(note["up"])).max() < 1e-6:
-            report["up"] = note["up"]
+        if note and _is_own_placement(matrix, note):
+            report["up"], own = note["up"], True
             matrix = np.eye(4)
-        pieces.append(_piece(shape, matrix, budget, exact=bool(note)))
+        matrices.append(matrix)
+    pieces = [_piece(shape, budget) for shape in shapes]
+    if own:
+        origin = np.array(note["origin"])
+    elif origin is None:
+        origin = _chosen_origin(pieces, matrices, report)
+    for piece, matrix in zip(pieces, matrices, strict=True):
+        _put(piece, matrix, zero_origin() if own else origin, exact=bool(note))
+    report["origin"] = origin.tolist()
     report.setdefault("up", [0, 0, 1] if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else [0, 1, 0])
     arrays = _joined(pieces)
     if note:
@@ -149,12 +158,45 @@ def _visible(stage: Any) -> tuple[list[Any], int]:
     return meshes, others
 
 
-def _piece(shape: Any, matrix: np.ndarray, budget: Budget, *, exact: bool) -> dict[str, np.ndarray]:
-    """Arrays of one mesh in the frame of the stage."""
+def _chosen_origin(
+    pieces: list[dict[str, np.ndarray]], matrices: list[np.ndarray], report: dict[str, Any]
+) -> np.ndarray:
+    """The origin that suits the meshes of another program."""
+    few = [
+        sampled(piece["vertices"]) @ matrix[:3, :3] + matrix[3, :3]
+        for piece, matrix in zip(pieces, matrices, strict=True)
+    ]
+    sample = np.concatenate(few)
+    if all((matrix == np.eye(4)).all() for matrix in matrices) and (lost := lost_detail(sample)):
+        report["warnings"].append(lost)
+    return choose_origin(sample)
+
+
+def _put(piece: dict[str, np.ndarray], matrix: np.ndarray, origin: np.ndarray, *, exact: bool) -> None:
+    """Puts a mesh into the frame of the stage, relative to ``origin``. ``exact`` keeps lengths of normals."""
+    points, normals = piece["vertices"], piece.get("normals")
+    if (matrix != np.eye(4)).any():
+        points = points @ matrix[:3, :3] + (matrix[3, :3] - origin)
+        if normals is not None:
+            normals = normals @ np.linalg.pinv(matrix[:3, :3]).T
+    elif origin.any():
+        points = points - origin
+    piece["vertices"] = points.astype(np.float32)
+    if normals is not None:
+        if not exact:
+            length = np.linalg.norm(normals, axis=1, keepdims=True)
+            normals = normals / np.where(length > 0, length, 1)
+        piece["normals"] = normals.astype(np.float32)
+
+
+def _piece(shape: Any, budget: Budget) -> dict[str, np.ndarray]:
+    """Arrays of one mesh in its own frame."""
     from pxr import UsdGeom
 
     at = str(shape.GetPath())[-100:]
-    points = _array(shape.GetPointsAttr(), np.float32, at, "points").reshape(-1, 3)
+    points = _array(shape.GetPointsAttr(), None, at, "points").reshape(-1, 3)
+    if points.dtype != np.float64:
+        points = points.astype(np.float32, copy=False)
     lengths = _array(shape.GetFaceVertexCountsAttr(), np.int64, at, "faceVertexCounts")
     corners = _array(shape.GetFaceVertexIndicesAttr(), np.int64, at, "faceVertexIndices")
     n, v = len(lengths), len(points)
@@ -189,17 +231,8 @@ def _piece(shape: Any, matrix: np.ndarray, budget: Budget, *, exact: bool) -> di
     faces, _ = cut_polygons(lengths, corners, {})
     if shape.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
         faces = faces[:, ::-1]
-    if (matrix != np.eye(4)).any():
-        points = (points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32)
-        if normals is not None:
-            normals = normals @ np.linalg.pinv(matrix[:3, :3]).T
     piece = {"vertices": points, "faces": faces.astype(np.int32), "linear": linear}
-    if normals is not None:
-        if not exact:
-            length = np.linalg.norm(normals, axis=1, keepdims=True)
-            normals = normals / np.where(length > 0, length, 1)
-        piece["normals"] = normals.astype(np.float32)
-    return piece
+    return piece if normals is None else piece | {"normals": normals}
 
 
 def _primvar(
@@ -230,7 +263,7 @@ def _primvar(
     return values, kind
 
 
-def _array(attribute: Any, dtype: type, at: str, what: str) -> np.ndarray:
+def _array(attribute: Any, dtype: type | None, at: str, what: str) -> np.ndarray:
     from pxr import Usd
 
     stored = attribute.Get(Usd.TimeCode.EarliestTime()) if attribute else None
@@ -266,18 +299,26 @@ def _our_note(shape: Any) -> dict[str, Any]:
         return {}
     try:
         up = [float(u) for u in note["up"]]
+        origin = [float(x) for x in note.get("origin", (0, 0, 0))]
     except (KeyError, TypeError, ValueError):
         return {}
     good = len(up) == 3 and 0.5 < np.linalg.norm(up) < 2 and note.get("blending") in get_args(Blending)
-    return {**note, "up": up} if good else {}
+    good = good and len(origin) == 3 and bool(np.isfinite(origin).all())
+    return {**note, "up": up, "origin": origin} if good else {}
 
 
-def _own_placement(up: list[float]) -> np.ndarray:
-    """The matrix (for row vectors) that our writer gives the node."""
+def _is_own_placement(matrix: np.ndarray, note: dict[str, Any]) -> bool:
+    """Whether the node has the matrix (for row vectors) that our writer gives it."""
     from pxr import Gf
 
-    x, y, z, w = up_quaternion(np.array(up))
-    return np.array(Gf.Matrix4d(Gf.Rotation(Gf.Quatd(w, x, y, z)), Gf.Vec3d(0)))
+    x, y, z, w = up_quaternion(np.array(note["up"]))
+    turn = np.array(Gf.Matrix4d(Gf.Rotation(Gf.Quatd(w, x, y, z)), Gf.Vec3d(0)))
+    shift = np.array(note["origin"]) @ turn[:3, :3]
+    rounding = 1e-12 * np.abs(shift).max()
+    return bool(
+        np.abs(matrix[:3, :3] - turn[:3, :3]).max() < 1e-6
+        and np.abs(matrix[3, :3] - shift).max() < max(1e-6, rounding)
+    )
 
 
 def _restored(
@@ -343,4 +384,5 @@ def _attributes_of(note: dict[str, Any]) -> Iterator[tuple[str, str, int]]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    given = np.array([float(x) for x in sys.argv[3:6]])
+    main(Path(sys.argv[1]), Path(sys.argv[2]), given if len(given) else None)

@@ -30,14 +30,15 @@ _BYTES_A_SECOND = 1 << 20
 """Reading is stopped after ``_SECONDS`` and a second for each of these; it takes a fiftieth of that."""
 
 
-def read_usd(path: Path) -> SplatMesh:
+def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     """The mesh in a `.usdc`, `.usda` or `.usd` file.
 
     Our own files give back positions and extra arrays exactly, and colours within 1e-6. From other programs'
     files, all visible meshes are joined, in the units and the frame of the stage, at the first time that has
     values: polygons are cut into triangles around their first corner, subdivision surfaces become their
     control cage, colours are displayColor (linear) and displayOpacity; materials and textures are ignored. A
-    DataWarning counts other shapes, which are left out.
+    DataWarning counts other shapes, which are left out. Positions are relative to ``origin``; by default to
+    that of our files, or to one that suits those of others, whose transforms are applied in float64.
 
     Raises:
         MissingDependencyError: usd-core is missing.
@@ -48,7 +49,7 @@ def read_usd(path: Path) -> SplatMesh:
     budget = Budget(path)
     with tempfile.TemporaryDirectory(prefix="meshsplats-") as folder:
         result = Path(folder) / "mesh.npz"
-        report = _extract(path.resolve(), path, result)
+        report = _extract(path.resolve(), path, result, origin)
         budget.spend(result.stat().st_size, "its meshes")
         with np.load(result, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
@@ -58,24 +59,27 @@ def read_usd(path: Path) -> SplatMesh:
     if report["blending"] != "linear":
         colors[:, :3] = linear_to_srgb(colors[:, :3])
     attributes = {name: arrays.pop(f"attribute_{i}") for i, name in enumerate(report["attributes"])}
-    return checked(
+    mesh = checked(
         path,
         SplatMesh,
         vertices=arrays.pop("vertices"),
         faces=arrays.pop("faces"),
         colors=colors,
         up=report["up"],
+        origin=report["origin"],
         blending=report["blending"],
         filter_px2=report.get("filter_px2", 0.0),
         attributes=attributes,
         **arrays,
     )
+    return mesh if origin is None else mesh.relative_to(origin)
 
 
-def _extract(file: Path, path: Path, result: Path) -> dict[str, Any]:
+def _extract(file: Path, path: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
     """Runs ``extraction``, which writes arrays to ``result``; returns the rest of its report."""
     size = file.stat().st_size
     command = [sys.executable, "-m", "meshsplats.formats.usd.extraction", str(file), str(result)]
+    command += [] if origin is None else [repr(float(x)) for x in origin]
     places = os.pathsep.join(os.path.abspath(place) for place in sys.path if place)
     try:
         done = subprocess.run(

@@ -2,10 +2,10 @@
 Blender.
 
 Needs the optional package usd-core. One Mesh under an Xform that rotates the mesh's up direction to the
-stage's +y; points are stored unchanged, metersPerUnit is 1. Colour and opacity are the primvars displayColor
-(linear) and displayOpacity, one value per vertex, and a UsdPreviewSurface material reads them. All else is in
-the mesh's custom data. Schemas: https://openusd.org/release/api/usd_geom_page_front.html and
-spec_usdpreviewsurface.html there.
+stage's +y and moves the mesh to its origin; points are stored unchanged, metersPerUnit is 1. Colour and
+opacity are the primvars displayColor (linear) and displayOpacity, one value per vertex, and a
+UsdPreviewSurface material reads them. All else is in the mesh's custom data. Schemas:
+https://openusd.org/release/api/usd_geom_page_front.html and spec_usdpreviewsurface.html there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats._validation import check_attribute_names
-from meshsplats.formats.gltf.writer import computed_normals, linear_colors, up_quaternion
+from meshsplats.formats.gltf.writer import computed_normals, linear_colors, turned_origin, up_quaternion
 from meshsplats.mesh import SplatMesh
 
 
@@ -41,6 +41,8 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     stage.SetDefaultPrim(root.GetPrim())
     Usd.ModelAPI(root.GetPrim()).SetKind(Kind.Tokens.component)
     x, y, z, w = up_quaternion(mesh.up)
+    if mesh.origin.any():
+        root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*turned_origin(mesh).tolist()))
     root.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
     shape = UsdGeom.Mesh.Define(stage, "/Splats/Mesh")
     shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices))
@@ -75,6 +77,8 @@ def write_usd(mesh: SplatMesh, path: Path, *, lit: bool = False) -> None:
     up = Gf.Vec3d(*(float(u) for u in mesh.up))
     note: dict[str, Any] = {"version": 1, "blending": mesh.blending, "up": up}
     note |= {field.name: True for field in extras}
+    if mesh.origin.any():
+        note["origin"] = Gf.Vec3d(*mesh.origin.tolist())
     if lit and mesh.normals is None:
         note["normals"] = "computed"
     if mesh.filter_px2:

@@ -1,0 +1,108 @@
+"""Origins: the points that float32 coordinates are relative to, where the world is wider than float32.
+
+float32 has 24 bits. At a northing of 4,500,000 m its step is half a metre, so a georeferenced scene keeps its
+detail only relative to a point nearby. Arrays hold coordinates relative to that origin; world = origin +
+local, in float64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+REACH = 64
+"""Distance from (0, 0, 0), in extents of the scene, up to which float32 is fine enough: 17 of its 24 bits
+are left for places in the scene, half a millimetre in 60 m."""
+FEWEST_STEPS = 1 << 10
+"""Steps across a scene below which what a float32 file itself has lost shows in images."""
+SAMPLE = 1 << 12
+"""Positions that the choice of an origin looks at, about."""
+_SHARE = 0.05
+"""Share of the positions at either end that do not count for the extent: outliers."""
+
+
+def zero_origin() -> np.ndarray:
+    """(3,) float64 zeros: coordinates are those of the world."""
+    return np.zeros(3)
+
+
+def choose_origin(positions: np.ndarray) -> np.ndarray:
+    """The origin for a scene of ``positions`` (n, 3) float64 in the world: (3,) float64.
+
+    Zero for a scene that is no farther away than ``REACH`` times its extent, so that coordinates stay as they
+    are; and for positions without an extent. Else the median, rounded to a power of ten of at most the extent
+    (below 1: a power of two). The nearest and farthest positions along each axis, one in twenty, do not
+    count.
+    """
+    found = _spread(positions)
+    if found is None:
+        return zero_origin()
+    center, extent, farthest = found
+    if extent == 0 or farthest <= REACH * extent:
+        return zero_origin()
+    unit = 10.0 ** math.floor(math.log10(extent)) if extent >= 1 else 2.0 ** math.floor(math.log2(extent))
+    return np.round(center / unit) * unit + 0.0
+
+
+def lost_detail(positions: np.ndarray) -> str:
+    """What a file that stores ``positions`` (n, 3), a sample of them, as float32 has lost, in words; empty
+    unless there are fewer than ``FEWEST_STEPS`` steps across the scene."""
+    found = _spread(positions)
+    if found is None:
+        return ""
+    center, extent, farthest = found
+    step = 2.0 ** (math.floor(math.log2(farthest)) - 23) if farthest else 0.0
+    if extent == 0 or extent >= FEWEST_STEPS * step:
+        return ""
+    return (
+        f"positions near {in_words(np.round(center))} are stored as float32, in steps of {step:g} across an"
+        f" extent of {extent:.3g}: detail is lost; double coordinates, or a point nearby that they are"
+        " relative to, keep it"
+    )
+
+
+def _spread(positions: np.ndarray) -> tuple[np.ndarray, float, float] | None:
+    """Median (3,), extent, and the greatest coordinate; None without finite positions."""
+    finite = positions[np.isfinite(positions).all(axis=1)].astype(np.float64, copy=False)
+    if not len(finite):
+        return None
+    low, center, high = np.quantile(finite, [_SHARE, 0.5, 1 - _SHARE], axis=0)
+    return center, float((high - low).max()), float(np.abs([low, high]).max())
+
+
+def sampled(positions: np.ndarray) -> np.ndarray:
+    """About ``SAMPLE`` of the rows of ``positions`` (n, 3), evenly spread, as float64."""
+    return positions[:: max(1, len(positions) // SAMPLE)].astype(np.float64)
+
+
+def relative(local: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """``local`` (n, 3) float32 coordinates, of the origin ``own``, relative to the origin ``other``."""
+    if (own == other).all():
+        return local
+    return (local + (own - other)).astype(np.float32)
+
+
+def shared_origin(origins: Iterable[np.ndarray]) -> np.ndarray:
+    """The origin for records of ``origins`` that are joined: that of the first one that is not zero."""
+    found = list(origins)
+    return next((origin for origin in found if origin.any()), found[0] if found else zero_origin())
+
+
+def need_one_origin(records: Mapping[str, Any]) -> None:
+    """Raises ValueError unless the ``records``, by name, that are not None are relative to one origin."""
+    known = [(name, record) for name, record in records.items() if record is not None]
+    for name, record in known[1:]:
+        first, wanted = known[0]
+        if (record.origin != wanted.origin).any():
+            raise ValueError(
+                f"{first} is relative to {in_words(wanted.origin)}, {name} to {in_words(record.origin)}:"
+                f" give {name}.relative_to({first}.origin)"
+            )
+
+
+def in_words(origin: np.ndarray) -> str:
+    """``origin`` as text that ``float`` reads back exactly, without digits that say nothing."""
+    return " ".join(repr(int(x)) if x == int(x) and abs(x) < 1e15 else repr(float(x)) for x in origin)
