@@ -94,8 +94,9 @@ demo: $(VENV)/installed
 	@echo 'Look in $(DEMO)/: scene.glb opens in any glTF viewer, turntable/ shows it turning,'
 	@echo 'compare/ shows splats, mesh and error side by side.'
 
+# A worker for each processor; each takes whole files, whose tests share what they make.
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
 # One wheel serves all versions of Python.
 PACKAGE_FILES := $(foreach kind,py wgsl js html css,$(shell find src -name '*.$(kind)'))
