@@ -211,7 +211,7 @@ def _cameras(cameras: Sequence[Camera], origin: np.ndarray) -> dict[str, Any]:
         "cameras": len(cameras),
         "image_sizes": [list(size) for size in sizes[:8]],
         "fx": _range([camera.fx for camera in cameras]),
-        "near": _range([camera.near for camera in cameras]),
+        "near": _near_planes(cameras),
         "lower": _in_world(centers.min(axis=0), origin),
         "upper": _in_world(centers.max(axis=0), origin),
         **_origin(origin),
@@ -223,6 +223,12 @@ def _world_cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
     """Findings about cameras that are in the world."""
     origin = choose_origin(np.array([camera.center for camera in cameras]))
     return _cameras([camera.relative_to(origin) for camera in cameras], origin)
+
+
+def _near_planes(cameras: Sequence[Camera]) -> list[float] | str:
+    """Range of those that are named."""
+    named = [camera.near for camera in cameras if camera.near is not None]
+    return _range(named) if named else "follows the scene"
 
 
 def _extent(points: np.ndarray, bounds: Bounds, origin: np.ndarray) -> dict[str, Any]:

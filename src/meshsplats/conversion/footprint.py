@@ -68,6 +68,7 @@ class CameraCoverage:
         self, means: np.ndarray, cameras: Sequence[Camera], origin: np.ndarray | None = None
     ) -> None:
         self.cameras = [cameras[i] for i in spread_indices(len(cameras), MAX_CAMERAS)]
+        self._near = [camera.near_plane(means) for camera in self.cameras]
         self.means = means
         # Relative to an origin among the splats: positions far from zero lose digits in float32.
         self.origin = origin_of(means[:: origin_step(len(means))]) if origin is None else origin
@@ -76,7 +77,7 @@ class CameraCoverage:
         """For each camera: (3, k) offsets from its centre to the splats ``part`` in the world frame, (k,)
         squares of their lengths, (k,) bool which of them it sees, and (k,) weights, 0 for the others."""
         points = np.ascontiguousarray((self.means[part] - self.origin).T, np.float32)
-        for camera in self.cameras:
+        for camera, near in zip(self.cameras, self._near, strict=True):
             rotation, center = camera.world_to_camera[:3, :3], camera.center - self.origin
             fx, fy = camera.fx, camera.fy
             # Rows to clip space: a point is in the image if and only if abs(x) <= z and abs(y) <= z.
@@ -91,13 +92,14 @@ class CameraCoverage:
             clip = matrix.astype(np.float32) @ points
             clip -= (matrix @ center).astype(np.float32)[:, None]
             z = clip[2]
-            seen = z > camera.near
+            seen = z > near
             np.abs(clip[:2], out=clip[:2])
             seen &= clip[0] <= z
             seen &= clip[1] <= z
             away = points - center.astype(np.float32)[:, None]
             square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
-            np.maximum(square, np.float32(1e-30), out=square)
+            # Of those that it sees, none is nearer; the others must not divide by zero.
+            np.maximum(square, np.float32(max(near, 1e-15)) ** 2, out=square)
             weight = np.float32(fx * fy) / square
             weight *= seen
             yield away, square, seen, weight

@@ -199,6 +199,7 @@ def convert_blocks(
     refuse_whole(chosen)
     scene = survey(source, chosen)
     direction = guess_up(scene.sample, cameras) if up is None else unit_up(up)
+    cameras = [camera.with_near_plane(scene.sample.means) for camera in cameras or ()]
     filter_px2 = filter_of(scene.kernel, chosen)
     pixels = ScenePixels(scene, chosen, cameras, direction)
     if pixels.has_unseen:
