@@ -97,7 +97,9 @@ class CameraCoverage:
             seen &= clip[0] <= z
             seen &= clip[1] <= z
             away = points - center.astype(np.float32)[:, None]
-            square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
+            with np.errstate(over="ignore"):
+                square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
+            seen &= square < np.inf  # farther than float32 can tell
             # Of those that it sees, none is nearer; the others must not divide by zero.
             np.maximum(square, np.float32(max(near, 1e-15)) ** 2, out=square)
             weight = np.float32(fx * fy) / square
@@ -228,6 +230,9 @@ def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str)
     """
     if pixel is None:
         return scales
-    low_pass = (px2 * np.square(pixel, dtype=np.float32))[:, None]
-    square = np.square(scales)
-    return np.sqrt(np.maximum(square, low_pass) if kernel == "2dgs" else square + low_pass)
+    with np.errstate(over="ignore"):
+        low_pass = (px2 * np.square(pixel, dtype=np.float32))[:, None]
+        square = np.square(scales)
+        result = np.sqrt(np.maximum(square, low_pass) if kernel == "2dgs" else square + low_pass)
+    # A splat so large that its variance overflows needs no filter.
+    return np.where(np.isfinite(result), result, scales) if result.max(initial=0) == np.inf else result
