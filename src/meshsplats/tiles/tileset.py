@@ -341,14 +341,14 @@ def _object(owner: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
 
 def _numbers(value: Any, count: int, what: str, path: Path) -> np.ndarray:
     good = isinstance(value, list) and len(value) == count
-    if not good or not all(_is_number(x) and abs(x) < 1e30 for x in value):
+    if not good or not all(_is_number(x) and abs(x) < 1e39 for x in value):
         raise FileFormatError(f"{path}: {what} must be {count} numbers, got {str(value)[:60]}")
     return np.array(value, np.float64)
 
 
 def _error(owner: dict[str, Any], path: Path) -> float:
     value: Any = owner.get("geometricError")
-    if not _is_number(value) or not 0 <= value < 1e30:
+    if not _is_number(value) or not 0 <= value < 1e39:
         raise FileFormatError(f"{path}: geometricError must be a number >= 0, got {str(value)[:40]}")
     return float(value)
 
