@@ -39,6 +39,7 @@ _RULES = {
     "crop": "outside the box",
     "min_opacity": "fainter than {:g}",
     "max_distance": "farther than {:g} radii",
+    "max_size": "longer than {:g} radii",
     "sparse": "fewer than {:.1%} of the usual neighbours",
     "min_part": "in parts below {:.1%} of all opacity",
 }
@@ -52,7 +53,7 @@ else:
     RuleOptions = as_cli_options(
         CleaningRules,
         "Rules: splats with any of these properties are removed."
-        f" Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
+        f" Default: --max-size {FLOATERS.max_size:g} --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
 
