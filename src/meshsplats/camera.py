@@ -166,3 +166,24 @@ class Camera:
         x, y = positions.T
         with np.errstate(invalid="ignore"):  # NaN lies nowhere
             return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
+def hiding_near_plane(cameras: Sequence[Camera], points: np.ndarray) -> str:
+    """What to say if ``cameras`` see none of ``points`` (n, 3) because the near planes that they name are
+    farther; empty otherwise."""
+    some = subsample(points, _POINTS)
+    nearest = np.inf
+    for camera in cameras:
+        if camera.sees(some).any():
+            return ""
+        bare = replace(camera, near=None)
+        positions, depth = bare.project(some)
+        depth = depth[bare.in_image(positions)]
+        if len(depth) and camera.near is not None:
+            nearest = min(nearest, camera.near)
+    if nearest == np.inf:
+        return ""
+    return (
+        f"all that the cameras look at is nearer than the near plane {nearest:g} that they name: leave 'near' out"
+        " of the camera file, and it follows the scene"
+    )

@@ -45,7 +45,13 @@ class CleaningRules:
     clumps in the air."""
 
     def __post_init__(self) -> None:
-        for name, top in [("min_opacity", 1), ("max_distance", np.inf), ("max_size", np.inf), ("sparse", 1), ("min_part", 1)]:
+        for name, top in [
+            ("min_opacity", 1),
+            ("max_distance", np.inf),
+            ("max_size", np.inf),
+            ("sparse", 1),
+            ("min_part", 1),
+        ]:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= top:
                 raise ValueError(f"{name} must lie between 0 and {top}, got {value}")
