@@ -184,6 +184,6 @@ def hiding_near_plane(cameras: Sequence[Camera], points: np.ndarray) -> str:
     if nearest == np.inf:
         return ""
     return (
-        f"all that the cameras look at is nearer than the near plane {nearest:g} that they name: leave 'near' out"
-        " of the camera file, and it follows the scene"
+        f"what they look at is nearer than the near plane {nearest:g} that they name; without 'near' in the"
+        " camera file, it follows the scene"
     )

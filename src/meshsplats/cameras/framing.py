@@ -127,9 +127,7 @@ def scene_bounds(scene: Framable) -> Bounds:
     return Bounds(center, radius, points[subject], weights[subject], sizes[subject])
 
 
-def warn_of_strays(
-    scene: GaussianCloud | SplatMesh, low: np.ndarray, high: np.ndarray, size: float
-) -> None:
+def warn_of_strays(scene: GaussianCloud | SplatMesh, low: np.ndarray, high: np.ndarray, size: float) -> None:
     """Issues a StraysWarning if splats lie ``STRAY`` radii from the subject of ``scene``, a sample of it, or
     are as large.
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from meshsplats._arrays import spread_indices
 from meshsplats._geometry import spacing
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.framing import SAMPLE
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks, thin_product
@@ -202,15 +202,22 @@ def pixel_sizes(
     sizes = coverage.pixel_sizes()
     seen = sizes > 0
     if not seen.any():
-        raise ValueError(
-            f"none of the {len(coverage.cameras)} cameras sees any of the {len(cloud)} splats: are they of"
-            " one scene? Choose footprint='framing' or 'none' to go without them"
-        )
+        raise ValueError(none_seen(coverage.cameras, cloud.means, len(cloud)))
     sizes = np.where(seen, sizes, np.median(sizes[seen]))
     if options.footprint == "framing":
         step = -(-len(cloud) // SAMPLE)
         np.minimum(sizes, largest_pixel(cloud.means[::step], step), out=sizes)
     return sizes
+
+
+def none_seen(cameras: Sequence[Camera], means: np.ndarray, count: int) -> str:
+    """What to say where ``cameras`` see none of ``count`` splats, some of which are at ``means`` (n, 3)."""
+    reason = hiding_near_plane(cameras, means)
+    reason = f"{reason}." if reason else "are they of one scene?"
+    return (
+        f"none of the {len(cameras)} cameras sees any of the {count:,} splats: {reason} Choose"
+        " footprint='framing' or 'none' to go without them"
+    )
 
 
 def largest_pixel(means: np.ndarray, step: int) -> np.float32:

@@ -22,6 +22,7 @@ from meshsplats.conversion.footprint import (
     FRAMING_VIEWS,
     CameraCoverage,
     largest_pixel,
+    none_seen,
     origin_of,
     origin_step,
 )
@@ -141,10 +142,7 @@ class ScenePixels:
             self._largest = largest_pixel(scene.sample.means, scene.step)
         sizes = self.seen(scene.sample.means)
         if not (sizes > 0).any():
-            raise ValueError(
-                f"none of the {len(self._cameras)} cameras sees any of {len(sizes):,} splats: are they of one"
-                " scene? Choose footprint='framing' or 'none' to go without them"
-            )
+            raise ValueError(none_seen(self._cameras, scene.sample.means, scene.kept))
         self.unseen = np.median(sizes[sizes > 0])
 
     @property
