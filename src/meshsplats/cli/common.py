@@ -99,11 +99,11 @@ class SplatOptions:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
-        if quiet:
-            return cloud
         if len(cloud):
             size = float(cloud.scales.max())
             warn_of_strays(cloud, cloud.means.min(axis=0), cloud.means.max(axis=0), size)
+        if quiet:
+            return cloud
         if up is None and cloud.up is not None:
             say(f"up: {direction_in_words(cloud.up)}, from the file's header")
         if self.kernel == "auto" and cloud.kernel != "3dgs":

@@ -19,7 +19,7 @@ from meshsplats.cameras.camera_path import is_camera_path
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import SplatOptions, cameras_beside
+from meshsplats.cli.common import SplatOptions, cameras_beside, load_scene
 from meshsplats.cli.messages import shown_path
 from meshsplats.datasets.colmap import count_points
 from meshsplats.datasets.folder import load_dataset
@@ -75,9 +75,9 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
         if cameras := cameras_beside(path, np.zeros(3)):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
     elif kind == "mesh":
-        from meshsplats.formats.meshes import load_mesh
-
-        found |= _mesh(load_mesh(path))
+        mesh = load_scene(path, reading)
+        assert isinstance(mesh, SplatMesh)
+        found |= _mesh(mesh)
     else:
         found |= _world_cameras(load_cameras(path))
         if is_camera_path(read_json(path)):
