@@ -36,7 +36,7 @@ def load_cameras(
     image's centre) may be missing. Another is the ``cameras.json`` that INRIA's 3DGS trainer writes:
     ``{img_name, width, height, position, rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and
     the principal point at the image's centre. The third is nerfstudio's ``camera_path.json``, whose cameras
-    are in the frame of the splats that ``ns-export`` writes. For a folder, the ``cameras.json`` in it is read.
+    are in the frame of the splats that ``ns-export`` writes. For a folder, its ``cameras.json`` is read.
 
     Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
     format, and OSError if it cannot be opened.
