@@ -49,7 +49,7 @@ def make_shape(mesh: ms.SplatMesh) -> mi.Mesh:
     return shape
 
 
-def make_sensor(camera: ms.Camera, samples: int) -> dict:
+def make_sensor(camera: ms.Camera, samples: int, points: np.ndarray) -> dict:
     """``camera`` for Mitsuba, whose cameras have x to the left and y up. Any principal point will do."""
     to_world = np.linalg.inv(camera.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
@@ -58,8 +58,8 @@ def make_sensor(camera: ms.Camera, samples: int) -> dict:
         "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
         "principal_point_offset_x": camera.cx / camera.width - 0.5,
         "principal_point_offset_y": camera.cy / camera.height - 0.5,
-        "near_clip": camera.near,
-        "far_clip": 1e5,
+        "near_clip": camera.near_plane(points),
+        "far_clip": 1e7 * camera.near_plane(points),
         "to_world": mi.ScalarTransform4f(to_world),
         "sampler": {"type": "independent", "sample_count": samples},
         "film": {
@@ -104,7 +104,7 @@ def make_scene_of(
             "type": "scene",
             # volpath traces shadow rays through layers, which path takes for opaque.
             "integrator": {"type": "volpath", "max_depth": 4, "rr_depth": 1000},
-            "sensor": make_sensor(camera, samples),
+            "sensor": make_sensor(camera, samples, mesh.vertices),
             "splats": make_shape(mesh),
             "ground": {
                 "type": "rectangle",

@@ -6,6 +6,8 @@ import numpy as np
 
 _STEPS = [(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 """From the key of a cell to those of the 26 cells around it, and its own."""
+_MOST = 1 << 20
+"""Cells in a row at most; farther points are strays."""
 
 
 class Cells:
@@ -13,9 +15,19 @@ class Cells:
 
     def __init__(self, points: np.ndarray, side: float) -> None:
         low = points.min(axis=0)
-        # Keys have 21 bits for each axis: far strays share the last cell.
-        steps = np.minimum((points - low) / side, 2**20 - 4).astype(np.int64) + 1
+        # Keys have 21 bits for each axis, of which half are for cells in a row.
+        whole = bool(((points.max(axis=0) - low) / side <= _MOST - 2).all())
+        if not whole:
+            low = np.median(points, axis=0) - _MOST // 2 * side
+        steps = (points - low) / side
+        far = np.zeros(len(points), bool) if whole else ((steps < 0) | (steps > _MOST - 2)).any(axis=1)
+        steps = np.where(far[:, None], 0, steps).astype(np.int64) + 1
         keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
+        if far.any():
+            # Strays are in cells as large as the space of all others, and these are never beside one another.
+            coarse = np.floor((points[far] - low) / (side * _MOST))
+            of_stray = np.unique(coarse, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+            keys[far] = ((_MOST + 8) << 42) | ((3 * (of_stray >> 18)) << 21) | (3 * (of_stray & 0x3FFFF))
         self._cells, of = np.unique(keys, return_inverse=True)
         self._of = of.reshape(-1)
 

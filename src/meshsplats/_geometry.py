@@ -9,6 +9,8 @@ import numpy as np
 
 _SPACING_LEVELS = 20
 """Halvings of the extent down to the smallest cell for ``spacing``."""
+STRAYS = 1024
+"""Extent of a scene, as a multiple of that of 98 % of its points, from which on the others are strays."""
 
 
 def rotation_rows(w: Any, x: Any, y: Any, z: Any) -> Iterator[tuple[Any, Any, Any]]:
@@ -93,11 +95,18 @@ def spacing(points: np.ndarray, share: int = 8) -> np.ndarray:
     surface. Points in one spot have the spacing of the smallest cell, 2^-20 of the extent.
     """
     levels = _SPACING_LEVELS
-    low = points.min(axis=0).astype(np.float64)
-    extent = float((points.max(axis=0) - low).max())
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     n = len(points)
-    if n == 1 or extent == 0:
+    if n == 1 or (high == low).all():
         return np.zeros(n, np.float32)
+    # The cells divide the place where nearly all points are: strays would leave a few of them for the rest.
+    usual = np.quantile(points[:: -(-n // 20_000)].astype(np.float64), (0.01, 0.99), axis=0)
+    side = float(np.ptp(usual, axis=0).max())
+    if 0 < STRAYS * side < float((high - low).max()):
+        low = np.maximum(low, usual[0] - STRAYS / 4 * side)
+        high = np.minimum(high, usual[1] + STRAYS / 4 * side)
+        points = np.clip(points, low, high)
+    extent = float((high - low).max())
     cells = ((points - low) * ((1 << levels) * (1 - 1e-9) / extent)).astype(np.uint64)
     code = _interleaved(cells)  # Morton order: cells of every level are runs of points
     order = np.argsort(code)  # points of one cell get one spacing: their order does not matter

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
+from meshsplats._arrays import checked_array, subsample
 
 MAX_SIDE = 1 << 15
 """Largest image side in pixels."""
+
+NEAR_SHARE = 0.002
+"""Depth of the near plane of a camera that names none, as a share of the distance from which on the scene
+lies around it: 1 cm where that is 5 m."""
+NEAREST_SHARE = 0.01
+"""Share of the scene's points that may lie nearer than that distance: floaters, and splats at the lens."""
+_POINTS = 20_000
+"""Number of points to measure at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +44,9 @@ class Camera:
     """Principal point in pixels from the top edge."""
     width: int
     height: int
-    near: float = 0.01
-    """Depth z of the near plane, scene units: nothing nearer is drawn."""
+    near: float | None = None
+    """Depth z of the near plane, scene units: nothing nearer is drawn. None: a small share of the distance to
+    the scene, ``with_near_plane``."""
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -53,6 +63,8 @@ class Camera:
             raise ValueError("world_to_camera must not mirror: its rotation has determinant -1")
         object.__setattr__(self, "world_to_camera", matrix)
         for name in ("fx", "fy", "near"):
+            if name == "near" and self.near is None:
+                continue
             value = float(getattr(self, name))
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be positive, got {value}")
@@ -108,6 +120,26 @@ class Camera:
         """The same view with no side of the image longer than ``side`` pixels; never a larger image."""
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
+    def near_plane(self, points: np.ndarray) -> float:
+        """Depth of the near plane for a scene of ``points`` (n, 3), its vertices or centres: ``near``, or
+        ``NEAR_SHARE`` of the distance within which ``NEAREST_SHARE`` of the points lie.
+
+        It depends on the position of the camera alone, so that parts of an image have that of the whole, and
+        follows the units of the scene.
+        """
+        if self.near is not None:
+            return self.near
+        distance = np.linalg.norm(subsample(points, _POINTS).astype(np.float64) - self.center, axis=1)
+        distance = distance[distance > 0]
+        if not len(distance):
+            return NEAR_SHARE  # there is nothing to see
+        nearest = int(NEAREST_SHARE * len(distance))
+        return max(NEAR_SHARE * float(np.partition(distance, nearest)[nearest]), sys.float_info.min)
+
+    def with_near_plane(self, points: np.ndarray) -> Camera:
+        """The camera with the near plane that it has in front of a scene of ``points`` (n, 3)."""
+        return self if self.near is not None else replace(self, near=self.near_plane(points))
+
     def sees(self, points: np.ndarray) -> np.ndarray:
         """(n,) bool: points (n, 3) beyond the near plane that project into the image."""
         return self.in_image(self.project(points)[0])
@@ -117,19 +149,41 @@ class Camera:
 
         Returns:
             (n, 2) x and y in pixels from the image's top left corner, NaN for points that are not beyond the
-            near plane; and (n,) depth z in the camera's frame. Both are float32 for float32 points, else
-            float64.
+            near plane, or not in front of a camera without one; and (n,) depth z in the camera's frame. Both
+            are float32 for float32 points, else float64.
         """
         points = np.asarray(points)
         if points.dtype != np.float32:
             points = points.astype(np.float64, copy=False)
         matrix = self.world_to_camera.astype(points.dtype, copy=False)
         x, y, z = matrix[:3, :3] @ points.T + matrix[:3, 3:]
-        beyond = np.where(z > self.near, z, points.dtype.type(np.nan))
-        return np.stack([self.fx * x / beyond + self.cx, self.fy * y / beyond + self.cy]).T, z
+        beyond = np.where(z > (self.near or 0), z, points.dtype.type(np.nan))
+        with np.errstate(over="ignore"):  # points right at the camera, beside the image
+            return np.stack([self.fx * x / beyond + self.cx, self.fy * y / beyond + self.cy]).T, z
 
     def in_image(self, positions: np.ndarray) -> np.ndarray:
         """(n,) bool: which of ``positions`` (n, 2), as from ``project``, lie in the image."""
         x, y = positions.T
         with np.errstate(invalid="ignore"):  # NaN lies nowhere
             return (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+
+
+def hiding_near_plane(cameras: Sequence[Camera], points: np.ndarray) -> str:
+    """What to say if ``cameras`` see none of ``points`` (n, 3) because the near planes that they name are
+    farther; empty otherwise."""
+    some = subsample(points, _POINTS)
+    nearest = np.inf
+    for camera in cameras:
+        if camera.sees(some).any():
+            return ""
+        bare = replace(camera, near=None)
+        positions, depth = bare.project(some)
+        depth = depth[bare.in_image(positions)]
+        if len(depth) and camera.near is not None:
+            nearest = min(nearest, camera.near)
+    if nearest == np.inf:
+        return ""
+    return (
+        f"what they look at is nearer than the near plane {nearest:g} that they name; without 'near' in the"
+        " camera file, it follows the scene"
+    )

@@ -21,6 +21,10 @@ class DataWarning(UserWarning):
     """Some of the data was left out or altered; the message counts it."""
 
 
+class StraysWarning(DataWarning):
+    """Splats lie far outside of the scene, or are far larger than it."""
+
+
 class NoColorsWarning(DataWarning):
     """A mesh file without vertex colours was read as grey."""
 

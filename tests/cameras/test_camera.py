@@ -273,7 +273,7 @@ def test_camera_file_of_ours(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps([OURS, {**OURS, "name": "c", "near": 0.5}]))
     first, second = load_cameras(path)
-    assert (first.name, first.width, first.height, first.near) == ("a", 4, 2, 0.01)
+    assert (first.name, first.width, first.height, first.near) == ("a", 4, 2, None)
     assert (first.fx, first.fy, first.cx, first.cy, second.near) == (3.0, 3.5, 1.75, 1.25, 0.5)
     np.testing.assert_array_equal(first.world_to_camera, OURS["world_to_camera"])
     np.testing.assert_allclose(first.center, (-0.5, -3, 0.25))
@@ -291,7 +291,7 @@ def test_camera_file_of_inria(tmp_path):
 
 
 def test_cameras_come_back_with_every_digit(tmp_path):
-    cameras = [*dome(ball(), 5, up=(0.1, 0.2, 1)), *look_around(ball(), 2)]
+    cameras = [*dome(ball(), 5, up=(0.1, 0.2, 1)), *look_around(ball(), 2), look_at((0, 0, 0), (0, 0, 1))]
     save_cameras(cameras, tmp_path / "c.json")
     for a, b in zip(cameras, load_cameras(tmp_path / "c.json"), strict=True):
         np.testing.assert_array_equal(a.world_to_camera, b.world_to_camera)

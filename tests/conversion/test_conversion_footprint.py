@@ -75,7 +75,7 @@ class TestPixelSize:
         [
             ((0, 0, 1), True),
             ((0, 0, -1), False),  # behind
-            ((0, 0, 0.005), False),  # nearer than the near plane
+            ((0, 0, 0.25), False),  # nearer than the near plane
             ((0.31, 0.31, 1), True),  # 31 pixels from the centre of 64
             ((0.33, 0, 1), False),
             ((-0.33, 0, 1), False),
@@ -84,7 +84,9 @@ class TestPixelSize:
         ],
     )
     def test_what_a_camera_sees(self, position, seen):
-        assert (CameraCoverage(np.float32([position]), [ahead()]).pixel_sizes()[0] > 0) == seen
+        assert (
+            CameraCoverage(np.float32([position]), [replace(ahead(), near=0.3)]).pixel_sizes()[0] > 0
+        ) == seen
 
     def test_principal_point(self):
         camera = Camera(np.eye(4), 100, 100, 0, 64, 64, 64)  # sees what is right of and above its axis

@@ -176,6 +176,25 @@ def test_linear_meshes_with_depth_groups_and_a_filter(browser, write_page, cloud
     page.close()
 
 
+def test_strays_cost_the_others_nothing(browser, write_page, cloud, cameras):
+    """One splat far away, one of a giant's size that cuts the scene, and the splats beside them."""
+    wild = ms.GaussianCloud(
+        np.concatenate([cloud.means, [[1e8, 0, 0], cloud.means.mean(axis=0)]]),
+        np.concatenate([cloud.quaternions, [[1, 0, 0, 0], [0.8, 0.6, 0, 0]]]),
+        np.concatenate([cloud.scales, [[1, 1, 1], [np.exp(40), np.exp(20), 1e-3]]]),
+        np.concatenate([cloud.opacities, [0.9, 0.4]]),
+        np.concatenate([cloud.sh[:, :1], np.zeros((2, 1, 3))]),
+    )
+    mesh = ms.convert(wild)
+    image = ms.render(mesh, cameras[0]).color
+    assert np.abs(image - ms.render(ms.convert(cloud), cameras[0]).color).mean() > 0.02
+    page = open_page(browser, write_page(mesh, "strays", splats=wild, cameras=cameras))
+    difference = np.abs(page.screenshot().astype(int) - levels(image))
+    assert (difference > 1).any(axis=-1).mean() < 0.005
+    assert page.problems() == []
+    page.close()
+
+
 def limited(most: int) -> str:
     """A script by which storage bindings have at most ``most`` bytes, and that notes the largest."""
     return f"""

@@ -110,6 +110,7 @@ def draw(
     counted = [subject.count(level, cameras, options) for level in meshes]
     layers, limit = max(counted)
     finest = meshes[0]
+    cameras = [camera.with_near_plane(finest.vertices) for camera in cameras]
     if layers > MAX_LAYERS:
         _warn(meshes[counted.index((layers, limit))], cameras, layers, options)
     if announce is not None:

@@ -32,11 +32,11 @@ def load_cameras(
     look at, ``GaussianCloud.origin`` or ``SplatMesh.origin``.
 
     Three forms are read. Ours is a list of ``{name, width, height, fx, fy, cx, cy, world_to_camera}`` with a
-    4x4 matrix and OpenCV axes; ``name``, ``near``, and cx and cy (then the image's centre) may be missing.
-    Another is the ``cameras.json`` that INRIA's 3DGS trainer writes: ``{img_name, width, height, position,
-    rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and the principal point at the image's
-    centre. The third is nerfstudio's ``camera_path.json``, whose cameras are in the frame of the splats that
-    ``ns-export`` writes. For a folder, the ``cameras.json`` in it is read.
+    4x4 matrix and OpenCV axes; ``name``, ``near`` (then it follows the scene), and cx and cy (then the
+    image's centre) may be missing. Another is the ``cameras.json`` that INRIA's 3DGS trainer writes:
+    ``{img_name, width, height, position, rotation, fx, fy}`` with ``rotation`` (3x3) from camera to world and
+    the principal point at the image's centre. The third is nerfstudio's ``camera_path.json``, whose cameras
+    are in the frame of the splats that ``ns-export`` writes. For a folder, its ``cameras.json`` is read.
 
     Raises FileFormatError, which names the camera and the field, for a file that is broken or of another
     format, and OSError if it cannot be opened.
@@ -109,8 +109,10 @@ def save_cameras(
     need_all(Camera, cameras=cameras)
     need_path(path=path)
     point = checked_array("origin", origin, np.float64, (3,))
+    fields = ("name", "width", "height", "fx", "fy", "cx", "cy")
     entries = [
-        {key: getattr(camera, key) for key in ("name", "width", "height", "fx", "fy", "cx", "cy", "near")}
+        {key: getattr(camera, key) for key in fields}
+        | ({} if camera.near is None else {"near": camera.near})
         | {"world_to_camera": camera.world_to_camera.tolist()}
         for camera in (camera.relative_to(-point) for camera in cameras)
     ]
@@ -135,7 +137,7 @@ def _camera_from_json(entry: object, where: str) -> Camera:
     else:
         has = ", ".join(entry)[:200]
         raise FileFormatError(f"{where}: needs 'world_to_camera', or 'rotation' and 'position'; it has {has}")
-    defaults = {"cx": width / 2, "cy": height / 2, "near": 0.01}
+    defaults = {"cx": width / 2, "cy": height / 2, "near": None}
     lens = {
         key: float(_numbers(entry, key, (), where)) if key in entry or key not in defaults else defaults[key]
         for key in ("fx", "fy", "cx", "cy", "near")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from meshsplats._arrays import subsample
 from meshsplats._cells import Cells
 from meshsplats._kinds import need_array
 from meshsplats.camera import Camera
+from meshsplats.errors import StraysWarning
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -40,6 +42,10 @@ LEVEL_ROLL = 0.2
 """Greatest mean square of what stands out of that plane, as a share of the former: people roll cameras."""
 LEVEL_AGREES = 0.3
 """Least cosine between that direction and the cameras' mean up direction."""
+
+STRAY = 10_000.0
+"""Distance from the subject, and size, in its radii, from which on splats are strays. In captures that were
+tried, floaters are at most 1,100 radii away."""
 
 Framable = GaussianCloud | SplatMesh | np.ndarray
 """Whatever cameras can be placed around: splats, a mesh, or points (n, 3)."""
@@ -119,6 +125,28 @@ def scene_bounds(scene: Framable) -> Bounds:
     subject = distance <= limit if limit > 0 else np.ones(len(points), bool)
     subject[subject] = _without_floaters(points[subject], weights[subject], APART * radius)
     return Bounds(center, radius, points[subject], weights[subject], sizes[subject])
+
+
+def warn_of_strays(scene: GaussianCloud | SplatMesh, low: np.ndarray, high: np.ndarray, size: float) -> None:
+    """Issues a StraysWarning if splats lie ``STRAY`` radii from the subject of ``scene``, a sample of it, or
+    are as large.
+
+    Args:
+        low, high: (3,) least and greatest coordinates of all centres.
+        size: largest standard deviation of all splats.
+    """
+    bounds = scene_bounds(scene)
+    with np.errstate(over="ignore"):
+        away = float(np.maximum(np.abs(low - bounds.center), np.abs(high - bounds.center)).max())
+    if max(away, size) <= STRAY * bounds.radius:
+        return
+    radii = f"about 10^{round(np.log10(max(away, size) / bounds.radius))} radii"
+    what = f"lie {radii} away from the rest" if away >= size else f"are {radii} of the scene large"
+    warnings.warn(
+        f"some splats {what}: 'meshsplats clean' removes such strays",
+        StraysWarning,
+        stacklevel=3,
+    )
 
 
 def _without_floaters(points: np.ndarray, weights: np.ndarray, gap: float) -> np.ndarray:

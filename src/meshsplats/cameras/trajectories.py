@@ -34,7 +34,7 @@ def look_at(
     width: int = 800,
     height: int = 800,
     fov: float = 45.0,
-    near: float = 0.01,
+    near: float | None = None,
     name: str = "",
 ) -> Camera:
     """A camera that looks at a point.
@@ -47,7 +47,7 @@ def look_at(
         up: (3,) direction towards the image's upper edge.
         width, height: of the image, pixels.
         fov: angle in degrees, 1 to 170, that the shorter side of the image spans.
-        near: depth of the near plane, scene units.
+        near: depth of the near plane, scene units; None: it follows the scene.
         name: of the camera.
 
     Raises ValueError if the two points coincide or are not finite, and for a value out of range.

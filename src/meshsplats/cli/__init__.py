@@ -125,10 +125,19 @@ def _signals_raise() -> Iterator[None]:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    from meshsplats.errors import DataWarning
+    from meshsplats.errors import DataWarning, StraysWarning
+
+    named: list[str] = []
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        if isinstance(message, StraysWarning):
+            if named:
+                return  # splats and their mesh have the same
+            named.append(str(message))
+        say(f"warning: {one_line(message)}")
 
     warnings.simplefilter("always", DataWarning)
-    warnings.showwarning = lambda message, *_, **__: say(f"warning: {one_line(message)}")
+    warnings.showwarning = show
 
     with _standard_input_as_file(_joined(arguments)) as words:
         return _execute(name, words)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,6 +33,7 @@ from meshsplats.cli.common import (
 from meshsplats.cli.messages import UsageError, shown_path
 from meshsplats.cli.records import PREVIEW, beside
 from meshsplats.conversion.cleaning import FLOATERS, CleaningRules, Findings, find, remove
+from meshsplats.errors import StraysWarning
 from meshsplats.gaussians import SH_C0, GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -39,6 +41,7 @@ _RULES = {
     "crop": "outside the box",
     "min_opacity": "fainter than {:g}",
     "max_distance": "farther than {:g} radii",
+    "max_size": "longer than {:g} radii",
     "sparse": "fewer than {:.1%} of the usual neighbours",
     "min_part": "in parts below {:.1%} of all opacity",
 }
@@ -52,7 +55,8 @@ else:
     RuleOptions = as_cli_options(
         CleaningRules,
         "Rules: splats with any of these properties are removed."
-        f" Default: --sparse {FLOATERS.sparse} --min-part {FLOATERS.min_part}.",
+        f" Default: --max-size {FLOATERS.max_size:g} --sparse {FLOATERS.sparse}"
+        f" --min-part {FLOATERS.min_part}.",
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
 
@@ -94,7 +98,9 @@ class Clean(Command):
         check_outputs(outputs, self.force, inputs=[self.input])
         explicit = any(value is not None for value in vars(self.rules).values())
         rules = self.rules if explicit else FLOATERS
-        scene = load_scene(self.input, self.reading)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", StraysWarning)  # which names this command
+            scene = load_scene(self.input, self.reading)
         if isinstance(scene, GaussianCloud) and self.output.suffix.lower() != ".ply":
             raise UsageError(f"splats are written as .ply, got {self.output.name!r}: 'convert' makes meshes")
         found = find(scene, rules)

@@ -20,7 +20,7 @@ from meshsplats._arrays import subsample
 from meshsplats._origin import in_words, lost_detail, sampled
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
-from meshsplats.cameras.framing import guess_up
+from meshsplats.cameras.framing import guess_up, warn_of_strays
 from meshsplats.cameras.trajectories import dome, look_around, orbit
 from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
@@ -99,6 +99,9 @@ class SplatOptions:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
+        if len(cloud):
+            size = float(cloud.scales.max())
+            warn_of_strays(cloud, cloud.means.min(axis=0), cloud.means.max(axis=0), size)
         if quiet:
             return cloud
         if up is None and cloud.up is not None:
@@ -394,7 +397,10 @@ def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> G
     reading.refuse_for(path)
     from meshsplats.formats.meshes import load_mesh
 
-    return load_mesh(path)
+    mesh = load_mesh(path)
+    if len(mesh.vertices):
+        warn_of_strays(mesh, mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), 0.0)
+    return mesh
 
 
 def cameras_beside(source: Path, origin: np.ndarray) -> list[Camera] | None:

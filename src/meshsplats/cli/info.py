@@ -19,7 +19,7 @@ from meshsplats.cameras.camera_path import is_camera_path
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import Bounds, guess_up, scene_bounds
 from meshsplats.cli.arguments import Command
-from meshsplats.cli.common import SplatOptions, cameras_beside
+from meshsplats.cli.common import SplatOptions, cameras_beside, load_scene
 from meshsplats.cli.messages import shown_path
 from meshsplats.datasets.colmap import count_points
 from meshsplats.datasets.folder import load_dataset
@@ -75,9 +75,9 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
         if cameras := cameras_beside(path, np.zeros(3)):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
     elif kind == "mesh":
-        from meshsplats.formats.meshes import load_mesh
-
-        found |= _mesh(load_mesh(path))
+        mesh = load_scene(path, reading)
+        assert isinstance(mesh, SplatMesh)
+        found |= _mesh(mesh)
     else:
         found |= _world_cameras(load_cameras(path))
         if is_camera_path(read_json(path)):
@@ -211,7 +211,7 @@ def _cameras(cameras: Sequence[Camera], origin: np.ndarray) -> dict[str, Any]:
         "cameras": len(cameras),
         "image_sizes": [list(size) for size in sizes[:8]],
         "fx": _range([camera.fx for camera in cameras]),
-        "near": _range([camera.near for camera in cameras]),
+        "near": _near_planes(cameras),
         "lower": _in_world(centers.min(axis=0), origin),
         "upper": _in_world(centers.max(axis=0), origin),
         **_origin(origin),
@@ -223,6 +223,12 @@ def _world_cameras(cameras: Sequence[Camera]) -> dict[str, Any]:
     """Findings about cameras that are in the world."""
     origin = choose_origin(np.array([camera.center for camera in cameras]))
     return _cameras([camera.relative_to(origin) for camera in cameras], origin)
+
+
+def _near_planes(cameras: Sequence[Camera]) -> list[float] | str:
+    """Range of those that are named."""
+    named = [camera.near for camera in cameras if camera.near is not None]
+    return _range(named) if named else "follows the scene"
 
 
 def _extent(points: np.ndarray, bounds: Bounds, origin: np.ndarray) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import tyro
 
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
@@ -37,6 +38,7 @@ from meshsplats.cli.common import (
 from meshsplats.cli.messages import UsageError
 from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, recorded_options, write_configuration
 from meshsplats.cluster import Shared
+from meshsplats.errors import DataWarning
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -125,6 +127,10 @@ class Render(Command):
         photographs = self.views.photographs(scene.origin)
         count = 1 if single else 60
         cameras = self.views.make(scene, self.input, count=count, side=800, photographs=photographs)
+        if tileset is None:
+            places = scene.means if isinstance(scene, GaussianCloud) else scene.vertices
+            if hidden := hiding_near_plane(cameras, places):
+                warnings.warn(f"the cameras see nothing: {hidden}", DataWarning, stacklevel=2)
         if single and len(cameras) > 1:
             raise UsageError(f"{plural(len(cameras), 'view')} do not fit one .png: give -o a folder")
         files = self._files(single, len(cameras))

@@ -48,6 +48,8 @@ __all__ = [
     "simplify",
 ]
 
+LARGEST_SIGMA = np.float32(1e18)
+"""Larger splats have this standard deviation: float32 holds no product of two that are larger."""
 CROSSED_REACH = 1.06
 """Rim of crossed ellipses as a multiple of the radius that fits a Gaussian best. Seen from between their
 axes, two ellipses are narrower than the splat; at equal integrated opacity, this gains 0.1 to 0.8 dB."""
@@ -284,7 +286,7 @@ def _drawn_gaussians(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 3) standard deviations along ``axes`` and (n,) opacities of splats after the low-pass filter."""
     widened = widen(cloud.scales, pixel, _filter_px2(cloud, options), cloud.kernel)
-    sigma = np.take_along_axis(widened, axes, axis=1)
+    sigma = np.minimum(np.take_along_axis(widened, axes, axis=1), LARGEST_SIGMA)
     opacity = cloud.opacities
     if cloud.kernel == "antialiased" and pixel is not None:
         # That kernel lowers the opacity by as much as its filter widens the splat.

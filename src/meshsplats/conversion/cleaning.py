@@ -34,6 +34,9 @@ class CleaningRules:
     max_distance: float | None = None
     """Farther from the middle than this many radii of the subject. Within one radius lie nine tenths of its
     opacity."""
+    max_size: float | None = None
+    """Longer, from its middle to an end, than this many radii of the subject. 1000 removes what no camera can
+    have seen whole."""
     sparse: float | None = None
     """Fewer neighbours than this share of the median, 0 to 1. 0.05 removes single floaters and thin
     clouds."""
@@ -42,7 +45,13 @@ class CleaningRules:
     clumps in the air."""
 
     def __post_init__(self) -> None:
-        for name, top in [("min_opacity", 1), ("max_distance", np.inf), ("sparse", 1), ("min_part", 1)]:
+        for name, top in [
+            ("min_opacity", 1),
+            ("max_distance", np.inf),
+            ("max_size", np.inf),
+            ("sparse", 1),
+            ("min_part", 1),
+        ]:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= top:
                 raise ValueError(f"{name} must lie between 0 and {top}, got {value}")
@@ -52,7 +61,7 @@ class CleaningRules:
                 raise ValueError(f"crop must be x0 y0 z0 x1 y1 z1 with x0 < x1 and so on, got {self.crop}")
 
 
-FLOATERS = CleaningRules(sparse=0.05, min_part=0.01)
+FLOATERS = CleaningRules(max_size=1000, sparse=0.05, min_part=0.01)
 """The default rules."""
 
 
@@ -106,11 +115,14 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
         bounds = scene_bounds(scene)
         away = np.linalg.norm(centers - bounds.center, axis=1)
         gone["max_distance"] = away > rules.max_distance * bounds.radius
+    lengths = np.linalg.norm(reach, axis=2).max(axis=1)
+    if rules.max_size is not None:
+        gone["max_size"] = lengths > rules.max_size * scene_bounds(scene).radius
     if rules.sparse is not None or rules.min_part is not None:
         cell = CELL * float(np.median(spacing(centers.astype(np.float32))))
-        cell = max(cell, 1e-12 * (1 + float(abs(centers).max())))
+        cell = max(cell, 1e-12 * scene_bounds(scene).radius)
         if rules.sparse is not None:
-            near = _neighbours(centers, np.linalg.norm(reach, axis=2).max(axis=1), cell)
+            near = _neighbours(centers, lengths, cell)
             gone["sparse"] = near < rules.sparse * float(np.median(near))
         if rules.min_part is not None:
             points = centers[:, None] + np.concatenate([0 * reach[:, :1], reach / 2, reach], axis=1)

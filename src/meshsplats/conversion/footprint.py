@@ -12,7 +12,7 @@ import numpy as np
 
 from meshsplats._arrays import spread_indices
 from meshsplats._geometry import spacing
-from meshsplats.camera import Camera
+from meshsplats.camera import Camera, hiding_near_plane
 from meshsplats.cameras.framing import SAMPLE
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks, thin_product
@@ -68,6 +68,7 @@ class CameraCoverage:
         self, means: np.ndarray, cameras: Sequence[Camera], origin: np.ndarray | None = None
     ) -> None:
         self.cameras = [cameras[i] for i in spread_indices(len(cameras), MAX_CAMERAS)]
+        self._near = [camera.near_plane(means) for camera in self.cameras]
         self.means = means
         # Relative to an origin among the splats: positions far from zero lose digits in float32.
         self.origin = origin_of(means[:: origin_step(len(means))]) if origin is None else origin
@@ -76,7 +77,7 @@ class CameraCoverage:
         """For each camera: (3, k) offsets from its centre to the splats ``part`` in the world frame, (k,)
         squares of their lengths, (k,) bool which of them it sees, and (k,) weights, 0 for the others."""
         points = np.ascontiguousarray((self.means[part] - self.origin).T, np.float32)
-        for camera in self.cameras:
+        for camera, near in zip(self.cameras, self._near, strict=True):
             rotation, center = camera.world_to_camera[:3, :3], camera.center - self.origin
             fx, fy = camera.fx, camera.fy
             # Rows to clip space: a point is in the image if and only if abs(x) <= z and abs(y) <= z.
@@ -91,13 +92,16 @@ class CameraCoverage:
             clip = matrix.astype(np.float32) @ points
             clip -= (matrix @ center).astype(np.float32)[:, None]
             z = clip[2]
-            seen = z > camera.near
+            seen = z > near
             np.abs(clip[:2], out=clip[:2])
             seen &= clip[0] <= z
             seen &= clip[1] <= z
             away = points - center.astype(np.float32)[:, None]
-            square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
-            np.maximum(square, np.float32(1e-30), out=square)
+            with np.errstate(over="ignore"):
+                square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
+            seen &= square < np.inf  # farther than float32 can tell
+            # Of those that it sees, none is nearer; the others must not divide by zero.
+            np.maximum(square, np.float32(max(near, 1e-15)) ** 2, out=square)
             weight = np.float32(fx * fy) / square
             weight *= seen
             yield away, square, seen, weight
@@ -198,15 +202,22 @@ def pixel_sizes(
     sizes = coverage.pixel_sizes()
     seen = sizes > 0
     if not seen.any():
-        raise ValueError(
-            f"none of the {len(coverage.cameras)} cameras sees any of the {len(cloud)} splats: are they of"
-            " one scene? Choose footprint='framing' or 'none' to go without them"
-        )
+        raise ValueError(none_seen(coverage.cameras, cloud.means, len(cloud)))
     sizes = np.where(seen, sizes, np.median(sizes[seen]))
     if options.footprint == "framing":
         step = -(-len(cloud) // SAMPLE)
         np.minimum(sizes, largest_pixel(cloud.means[::step], step), out=sizes)
     return sizes
+
+
+def none_seen(cameras: Sequence[Camera], means: np.ndarray, count: int) -> str:
+    """What to say where ``cameras`` see none of ``count`` splats, some of which are at ``means`` (n, 3)."""
+    reason = hiding_near_plane(cameras, means)
+    reason = f"{reason}." if reason else "are they of one scene?"
+    return (
+        f"none of the {len(cameras)} cameras sees any of the {count:,} splats: {reason} Choose"
+        " footprint='framing' or 'none' to go without them"
+    )
 
 
 def largest_pixel(means: np.ndarray, step: int) -> np.float32:
@@ -226,6 +237,9 @@ def widen(scales: np.ndarray, pixel: np.ndarray | None, px2: float, kernel: str)
     """
     if pixel is None:
         return scales
-    low_pass = (px2 * np.square(pixel, dtype=np.float32))[:, None]
-    square = np.square(scales)
-    return np.sqrt(np.maximum(square, low_pass) if kernel == "2dgs" else square + low_pass)
+    with np.errstate(over="ignore"):
+        low_pass = (px2 * np.square(pixel, dtype=np.float32))[:, None]
+        square = np.square(scales)
+        result = np.sqrt(np.maximum(square, low_pass) if kernel == "2dgs" else square + low_pass)
+    # A splat so large that its variance overflows needs no filter.
+    return np.where(np.isfinite(result), result, scales) if result.max(initial=0) == np.inf else result

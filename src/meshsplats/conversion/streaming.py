@@ -14,7 +14,7 @@ import numpy as np
 
 from meshsplats._kinds import each, need, need_all
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import SAMPLE, guess_up, unit_up
+from meshsplats.cameras.framing import SAMPLE, guess_up, unit_up, warn_of_strays
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion import Fans, filter_of
 from meshsplats.conversion.footprint import (
@@ -22,6 +22,7 @@ from meshsplats.conversion.footprint import (
     FRAMING_VIEWS,
     CameraCoverage,
     largest_pixel,
+    none_seen,
     origin_of,
     origin_step,
 )
@@ -65,7 +66,7 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
     """
     read = kept = 0
     kernels: set[Kernel] = set()
-    low, high, most = np.full(3, np.inf), np.full(3, -np.inf), 0.0
+    low, high, most, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0, 0.0
     for block in source:
         read += len(block)
         kernels.add(block.kernel)
@@ -75,6 +76,7 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
             kept += len(rows)
             means = block.means[rows]
             low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
+            largest = max(largest, float(block.scales[rows].max()))
     if not kept:
         raise ValueError(
             f"none of the {read:,} splats is left to convert: the crop box holds none, or the greatest"
@@ -91,7 +93,9 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
         passed += len(part)
     if passed != kept:
         raise ValueError(f"the splats changed while they were read: {kept:,} before, {passed:,} now")
-    return Survey(kept, kernel, low, high, joined(samples), step, origin_of(np.concatenate(near_origin)))
+    sample = joined(samples)
+    warn_of_strays(sample, low, high, largest)
+    return Survey(kept, kernel, low, high, sample, step, origin_of(np.concatenate(near_origin)))
 
 
 def worth_drawing(block: GaussianCloud, options: ConversionOptions) -> np.ndarray:
@@ -138,10 +142,7 @@ class ScenePixels:
             self._largest = largest_pixel(scene.sample.means, scene.step)
         sizes = self.seen(scene.sample.means)
         if not (sizes > 0).any():
-            raise ValueError(
-                f"none of the {len(self._cameras)} cameras sees any of {len(sizes):,} splats: are they of one"
-                " scene? Choose footprint='framing' or 'none' to go without them"
-            )
+            raise ValueError(none_seen(self._cameras, scene.sample.means, scene.kept))
         self.unseen = np.median(sizes[sizes > 0])
 
     @property
@@ -199,6 +200,7 @@ def convert_blocks(
     refuse_whole(chosen)
     scene = survey(source, chosen)
     direction = guess_up(scene.sample, cameras) if up is None else unit_up(up)
+    cameras = [camera.with_near_plane(scene.sample.means) for camera in cameras or ()]
     filter_px2 = filter_of(scene.kernel, chosen)
     pixels = ScenePixels(scene, chosen, cameras, direction)
     if pixels.has_unseen:

@@ -244,9 +244,11 @@ struct Scene {
             for (int k = 0; k < 3; ++k) {
                 const Vec3 &a = v[k], &b = v[(k + 1) % 3];
                 if ((p[k]->w > 0) == (p[(k + 1) % 3]->w > 0)) continue;
-                double t = (projection.near - a.z) / (b.z - a.z);
-                bounds.include((a.x + t * (b.x - a.x)) / projection.near,
-                               (a.y + t * (b.y - a.y)) / projection.near);
+                // Both shares on their own: differences of a corner far away and a near one lose the latter.
+                double of_a = (b.z - projection.near) / (b.z - a.z);
+                double of_b = (projection.near - a.z) / (b.z - a.z);
+                bounds.include((of_a * a.x + of_b * b.x) / projection.near,
+                               (of_a * a.y + of_b * b.y) / projection.near);
             }
             bounds.nearest = 1 / projection.near;
         }

@@ -119,6 +119,12 @@ struct TriangleSetup {
                 q[2][t] += c * s;
             }
         }
+        unsigned huge = 0;
+        for (int i = 0; i < 3; ++i)
+            for (int t = 0; t < N; ++t)
+                huge |= !(std::fabs(ea[i][t]) < HUGE_EDGE) | !(std::fabs(eb[i][t]) < HUGE_EDGE) |
+                        !(std::fabs(ec[i][t]) < HUGE_EDGE);
+        if (huge) set_huge_edges(flip);
         for (int t = 0; t < N; ++t) {
             qa[t] = (float)q[0][t];
             qb[t] = (float)q[1][t];
@@ -166,6 +172,7 @@ struct TriangleSetup {
             ea[i][t] = (float)a;
             eb[i][t] = (float)b;
             ec[i][t] = (float)c;
+            set_huge_edge(i, t, a, b, c);
             threshold[i][t] = edge_threshold(ea[i][t], eb[i][t]);
             sa[i][t] = (float)(a * s);
             sb[i][t] = (float)(b * s);
@@ -183,6 +190,30 @@ struct TriangleSetup {
     }
 
   private:
+    // Coefficients of edge functions from which on their sums at the samples of a tile might overflow float:
+    // of triangles that reach as far as 1e15 samples, or scene units.
+    static constexpr float HUGE_EDGE = 0x1p100f;
+
+    void set_huge_edges(const double flip[N]) {
+        for (int i = 0; i < 3; ++i) {
+            const int j = (i + 1) % 3, k = (i + 2) % 3;
+            for (int t = 0; t < N; ++t)
+                set_huge_edge(i, t, flip[t] * (y[j][t] - y[k][t]), flip[t] * (x[k][t] - x[j][t]),
+                              flip[t] * (x[j][t] * y[k][t] - x[k][t] * y[j][t]));
+        }
+    }
+
+    // Stores edge function i of lane t times a power of two that makes it fit, if it is so large: only its
+    // sign matters, and from both sides of a shared edge the power is the same.
+    void set_huge_edge(int i, int t, double a, double b, double c) {
+        const double largest = std::max({std::fabs(a), std::fabs(b), std::fabs(c)});
+        if (!(largest >= HUGE_EDGE && largest <= std::numeric_limits<double>::max())) return;
+        const int power = std::ilogb(largest);
+        ea[i][t] = (float)std::ldexp(a, -power);
+        eb[i][t] = (float)std::ldexp(b, -power);
+        ec[i][t] = (float)std::ldexp(c, -power);
+    }
+
     // Whether 1 / size is finite and not 0.
     static bool is_valid(double size) { return size < 1e300 && size > 1e-300; }
 

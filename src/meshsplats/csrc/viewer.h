@@ -107,8 +107,11 @@ class ViewerPass {
         for (int k = 0; k < 3; ++k) {
             const Vec3 &a = v[k], &b = v[(k + 1) % 3];
             if ((vertices[face[k]].w > 0) == (vertices[face[(k + 1) % 3]].w > 0)) continue;
-            const double t = (projection.near - a.z) / (b.z - a.z);
-            box.include((a.x + t * (b.x - a.x)) / projection.near, (a.y + t * (b.y - a.y)) / projection.near);
+            // As in Scene::bound_triangle.
+            const double of_a = (b.z - projection.near) / (b.z - a.z);
+            const double of_b = (projection.near - a.z) / (b.z - a.z);
+            box.include((of_a * a.x + of_b * b.x) / projection.near,
+                        (of_a * a.y + of_b * b.y) / projection.near);
         }
         return true;
     }

@@ -125,6 +125,7 @@ def splat_dataset(
         raise ValueError(f"distance must be the nearest and the farthest multiple, > 0, got {distance!r}")
     first = max(test, HELD_OUT)  # of the training views
     if cameras is not None:
+        cameras = [camera.with_near_plane(cloud.means) for camera in cameras]
         placed, first = _given(cameras, train, test, width)
     elif placement == "inside":
         placed = inside_cameras(

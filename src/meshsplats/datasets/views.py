@@ -173,6 +173,12 @@ class Dataset:
 
         return replace(self, train=moved(self.train), test=moved(self.test), origin=point)
 
+    def with_near_planes(self, points: np.ndarray) -> Dataset:
+        """The same views with the near planes of a scene of ``points`` (n, 3), its vertices or centres, where
+        their cameras name none: ``Camera.with_near_plane``."""
+        train, test = (with_near_planes(views, points) for views in (self.train, self.test))
+        return replace(self, train=train, test=test)
+
     def over(self, background: Sequence[float]) -> Dataset:
         """The same views with another ``background`` for images with alpha."""
         red, green, blue = map(float, background)
@@ -181,6 +187,11 @@ class Dataset:
             return tuple(replace(view, background=(red, green, blue)) for view in views)
 
         return replace(self, train=changed(self.train), test=changed(self.test))
+
+
+def with_near_planes(views: Sequence[View], points: np.ndarray) -> tuple[View, ...]:
+    """``views`` whose cameras have the near plane of a scene of ``points`` (n, 3), where they name none."""
+    return tuple(replace(view, camera=view.camera.with_near_plane(points)) for view in views)
 
 
 class ImageCache:

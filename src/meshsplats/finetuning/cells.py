@@ -154,6 +154,10 @@ class CellScene:
     dataset: Dataset
     _divided: dict[int, Cells] = field(default_factory=dict, init=False, repr=False)
 
+    def __post_init__(self) -> None:
+        # By the whole scene, not by the splats of a cell.
+        object.__setattr__(self, "dataset", self.dataset.with_near_planes(self.cloud.means))
+
     def cells(self, most: int) -> Cells:
         """The splats in cells of at most ``most``; divided once."""
         if most not in self._divided:

@@ -263,7 +263,9 @@ class TrainingLoop:
         journal: Journal | None,
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
-        self.dataset, self.config, self.options = dataset, config, options
+        # One near plane for all steps, though vertices move.
+        self.dataset = dataset.with_near_planes(start.mesh.vertices)
+        self.config, self.options = config, options
         self.journal, self.on_progress = journal, on_progress
         # The start itself is not kept: pruning replaces its state, whose memory is then free.
         self.state, self.step, self.losses = start.state, start.step, list(start.losses)

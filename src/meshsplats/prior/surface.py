@@ -134,7 +134,7 @@ def signed_distances(
     in front of it for some cameras as behind it for others: with 1 a sheet leaves noise, with less nothing.
     """
     total, weight = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
-    for camera in cameras:
+    for camera in (camera.with_near_plane(mesh.vertices) for camera in cameras):
         drawn = render(mesh, camera, background=(0, 0, 0), depth=True, threads=threads)
         _integrate(total, weight, drawn.mean_depth(min_alpha=_SOLID), camera, grid, behind)
         if each is not None:
@@ -214,7 +214,7 @@ def _integrate(
     for i in range(total.shape[0]):
         x = low[0] + voxel * i
         place = [(matrix[k, 0] * x + matrix[k, 3]) + matrix[k, 1] * y + matrix[k, 2] * z for k in range(3)]
-        front = place[2] > camera.near
+        front = place[2] > (camera.near or 0)
         away = np.where(front, place[2], 1)
         column = np.floor(camera.fx * place[0] / away + camera.cx)
         row = np.floor(camera.fy * place[1] / away + camera.cy)

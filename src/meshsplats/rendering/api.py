@@ -117,6 +117,7 @@ def render(
     need(SplatMesh, mesh=mesh, instead={"GaussianCloud": "render_splats draws splats, convert makes a mesh"})
     need(Camera, camera=camera)
     check_device(device)
+    camera = camera.with_near_plane(mesh.vertices)
     keep = Pointers()
     options = checked_options(keep, camera, background, samples, threads)
     if max_layers is not None and not (
@@ -213,7 +214,7 @@ def render_splats(
 
     Args:
         cloud: the splats.
-        camera: viewpoint, lens and size of the image; splats whose centres are nearer than ``camera.near``
+        camera: viewpoint, lens and size of the image; splats whose centres are nearer than its near plane
             are left out.
         background: RGB, (3,) or (h, w, 3).
         samples: side of the grid of samples in each pixel, 1 to 16; the widening stays that of whole pixels.
@@ -230,6 +231,7 @@ def render_splats(
     """
     need(GaussianCloud, cloud=cloud, instead={"SplatMesh": "render draws meshes"})
     need(Camera, camera=camera)
+    camera = camera.with_near_plane(cloud.means)
     keep = Pointers()
     options = checked_options(keep, camera, background, samples, threads)
     if sh_degree is not None and sh_degree not in (0, 1, 2, 3):
@@ -291,6 +293,8 @@ def mesh_struct(keep: Pointers, triangles: Triangles) -> structures.MeshStruct:
 
 
 def camera_struct(camera: Camera) -> structures.CameraStruct:
+    """``camera``, which has a near plane, for the core."""
+    assert camera.near is not None
     rows = (c_double * 12)(*camera.world_to_camera[:3].ravel())
     return structures.CameraStruct(
         rows, camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.width, camera.height

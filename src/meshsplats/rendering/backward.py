@@ -102,7 +102,7 @@ class TapedRendering:
             self._options.cutoff, self._options.ramp_height = ramp.cutoff, ramp.height
             self._options.ramp_slope, self._options.ramp_leak = ramp.slope, ramp.leak
             self._options.ramp_width = ramp.width * samples
-        self._camera = camera_struct(camera)
+        self._camera = camera_struct(camera.with_near_plane(triangles.vertices))
         if world_to_camera is not None:
             self._camera.world_to_camera = (ctypes.c_double * 12)(*world_to_camera[:3].ravel())
         self._mesh = mesh_struct(keep, triangles._replace(normals=None))

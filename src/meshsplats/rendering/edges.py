@@ -103,12 +103,12 @@ def edge_gradients(
             over their area.
         beyond: ``corners_beyond(mesh.faces)``, precomputed, if you have it.
     """
-    fine = camera.scaled(EDGE_SAMPLES)
+    fine, near = camera.scaled(EDGE_SAMPLES), camera.near_plane(mesh.vertices)
     front = front_faces(mesh, fine, cutoff, background=background, threads=threads)
     rotation, offset = fine.world_to_camera[:3, :3], fine.world_to_camera[:3, 3]
     points = mesh.vertices.astype(np.float64) @ rotation.T + offset
     depth = points[:, 2]
-    drawn = depth >= fine.near
+    drawn = depth >= near
     scale = np.where(drawn, 1 / np.where(drawn, depth, 1), 0)[:, None] * [fine.fx, fine.fy]
     screen = np.column_stack([points[:, :2] * scale + [fine.cx, fine.cy], depth])
     moved = scale * kernels.edge_gradients(
@@ -119,7 +119,7 @@ def edge_gradients(
         front.faces,
         front.color,
         gradient,
-        near=fine.near,
+        near=near,
         cutoff=cutoff,
         threads=threads,
     )

@@ -37,9 +37,10 @@ def layers(scene: SplatMesh | GaussianCloud, camera: Camera) -> float:
         reach = _REACH * np.sqrt(ordered[:, 1:].prod(axis=1))[:, None]
     if not count:
         return 0.0
+    near = camera.near_plane(scene.vertices if isinstance(scene, SplatMesh) else scene.means)
     with np.errstate(over="ignore", invalid="ignore"):
         points = corners.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        depth = np.maximum(points[..., 2], camera.near)
+        depth = np.maximum(points[..., 2], near)
         sides, at, areas = [], [], np.full(len(points), np.inf)
         for axis, (focal, center, size) in enumerate(
             [(camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height)]
@@ -53,7 +54,7 @@ def layers(scene: SplatMesh | GaussianCloud, camera: Camera) -> float:
             areas = 0.5 * np.abs(
                 (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
             )
-        shown = (points[..., 2] > camera.near).any(axis=1)
+        shown = (points[..., 2] > near).any(axis=1)
         covered = np.where(shown, np.fmin(areas, sides[0] * sides[1]), 0)
     return float(covered.mean()) * count / (camera.width * camera.height)
 

@@ -125,7 +125,7 @@ def render_splats(
     """The image of splats as 3D Gaussian Splatting draws it (Kerbl et al. 2023). Arrays are float64.
 
     Splats are blended front to back in the order of the depth z of their centres, equal depths by index;
-    those with a centre nearer than ``camera.near`` are left out. ``dilation`` (square pixels for any
+    those with a centre nearer than the near plane are left out. ``dilation`` (square pixels for any
     ``samples``) widens every projected splat; for the kernel '2dgs', 5/3 of it is the least variance.
     ``sh_degree`` limits the degree of the view-dependent colour; None uses all that is stored.
 
@@ -139,11 +139,12 @@ def render_splats(
         raise ValueError(f"sh_degree must be a whole number from 0 on, or None for all, got {sh_degree}")
     if not (np.isfinite(dilation) and dilation >= 0):
         raise ValueError(f"dilation must be >= 0, got {dilation}")
+    camera = camera.with_near_plane(cloud.means)
     x, y = _sample_positions(camera, samples)
     rgb = splat_colors(cloud, camera, cloud.sh_degree if sh_degree is None else int(sh_degree))
     opacities = cloud.opacities.astype(np.float64)
     centers = _to_camera(cloud.means, camera)
-    in_front = np.flatnonzero(centers[:, 2] >= camera.near)
+    in_front = np.flatnonzero(centers[:, 2] >= (camera.near or 0))
     nearest_first = in_front[np.argsort(centers[in_front, 2], kind="stable")]
     # Columns are the splat's own axes in the camera's frame.
     axes = camera.world_to_camera[:3, :3] @ _rotations(cloud)
@@ -194,6 +195,7 @@ def viewer_images(
     """
     positions = VIEWER_SAMPLES if multisample else ((0.5, 0.5),)
     middle_x, middle_y = _sample_positions(camera, 1)
+    near = camera.near_plane(mesh.vertices)
     corners = _to_camera(mesh.vertices, camera)
     corners[:, 0] = camera.fx * corners[:, 0] + camera.cx * corners[:, 2]
     corners[:, 1] = camera.fy * corners[:, 1] + camera.cy * corners[:, 2]
@@ -208,7 +210,7 @@ def viewer_images(
     for face in np.argsort(determinants <= 0, kind="stable"):
         for sample, (right, down) in enumerate(positions):
             x, y = middle_x - 0.5 + right, middle_y - 0.5 + down
-            at, depth, _ = _cover(corners[face], edges[face], determinants[face], x, y, camera.near)
+            at, depth, _ = _cover(corners[face], edges[face], determinants[face], x, y, near)
             if not len(at):
                 continue
             weights = np.column_stack([middle_x, middle_y, np.ones(len(middle_x))])[at] @ edges[face].T
@@ -288,13 +290,14 @@ def filtered(points: np.ndarray, mesh: SplatMesh, camera: Camera, px2: float) ->
     nearer than the near plane, or has no area at all, stays as it is.
     """
     assert mesh.face_splat is not None
+    near = camera.near_plane(mesh.vertices)
     result = points.copy()
     with np.errstate(all="ignore"):
         projected = points[:, :2] / points[:, 2:] * (camera.fx, camera.fy)
         nearness = 1 / points[:, 2]
     for splat in np.unique(mesh.face_splat):
         faces = mesh.faces[mesh.face_splat == splat]
-        if not (points[faces, 2] >= camera.near).all():
+        if not (points[faces, 2] >= near).all():
             continue
         k = FILTER_DEPTH_SHARE * np.sqrt(camera.fx * camera.fy) * points[faces[0, 0], 2]
         lifted = np.column_stack([projected, k * nearness])[faces]
@@ -329,16 +332,15 @@ def _fragments(
 
     corners = homogeneous[mesh.faces]
     edges, determinants = _edge_functions(corners)
-    covers = [
-        _cover(*triangle, x, y, camera.near) for triangle in zip(corners, edges, determinants, strict=True)
-    ]
+    near = camera.near_plane(mesh.vertices)
+    covers = [_cover(*triangle, x, y, near) for triangle in zip(corners, edges, determinants, strict=True)]
     if not covers:
         return _Fragments(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 3)))
     sample, depth, weights = (np.concatenate(parts) for parts in zip(*covers, strict=True))
     face = np.repeat(np.arange(len(covers)), [len(cover[0]) for cover in covers])
     nearness = 1 / depth
     if mesh.depth_group is not None:
-        _share_depths(mesh, homogeneous, camera.near, sample, face, nearness, x, y)
+        _share_depths(mesh, homogeneous, near, sample, face, nearness, x, y)
     order = np.lexsort((face, -nearness, sample))
     return _Fragments(sample[order], face[order], depth[order], weights[order])
 
@@ -565,7 +567,7 @@ def _flat_falloff(
     """exp(-rho / 2) of one flat splat at all samples, rho = min(rho3d, rho2d) (2DGS, Huang et al. 2024).
 
     rho3d is the squared distance, in standard deviations, from the centre to where the ray meets the plane of
-    the splat's first two axes; it is infinite where that is nearer than ``camera.near``, behind the camera or
+    the splat's first two axes; it is infinite where that is nearer than the near plane, behind the camera or
     nowhere, and beside the line that a splat with a scale of 0 is. rho2d = 0.6 / dilation |p - c|^2 (2 in the
     2DGS code), with p the sample and c the projected centre in pixels, keeps splats that are tiny or seen
     edge on from falling between the samples.
@@ -576,7 +578,7 @@ def _flat_falloff(
         z = (normal @ center) / (rays @ normal)
         local = (z[:, None] * rays - center) @ axes[:, :2] / scales[:2]
         rho3d = (local**2).sum(axis=1)
-    rho3d = np.where((z >= camera.near) & np.isfinite(rho3d), rho3d, np.inf)
+    rho3d = np.where((z >= (camera.near or 0)) & np.isfinite(rho3d), rho3d, np.inf)
     dx = x - (camera.fx * center[0] / center[2] + camera.cx)
     dy = y - (camera.fy * center[1] / center[2] + camera.cy)
     return np.exp(-0.5 * np.minimum(rho3d, 0.6 / max(dilation, 1e-6) * (dx * dx + dy * dy)))

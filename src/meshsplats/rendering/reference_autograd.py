@@ -125,12 +125,12 @@ def filtered(
     px2: float,
 ) -> torch.Tensor:
     """``reference.filtered``: (v, 3) ``points`` in the camera's frame, widened by their (v,) ``opacity``."""
-    result = points.clone()
+    result, near = points.clone(), camera.near or 0
     focal = points.new_tensor([camera.fx, camera.fy])
     for splat in np.unique(face_splat):
         corner = torch.from_numpy(np.asarray(faces, np.int64)[face_splat == splat])
         z = points[corner][..., 2:]
-        if not bool((z >= camera.near).all()):
+        if not bool((z >= near).all()):
             continue
         projected = points[corner][..., :2] / z * focal
         k = reference.FILTER_DEPTH_SHARE * focal.prod().sqrt() * z[0, 0]
@@ -169,6 +169,7 @@ def _image(
     ramp: OpacityRamp | None,
 ) -> tuple[Raster, torch.Tensor]:
     """The image, and (h, w) ``sum_k T_k a_k |c_k|^2``, with the background's."""
+    camera = camera.with_near_plane(vertices.detach().numpy())
     posed = replace(camera, world_to_camera=pose.detach().numpy())
     x, y = reference._sample_positions(camera, samples)
     vertices, attributes = vertices.double(), attributes.double()

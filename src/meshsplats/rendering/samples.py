@@ -51,13 +51,14 @@ def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
     points = mesh.vertices[corners].astype(np.float64)
     sides = []
     for camera in subsample(cameras, CAMERAS):
+        near = camera.near_plane(mesh.vertices)
         x, y, z = np.moveaxis(points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3], 2, 0)
-        depth = np.maximum(z, camera.near)
+        depth = np.maximum(z, near)
         u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
         area = 0.5 * np.abs(
             (u[:, 1] - u[:, 0]) * (v[:, 2] - v[:, 0]) - (u[:, 2] - u[:, 0]) * (v[:, 1] - v[:, 0])
         )
-        shown = (z > camera.near).all(axis=1) & (u.max(axis=1) > 0) & (u.min(axis=1) < camera.width)
+        shown = (z > near).all(axis=1) & (u.max(axis=1) > 0) & (u.min(axis=1) < camera.width)
         shown &= (v.max(axis=1) > 0) & (v.min(axis=1) < camera.height)
         area *= shown
         whole, weight = np.add.reduceat(area, first), np.add.reduceat(area * opacity, first)

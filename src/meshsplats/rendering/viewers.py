@@ -53,7 +53,7 @@ def viewer_images(
         mesh.vertices,
         np.ascontiguousarray(colors, np.float32),
         mesh.faces,
-        camera_struct(camera),
+        camera_struct(camera.with_near_plane(mesh.vertices)),
         backdrop,
         np.array([-1 if c is None else checked_cutoff(c) for c in cutoffs], np.float32),
         multisample=multisample,

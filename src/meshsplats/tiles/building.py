@@ -466,6 +466,9 @@ class _Tiles:
         away = np.square(cloud.means.astype(np.float64) - result.cloud.means[result.group]).sum(axis=1)
         merged["spread"] = np.bincount(result.group, weights * (below["spread"] + away), len(rows))
         apart = np.sqrt(merged["spread"])
+        # None counts for more than the whole tile: else one stray, of any size, would speak for all.
+        usual = np.quantile(cloud.means.astype(np.float64), (0.01, 0.99), axis=0)
+        totals = np.minimum(totals, float(np.ptp(usual, axis=0).max()) ** 2)
         error = weighted_quantile(apart, totals, ERROR_SHARE) if totals.any() else float(apart.max())
         error = max(error, finest)
         size = None if self._pixels.is_none else np.full(len(rows), error, np.float32)

@@ -36,6 +36,7 @@ def choose_tiles(
     """
     if not max_error >= 0:
         raise ValueError(f"max_error must be a number of pixels, at least 0, got {max_error}")
+    cameras = [tileset.seen_by(camera) for camera in cameras]
     order = count()
     queue: list[tuple[float, int, tuple[int, ...], Tile]] = []
     chosen: list[tuple[tuple[int, ...], Tile]] = []
@@ -75,6 +76,7 @@ def screen_error(camera: Camera, tile: Tile) -> float:
     lengths = np.maximum(np.linalg.norm(tile.axes, axis=1), 1e-30)
     along = (tile.axes / lengths[:, None]) @ offset
     outside = np.maximum(np.abs(along) - lengths, 0)
+    assert camera.near is not None
     distance = max(float(np.linalg.norm(outside)), camera.near)
     return tile.error * max(camera.fx, camera.fy) / distance
 
@@ -124,6 +126,7 @@ def render_tiles(
     """
     need(Tileset, tileset=tileset)
     need(Camera, camera=camera)
+    camera = tileset.seen_by(camera)
     tiles, _ = choose_tiles(tileset, [camera], max_error=max_error)
     if sum(tile.triangles for tile in tiles) <= max_triangles:
         return render(join_tiles(tileset, tiles), camera, **options)
@@ -183,7 +186,7 @@ def tiles_mesh(
 def samples_for(tileset: Tileset, cameras: Sequence[Camera], max_error: float = MAX_ERROR) -> int:
     """Side of the grid of samples in each pixel that the tiles need; see ``needed_samples``."""
     found = 1
-    for camera in subsample(cameras, CAMERAS):
+    for camera in map(tileset.seen_by, subsample(cameras, CAMERAS)):
         tiles, _ = choose_tiles(tileset, [camera], max_error=max_error, most=MAX_TRIANGLES // 8)
         found = max(found, needed_samples(join_tiles(tileset, tiles), [camera]))
     return found

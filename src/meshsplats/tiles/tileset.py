@@ -22,6 +22,7 @@ from meshsplats import __version__
 from meshsplats._files.atomic import write_text
 from meshsplats._json import read_json
 from meshsplats._kinds import need_path
+from meshsplats.camera import Camera
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.writer import up_quaternion
@@ -238,7 +239,16 @@ class Tileset:
         _error(document, self.path)
         self._to_world = tile_frame(self.up).T
         self._count = 0
+        self._coarsest: np.ndarray | None = None
         self.root = self._tile(self._root_entry(document), self.path, 0)
+
+    def seen_by(self, camera: Camera) -> Camera:
+        """``camera`` with its near plane in front of the coarsest tile, whatever tiles it needs."""
+        if camera.near is not None:
+            return camera
+        if self._coarsest is None:
+            self._coarsest = self.root.load().vertices
+        return camera.with_near_plane(self._coarsest)
 
     def children(self, tile: Tile) -> list[Tile]:
         """The tiles that take the place of ``tile``; none for a leaf. A tileset file is read once."""
@@ -331,14 +341,14 @@ def _object(owner: dict[str, Any], key: str, path: Path) -> dict[str, Any]:
 
 def _numbers(value: Any, count: int, what: str, path: Path) -> np.ndarray:
     good = isinstance(value, list) and len(value) == count
-    if not good or not all(_is_number(x) and abs(x) < 1e30 for x in value):
+    if not good or not all(_is_number(x) and abs(x) < 1e39 for x in value):
         raise FileFormatError(f"{path}: {what} must be {count} numbers, got {str(value)[:60]}")
     return np.array(value, np.float64)
 
 
 def _error(owner: dict[str, Any], path: Path) -> float:
     value: Any = owner.get("geometricError")
-    if not _is_number(value) or not 0 <= value < 1e30:
+    if not _is_number(value) or not 0 <= value < 1e39:
         raise FileFormatError(f"{path}: geometricError must be a number >= 0, got {str(value)[:40]}")
     return float(value)
 

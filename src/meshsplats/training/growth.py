@@ -152,7 +152,7 @@ class NearFields(NamedTuple):
             rows = np.flatnonzero((depth > 0) & (depth < limit))
             if len(rows):
                 # The near plane is as near as it gets here: what it cuts off floats there, too.
-                closest = replace(camera, near=min(camera.near, 1e-3 * float(limit)))
+                closest = replace(camera, near=min(camera.near or np.inf, 1e-3 * float(limit)))
                 inside[rows] |= closest.sees(centers[rows])
         return inside
 

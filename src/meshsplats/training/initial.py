@@ -263,10 +263,11 @@ def apart(points: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray
 def depth_ranges(views: Sequence[View], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(views,) least and greatest depth of ``points`` (n, 3) in each view."""
     near, far = np.empty(len(views)), np.empty(len(views))
+    some = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)) or 1.0
     for i, view in enumerate(views):
         depth = view.camera.project(points)[1]
-        depth = depth[depth > view.camera.near]
-        near[i], far[i] = (0.98 * depth.min(), 1.02 * depth.max()) if len(depth) else (1.0, 2.0)
+        depth = depth[depth > (view.camera.near or 0)]
+        near[i], far[i] = (0.98 * depth.min(), 1.02 * depth.max()) if len(depth) else (some, 2 * some)
     return near, far
 
 

@@ -193,7 +193,7 @@ class GrowingLoop(TrainingLoop):
         self._store = ImageCache(options.cache_bytes // REDUCED_PART)
         self._reduced: dict[float, Sequence[View]] = {}
         self.first_fans = fan_count(start.mesh)
-        self.near = NearFields.around(dataset.train, start.mesh)
+        self.near = NearFields.around(self.dataset.train, start.mesh)
         self.events = events_passed(config, self.fraction)
         self._loss_sums, self._loss_counts = np.zeros((2, len(dataset.train)))
 

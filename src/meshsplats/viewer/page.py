@@ -89,7 +89,7 @@ def make_page(
     need(PageOptions, options=options, optional=True)
     options = options or PageOptions()
     packed = quantise_mesh(mesh)
-    views = list(subsample(cameras, MOST_CAMERAS))
+    views = [camera.with_near_plane(mesh.vertices) for camera in subsample(cameras, MOST_CAMERAS)]
     up = guess_up(mesh, views) if options.up is None else unit_up(options.up)
     if not views:
         views = [orbit(mesh, 1, azimuth=30, elevation=15, width=1000, height=1000, up=up)[0]]

@@ -33,6 +33,9 @@ SMALL = 1_000_000
 FINER = 8
 """Steps of the vertices from which others are predicted are this much finer."""
 
+MOST_STEPS = 1 << 30
+"""Positions are at most this many of the fine steps from their origin; those of strays are floats."""
+
 WORTHWHILE = 64
 """Fewest fans of a pattern for which weights are fitted and stored."""
 
@@ -41,6 +44,9 @@ MOST_PATTERNS = 256
 
 SCALE_STEPS = 64
 """Steps of a standard deviation in each power of two."""
+
+LARGEST_SPLAT = 64
+"""Standard deviation in radii of the scene; larger ones are strays, which must not make small ones flat."""
 
 ROTATION_STEPS = 511
 """Steps of a component of a quaternion in one."""
@@ -173,10 +179,14 @@ def _packed(mesh: SplatMesh, order: np.ndarray, precision: Precision, radius: fl
     renumber = np.zeros(len(mesh.vertices), np.int64)
     renumber[order] = np.arange(len(order))
     faces = renumber[mesh.faces]
-    origin = rounded((vertices.min(axis=0) + vertices.max(axis=0)) / 2)
-    # Positions are at most 2^30 fine steps from the origin, whatever strays there are.
-    step = max(radius * 2.0**-precision.position, float(np.ptp(vertices, axis=0).max()) * FINER * 2.0**-31)
-    step = rounded([step])[0]
+    step = rounded([radius * 2.0**-precision.position])[0]
+    origin = _origin(vertices, step / FINER)
+    far = _far(vertices - origin, step / FINER)
+    fans = _fans(faces, mesh.face_splat)
+    if fans is not None and far.any():
+        # All vertices of a fan, so that none is predicted from another that is not there.
+        far = np.repeat(np.logical_or.reduceat(far, fans.first), np.diff(np.append(fans.first, len(far))))
+    places = np.where(far[:, None], 0, vertices - origin)
     rgb = np.rint(colors[:, :3].astype(np.float64) * (2**precision.color - 1)).astype(np.int64)
     alpha = np.rint(colors[:, 3].astype(np.float64) * (2**precision.alpha - 1)).astype(np.int64)
     packer = Packer()
@@ -193,13 +203,13 @@ def _packed(mesh: SplatMesh, order: np.ndarray, precision: Precision, radius: fl
         "filter": mesh.filter_px2,
         "up": rounded(mesh.up),
     }
-    fans = _fans(faces, mesh.face_splat)
     if fans is None:
-        header |= _pack_vertices(packer, vertices - origin, rgb, alpha, step)
+        header |= _pack_vertices(packer, places, rgb, alpha, step)
         header["faces"] = packer.add_rows(_compact_faces(faces))
         header["splat"] = -1 if mesh.face_splat is None else packer.add(mesh.face_splat)
     else:
-        header |= _pack_fans(packer, fans, vertices - origin, rgb, alpha, step)
+        header |= _pack_fans(packer, fans, places, rgb, alpha, step)
+    header |= _pack_far(packer, far, vertices)
     header["group"] = -1 if mesh.depth_group is None else packer.add(mesh.depth_group)
     return packer.finish(header)
 
@@ -225,8 +235,10 @@ def unpack_mesh(data: bytes) -> SplatMesh:
         faces = _expanded_faces(source.columns(header["faces"], 3))
         splat = None if header["splat"] < 0 else source.row(header["splat"])
     scale = np.array([header["color"]] * 3 + [header["alpha"]], np.float64)
+    positions += header["origin"]
+    _unpack_far(source, positions)
     return SplatMesh(
-        positions + header["origin"],
+        positions,
         faces.astype(np.int32),
         (colors / scale).astype(np.float32),
         face_splat=None if splat is None else splat.astype(np.int32),
@@ -235,6 +247,41 @@ def unpack_mesh(data: bytes) -> SplatMesh:
         blending=header["blending"],
         filter_px2=header["filter"],
     )
+
+
+# ---- Strays
+
+
+def _origin(points: np.ndarray, step: float) -> list[float]:
+    """(3,) what positions ``points`` (n, 3) are relative to: the middle of all, if all can be stored so."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    whole = float((high - low).max()) <= 2 * MOST_STEPS * step
+    return rounded((low + high) / 2 if whole else np.median(points, axis=0))
+
+
+def _far(points: np.ndarray, step: float) -> np.ndarray:
+    """(n,) bool: ``points`` (n, 3), relative to the origin, that are too far for whole steps."""
+    return np.asarray(np.abs(points).max(axis=1) > 1.001 * MOST_STEPS * step)
+
+
+def _pack_far(packer: Packer, far: np.ndarray, points: np.ndarray) -> dict[str, Any]:
+    """Which points are ``far`` (n,) bool, and those of ``points`` (n, 3) as the two halves of their float32
+    bits: strays are as exact as they were, and all others as exact as without them."""
+    rows = np.flatnonzero(far)
+    if not len(rows):
+        return {"far": -1}
+    bits = points[rows].astype("<f4").view("<u4").astype(np.int64)
+    halves = np.concatenate([bits >> 16, bits & 0xFFFF], axis=1)
+    return {"far": packer.add(rows), "far_places": packer.add_rows(halves)}
+
+
+def _unpack_far(source: Unpacker, points: np.ndarray) -> None:
+    """Puts the far points into ``points`` (n, 3)."""
+    if source.header["far"] < 0:
+        return
+    halves = source.columns(source.header["far_places"], 6)
+    bits = (halves[:, :3] << 16 | halves[:, 3:]).astype("<u4")
+    points[source.row(source.header["far"])] = bits.view("<f4")
 
 
 # ---- Meshes without fans
@@ -489,9 +536,11 @@ def pack_splats(cloud: GaussianCloud) -> bytes:
     """
     radius = scene_bounds(cloud).radius
     means = cloud.means.astype(np.float64)
-    origin = rounded((means.min(axis=0) + means.max(axis=0)) / 2)
-    step = rounded([max(radius * 2.0**-15, float(np.ptp(means, axis=0).max()) * 2.0**-28)])[0]
-    largest = float(cloud.scales.max()) or 1.0
+    step = rounded([radius * 2.0**-15])[0]
+    origin = _origin(means, step)
+    far = _far(means - origin, step)
+    places = np.where(far[:, None], 0, means - origin)
+    largest = min(float(cloud.scales.max()), LARGEST_SPLAT * radius) or 1.0
     # A standard deviation below a millionth of the largest one is flat.
     scales = np.log2(np.maximum(cloud.scales.astype(np.float64) / largest, 2.0**-20))
     q = cloud.quaternions.astype(np.float64)
@@ -507,7 +556,8 @@ def pack_splats(cloud: GaussianCloud) -> bytes:
         "origin": origin,
         "step": step,
         "largest": largest,
-        "means": packer.add_rows(np.rint((means - origin) / step).astype(np.int64)),
+        "means": packer.add_rows(np.rint(places / step).astype(np.int64)),
+        **_pack_far(packer, far, means),
         "scales": packer.add_rows(np.rint(scales * SCALE_STEPS).astype(np.int64)),
         "scale_steps": SCALE_STEPS,
         "leader": packer.add(leader),

@@ -376,6 +376,7 @@ def frame_uniform(
     data[16:19] = center - data[12:15]
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy]) * s
     data[20:24] = lens
+    assert camera.near is not None
     data[24:28] = camera.near, settings.min_transmittance, settings.cutoff, settings.filter_px2 * s * s
     words[28:32] = w, h, tiles_of(w), tiles_of(h)
     words[32:36] = counts["vertices"], counts["faces"], counts["runs"], counts["fans"]

@@ -38,6 +38,7 @@ fn along(axis: vec4f, rest: vec4f, x: vec2f, y: vec2f, z: vec2f) -> vec2f {
   return add_pairs(xy, multiply_pairs(vec2f(axis.z, rest.z), z));
 }
 
+const FARTHEST = 68719476736.0;  // 2^36 depths of the near plane
 struct Point { x: vec2f, y: vec2f, z: vec2f };
 // In camera space.
 fn precise_point(p: vec3f) -> Point {
@@ -63,8 +64,14 @@ fn place_of(c: Point) -> Place {
 @compute @workgroup_size(256)
 fn project(@builtin(global_invocation_id) id: vec3u) {
   if (id.x >= frame.vertices) { return; }
-  let p = precise_point(world(id.x));
-  let c = vec3f(p.x.x, p.y.x, p.z.x);
+  var p = precise_point(world(id.x));
+  var c = vec3f(p.x.x, p.y.x, p.z.x);
+  // What lies farther than float32 can tell is drawn nearer, in its direction.
+  let far = max(max(abs(c.x), abs(c.y)), abs(c.z)) / (frame.near * FARTHEST);
+  if (far > 1.0) {
+    p = Point(p.x / far, p.y / far, p.z / far);
+    c /= far;
+  }
   if (c.z >= frame.near) {
     projected_out[id.x] = pack_place(place_of(p));
   } else {
@@ -277,7 +284,9 @@ fn bound_runs(@builtin(global_invocation_id) id: vec3u) {
         if ((q.z > 0.0) == (r.z > 0.0)) { continue; }
         let u = homogeneous(q);
         let v = homogeneous(r);
-        let cut = (u.xy + (frame.near - u.z) / (v.z - u.z) * (v.xy - u.xy)) / frame.near;
+        // Both shares on their own: differences of a corner far away and a near one lose the latter.
+        let shares = vec2f(v.z - frame.near, frame.near - u.z) / (v.z - u.z);
+        let cut = (shares.x * u.xy + shares.y * v.xy) / frame.near;
         let reach = 1e-4 * (abs(cut) + vec2f(1.0));
         a = min(a, cut - reach);
         b = max(b, cut + reach);

@@ -151,6 +151,7 @@ class MeshRenderer:
         normals: bool = False,
         values: np.ndarray | None = None,
     ) -> Images:
+        camera = camera.with_near_plane(self.mesh.vertices)
         h, w = camera.height, camera.width
         images = Images(np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32))
         images.depth = np.zeros((h, w), np.float32) if depth else None

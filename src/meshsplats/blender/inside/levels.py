@@ -169,5 +169,6 @@ def _framing(chain: Any) -> tuple[np.ndarray, float]:
     if not len(points):
         raise ValueError(f"{chain.name} has no visible vertices")
     camera = dome(points, 32, up=(0.0, 0.0, 1.0), width=100, height=100, fov=_FOV)[0]
+    assert camera.near is not None
     away = camera.near / NEAR_SHARE
     return camera.center + away * camera.world_to_camera[2, :3], away

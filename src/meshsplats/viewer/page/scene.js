@@ -58,6 +58,7 @@ export function decodeMesh({ header, row, rows }) {
     mesh.vertices[3 * v + 2] = z + header.origin[2];
   } };
   if (header.patterns) decodeFans(mesh, steps); else decodeVertices(mesh, steps);
+  decodeFar({ header, row, rows }, mesh.vertices);
   const { color, alpha } = header;
   for (let v = 0; v < V; v++) {
     for (let c = 0; c < 3; c++) mesh.colors[4 * v + c] /= color;
@@ -66,6 +67,15 @@ export function decodeMesh({ header, row, rows }) {
   mesh.fans ??= counting(F + 1);
   if (header.group >= 0) mesh.group = Int32Array.from(row(header.group));
   return mesh;
+}
+
+// Strays, as the two halves of their bits, into points (3 floats each).
+function decodeFar({ header, row, rows }, points) {
+  if (header.far < 0) return;
+  const halves = rows(header.far_places, 6), bits = new Uint32Array(points.buffer, points.byteOffset, points.length);
+  row(header.far).forEach((point, i) => {
+    for (let k = 0; k < 3; k++) bits[3 * point + k] = halves[k][i] * 65536 + halves[3 + k][i];
+  });
 }
 
 function decodeVertices(mesh, { rows, row, store, step, attributes, faces, splat, vertices, triangles }) {
@@ -179,5 +189,6 @@ export function decodeSplats({ header, row, rows }) {
       }
     }
   }
+  decodeFar({ header, row, rows }, splats.means);
   return splats;
 }
