@@ -112,12 +112,12 @@ $(LOWEST_VENV)/installed: build/wheel/made lowest-constraints.txt
 	@echo 'Installing the lowest versions into $(@D) with $(LOWEST_PYTHON)'
 	@test -x $(@D)/bin/python || $(LOWEST_PYTHON) -m venv $(@D)
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --only-binary :all: \
-	  --constraint lowest-constraints.txt pytest pytest-xdist hypothesis $(<D)/*.whl
+	  --constraint lowest-constraints.txt pytest hypothesis $(<D)/*.whl
 	@$(@D)/bin/python -m pip --disable-pip-version-check --quiet install --force-reinstall --no-deps $(<D)/*.whl
 	@touch $@
 
 test-lowest: $(LOWEST_VENV)/installed
-	$(LOWEST_VENV)/bin/python -m pytest --numprocesses auto --dist loadfile
+	$(LOWEST_VENV)/bin/python -m pytest
 
 $(BLENDER_VENV)/%/installed: blender_python = $(if $(call before_5_1,$*),$(BLENDER_PYTHON),$(BLENDER_PYTHON_313))
 $(BLENDER_VENV)/%/installed: blender_numpy = $(if $(call before_5_1,$*),'numpy<2')

@@ -122,8 +122,8 @@ struct TriangleSetup {
         unsigned huge = 0;
         for (int i = 0; i < 3; ++i)
             for (int t = 0; t < N; ++t)
-                huge |= !(std::fabs(ea[i][t]) < HUGE_EDGE) | !(std::fabs(eb[i][t]) < HUGE_EDGE) |
-                        !(std::fabs(ec[i][t]) < HUGE_EDGE);
+                huge |= (int)!(std::fabs(ea[i][t]) < HUGE_EDGE) | (int)!(std::fabs(eb[i][t]) < HUGE_EDGE) |
+                        (int)!(std::fabs(ec[i][t]) < HUGE_EDGE);
         if (huge) set_huge_edges(flip);
         for (int t = 0; t < N; ++t) {
             qa[t] = (float)q[0][t];
