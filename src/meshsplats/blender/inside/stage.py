@@ -38,8 +38,8 @@ def clear() -> None:
 
 
 def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, home: Any) -> Any:
-    """A Blender camera like ``camera`` that clips beyond ``reach``. The pixel aspect belongs to the scene:
-    see ``aim``."""
+    """A Blender camera like ``camera`` that clips beyond ``reach``, and before its near plane or, if it names
+    none, a hundred-thousandth of ``reach``. The pixel aspect belongs to the scene: see ``aim``."""
     from mathutils import Matrix
 
     data = bpy.data.cameras.new(name)
@@ -48,7 +48,7 @@ def add_camera(camera: Camera, name: str, rotation: np.ndarray, reach: float, ho
     data.sensor_width = 36.0
     for key in ("lens", "shift_x", "shift_y"):
         setattr(data, key, settings[key])
-    data.clip_start = camera.near
+    data.clip_start = 1e-5 * reach if camera.near is None else camera.near
     data.clip_end = reach
     obj = bpy.data.objects.new(name, data)
     obj.matrix_world = Matrix(frame.camera_pose(camera, rotation).tolist())
