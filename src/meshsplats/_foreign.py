@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -69,8 +70,11 @@ _KINDS: Sequence[_Kind] = (
     ),
 )
 _MODEL = re.compile(r"(cameras|images|points3d|rigs|frames)\.(bin|txt)", re.IGNORECASE)
-_BROKEN = (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, ValueError)
-"""Errors of the zip reader."""
+BROKEN_ZIP = (
+    *(zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError),
+    *(RuntimeError, OSError, ValueError),
+)
+"""Errors of the zip reader: broken or encrypted archives, unknown methods."""
 _TORCH = (".pt", ".pth", ".ckpt")
 
 
@@ -99,7 +103,7 @@ def what_it_is(path: Path) -> str:
         try:
             with zipfile.ZipFile(path) as archive:
                 return foreign_archive(path, archive.namelist())
-        except _BROKEN:
+        except BROKEN_ZIP:
             return ""
     return foreign(path, head)
 
@@ -138,7 +142,7 @@ def _names_in(path: Path) -> bytes:
                 return b""
             with archive.open(name) as member:
                 return member.read(_MAX_PICKLE)
-    except _BROKEN:
+    except BROKEN_ZIP:
         return b""
 
 

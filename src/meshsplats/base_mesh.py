@@ -121,6 +121,8 @@ class BaseMesh:
     def relative_to(self, origin: Sequence[float] | np.ndarray) -> BaseMesh:
         """The same mesh in the world, with coordinates relative to ``origin`` (3,)."""
         point = checked_array("origin", origin, np.float64, (3,))
+        if (point == self.origin).all():
+            return self
         return replace(self, vertices=relative(self.vertices, self.origin, point), origin=point)
 
     @property

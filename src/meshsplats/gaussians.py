@@ -121,6 +121,8 @@ class GaussianCloud:
     def relative_to(self, origin: Sequence[float] | np.ndarray) -> GaussianCloud:
         """The same splats in the world, with coordinates relative to ``origin`` (3,)."""
         point = checked_array("origin", origin, np.float64, (3,))
+        if (point == self.origin).all():
+            return self
         return replace(self, means=relative(self.means, self.origin, point), origin=point)
 
 

@@ -231,6 +231,17 @@ def test_checkpoints_are_named_and_not_opened(tmp_path, monkeypatch, name, conte
     assert not (tmp_path / "sprung").exists()
 
 
+def test_a_checkpoint_that_cannot_be_unpacked_is_named(tmp_path):
+    name, noise = "a/data.pkl", np.random.default_rng(0).bytes(4096)
+    path = zipped(tmp_path / "a.pt", {name: bytes(4096) + noise})
+    data = bytearray(path.read_bytes())
+    start = data.index(name.encode()) + len(name)
+    data[start : start + 64] = b"\xff" * 64  # no deflate block begins so
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError, match="a checkpoint of PyTorch"):
+        load_gaussians(path)
+
+
 def test_the_line_for_gsplats_checkpoints_works(tmp_path):
     torch = pytest.importorskip("torch")
     plain = load_gaussians(write_ply(tmp_path / "_source.ply", [splat_table(SPLATS)]))

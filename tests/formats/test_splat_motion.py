@@ -57,6 +57,12 @@ def test_spacetime_gaussians_at_an_instant(tmp_path, encoding):
     assert shown == len(cloud) > 20
 
 
+def test_colours_that_are_stored_as_they_are_are_converted_once(tmp_path):
+    path = saved(tmp_path, spacetime())
+    plain, told = (load_gaussians(path, time=0.25, activated=which) for which in ((), ("colors",)))
+    np.testing.assert_array_equal(told.sh, plain.sh)
+
+
 def test_two_balls_alive_at_different_times(tmp_path):
     values = spacetime(800, trbf_center=np.repeat([0, 1], 400), trbf_scale=np.full(800, -2))
     values["x"][400:] += 100

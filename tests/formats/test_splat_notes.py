@@ -214,6 +214,11 @@ def test_third_scales_of_2dgs_splats_mean_nothing(tmp_path):
         warnings.simplefilter("error")
         save_gaussians(cloud, tmp_path / "b.ply")
     assert load_gaussians(tmp_path / "b.ply").kernel == "2dgs"
+    solid = load_gaussians(path, kernel="3dgs")  # its third scales count
+    np.testing.assert_allclose(solid.scales, expected_cloud(random_splats(50, 0))["scales"], rtol=1e-6)
+    np.testing.assert_array_equal(
+        joined(list(stream_gaussians(path, block=16, kernel="3dgs"))).scales, solid.scales
+    )
 
 
 # -- colour space
@@ -267,6 +272,21 @@ def test_linear_colours_that_depend_on_the_direction(tmp_path):
     bright = linear.min(axis=(1, 2)) > 0.1  # the curve bends most near black, where harmonics cannot follow
     assert bright.any()
     np.testing.assert_allclose((0.5 + basis @ cloud.sh)[bright], linear_to_srgb(linear)[bright], atol=0.01)
+
+
+def test_a_stream_warns_as_often_as_a_file(tmp_path):
+    """Though it looks at the file twice: for the origin, and for the splats."""
+    path = tmp_path / "a.glb"
+    path.write_bytes(encode.gltf(encode.splat_accessors(random_splats(9, 0)), properties={"kernel": "cube"}))
+    for file in (path, sharp(tmp_path, 1)):
+        told = []
+        for read in (load_gaussians, lambda file: list(stream_gaussians(file))):
+            with warnings.catch_warnings(record=True) as found:
+                warnings.simplefilter("always")
+                read(file)
+            told.append([str(warning.message) for warning in found])
+        assert len(told[0]) == 1
+        assert told[1] == told[0]
 
 
 def test_gltf_kernels_that_are_not_known_are_named(tmp_path):

@@ -47,7 +47,7 @@ def transformed(cloud: GaussianCloud, matrix: np.ndarray, origin: np.ndarray | N
         return replace(moved, means=means, origin=origin)
     if shift.any():
         moved = replace(moved, means=moved.means + shift.astype(np.float32))
-    return replace(moved, origin=mapped) if mapped.any() else moved
+    return moved if (mapped == moved.origin).all() else replace(moved, origin=mapped)
 
 
 def _mirrored(cloud: GaussianCloud, signs: np.ndarray) -> GaussianCloud:

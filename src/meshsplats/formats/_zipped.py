@@ -5,11 +5,10 @@ from __future__ import annotations
 import io
 import os
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
-from meshsplats._foreign import foreign_archive
+from meshsplats._foreign import BROKEN_ZIP, foreign_archive
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 
@@ -17,8 +16,6 @@ _SUFFIXES = (".ply", ".spz", ".splat")
 _PIECE = 1 << 20
 _MAX_TRIED = 64
 """Of files that are named like splats, only this many are opened to see whether they are."""
-BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, ValueError)
-"""Errors of the zip reader: broken or encrypted archives, unknown methods."""
 
 
 class BoundedReader(io.BufferedReader):
@@ -47,7 +44,7 @@ class Archive:
         try:
             with BoundedReader(path) as file, zipfile.ZipFile(file) as archive:
                 infos = archive.infolist()
-        except BROKEN as error:
+        except BROKEN_ZIP as error:
             raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
         named = [info.filename for info in infos if not info.filename.endswith("/")]
         self.names = [name for name in named if not _is_hidden(name)]
@@ -98,7 +95,7 @@ class ZippedFile(io.RawIOBase):
         except FileFormatError:
             self._raw.close()
             raise
-        except (KeyError, *BROKEN) as error:
+        except (KeyError, *BROKEN_ZIP) as error:
             self._raw.close()
             raise FileFormatError(f"{self._where} cannot be unpacked: {str(error)[:120]}") from None
 
@@ -147,5 +144,5 @@ class ZippedFile(io.RawIOBase):
     def _guarded(self, read: Any, argument: Any) -> Any:
         try:
             return read(argument)
-        except BROKEN as error:
+        except BROKEN_ZIP as error:
             raise FileFormatError(f"{self._where} cannot be unpacked: {str(error)[:120]}") from None

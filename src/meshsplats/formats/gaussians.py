@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Literal, get_args
@@ -102,7 +103,7 @@ def load_gaussians(
         MissingDependencyError: SPZ 4 without Zstandard.
     """
     need_path(path=path)
-    reading = _Reading(strict, axes, kernel, time, activated)
+    reading = _Reading(axes, kernel, time, activated)
     found = splat_file(Path(path))
     content = Content(found)
     kind, stored = content.splat_format(), None
@@ -130,7 +131,6 @@ class _Reading:
 
     def __init__(
         self,
-        strict: bool,
         axes: Axes,
         kernel: Kernel | None,
         time: float | None,
@@ -142,30 +142,29 @@ class _Reading:
             raise ValueError(f"kernel must be one of {', '.join(get_args(Kernel))}, got {kernel!r}")
         if time is not None and not np.isfinite(time):
             raise ValueError(f"time must be a finite number, got {time!r}")
-        self.strict, self.axes, self.kernel = strict, axes, kernel
+        self.kernel = kernel
         self.time = None if time is None else float(time)
         self.activated = checked_activated(activated)
 
     def reader(self, content: Content, kind: SplatFormat, file: BinaryIO, path: Path) -> SplatReader | None:
         """The reader of the formats that are read in the same way as a whole and in blocks."""
-        if kind == "ply":
-            reader = read_float_ply(file, content.ply_header, path, time=self.time, activated=self.activated)
-            if self.time is not None and reader.instant is None:
-                raise ValueError(f"{path}: its splats do not move: time is for those that do")
-            if reader.linear:
-                say_converted(path)
-            return reader
-        if self.activated or self.time is not None:
+        if kind != "ply" and (self.activated or self.time is not None):
             given = "activated" if self.activated else "time"
             raise ValueError(f"{path}: {given} is for float .ply files, this is {kind}")
-        if kind == "compressed.ply":
-            reader = read_compressed_ply(file, content.ply_header, path)
-            if reader.linear:
-                say_converted(path)
-            return reader
-        if kind == "splat":
-            return read_dot_splat(file, path)
-        return read_sog(path, Budget(path)) if kind == "sog" else None
+        found: SplatReader | None = None
+        if kind == "ply":
+            found = read_float_ply(file, content.ply_header, path, time=self.time, activated=self.activated)
+            if self.time is not None and found.instant is None:
+                raise ValueError(f"{path}: its splats do not move: time is for those that do")
+        elif kind == "compressed.ply":
+            found = read_compressed_ply(file, content.ply_header, path)
+        elif kind == "splat":
+            found = read_dot_splat(file, path)
+        elif kind == "sog":
+            found = read_sog(path, Budget(path))
+        if found is not None and found.linear:
+            say_converted(path)
+        return found if found is None or self.kernel is None else replace(found, kernel=self.kernel)
 
     def finished(self, cloud: GaussianCloud, reader: SplatReader) -> GaussianCloud:
         """Splats of ``reader`` with display colours and up, those that are visible at the instant."""
@@ -216,7 +215,7 @@ class SplatStream:
         activated: Iterable[Activated] = (),
         origin: Sequence[float] | np.ndarray | None = None,
     ) -> None:
-        self._reading = _Reading(strict, axes, kernel, time, activated)
+        self._reading = _Reading(axes, kernel, time, activated)
         if isinstance(paths, (str, os.PathLike)):
             what = described(paths)
             raise TypeError(f"paths must be a list of paths, got {what}: stream_gaussians(path) opens one")
@@ -234,9 +233,9 @@ class SplatStream:
         """(3,) float64 origin of all blocks. The files are looked at when it is first needed."""
         if self._origin is None:
             if len(self.paths) == 1:
-                self._origin = self._own_origin(self.paths[0])
+                self._origin = self._looked_at(self.paths[0], alone=True)
             else:
-                samples = [self._sample(path) for path in self.paths]
+                samples = [self._looked_at(path, alone=False) for path in self.paths]
                 self._origin = choose_origin(np.concatenate([np.empty((0, 3)), *samples]))
         return self._origin
 
@@ -244,46 +243,31 @@ class SplatStream:
         for path in self.paths:
             yield from self._of(path)
 
-    def _own_origin(self, path: Path) -> np.ndarray:
-        return self._looked_at(path, SplatReader.chosen_origin, choose_origin)
-
-    def _sample(self, path: Path) -> np.ndarray:
-        return self._looked_at(path, SplatReader.world_sample, lambda positions: positions)
-
-    def _looked_at(
-        self,
-        path: Path,
-        of_reader: Callable[[SplatReader], np.ndarray],
-        of_sample: Callable[[np.ndarray], np.ndarray],
-    ) -> np.ndarray:
-        """A position or positions (..., 3) of the file ``path``, with y down: of its reader, or of a sample
-        where a format has none."""
+    def _looked_at(self, path: Path, *, alone: bool) -> np.ndarray:
+        """(3,) the origin of the file ``path`` by itself if it is ``alone``, else a sample (k, 3) of its
+        positions in the world; with y down."""
         content = Content(path)
         kind, stored = content.splat_format(), None
-        with content.open() as file:
+        reader = whole = None
+        with content.open() as file, ExitStack() as opened:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # those of the file come when it is read
-                reader = self._reading.reader(content, kind, file, path)
-            if kind == "spz" and content.member is not None:
-                cloud, stored = read_spz(file.read(), path, Budget(path), strict=self.strict)
-                found = cloud.origin
-                if of_reader is not SplatReader.chosen_origin:
-                    found = of_sample(sampled(cloud.means) + cloud.origin)
-            elif kind == "spz":
-                reader, stored, close = open_spz(path)
-                try:
-                    found = of_reader(reader)
-                finally:
-                    close()
-            elif reader is not None:
-                found = of_reader(reader)
-            elif kind == "streamed sog":
-                found = of_sample(streamed_corners(path))
+                if kind == "spz" and content.member is not None:
+                    whole, stored = read_spz(file.read(), path, Budget(path), strict=self.strict)
+                elif kind == "spz":
+                    reader, stored, close = open_spz(path)
+                    opened.callback(close)
+                elif kind == "gltf":
+                    whole = read_splat_gltf(path, strict=self.strict)
+                else:
+                    reader = self._reading.reader(content, kind, file, path)
+            if reader is not None:
+                found = reader.chosen_origin() if alone else reader.world_sample()
+            elif whole is not None:
+                found = whole.origin if alone else sampled(whole.means) + whole.origin
             else:
-                cloud = read_splat_gltf(path, strict=self.strict)
-                found = cloud.origin
-                if of_reader is not SplatReader.chosen_origin:
-                    found = of_sample(sampled(cloud.means) + cloud.origin)
+                corners = streamed_corners(path)
+                found = choose_origin(corners) if alone else corners
         return found @ _to_y_down(kind, self.axes, stored).T + 0.0
 
     def _of(self, path: Path) -> Iterator[GaussianCloud]:

@@ -76,6 +76,12 @@ def load_mesh(
     need_path(path=path)
     source = Path(path)
     point = None if origin is None else checked_array("origin", origin, np.float64, (3,))
+    mesh = _read(source, point)
+    # Files of our own name an origin, which takes the place of the one that is asked for.
+    return mesh if point is None else mesh.relative_to(point)
+
+
+def _read(source: Path, point: np.ndarray | None) -> SplatMesh:
     content = Content(source)
     content.refuse_empty()
     if content.member is not None:

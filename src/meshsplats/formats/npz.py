@@ -15,13 +15,13 @@ import ast
 import re
 import struct
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
+from meshsplats._foreign import BROKEN_ZIP
 from meshsplats.binding import Binding
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import (
@@ -37,18 +37,8 @@ from meshsplats.mesh import SplatMesh
 _ATTRIBUTE = "attribute_"
 _MAX_HEADER = 10_000
 _BLOCK = 1 << 20
-_BROKEN_ZIP = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    EOFError,
-    OSError,
-    NotImplementedError,
-    RuntimeError,
-    ValueError,
-    OverflowError,
-)
-"""Errors of the zip reader for broken archives; its own checks do not cover every field."""
+_BROKEN = (*BROKEN_ZIP, struct.error, OverflowError)
+"""Errors for broken archives; the zip reader's own checks do not cover every field."""
 _DEFAULTS = {"up": np.array([0, -1, 0], np.float32), "blending": np.array("display")}
 """For files of the published MeshSplats code, which lack them."""
 
@@ -93,7 +83,7 @@ def read_npz(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
                 return _read(archive, path, origin)
         except FileFormatError:
             raise
-        except _BROKEN_ZIP as error:
+        except _BROKEN as error:
             raise FileFormatError(f"{path}: not a readable .npz file: {error}") from None
 
 
@@ -130,8 +120,7 @@ def _read(archive: zipfile.ZipFile, path: Path, origin: np.ndarray | None) -> Sp
         arrays["vertices"], arrays["origin"] = local_positions(arrays["vertices"], origin, path)
     named = {_NAMES.get(name) or name.replace("_", ".", 1): array for name, array in arrays.items()}
     try:
-        mesh = checked(path, SplatMesh.from_arrays, _DEFAULTS | named)
-        return mesh if origin is None else mesh.relative_to(origin)
+        return checked(path, SplatMesh.from_arrays, _DEFAULTS | named)
     except KeyError as error:
         lost = _stored(error.args[0])
         raise FileFormatError(f"{path}: the binding to a base is not whole: {lost} is missing") from None

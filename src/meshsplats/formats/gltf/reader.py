@@ -17,7 +17,7 @@ from meshsplats.colors import linear_to_srgb
 from meshsplats.errors import DataWarning, FileFormatError, NoTextureWarning
 from meshsplats.formats._validation import checked, straight_colors, warn_of_lost_detail
 from meshsplats.formats.gltf.document import GltfDocument
-from meshsplats.formats.gltf.scene import Placed, placed_meshes, rotation_matrix
+from meshsplats.formats.gltf.scene import Placed, Skinning, placed_meshes, rotation_matrix
 from meshsplats.formats.gltf.writer import camel_case, up_quaternion
 from meshsplats.mesh import Blending, SplatMesh
 
@@ -30,18 +30,17 @@ class _Piece:
     """A primitive, which a node places."""
 
     place: Placed
-    attributes: dict[str, Any]
+    skinning: Skinning | None
     vertices: np.ndarray
     """In the frame of the mesh; in that of the scene after ``put``."""
     faces: np.ndarray
     linear: np.ndarray
     normals: np.ndarray | None
 
-    def put(self, document: GltfDocument, origin: np.ndarray) -> None:
+    def put(self, origin: np.ndarray) -> None:
         """Puts the piece into the scene, relative to ``origin``."""
-        self.vertices, self.normals = self.place.applied(
-            document, self.attributes, self.vertices, self.normals, origin
-        )
+        self.vertices, self.normals = self.place.applied(self.skinning, self.vertices, self.normals, origin)
+        self.skinning = None
 
 
 def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
@@ -57,8 +56,7 @@ def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         FileFormatError: the file is broken, or has Draco or meshopt compression or sparse accessors.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # SplatMesh refuses values that are not finite
-        mesh = _read(GltfDocument(path), origin)
-        return mesh if origin is None else mesh.relative_to(origin)
+        return _read(GltfDocument(path), origin)
 
 
 def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
@@ -90,17 +88,18 @@ def _read(document: GltfDocument, origin: np.ndarray | None) -> SplatMesh:
         warnings.warn(message, NoTextureWarning, stacklevel=3)
     if not pieces:
         raise document.error("the scene holds no triangles")
-    if origin is None or named is not None:
-        origin = _chosen_origin(document, pieces) if named is None else named
+    shift = zero_origin()  # what is ours is relative to its origin already
+    if named is not None:
+        origin = named
+    else:
+        shift = origin = _chosen_origin(document, pieces) if origin is None else origin
     for piece in pieces:
-        piece.put(document, zero_origin() if named is not None else origin)
+        piece.put(shift)
     return _join(document, pieces, own, note, origin)
 
 
 def _chosen_origin(document: GltfDocument, pieces: list[_Piece]) -> np.ndarray:
-    sample = np.concatenate(
-        [piece.place.sample(document, piece.attributes, piece.vertices) for piece in pieces]
-    )
+    sample = np.concatenate([piece.place.sample(piece.skinning, piece.vertices) for piece in pieces])
     if all((piece.place.matrix == np.eye(4)).all() for piece in pieces):
         warn_of_lost_detail(sample, document.path)
     return choose_origin(sample)
@@ -136,7 +135,7 @@ def _piece(
     for name, values in (("POSITION", vertices), ("NORMAL", normals)):
         if values is not None and values.shape != (v, 3):
             raise document.error(f"{name} must be {v:,} vectors of 3, got shape {values.shape}")
-    return _Piece(place, attributes, vertices, faces, linear, normals)
+    return _Piece(place, place.skinning(document, attributes, v), vertices, faces, linear, normals)
 
 
 def primitive_faces(document: GltfDocument, primitive: dict[str, Any], v: int) -> np.ndarray:

@@ -31,14 +31,13 @@ class Placed(NamedTuple):
 
     def applied(
         self,
-        document: GltfDocument,
-        attributes: dict[str, Any],
+        skinning: Skinning | None,
         vertices: np.ndarray,
         normals: np.ndarray | None,
         origin: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Vertices and normals (v, 3) float32 of a primitive in the scene's frame, relative to ``origin``."""
-        skinning = self._skinning(document, attributes, len(vertices))
+        """Vertices and normals (v, 3) float32 of a primitive in the scene's frame, relative to ``origin``;
+        ``skinning``: that of the primitive."""
         if skinning is None and (self.matrix == np.eye(4)).all():
             return ((vertices - origin).astype(np.float32) if origin.any() else vertices), normals
         moved = np.empty_like(vertices)
@@ -57,20 +56,20 @@ class Placed(NamedTuple):
                 turned[part] = sides / np.where(length > 0, length, 1)
         return moved, turned
 
-    def sample(self, document: GltfDocument, attributes: dict[str, Any], vertices: np.ndarray) -> np.ndarray:
+    def sample(self, skinning: Skinning | None, vertices: np.ndarray) -> np.ndarray:
         """(k, 3) float64: a sample of the vertices of a primitive in the scene's frame."""
         part = slice(None, None, max(1, len(vertices) // SAMPLE))
-        skinning = self._skinning(document, attributes, len(vertices))
         matrices = self.matrix[None] if skinning is None else skinning.of(part)
         return np.asarray(np.einsum("nij,nj->ni", matrices[:, :3, :3], vertices[part]) + matrices[:, :3, 3])
 
-    def _skinning(self, document: GltfDocument, attributes: dict[str, Any], v: int) -> _Skinning | None:
+    def skinning(self, document: GltfDocument, attributes: dict[str, Any], v: int) -> Skinning | None:
+        """That of a primitive of ``v`` vertices; None without joints and weights."""
         if self.joints is not None and {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
-            return _Skinning(document, attributes, self.joints(), v)
+            return Skinning(document, attributes, self.joints(), v)
         return None
 
 
-class _Skinning:
+class Skinning:
     """Linear blend skinning: the matrices of a skin's joints, blended by the weights of each vertex."""
 
     def __init__(

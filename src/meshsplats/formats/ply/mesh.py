@@ -198,8 +198,7 @@ def read_mesh_ply(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
             raise FileFormatError(f"{path}: not a mesh: no element 'vertex' with x, y and z")
         if face is None:
             raise FileFormatError(f"{path}: not a mesh but points: it has no element 'face'")
-        mesh = _read(file, header, vertex, face, path, origin)
-        return mesh if origin is None else mesh.relative_to(origin)
+        return _read(file, header, vertex, face, path, origin)
 
 
 def _read(

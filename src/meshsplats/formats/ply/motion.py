@@ -22,7 +22,6 @@ import numpy as np
 from meshsplats._geometry import quaternions_of
 from meshsplats.errors import FileFormatError
 from meshsplats.formats.splats._cloud_builder import SplatRows
-from meshsplats.gaussians import SH_C0
 
 VISIBLE = 1 / 255
 """Splats of less opacity than this at the instant are left out: they would be no part of its image."""
@@ -64,8 +63,6 @@ class Motion:
                 self._spacetime(rows, columns, dt)
             else:
                 self._sliced(rows, columns, dt)
-        if self.plain_colors:
-            rows.sh[:, 0] = (rows.sh[:, 0] - np.float32(0.5)) / np.float32(SH_C0)
 
     def _spacetime(self, rows: SplatRows, columns: dict[str, np.ndarray], dt: np.ndarray) -> None:
         rows.opacities[:] *= np.exp(-np.square(dt / np.exp(columns[self.span].astype(np.float64))))

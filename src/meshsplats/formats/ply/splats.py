@@ -82,6 +82,8 @@ class _Columns:
         if self.color is _RGB:
             kinds = [p.dtype for name in _RGB for p in element.properties if p.name == name]
             self.color_span = np.array([np.iinfo(d).max if d.kind in "iu" else 1 for d in kinds], np.float32)
+        elif self.motion and self.motion.plain_colors:
+            self.color_span = np.ones(3, np.float32)
 
     @property
     def needed(self) -> tuple[str, ...]:
@@ -230,7 +232,7 @@ def _chunks(
     for chunk in table.chunks():
         yield len(chunk), partial(_fill, chunk, reading)
     found = suspects(reading.sample.count, *reading.sample.values()) if reading.sample.parts else {}
-    if reading.columns.color is _RGB or (reading.columns.motion and reading.columns.motion.plain_colors):
+    if reading.columns.color_span is not None:
         found.pop("colors", None)
     warn_of({name: span for name, span in found.items() if name not in reading.activated}, where)
 

@@ -12,7 +12,6 @@ import os
 import re
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from meshsplats._foreign import BROKEN_ZIP
 from meshsplats._json import json_object
 from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError, MissingDependencyError
@@ -112,15 +112,7 @@ class _Archive:
         try:
             with self._archive.open(name) as file:
                 data = file.read(limit + 1)
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            NotImplementedError,
-            RuntimeError,
-            OSError,
-            ValueError,
-        ) as e:
+        except BROKEN_ZIP as e:
             raise FileFormatError(f"{self._path}: cannot unpack {name[:60]!r}: {str(e)[:120]}") from None
         if len(data) > limit:
             raise FileFormatError(f"{self._path}: {name[:60]!r} unpacks to over {limit:,} bytes; refused")

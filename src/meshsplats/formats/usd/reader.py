@@ -59,7 +59,7 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
     if report["blending"] != "linear":
         colors[:, :3] = linear_to_srgb(colors[:, :3])
     attributes = {name: arrays.pop(f"attribute_{i}") for i, name in enumerate(report["attributes"])}
-    mesh = checked(
+    return checked(
         path,
         SplatMesh,
         vertices=arrays.pop("vertices"),
@@ -72,7 +72,6 @@ def read_usd(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
         attributes=attributes,
         **arrays,
     )
-    return mesh if origin is None else mesh.relative_to(origin)
 
 
 def _extract(file: Path, path: Path, result: Path, origin: np.ndarray | None) -> dict[str, Any]:
