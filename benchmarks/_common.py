@@ -142,7 +142,7 @@ def take_steps(
         make_step(state, views, step, done)
         step += 1
         if interval and step % interval == 0 and fraction(step) < 1:
-            state = state.prune(kept_faces(state, views))
+            state = state.prune(kept_faces(state))
     return state.result(), step
 
 

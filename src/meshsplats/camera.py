@@ -120,25 +120,28 @@ class Camera:
         """The same view with no side of the image longer than ``side`` pixels; never a larger image."""
         return self.scaled(min(1.0, side / max(self.width, self.height)))
 
-    def near_plane(self, points: np.ndarray) -> float:
+    def near_plane(self, points: np.ndarray, pose: np.ndarray | None = None) -> float:
         """Depth of the near plane for a scene of ``points`` (n, 3), its vertices or centres: ``near``, or
-        ``NEAR_SHARE`` of the distance within which ``NEAREST_SHARE`` of the points lie.
+        ``NEAR_SHARE`` of the distance within which ``NEAREST_SHARE`` of the points lie. ``pose``, (4, 4)
+        world to camera, takes the place of the camera's.
 
         It depends on the position of the camera alone, so that parts of an image have that of the whole, and
         follows the units of the scene.
         """
         if self.near is not None:
             return self.near
-        distance = np.linalg.norm(subsample(points, _POINTS).astype(np.float64) - self.center, axis=1)
+        center = self.center if pose is None else -np.linalg.solve(pose[:3, :3], pose[:3, 3])
+        distance = np.linalg.norm(subsample(points, _POINTS).astype(np.float64) - center, axis=1)
         distance = distance[distance > 0]
         if not len(distance):
             return NEAR_SHARE  # there is nothing to see
         nearest = int(NEAREST_SHARE * len(distance))
         return max(NEAR_SHARE * float(np.partition(distance, nearest)[nearest]), sys.float_info.min)
 
-    def with_near_plane(self, points: np.ndarray) -> Camera:
-        """The camera with the near plane that it has in front of a scene of ``points`` (n, 3)."""
-        return self if self.near is not None else replace(self, near=self.near_plane(points))
+    def with_near_plane(self, points: np.ndarray, pose: np.ndarray | None = None) -> Camera:
+        """The camera with the near plane that it has in front of a scene of ``points`` (n, 3), at the
+        ``pose`` as in ``near_plane``."""
+        return self if self.near is not None else replace(self, near=self.near_plane(points, pose))
 
     def sees(self, points: np.ndarray) -> np.ndarray:
         """(n,) bool: points (n, 3) beyond the near plane that project into the image."""

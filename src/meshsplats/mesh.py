@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from types import MappingProxyType
 from typing import ClassVar, Literal, NamedTuple, get_args
 
@@ -213,10 +212,10 @@ class SplatMesh:
             return None
         return len(self.splats)
 
-    @cached_property
+    @property
     def splats(self) -> FaceSplats:
         """Which triangles and vertices belong to which splat; without ``face_splat``, each triangle counts as
-        one."""
+        one. Found anew at each access, and as large as the mesh: hold it while it is used."""
         return FaceSplats(self.faces, self.face_splat, len(self.vertices))
 
     def relative_to(self, origin: Sequence[float] | np.ndarray) -> SplatMesh:

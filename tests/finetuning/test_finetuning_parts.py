@@ -172,22 +172,7 @@ def test_open_edges_are_those_of_one_triangle():
     assert np.array_equal(boundary_vertices(shuffled, len(mesh.vertices)), rims)
 
 
-# ---- Relocation
-
-
-def fans(count: int, sides: int = 4) -> SplatMesh:
-    """Fans side by side, twice as long as wide."""
-    angles = np.arange(sides) * 2 * np.pi / sides
-    fan = np.concatenate([[[0, 0, 0]], np.stack([2 * np.cos(angles), np.sin(angles), 0 * angles], 1)])
-    ring = 1 + np.arange(sides)
-    faces = np.stack([0 * ring, ring, np.roll(ring, -1)], 1)
-    numbers = np.arange(count)
-    return SplatMesh(
-        (fan[None] + 10 * numbers[:, None, None]).reshape(-1, 3),
-        (faces[None] + (sides + 1) * numbers[:, None, None]).reshape(-1, 3),
-        np.full((count * (sides + 1), 4), 0.5),
-        face_splat=np.repeat(numbers, sides),
-    )
+# ---- The start
 
 
 def test_triangles_of_a_splat_suit_the_run(monkeypatch):

@@ -404,6 +404,17 @@ def test_light_left_out_by_stopping_early():
     assert render(half, camera(1, 1), min_transmittance=0.25).fragments == 3
 
 
+def test_the_near_plane_is_measured_from_the_pose():
+    mesh = fan(5, 8, 0.6)
+    view = replace(camera(40, 30), near=None)
+    pose = view.world_to_camera.copy()
+    far = pose.copy()
+    far[2, 3] += 1e4  # from there, the near plane would lie behind the mesh
+    image = TapedRendering(mesh.triangles, replace(view, world_to_camera=far), world_to_camera=pose)
+    assert np.array_equal(image.color, render(mesh, view).color)
+    assert image.alpha.any()
+
+
 def test_a_taped_rendering_of_a_mesh_has_its_groups_and_its_filter():
     """Each of which changes the image."""
     view = camera(48, 40)

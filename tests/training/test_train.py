@@ -511,7 +511,7 @@ def test_no_growth_event_happens_twice(ball, start, monkeypatch):
     passed = []
     for step in (9, 11, 9, 11, 21):
         loop.step = step
-        loop._adapt(step)
+        loop._adapt()
         passed.append(loop.events)
     assert passed == [0, 1, 1, 1, 2]
 

@@ -210,9 +210,10 @@ class _Splats:
     """The splats of a mesh; without ``face_splat``, each triangle counts as one."""
 
     def __init__(self, mesh: SplatMesh, normals: np.ndarray) -> None:
-        count = len(mesh.splats)
-        self.of_face = mesh.splats.of_face
-        self.of_vertex = np.maximum(mesh.splats.of_vertex, 0)  # vertices of no triangle are not drawn
+        splats = mesh.splats
+        count = len(splats)
+        self.of_face = splats.of_face
+        self.of_vertex = np.maximum(splats.of_vertex, 0)  # vertices of no triangle are not drawn
         corner, owner = mesh.faces.ravel(), np.repeat(self.of_face, 3)
         weight = mesh.colors[corner, 3].astype(np.float64) + 1e-6
         total = np.bincount(owner, weight, count)

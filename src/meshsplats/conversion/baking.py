@@ -69,9 +69,10 @@ def bake_filter(
     if not cameras and pixel is None:
         cameras = orbit(mesh, FRAMING_VIEWS, width=FRAMING_PIXELS, height=FRAMING_PIXELS)
     assert mesh.face_splat is not None
-    if mesh.splats.share_vertices:
+    splats = mesh.splats
+    if splats.share_vertices:
         raise ValueError("two splats share a vertex: the filter moves each splat's vertices on their own")
-    starts, ends, owner = mesh.splats.starts, mesh.splats.ends, mesh.splats.of_vertex
+    starts, ends, owner = splats.starts, splats.ends, splats.of_vertex
     means = np.empty((len(starts), 3))
     axes = np.empty((len(starts), 3, 3))
     variances = np.empty((len(starts), 3))

@@ -111,16 +111,17 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
         gone["crop"] = ~inside(centers, rules.crop, scene.origin)
     if rules.min_opacity is not None:
         gone["min_opacity"] = opacities < rules.min_opacity
-    if rules.max_distance is not None:
+    if any(name not in ("crop", "min_opacity") for name in given):
         bounds = scene_bounds(scene)
+        lengths = np.linalg.norm(reach, axis=2).max(axis=1)
+    if rules.max_distance is not None:
         away = np.linalg.norm(centers - bounds.center, axis=1)
         gone["max_distance"] = away > rules.max_distance * bounds.radius
-    lengths = np.linalg.norm(reach, axis=2).max(axis=1)
     if rules.max_size is not None:
-        gone["max_size"] = lengths > rules.max_size * scene_bounds(scene).radius
+        gone["max_size"] = lengths > rules.max_size * bounds.radius
     if rules.sparse is not None or rules.min_part is not None:
         cell = CELL * float(np.median(spacing(centers.astype(np.float32))))
-        cell = max(cell, 1e-12 * scene_bounds(scene).radius)
+        cell = max(cell, 1e-12 * bounds.radius)
         if rules.sparse is not None:
             near = _neighbours(centers, lengths, cell)
             gone["sparse"] = near < rules.sparse * float(np.median(near))
@@ -179,7 +180,8 @@ def _splats(
         return scene.means.astype(np.float64), np.concatenate([half, -half], axis=1), scene.opacities, None
     if not len(scene.faces):
         raise ValueError("the mesh has no triangles: there is nothing to clean")
-    splats, starts = scene.splats, scene.splats.starts
+    splats = scene.splats
+    starts = splats.starts
     corners = scene.vertices[scene.faces].astype(np.float64)
     centers = splats.sums(corners.mean(axis=1)) / splats.counts[:, None]
     # The ends along the two axes of the frame that the splat is longest in.

@@ -99,8 +99,9 @@ def visibility(
     """
     assert mesh.face_splat is not None
     n = len(means)
-    owner = np.zeros(len(mesh.vertices), np.int64)
-    owner[mesh.faces.ravel()] = np.repeat(mesh.face_splat, 3)
+    splats = mesh.splats
+    owner = splats.numbers[splats.of_vertex]
+    triangles = mesh.triangles._replace(values=np.zeros((len(owner), 2), np.float32))
     pixels, error, views = np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
     samples = 1 if look == "splats" else AREA_SAMPLES
     fewest, most = IMAGES
@@ -110,7 +111,6 @@ def visibility(
     order = np.argsort(np.argsort(np.arange(len(chosen)) * GOLDEN % 1, kind="stable"), kind="stable")
     for own in (chosen[i] for i in order):
         camera = own.within(SIDE)
-        triangles = mesh.triangles._replace(values=np.zeros((len(owner), 2), np.float32))
         rendering = TapedRendering(triangles, camera, background=(0, 0, 0), samples=samples, threads=threads)
         # Colours over black and alpha: then no background hides a difference.
         target = draw_splats(cloud, camera, look, background=(0, 0, 0), samples=samples, threads=threads)

@@ -79,10 +79,10 @@ def softness(
     """The score of each splat, by its index; see ``with_soft_splats``."""
     assert start.face_splat is not None
     sums = np.zeros(len(start.vertices))
+    triangles = start.triangles._replace(values=np.zeros((len(start.vertices), 1), np.float32))
     for view in subsample(views, ERROR_VIEWS):
         background, camera = view.background, view.camera
         opaque = render(core, camera, background=background, samples=ERROR_SAMPLES, threads=threads).color
-        triangles = start.triangles._replace(values=np.zeros((len(start.vertices), 1), np.float32))
         rendering = TapedRendering(triangles, camera, background=background, threads=threads)
         error, blended = (
             np.square(color - view.image).sum(axis=2, keepdims=True) for color in (opaque, rendering.color)
@@ -94,10 +94,8 @@ def softness(
     # A corner has the sum of e T a, weighted by its barycentric weight: by these, 1 - a is interpolated.
     sums *= 1 - start.colors[:, 3]
     splats = start.splats
-    used = splats.of_vertex >= 0
-    scores = np.zeros(int(splats.numbers.max()) + 1)
-    scores[splats.numbers] = np.bincount(splats.of_vertex[used], sums[used], len(splats))
-    return scores
+    # Vertices of no triangle are not drawn: their sums are 0, wherever they are added.
+    return np.bincount(splats.numbers[splats.of_vertex], sums, int(splats.numbers[-1]) + 1)
 
 
 class ColorLimits:

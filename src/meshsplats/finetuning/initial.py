@@ -125,7 +125,8 @@ def vertex_sizes(mesh: SplatMesh) -> np.ndarray:
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.sqrt(np.linalg.norm(normals, axis=1))
-    size = (mesh.splats.sums(size) / mesh.splats.counts)[mesh.splats.of_face]
+    splats = mesh.splats
+    size = (splats.sums(size) / splats.counts)[splats.of_face]
     return vertex_means(mesh, size)
 
 

@@ -318,16 +318,16 @@ class TrainingLoop:
                 if signals.received is not None:
                     self._save_checkpoint()
                     raise Interrupted(self.step, signals.received)
-                start, before = time.perf_counter(), self.step
-                loss = make_step(self.state, self._views(), before, self.fraction)
+                start, step = time.perf_counter(), self.step
+                loss = make_step(self.state, self._views(), step, self.fraction)
                 self.step_cost = time.perf_counter() - start
                 self.step += 1
                 if loss is not None:
-                    self._note(before, loss)
-                self._adapt(before)
-                if self._due(self.options.report_every, before) and not self._done():
+                    self._note(step, loss)
+                self._adapt()
+                if self._due(self.options.report_every) and not self._done():
                     self._report()
-                if self._passed_quarter() or self._due(self.options.preview_every, before):
+                if self._passed_quarter() or self._due(self.options.preview_every):
                     self._save_preview()
                 if time.perf_counter() - self.save_time >= self._checkpoint_interval:
                     self._save_checkpoint()
@@ -367,21 +367,20 @@ class TrainingLoop:
         self.losses.append(loss)
         self.last_loss = loss
 
-    def _adapt(self, before: int) -> None:
-        """Removes triangles where the steps since ``before`` make that due."""
-        views = self.dataset.train
+    def _adapt(self) -> None:
+        """Removes triangles where that is due after the step that was taken."""
         if self._settles():
             self._remove_hidden()
         if self._becomes_hybrid():
             self._cut()
-        if self._due(self.config.prune_interval(len(views)), before) and not self._done():
+        if self._due(self.config.prune_interval(len(self.dataset.train))) and not self._done():
             self.state = self.state.prune(kept_faces(self.state))
         if self.state.solid is not None:
             self._limit_colors()
 
-    def _due(self, interval: int, before: int) -> bool:
-        """Whether the steps since ``before`` have come to a multiple of ``interval``; 0: never."""
-        return bool(interval) and self.step // interval > before // interval
+    def _due(self, interval: int) -> bool:
+        """Whether the count of steps is a multiple of ``interval``; 0: never."""
+        return bool(interval) and self.step % interval == 0
 
     def _settles(self) -> bool:
         """Whether it is time to remove the triangles that no training view shows: once."""

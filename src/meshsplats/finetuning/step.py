@@ -189,13 +189,11 @@ def loss_of(
 
 
 class ViewGradients(NamedTuple):
-    """Loss and gradients of a view."""
+    """Loss and gradients of a view, all of them finite."""
 
     loss: float
-    gradients: Gradients | None
-    """None if the loss is not finite."""
-    finite: bool
-    edges: bool = False
+    gradients: Gradients
+    edges: bool
     """Whether they include the motion of edges."""
 
 
@@ -212,8 +210,6 @@ def make_step(state: State, views: Sequence[View], step: int, fraction: float) -
     found = view_gradients(state, views, index, step, fraction)
     if found is None:
         return None
-    if found.gradients is None or not found.finite:
-        raise _divergence(step, views[index], "the loss" if found.gradients is None else "a gradient")
     steps_before = 0.0
     if state.solid is not None:
         steps_before = step * (1 - config.soft_phase) / fraction
@@ -229,7 +225,7 @@ def view_gradients(
     state: State, views: Sequence[View], index: int, step: int, fraction: float
 ) -> ViewGradients | None:
     """Loss and gradients of the training view of that ``index`` in step ``step``, after ``fraction`` of the
-    run; None if none of its pixels counts."""
+    run; None if none of its pixels counts. DivergenceError if they are not finite."""
     config, view = state.config, views[index]
     hybrid = state.solid is not None
     fraction = soft_fraction(config, fraction) if hybrid else opaque_fraction(config, fraction)
@@ -248,7 +244,7 @@ def view_gradients(
         image = image * exposure[GAIN] + exposure[OFFSET]
     loss, grad_image = loss_of(image, target, config, state.threads)
     if not np.isfinite(loss):
-        return ViewGradients(loss, None, False)
+        raise _divergence(step, view, "the loss")
     grad_exposure = None
     if state.exposures is not None:
         grad_exposure = exposure_gradient(rendered.color, grad_image)
@@ -272,7 +268,9 @@ def view_gradients(
     gradients = rendered.backward(grad_image, expected)._replace(exposure=grad_exposure)
     if edges is not None:
         np.add(gradients.vertices, edges, out=gradients.vertices)
-    return ViewGradients(loss, gradients, gradients.finite(), edges is not None)
+    if not gradients.finite():
+        raise _divergence(step, view, "a gradient")
+    return ViewGradients(loss, gradients, edges is not None)
 
 
 def _step_on_gpu(state: State, view: View, step: int, fraction: float) -> float | None:
@@ -316,6 +314,5 @@ def exposure_gradient(image: np.ndarray, grad_image: np.ndarray) -> np.ndarray:
 
 def kept_faces(state: State) -> np.ndarray:
     """(f,) bool: the triangles that pruning keeps."""
-    mesh = state.result()
-    keep = (mesh.colors[mesh.faces, 3] >= state.config.prune_opacity).any(axis=1)
+    keep = (state.colors[state.mesh.faces, 3] >= state.config.prune_opacity).any(axis=1)
     return keep if keep.any() else np.ones(len(keep), bool)

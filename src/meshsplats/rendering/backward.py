@@ -102,7 +102,7 @@ class TapedRendering:
             self._options.cutoff, self._options.ramp_height = ramp.cutoff, ramp.height
             self._options.ramp_slope, self._options.ramp_leak = ramp.slope, ramp.leak
             self._options.ramp_width = ramp.width * samples
-        self._camera = camera_struct(camera.with_near_plane(triangles.vertices))
+        self._camera = camera_struct(camera.with_near_plane(triangles.vertices, world_to_camera))
         if world_to_camera is not None:
             self._camera.world_to_camera = (ctypes.c_double * 12)(*world_to_camera[:3].ravel())
         self._mesh = mesh_struct(keep, triangles._replace(normals=None))
@@ -208,20 +208,8 @@ class TapedRendering:
         return sums
 
 
-def visible_pixels(
-    triangles: Triangles,
-    camera: Camera,
-    *,
-    mask: np.ndarray | None = None,
-    samples: int = 1,
-    threads: int | None = None,
-) -> np.ndarray:
-    """(v,) float32 visible pixels of each vertex: sums of its blending weights over the image.
-
-    Args:
-        mask: (h, w) bool pixels that count; all by default. The others are those of ``TapedRendering``.
-    """
+def visible_pixels(triangles: Triangles, camera: Camera, *, threads: int | None = None) -> np.ndarray:
+    """(v,) float32 visible pixels of each vertex: sums of its blending weights over the image."""
     blank = np.zeros((len(triangles.vertices), 1), np.float32)
-    rendering = TapedRendering(triangles._replace(values=blank), camera, samples=samples, threads=threads)
-    ones = np.ones_like(rendering.attributes) if mask is None else mask[..., None]
-    return rendering.scatter_to_vertices(ones)[:, 0]
+    rendering = TapedRendering(triangles._replace(values=blank), camera, threads=threads)
+    return rendering.scatter_to_vertices(np.ones_like(rendering.attributes))[:, 0]

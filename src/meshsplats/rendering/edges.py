@@ -103,6 +103,7 @@ def edge_gradients(
             over their area.
         beyond: ``corners_beyond(mesh.faces)``, precomputed, if you have it.
     """
+    camera = camera.with_near_plane(mesh.vertices)  # not measured again on the triangles of front_faces
     fine, near = camera.scaled(EDGE_SAMPLES), camera.near_plane(mesh.vertices)
     front = front_faces(mesh, fine, cutoff, background=background, threads=threads)
     rotation, offset = fine.world_to_camera[:3, :3], fine.world_to_camera[:3, 3]

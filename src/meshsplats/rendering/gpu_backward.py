@@ -52,7 +52,6 @@ class GpuRendering:
         """
         options = checked_options(Pointers(), camera, background, samples, None)
         self._background = np.asarray(background, np.float32)
-        camera = camera.with_near_plane(triangles.vertices)
         self._matrix = camera.world_to_camera if world_to_camera is None else world_to_camera
         if triangles.values is not None and not triangles.values.shape[1]:
             triangles = triangles._replace(values=None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from meshsplats._arrays import subsample
 from meshsplats.camera import Camera
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -27,17 +28,17 @@ def layers(scene: SplatMesh | GaussianCloud, camera: Camera) -> float:
     """
     if isinstance(scene, SplatMesh):
         count = len(scene.faces)
-        corners = scene.vertices[scene.faces[:: _step(count)]]
+        places, corners = scene.vertices, scene.vertices[subsample(scene.faces, SAMPLE)]
         reach = np.zeros(corners.shape[:2])
     else:
         count = len(scene)
-        corners = scene.means[:: _step(count), None]
+        places, corners = scene.means, subsample(scene.means, SAMPLE)[:, None]
         # The two largest axes are what is seen on average.
-        ordered = np.sort(scene.scales[:: _step(count)].astype(np.float64), axis=1)
+        ordered = np.sort(subsample(scene.scales, SAMPLE).astype(np.float64), axis=1)
         reach = _REACH * np.sqrt(ordered[:, 1:].prod(axis=1))[:, None]
     if not count:
         return 0.0
-    near = camera.near_plane(scene.vertices if isinstance(scene, SplatMesh) else scene.means)
+    near = camera.near_plane(places)
     with np.errstate(over="ignore", invalid="ignore"):
         points = corners.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         depth = np.maximum(points[..., 2], near)
@@ -67,13 +68,9 @@ def fragments(scene: SplatMesh | GaussianCloud, camera: Camera, samples: int) ->
 def affordable(scene: SplatMesh | GaussianCloud, camera: Camera, samples: int, most: float) -> Camera | None:
     """``camera``, or the same of a half, a quarter or an eighth of the size, whose image has at most ``most``
     fragments; None if none has."""
-    share = 1.0
+    share, whole = 1.0, fragments(scene, camera, samples)
     while share >= SMALLEST:
-        if share * share * fragments(scene, camera, samples) <= most:
+        if share * share * whole <= most:
             return camera if share == 1 else camera.scaled(share)
         share /= 2
     return None
-
-
-def _step(count: int) -> int:
-    return max(1, -(-count // SAMPLE))

@@ -169,7 +169,7 @@ def _image(
     ramp: OpacityRamp | None,
 ) -> tuple[Raster, torch.Tensor]:
     """The image, and (h, w) ``sum_k T_k a_k |c_k|^2``, with the background's."""
-    camera = camera.with_near_plane(vertices.detach().numpy())
+    camera = camera.with_near_plane(triangles.vertices, pose.detach().numpy())
     posed = replace(camera, world_to_camera=pose.detach().numpy())
     x, y = reference._sample_positions(camera, samples)
     vertices, attributes = vertices.double(), attributes.double()

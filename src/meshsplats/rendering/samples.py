@@ -42,8 +42,9 @@ def needed_samples(mesh: SplatMesh, cameras: Sequence[Camera]) -> int:
         return 1  # its filter is as wide as a pixel, as that of splats
     if mesh.face_splat is None or not len(mesh.faces):
         return FEWEST
-    step = -(-len(mesh.splats) // FANS)
-    starts, counts = mesh.splats.starts[::step], mesh.splats.counts[::step]
+    splats = mesh.splats
+    step = -(-len(splats) // FANS)
+    starts, counts = splats.starts[::step], splats.counts[::step]
     first = np.cumsum(counts) - counts
     rows = np.arange(int(counts.sum())) - np.repeat(first, counts) + np.repeat(starts, counts)
     corners = mesh.faces[rows]

@@ -59,11 +59,12 @@ def score(state: State, views: Sequence[View], turn: int = 0) -> Scores:
     total, most, pixels = np.zeros(n), np.zeros(n), np.zeros(n)
     all_pixels, clear_pixels = np.zeros(n), np.zeros(n)
     in_view = np.zeros(n, bool)
+    triangles = mesh.triangles._replace(values=np.zeros((len(mesh.vertices), 3), np.float32))
     step = -(-len(views) // JUDGED_VIEWS)
     for index in range(turn % step, len(views), step):
         view = views[index]
         rendering = TapedRendering(
-            mesh.triangles._replace(values=np.zeros((len(mesh.vertices), 3), np.float32)),
+            triangles,
             view.camera,
             background=view.background,
             samples=samples_of(view, state.config),

@@ -228,10 +228,10 @@ class GrowingLoop(TrainingLoop):
             self._reduced[factor] = reduced_views(views, factor, self._store)
         return self._reduced[factor]
 
-    def _adapt(self, before: int) -> None:
+    def _adapt(self) -> None:
         if self.config.shape_decay:
             # In proportion to the learning rate, as the steps that it is weighed against.
-            color_rate, _ = learning_rates(self.config, before, self.fraction)
+            color_rate, _ = learning_rates(self.config, self.step - 1, self.fraction)
             share = self.config.shape_decay * color_rate / self.config.color_rate
             self.state.round_fans(corners_of(self.state.mesh), min(share, 1.0))
         # In a run by minutes, a slow step or report may put the fraction back.

@@ -520,7 +520,8 @@ def _sample(mesh: SplatMesh) -> SplatMesh:
     if mesh.face_splat is None:
         keep = np.arange(len(mesh.faces)) < SAMPLE
         return mesh.keep_faces(keep)
-    return mesh.keep_faces(mesh.splats.of_face % max(1, len(mesh.splats) // SAMPLE) == 0)
+    splats = mesh.splats
+    return mesh.keep_faces(splats.of_face % max(1, len(splats) // SAMPLE) == 0)
 
 
 # ---- Splats

@@ -182,7 +182,7 @@ class MeshFrames:
         data = np.ascontiguousarray(array)
         self.allocate(name, data.nbytes)
         if data.nbytes:
-            self.device.device.queue.write_buffer(self._buffers[name], 0, data)
+            self.write(name, data)
 
     def write(self, name: str, array: np.ndarray, offset: int = 0) -> None:
         """Writes an array into a buffer from byte ``offset`` on."""
@@ -247,7 +247,7 @@ class MeshFrames:
         if s > 1:
             self.allocate("pixels", 16 * camera.width * camera.height)
         frame = frame_uniform(camera, settings, counts, self.capacity, self.offsets, pose)
-        self.device.device.queue.write_buffer(self._buffers["frame"], 0, frame)
+        self.write("frame", frame)
         return counts
 
     def repeat(
@@ -283,8 +283,7 @@ class MeshFrames:
         )
 
     def counters(self) -> np.ndarray:
-        data = self.device.device.queue.read_buffer(self._buffers["counters"], 0, 64)
-        return np.frombuffer(data, np.uint32).copy()
+        return self.read("counters", 64).copy()
 
     def read_pixels(self, width: int, height: int, samples: int) -> np.ndarray:
         """(h, w, 4) float32: the pixels of the last frame."""
@@ -293,8 +292,7 @@ class MeshFrames:
             counts = {"columns": width, "rows": height}
             self.run(_RESOLVE_STEPS, "color", counts, DrawSettings())
             name = "pixels"
-        data = self.device.device.queue.read_buffer(self._buffers[name], 0, 16 * width * height)
-        return np.frombuffer(data, np.float32).reshape(height, width, 4)
+        return self.read(name, 16 * width * height).view(np.float32).reshape(height, width, 4)
 
     def run(
         self,
@@ -430,13 +428,14 @@ def checked_fans(mesh: SplatMesh, most: int) -> np.ndarray:
         DeviceError: a splat of more than ``most`` triangles.
         ValueError: two splats share a vertex.
     """
-    starts = np.append(mesh.splats.starts, len(mesh.faces)).astype(np.uint32)
+    splats = mesh.splats
+    starts = np.append(splats.starts, len(mesh.faces)).astype(np.uint32)
     if np.diff(starts).max() > most:
         raise DeviceError(
             f"the filter of the GPU takes splats of up to {most:,} triangles; one has"
             f" {np.diff(starts).max():,}. Use device='cpu'"
         )
-    if mesh.splats.share_vertices:
+    if splats.share_vertices:
         raise ValueError("two splats share a vertex: a filter widens the triangles of each splat apart")
     return starts
 

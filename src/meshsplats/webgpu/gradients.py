@@ -251,7 +251,7 @@ class GradientRenderer:
             MemoryError: a single pixel does not fit.
             ValueError: two splats share a vertex, and there is a filter.
         """
-        camera = camera.with_near_plane(triangles.vertices)
+        camera = camera.with_near_plane(triangles.vertices, pose)
         h, w = camera.height, camera.width
         images = Images(np.zeros((h, w, 3), np.float32), np.ones((h, w), np.float32))
         values = triangles.values
