@@ -203,8 +203,11 @@ def _described(command: type[T], shown: Collection[str], options: Collection[str
             continue
         if part.default is not MISSING:
             values[name] = part.default
-        help_ = tyro.conf.arg(help=_with_flags(texts.get(name, ""), options))
-        hints[name] = Annotated[hint, help_ if name in shown else tyro.conf.Suppress]
+        if name not in shown:
+            hint = Annotated[hint, tyro.conf.Suppress]
+        elif name in texts:  # else its type has the help, for options of several commands
+            hint = Annotated[hint, tyro.conf.arg(help=_with_flags(texts[name], options))]
+        hints[name] = hint
     made = type(
         command.__name__, (command,), {"__annotations__": hints, "__doc__": command.__doc__, **values}
     )

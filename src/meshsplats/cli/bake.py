@@ -47,8 +47,6 @@ class Bake(Command):
     filter_px2: Number = None
     """Variance of the filter in square pixels, 0 to 100. Default: the mesh's own."""
     origin: Origin = "keep"
-    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False

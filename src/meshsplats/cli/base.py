@@ -50,8 +50,6 @@ class Base(Command):
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
     origin: Origin = "keep"
-    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False

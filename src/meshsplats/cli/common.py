@@ -52,7 +52,11 @@ Box = Annotated[
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 Origin = Annotated[
     Literal["keep", "local"] | tuple[float, float, float],
-    tyro.conf.arg(metavar="{keep,local,X Y Z}"),
+    tyro.conf.arg(
+        metavar="{keep,local,X Y Z}",
+        help="Georeferenced scenes. keep: the result stands where the input does; local: without its origin;"
+        " X Y Z: coordinates are relative to this point of the world, which several scenes can share.",
+    ),
 ]
 
 NAMED_COLORS: dict[str, tuple[float, float, float]] = {

@@ -160,8 +160,6 @@ class Convert(Command):
     """Convert in blocks, so that memory does not grow with the file: into a .ply mesh, or with --as-splats
     into a .ply of splats, without a preview. The result is the same."""
     origin: Origin = "keep"
-    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world, which several scenes can share."""
     no_preview: bool = False
     """Write no preview."""
     no_sidecar: bool = False

@@ -46,8 +46,6 @@ class Deform(Command):
     layers 0 in .npz, and 1/50000 of the base's diagonal in other formats, whose readers do not know the order
     of coplanar layers."""
     origin: Origin = "keep"
-    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False

@@ -105,8 +105,6 @@ class Levels(Command):
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the
     file, else -y."""
     origin: Origin = "keep"
-    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world, which several scenes can share."""
     resume: bool = False
     """Continue an interrupted run of the same command, from the levels in FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)

@@ -76,8 +76,6 @@ class Tiles(Command):
     images of both. blend: viewers blend true opacities; mask: they draw as solid what is at least 20 %
     opaque; opaque: solid triangles, cut there."""
     origin: Origin = "keep"
-    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world, which several scenes can share."""
     resume: bool = False
     """Continue an interrupted run of the same command, from FOLDER.partial."""
     reading: SplatOptions = field(default_factory=SplatOptions)

@@ -257,8 +257,6 @@ class TrainingCommand(Command):
     device: Annotated[Literal["cpu", "gpu"], tyro.conf.arg(metavar="NAME")] = "cpu"
     """cpu, or gpu: a graphics card (extra gpu)."""
     origin: Origin = "keep"
-    """Georeferenced scenes. keep: the result stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world, which several scenes can share."""
     json: bool = False
     """Print the result as JSON."""
     force: bool = False
