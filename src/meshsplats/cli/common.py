@@ -17,6 +17,7 @@ import numpy as np
 import tyro
 
 from meshsplats._arrays import subsample
+from meshsplats._core.library import processors
 from meshsplats._origin import in_words, lost_detail, sampled
 from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
@@ -612,7 +613,7 @@ def announce_cost(
 
     some = subsample(cameras, 8)
     each = float(np.mean([fragments(scene, camera, samples) for camera in some]))
-    seconds = each * len(cameras) / FRAGMENTS_A_SECOND / (threads or os.cpu_count() or 1)
+    seconds = each * len(cameras) / FRAGMENTS_A_SECOND / (threads or processors())
     count = layers(scene, some[0])
     if seconds > LONG_SECONDS and count > MANY_LAYERS:
         long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
