@@ -391,6 +391,9 @@ def test_another_scene_or_other_options_are_not_mixed(splats, tmp_path, monkeypa
         build_tiles(stream_gaussians(other), out, SMALL, resume=True)
     with pytest.raises(ValueError, match="started with other reading"):
         build_tiles(stream_gaussians(splats, axes="y-up"), out, SMALL, resume=True)
+    for more in ({"kernel": "antialiased"}, {"activated": ["scales"]}):
+        with pytest.raises(ValueError, match="started with other reading"):
+            build_tiles(stream_gaussians(splats, **more), out, SMALL, resume=True)
 
 
 def test_a_torn_line_of_the_journal_does_not_count(tmp_path):

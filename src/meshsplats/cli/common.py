@@ -60,6 +60,11 @@ Origin = Annotated[
     ),
 ]
 
+Missing = Annotated[
+    Literal["error", "skip"],
+    tyro.conf.arg(help="With --data: images that are missing are an error, or their views are left out."),
+]
+
 NAMED_COLORS: dict[str, tuple[float, float, float]] = {
     "white": (1.0, 1.0, 1.0),
     "black": (0.0, 0.0, 0.0),
@@ -172,8 +177,7 @@ class ViewOptions:
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): the cameras of its test views."""
     downscale: int = 1
     """With --data: factor by which images are smaller than the photographs."""
-    missing: Literal["error", "skip"] = "error"
-    """With --data: images that are missing are an error, or their views are left out."""
+    missing: Missing = "error"
     elevation: Number = None
     """Degrees above the horizon. Default: 15; 0 with --look-around."""
     azimuth: float = 0.0
@@ -612,10 +616,12 @@ def announce_cost(
     from meshsplats.rendering.layers import FRAGMENTS_A_SECOND, fragments, layers
 
     some = subsample(cameras, 8)
+    count = layers(scene, some[0])
+    if count <= MANY_LAYERS:
+        return
     each = float(np.mean([fragments(scene, camera, samples) for camera in some]))
     seconds = each * len(cameras) / FRAGMENTS_A_SECOND / (threads or processors())
-    count = layers(scene, some[0])
-    if seconds > LONG_SECONDS and count > MANY_LAYERS:
+    if seconds > LONG_SECONDS:
         long = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
         say(f"about {count:,.0f} layers lie over each other at each pixel: this may take about {long}")
 

@@ -27,6 +27,7 @@ from meshsplats.cli.common import (
     Count,
     File,
     Folder,
+    Missing,
     Number,
     Origin,
     Output,
@@ -130,8 +131,7 @@ class Convert(Command):
     folder that has one. Default: those of the input if it is a model folder, else none."""
     data: Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
-    missing: Literal["error", "skip"] = "error"
-    """With --data: images that are missing are an error, or their views are left out."""
+    missing: Missing = "error"
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, of the
     file, else -y."""

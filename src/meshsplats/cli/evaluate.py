@@ -23,6 +23,7 @@ from meshsplats.cli.common import (
     Count,
     File,
     Folder,
+    Missing,
     Output,
     SplatOptions,
     Text,
@@ -117,8 +118,7 @@ class Evaluate(Command):
     """Factor by which images are smaller than the photographs. Default: 1, or that of the protocol."""
     test_every: int = 8
     """Every n-th view is held out, if the data set has no split."""
-    missing: Literal["error", "skip"] = "error"
-    """With --data: images that are missing are an error, or their views are left out."""
+    missing: Missing = "error"
     protocol: Annotated[
         Literal["mipnerf360", "mipnerf360-9", "tanks-and-temples", "deep-blending"] | None,
         tyro.conf.arg(metavar="{" + ",".join(BENCHMARKS) + "}", help_behavior_hint=""),

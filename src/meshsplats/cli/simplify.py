@@ -6,7 +6,6 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import tyro
@@ -19,6 +18,7 @@ from meshsplats.cli.common import (
     Count,
     File,
     Folder,
+    Missing,
     Number,
     Origin,
     Output,
@@ -61,13 +61,10 @@ class Simplify(Command):
     model folder, else images of 1000 pixels that hold the subject."""
     data: Folder = None
     """Data set of photographs, in place of --cameras: the cameras of its training views."""
-    missing: Literal["error", "skip"] = "error"
-    """With --data: images that are missing are an error, or their views are left out."""
+    missing: Missing = "error"
     no_preview: bool = False
     """Write no preview."""
     origin: Origin = "keep"
-    """Of georeferenced splats. keep: the file stands where the input does; local: without its origin; X Y Z:
-    coordinates are relative to this point of the world."""
     reading: SplatOptions = field(default_factory=SplatOptions)
     threads: Count = None
     """Maximum number of threads. Default: all processors."""

@@ -11,7 +11,7 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
-from meshsplats.cli.common import Count, File, Folder, Text, cameras_beside, parse_up
+from meshsplats.cli.common import Count, File, Folder, Missing, Text, cameras_beside, parse_up
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset
@@ -33,8 +33,7 @@ class TargetOptions:
     """With --data: factor by which images are smaller than the photographs."""
     test_every: int = 8
     """With --data: every n-th view is held out, if the data set has no split; 0: none."""
-    missing: Literal["error", "skip"] = "error"
-    """With --data: images that are missing are an error, or their views are left out."""
+    missing: Missing = "error"
     views: Count = None
     """Without --data: number of training images. Default: one per second, or per two --steps, from 200 to
     1000."""

@@ -7,7 +7,7 @@ import os
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -19,6 +19,7 @@ from meshsplats.cli.common import (
     Count,
     File,
     Folder,
+    Missing,
     PartOptions,
     SplatOptions,
     Text,
@@ -120,8 +121,7 @@ class View(Command):
     folder that has one. Default: those of the input, if it is a model folder."""
     data: Folder = None
     """Data set of photographs (COLMAP, NeRF-synthetic, nerfstudio, LLFF): viewpoints to choose from."""
-    missing: Literal["error", "skip"] = "error"
-    """With --data: images that are missing are an error, or their views are left out."""
+    missing: Missing = "error"
     up: Text = None
     """Direction that points up: an axis (-y, z, ...) or x,y,z. Default: that of the cameras, else of the
     mesh."""

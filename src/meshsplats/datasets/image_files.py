@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -415,10 +415,9 @@ def _first(names: Sequence[str]) -> str:
 def _camera(frame: Frame, pinhole: Pinhole, where: str) -> Camera:
     matrix = np.eye(4)
     matrix[:3] = pinhole.rotation @ frame.world_to_camera[:3]
-    lens: dict[str, Any] = {key: getattr(pinhole, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
-    lens |= {} if frame.near is None else {"near": frame.near}
+    lens = {key: getattr(pinhole, key) for key in ("fx", "fy", "cx", "cy", "width", "height")}
     try:
-        return Camera(matrix, **lens, name=frame.name + pinhole.suffix)
+        return Camera(matrix, **lens, near=frame.near, name=frame.name + pinhole.suffix)
     except ValueError as error:
         raise FileFormatError(f"{where}: {error}") from None
 

@@ -277,7 +277,7 @@ class TrainingLoop:
         self.last_loss: float | None = None
         self.held_out: float | None = None
         self.report_cost = self.save_cost = self.step_cost = 0.0
-        self.scored_views: tuple[View, ...] = subsample(dataset.test, SCORED_VIEWS)
+        self.scored_views: tuple[View, ...] = subsample(self.dataset.test, SCORED_VIEWS)
         self.views_limited = False
         self.quarter = int(MIN_PREVIEWS * self.fraction)
         share = config.opaque_share

@@ -8,8 +8,9 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO, Literal, get_args
+from typing import Any, BinaryIO, Literal, get_args
 
 import numpy as np
 
@@ -300,6 +301,15 @@ class SplatStream:
                 yield transformed(reading.of_kernel(whole.select(part)), to_y_down)
 
     @property
+    def reading(self) -> list[Any]:
+        """What the splats depend on besides the files, for JSON: ``axes``, ``strict``, and what is given of
+        ``kernel``, ``time`` and ``activated``."""
+        own = self._reading
+        given = {"kernel": own.kernel, "time": own.time, "activated": sorted(own.activated) or None}
+        changed = {name: value for name, value in given.items() if value is not None}
+        return [self.axes, self.strict, *([changed] if changed else [])]
+
+    @cached_property
     def up(self) -> np.ndarray | None:
         """(3,) unit direction that points up, where all of the files say so, and the same."""
         return shared_up([self._up(path) for path in self.paths])

@@ -322,9 +322,8 @@ class _Build:
     def _check_start(self) -> None:
         """Notes what the run is about, or refuses to resume another one."""
         files = [[str(path), os.stat(path).st_size, os.stat(path).st_mtime_ns] for path in self._source.paths]
-        reading = [self._source.axes, self._source.strict]
         options = json.loads(json.dumps(asdict(self._options)))
-        facts: dict[str, Any] = {"files": files, "reading": reading, "options": options}
+        facts: dict[str, Any] = {"files": files, "reading": self._source.reading, "options": options}
         if self._source.origin.any():
             facts["origin"] = self._source.origin.tolist()
         before = self.journal.find("start")
