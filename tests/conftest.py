@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from _needs import lacking, skipped_lines
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -47,20 +48,27 @@ def make_link(link: Path, target: Path) -> None:
         pytest.skip("symbolic links are not recognised here")
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Says what was skipped, and how to get it."""
+    skipped = [report.longrepr for report in terminalreporter.stats.get("skipped", [])]
+    for line in skipped_lines(str(where[2]) for where in skipped if isinstance(where, tuple)):
+        terminalreporter.write_line(line)
+
+
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     """A headless Chromium, for the tests of the viewer; skips where there is none."""
     from _browser import PROGRAM, Browser
 
     if PROGRAM is None:
-        pytest.skip("Chromium is not installed here (the variable CHROMIUM names it)")
+        lacking("browser", "Chromium is not installed here")
     if not hasattr(os, "posix_spawn"):
         pytest.skip("Chromium is driven through pipes, which needs a POSIX system")
     try:
         running = Browser()
         running.send("Browser.getVersion", timeout=120)
     except (OSError, TimeoutError, ConnectionError) as error:
-        pytest.skip(f"Chromium does not start here: {error}")
+        lacking("browser", f"Chromium does not start here: {error}")
     yield running
     running.close()
 

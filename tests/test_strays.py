@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _gpu import need_gpu
 from conftest import shared_data
 
 import meshsplats as ms
@@ -94,7 +95,7 @@ def test_a_splat_of_any_size_is_drawn_as_a_plane(power, camera):
 
 @pytest.mark.parametrize("power", [40, 80])
 def test_a_splat_of_any_size_on_the_gpu(power, camera):
-    pytest.importorskip("wgpu")
+    need_gpu()
     mesh = ms.convert(beside(ball(), np.array([[0.3, 2, 1]]), np.exp(power)))
     images = [render(mesh, camera, samples=2, device=device).color for device in ("cpu", "gpu")]
     assert np.mean(np.abs(images[0] - images[1]) > 0.01) < 1e-3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+from _needs import lacking
 
 from meshsplats.webgpu import kernels
 
@@ -47,5 +48,5 @@ def test_kernels_of_gradients_and_training_compile(browser, tmp_path, source, en
     problems = page.run(f"{COMPILE}({json.dumps(source)}, {json.dumps(entries)})")
     page.close()
     if problems is None:
-        pytest.skip("Chromium has no WebGPU here")
+        lacking("browser", "Chromium has no WebGPU here")
     assert problems == []

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from _browser import Browser, Page
+from _needs import lacking
 from _pages import HEIGHT, WIDTH, cameras_fixture, cloud_fixture, levels, mesh_fixture  # noqa: F401
 
 import meshsplats as ms
@@ -33,7 +34,7 @@ def open_page(browser: Browser, url: str, before: str = "") -> Page:
         reason = page.text("#messageText")
         page.close()
         if "no graphics device" in reason or "no WebGPU" in reason:
-            pytest.skip(f"Chromium draws without WebGPU here: {reason}")
+            lacking("browser", f"Chromium draws without WebGPU here: {reason}")
         raise AssertionError(reason)
     return page
 

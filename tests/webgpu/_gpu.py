@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-import pytest
+from _needs import lacking
 from _rendering import outputs
 
 from meshsplats import Camera, SplatMesh, render
@@ -26,10 +26,10 @@ def missing() -> str | None:
 
 
 def need_gpu() -> None:
-    """Skips without a GPU or a software driver."""
+    """Skips, or fails where one is required, without a GPU or a software driver."""
     reason = missing()
     if reason:
-        pytest.skip(reason)
+        lacking("gpu", reason)
 
 
 def psnr(one: np.ndarray, two: np.ndarray) -> float:
