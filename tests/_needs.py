@@ -21,12 +21,14 @@ def lacking(need: str, reason: str) -> NoReturn:
     remedy = REMEDIES[need]
     required = os.environ.get(VARIABLE, "").split(",")
     if need in required:
-        pytest.fail(f"{VARIABLE} asks for the tests of {need}, but {reason}; it takes {remedy}", pytrace=False)
+        pytest.fail(
+            f"{VARIABLE} asks for the tests of {need}, but {reason}; it takes {remedy}", pytrace=False
+        )
     pytest.skip(f"no {need}: {reason} ({remedy})")
 
 
 def skipped_lines(reasons: Iterable[str], most: int = 12) -> list[str]:
-    """A line for each reason, the most frequent first; reasons that differ from their first colon on are one."""
+    """A line for each reason, the most frequent first. Reasons are one that are the same up to a colon."""
     kinds: dict[str, list[str]] = {}
     for reason in reasons:
         kinds.setdefault(reason.removeprefix("Skipped: ").partition(":")[0], []).append(reason)

@@ -8,13 +8,13 @@ from _needs import VARIABLE, lacking, skipped_lines
 
 def test_a_test_without_its_browser_is_skipped_with_the_remedy(monkeypatch):
     monkeypatch.setenv(VARIABLE, "")
-    with pytest.raises(pytest.skip.Exception, match="no browser: it does not start .*apt install chromium"):
+    with pytest.raises(pytest.skip.Exception, match=r"no browser: it does not start .*apt install chromium"):
         lacking("browser", "it does not start")
 
 
 def test_it_fails_where_a_browser_is_required(monkeypatch):
     monkeypatch.setenv(VARIABLE, "gpu,browser")
-    with pytest.raises(pytest.fail.Exception, match="MESHSPLATS_REQUIRE asks for .*browser, but it is gone"):
+    with pytest.raises(pytest.fail.Exception, match=r"MESHSPLATS_REQUIRE asks for .*browser, but it is gone"):
         lacking("browser", "it is gone")
     monkeypatch.setenv(VARIABLE, "gpu")
     with pytest.raises(pytest.skip.Exception):
@@ -22,7 +22,11 @@ def test_it_fails_where_a_browser_is_required(monkeypatch):
 
 
 def test_each_reason_has_a_line_with_its_count_the_most_frequent_first():
-    reasons = ["Skipped: no symbolic links", *["Skipped: real data not here: a.ply"] * 2, "real data not here: b.ply"]
+    reasons = [
+        "Skipped: no symbolic links",
+        *["Skipped: real data not here: a.ply"] * 2,
+        "real data not here: b.ply",
+    ]
     assert skipped_lines(reasons) == [
         "    3 skipped: real data not here: a.ply",
         "    1 skipped: no symbolic links",
