@@ -3,11 +3,11 @@
 
     python tools/compare_commits.py v0.1.0 HEAD --rounds 7
 
-Each commit is installed into a folder of its own (build/compared), with this Python's libraries. Both then take
-the same measurements in turns, A B, B A, ..., in processes of their own, so that a machine whose speed drifts is
-as slow for one as for the other. A figure has moved where the median of the paired ratios is farther from 1 than
-their noise, and than half a per cent. Exit code 1 if a figure became worse. The scene is our own, or splats given
-with --splats.
+Each commit is installed into a folder of its own (build/compared), with this Python's libraries. Both then
+take the same measurements in turns, A B, B A, ..., in processes of their own, so that a machine whose speed
+drifts is as slow for one as for the other. A figure has moved where the median of the paired ratios is
+farther from 1 than their noise, and than half a per cent. Exit code 1 if a figure became worse. The scene
+is our own, or splats given with --splats.
 """
 
 from __future__ import annotations
