@@ -56,7 +56,7 @@ CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 .DEFAULT_GOAL := help
 
 help:
-	@echo 'make demo    splats to mesh, GLB, images and a comparison, in $(DEMO)/'
+	@echo 'make demo    splats to mesh, GLB, images, a comparison and a page, in $(DEMO)/'
 	@echo 'make test    the tests'
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
@@ -86,13 +86,7 @@ $(VENV)/installed-dev: $(BUILD_INPUTS) | $(BIN)/python
 	@touch $(VENV)/installed $@
 
 demo: $(VENV)/installed
-	$(BIN)/python -m meshsplats.demo_scene $(DEMO)/scene.ply
-	$(BIN)/meshsplats convert $(DEMO)/scene.ply -o $(DEMO)/scene.glb --force
-	$(BIN)/meshsplats render $(DEMO)/scene.glb -o $(DEMO)/turntable --orbit 24 --width 480 --force
-	$(BIN)/meshsplats compare $(DEMO)/scene.ply $(DEMO)/scene.glb -o $(DEMO)/compare --force
-	@echo
-	@echo 'Look in $(DEMO)/: scene.glb opens in any glTF viewer, turntable/ shows it turning,'
-	@echo 'compare/ shows splats, mesh and error side by side.'
+	$(BIN)/meshsplats demo -o $(DEMO) --force
 
 # A worker for each processor; each takes whole files, whose tests share what they make.
 test: $(VENV)/installed-dev

@@ -34,6 +34,7 @@ from meshsplats.cli.messages import (
 from meshsplats.errors import ClusterError, DeviceError
 
 COMMANDS = {
+    "demo": ("meshsplats.cli.demo:Demo", "the first commands, on a scene of its own"),
     "convert": ("meshsplats.cli.convert:Convert", "splats to a mesh of translucent triangles"),
     "clean": ("meshsplats.cli.clean:Clean", "splats or a mesh without its floaters"),
     "view": ("meshsplats.cli.view:View", "a scene in the browser, or in one .html file for anyone"),
@@ -230,6 +231,8 @@ def _overview() -> str:
         "exit codes: 0 done, 1 wrong input, 2 wrong usage, 3 the output exists, 4 no space, 5 something is\n"
         "missing (a library, a program, memory); 128 + n ended by signal n, 141 by `| head`\n\n"
         "start with:\n"
+        "  meshsplats demo                          without a file\n"
+        "  meshsplats view scene.ply                in the browser\n"
         "  meshsplats convert scene.ply -o scene.glb"
     )
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -301,7 +299,7 @@ class View(Command):
         print("next: open it with a double click, or send it to someone; it needs no network")
 
     def _serve(self, page: Page, result: dict[str, Any]) -> None:
-        from meshsplats.viewer.server import serving
+        from meshsplats.viewer.server import open_page, serving
 
         with serving(page.html) as server:
             if self.json:
@@ -310,7 +308,7 @@ class View(Command):
                 print(_contents(result))
                 print(_errors(result))
                 print(f"{server.url}\nCtrl-C ends", flush=True)
-            if not self.no_open and not _opened(server.url):
+            if not self.no_open and not open_page(server.url):
                 say("no browser was found: open the address above in one, on this machine")
             try:
                 server.serve_forever()
@@ -355,16 +353,6 @@ def _likeness(cloud: GaussianCloud, merged: GaussianCloud, cameras: list[Camera]
 
     camera = _camera(cloud, cameras)
     return psnr(*(render_splats(each, camera).color for each in (merged, cloud)))
-
-
-def _opened(url: str) -> bool:
-    """Whether a browser with a window opens ``url``."""
-    import webbrowser
-
-    windowless = sys.platform not in ("win32", "darwin") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    )
-    return not windowless and webbrowser.open(url)
 
 
 def _contents(result: dict[str, Any]) -> str:

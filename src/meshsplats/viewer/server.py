@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import hmac
+import os
 import secrets
+import sys
+import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 HOST = "127.0.0.1"
+
+
+def open_page(url: str) -> bool:
+    """Whether a browser with a window opens ``url``."""
+    windowless = sys.platform not in ("win32", "darwin") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
+    return not windowless and webbrowser.open(url)
 
 
 class _Handler(BaseHTTPRequestHandler):
