@@ -195,8 +195,11 @@ $(DOCS_VENV)/installed: tools/docs-requirements.txt
 	@$(DOCS_VENV)/bin/python -m pip --disable-pip-version-check --quiet install --requirement $<
 	@touch $@
 
-docs: $(DOCS_VENV)/installed
-	$(DOCS_VENV)/bin/python tools/docs_site.py -o site
+docs: $(DOCS_VENV)/installed $(VENV)/installed
+	@mkdir -p build/docs
+	$(BIN)/python -m meshsplats.demo_scene build/docs/scene.ply
+	$(BIN)/meshsplats view build/docs/scene.ply -o build/docs/scene.html --title 'A still life of splats' --force
+	$(DOCS_VENV)/bin/python tools/docs_site.py -o site --page build/docs/scene.html
 
 lint: $(VENV)/installed-dev
 	$(BIN)/python -m ruff check .

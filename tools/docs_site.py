@@ -1,11 +1,12 @@
 """Makes the documents a site; ``make docs`` runs it:
 
-    python tools/docs_site.py -o site
+    python tools/docs_site.py -o site --page scene.html
 
 Documents keep the places that they have in the repository, so the same links work in both; README.md is the
-first page. A page for each group of public names comes from their docstrings, and one shows the examples.
-The site works from the disk, with its search, and loads nothing from other servers. It appears whole or not
-at all: broken links and anchors, docstrings that cannot be read and public names without a page are errors.
+first page, with a scene of ``meshsplats view`` in it (``--page``). A page for each group of public names
+comes from their docstrings, and one shows the examples. The site works from the disk, with its search, and
+loads nothing from other servers. It appears whole or not at all: broken links and anchors, docstrings that
+cannot be read and public names without a page are errors.
 
 Needs the packages of ``tools/docs-requirements.txt``.
 """
@@ -63,7 +64,23 @@ REFERENCE = {
 """Public names by page; names that are not listed come last."""
 
 
+PLACE_OF_SCENE = "<!-- On the site, the scene itself is here. -->"
+"""What the scene of ``--page`` replaces in README.md."""
+SCENE = "live/scene.html"
+"""Place of its page on the site."""
+MOST_BYTES = 5_000_000
+"""Of the page: visitors wait for it."""
+
+
 # Pages
+
+
+def frame_of_scene(address: str) -> str:
+    """HTML that shows the page at ``address`` inside another page."""
+    return (
+        f'<iframe src="{address}" title="A still life of splats, as a mesh and as splats: drag to turn"'
+        ' loading="lazy" allow="fullscreen" style="width: 100%; height: 30rem; border: 0"></iframe>'
+    )
 
 
 @cache
@@ -146,8 +163,8 @@ def moved_links(text: str, here: str) -> str:
     return re.sub(r"\]\(([\w./#-]+)\)", moved, text)
 
 
-def write_sources(folder: Path) -> None:
-    """All that Sphinx reads."""
+def write_sources(folder: Path, scene: bool) -> None:
+    """All that Sphinx reads. ``scene``: whether the first page shows one."""
     documents = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
     documents += sorted((ROOT / "benchmarks").rglob("*.md"))
     texts = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in documents}
@@ -161,6 +178,10 @@ def write_sources(folder: Path) -> None:
         f"\n```{{toctree}}\n:hidden:\n\n{below.replace(RESULTS, 'results/')}\n```\n"
     )
     index = texts.pop("README.md")
+    if scene:
+        if PLACE_OF_SCENE not in index:
+            raise SystemExit(f"README.md has no line {PLACE_OF_SCENE}")
+        index = index.replace(PLACE_OF_SCENE, f"```{{raw}} html\n{frame_of_scene(SCENE)}\n```")
     texts["index.md"] = index + navigation([place.removesuffix(".md") for place in [*texts, "index.md"]])
     for place, text in texts.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
@@ -222,15 +243,22 @@ def problems_of(site: Path) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Makes the documents a site.")
     parser.add_argument("-o", "--output", type=Path, default=Path("site"), help="folder of the site")
-    output = parser.parse_args().output.resolve()
+    parser.add_argument("--page", type=Path, help="page of meshsplats view, for the first page")
+    arguments = parser.parse_args()
+    output, page = arguments.output.resolve(), arguments.page
+    if page is not None and page.stat().st_size > MOST_BYTES:
+        raise SystemExit(f"{page} has {page.stat().st_size:,} bytes, more than {MOST_BYTES:,}")
     output.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".site-") as scratch:
         sources, site = Path(scratch, "sources"), Path(scratch, "site").resolve()
-        write_sources(sources)
+        write_sources(sources, page is not None)
         command = [sys.executable, "-m", "sphinx", "-b", "html", "-c", str(ROOT / "docs"), "-q"]
         command += ["--fail-on-warning", "--keep-going", "-d", f"{scratch}/doctrees", str(sources), str(site)]
         if subprocess.run(command).returncode:
             raise SystemExit("the site was not made")
+        if page is not None:
+            (site / SCENE).parent.mkdir()
+            shutil.copyfile(page, site / SCENE)
         if problems := problems_of(site):
             raise SystemExit("\n".join(["the site was not made:", *problems]))
         for name in (".buildinfo", "objects.inv"):

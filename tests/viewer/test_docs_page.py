@@ -1,0 +1,57 @@
+"""The page with a scene inside the first page of the documents' site."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import threading
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from _pages import cloud_fixture, mesh_fixture  # noqa: F401
+
+from meshsplats.viewer.page import make_page
+
+TOOL = Path(__file__).parents[2] / "tools" / "docs_site.py"
+if not TOOL.exists():
+    pytest.skip("the tools are no part of a wheel", allow_module_level=True)
+_spec = importlib.util.spec_from_file_location("docs_site", TOOL)
+assert _spec is not None
+assert _spec.loader is not None
+docs_site = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(docs_site)
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture
+def site(tmp_path, mesh, cloud):
+    """The address of a page that shows the scene as the site does, on a server as sites have one."""
+    (tmp_path / docs_site.SCENE).parent.mkdir()
+    (tmp_path / docs_site.SCENE).write_text(make_page(mesh, splats=cloud).html, encoding="utf-8")
+    frame = docs_site.frame_of_scene(docs_site.SCENE)
+    (tmp_path / "index.html").write_text(f"<!doctype html><title>site</title><h1>Title</h1>{frame}")
+    with ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(tmp_path))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/index.html"
+        server.shutdown()
+
+
+def test_the_scene_is_drawn_within_the_site(browser, site):
+    page = browser.page(site, 640, 560)
+    inside = "document.querySelector('iframe').contentDocument.body"
+    page.wait(f"{inside}.dataset.state === 'still'", 400)
+    drawn = page.screenshot()[120:500, 100:540]
+    assert page.run(f"{inside}.dataset.renderer") in ("exact", "sorted")
+    assert np.unique(drawn.reshape(-1, 3), axis=0).shape[0] > 100  # a scene, not a message
+    page.close()
+
+
+def test_the_readme_says_where_it_goes():
+    text = (TOOL.parents[1] / "README.md").read_text(encoding="utf-8")
+    assert text.count(docs_site.PLACE_OF_SCENE) == 1
