@@ -51,7 +51,7 @@ CORE_TESTS := test_rendering test_rendering_variants test_rendering_splats test_
 # Libraries of variants are not under test, nor is memory, which sanitizers need a lot of.
 CORE_TESTS_LEFT_OUT := unknown_variant or memory_stays_bounded
 
-.PHONY: help demo test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
+.PHONY: help demo fuzz test test-lowest test-blender test-sanitizers test-windows test-arm64 wheels \
 	release docs lint format clean
 .DEFAULT_GOAL := help
 
@@ -61,6 +61,7 @@ help:
 	@echo 'make test-lowest    those that need no extra, with the lowest versions allowed of Python, NumPy and the rest'
 	@echo 'make test-blender   those of the Blender part, with Blender $(BPY) (half a gigabyte each)'
 	@echo 'make test-sanitizers   those of the compiled core, with GCC'"'"'s sanitizers and with assertions'
+	@echo 'make fuzz    broken files against every reader, guided by coverage, for MINUTES=60'
 	@echo 'make wheels  wheels for Linux, Windows and macOS, in dist/'
 	@echo 'make test-windows, test-arm64   the tests with the wheels for Windows, under wine, and for arm64, under qemu'
 	@echo 'make release   all that a release consists of, in dist/ (docs/releasing.md)'
@@ -184,6 +185,12 @@ test-arm64: $(VENV)/installed-dev $(WHEELS_VENV)/installed
 	$(WHEELS_BIN)/python tools/arm64_python.py $(ARM64)/root $(ARM64)/wheel/*.whl
 	$(digest) qemu-aarch64-static -L $(ARM64)/root $(ARM64)/root/usr/bin/python3.11 -m pytest -p no:cacheprovider \
 	  -k 'not variants_do_not_change and not memory_stays_bounded' tests/rendering tests/conversion
+
+# Coverage-guided; the tests feed each reader a few dozen random changes.
+MINUTES ?= 60
+fuzz: $(VENV)/installed-dev
+	@$(PIP) install atheris
+	$(BIN)/python tests/fuzz/guided.py --minutes $(MINUTES)
 
 release: $(WHEELS_VENV)/installed
 	$(WHEELS_BIN)/python tools/release.py -o dist

@@ -65,8 +65,9 @@ def lost_detail(positions: np.ndarray) -> str:
 
 
 def _spread(positions: np.ndarray) -> tuple[np.ndarray, float, float] | None:
-    """Median (3,), extent, and the greatest coordinate; None without finite positions."""
-    finite = positions[np.isfinite(positions).all(axis=1)].astype(np.float64, copy=False)
+    """Median (3,), extent, and the greatest coordinate; None without positions that float32 could hold."""
+    holds = np.abs(positions) <= np.finfo(np.float32).max  # False for NaN
+    finite = positions[holds.all(axis=1)].astype(np.float64, copy=False)
     if not len(finite):
         return None
     low, center, high = np.quantile(finite, [_SHARE, 0.5, 1 - _SHARE], axis=0)

@@ -49,6 +49,15 @@ def same(a: ms.GaussianCloud, b: ms.GaussianCloud) -> None:
 # ---- Splats in a zip archive
 
 
+@pytest.mark.parametrize("suffix", [".zip", ".sog"])
+def test_names_that_are_no_text_are_an_error(tmp_path, suffix):
+    """The archive says that its names are UTF-8, and they are not; found by the fuzzer."""
+    path = zipped(tmp_path / f"scan{suffix}", {"\u00e9.ply": ply_bytes(tmp_path)})
+    path.write_bytes(path.read_bytes().replace("\u00e9".encode(), b"\xe9\xe9"))
+    with pytest.raises(FileFormatError, match="zip"):
+        load_gaussians(path)
+
+
 @pytest.mark.parametrize("method", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 @pytest.mark.parametrize("kind", ["ply", "spz", "splat"])
 def test_the_only_splats_in_an_archive_are_read(tmp_path, kind, method):

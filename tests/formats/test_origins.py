@@ -90,6 +90,12 @@ def test_the_distance_in_extents_decides():
     assert choose_origin(10_000 * points + FAR).any()
 
 
+def test_positions_beyond_float32_have_none():
+    """Differences of the largest doubles overflow; found by the fuzzer, in a data set's camera."""
+    assert not choose_origin(np.array([[0, 0, 1.7e308], [0, 0, -1.7e308], [np.nan, 0, 0]])).any()
+    assert choose_origin(np.array([[5e6, 0, 0], [5e6, 1, 0], [0, 0, 1.7e308]])).any()
+
+
 def test_an_origin_is_short_and_exact():
     points = np.random.default_rng(1).normal(size=(500, 3)) + np.array([500_123.4, 4_512_345.6, 87.3])
     found = choose_origin(points)

@@ -59,7 +59,7 @@ def _opened(path: Path, budget: Budget, read: Callable[[_Reader], T]) -> T:
     try:
         with zipfile.ZipFile(path) as archive:
             return read(_Reader(_Archive(archive, path), path, budget))
-    except (zipfile.BadZipFile, NotImplementedError) as error:
+    except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
 
 
