@@ -190,7 +190,7 @@ test-arm64: $(VENV)/installed-dev $(WHEELS_VENV)/installed
 MINUTES ?= 60
 fuzz: $(VENV)/installed-dev
 	@$(PIP) install atheris
-	$(BIN)/python tests/fuzz/guided.py --minutes $(MINUTES)
+	$(BIN)/python tests/fuzz/guided.py $(if $(INPUTS),--inputs $(INPUTS),--minutes $(MINUTES))
 
 release: $(WHEELS_VENV)/installed
 	$(WHEELS_BIN)/python tools/release.py -o dist

@@ -136,6 +136,7 @@ def main() -> int:
     )
     parser.add_argument("--target", nargs="*", help="default: all")
     parser.add_argument("--minutes", type=float, default=60, help="for all targets together (default: 60)")
+    parser.add_argument("--inputs", type=int, help="for each target, in place of a time")
     parser.add_argument(
         "--corpus", type=Path, help="folder of inputs that reach new lines (default: not kept)"
     )
