@@ -21,7 +21,7 @@ mesh = ms.convert(cloud)
 center, radius = BALL
 in_ball = np.abs(np.linalg.norm(cloud.means - center, axis=1) - radius) < 1e-4
 ball_faces = in_ball[mesh.face_splat]
-without_ball = mesh.keep_faces(~ball_faces)
+without_ball = mesh.take(~ball_faces)
 print(f"{ball_faces.sum():,} of {len(mesh.faces):,} triangles belong to the ball")
 
 # Lift the ball and dye it: vertices and colours are arrays.

@@ -94,7 +94,7 @@ for step in range(steps):
         mesh = replace(mesh, vertices=vertices.detach().numpy(), colors=colors.detach().numpy())
         keep = visible_pixels(vertices, colors)[mesh.faces].sum(axis=1) > 0.2
         rows = np.unique(mesh.faces[keep])
-        mesh = mesh.keep_faces(keep)
+        mesh = mesh.take(keep)
         vertices, colors = leaves(mesh)
         moving, painting = moving.select(vertices, rows), painting.select(colors, rows)
 

@@ -48,5 +48,5 @@ def test_no_triangles_are_no_splats():
 def test_a_mesh_has_them():
     mesh = SplatMesh(np.zeros((13, 3)), FACES, np.zeros((13, 4)), face_splat=SPLATS.face_splat)
     assert mesh.splat_count == len(mesh.splats) == 3
-    kept = mesh.keep_faces(mesh.splats.of_face != 1)
+    kept = mesh.take(mesh.splats.of_face != 1)
     assert kept.splats.numbers.tolist() == [3, 9]

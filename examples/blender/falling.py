@@ -37,7 +37,7 @@ ends = np.cumsum([count for _, count in order])
 part_of_splat = np.searchsorted(ends, np.arange(len(cloud)), side="right")
 part_of_splat[part_of_splat == 4] = 0  # the flowers stand in the vase and fall with it
 part_of_face = part_of_splat[mesh.face_splat]
-table = mesh.keep_faces(part_of_face == 5)
+table = mesh.take(part_of_face == 5)
 
 # The table with ground, sun, sky and camera is a .blend of its own; the bodies are added to it.
 width, height = asked.width, asked.width * 5 // 6
@@ -83,7 +83,7 @@ def hull(points, name):
 
 bodies = {}
 for index, (name, _) in enumerate(order[:4]):
-    part = mesh.keep_faces(part_of_face == index)
+    part = mesh.take(part_of_face == index)
     splats = objects.add(objects.prepare(part, lit=True), name, home)
     # The vase collides with its own splats only: leaves would make it as wide as they reach.
     solid = cloud.means[ends[index] - order[index][1] : ends[index]]

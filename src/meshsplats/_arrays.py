@@ -1,8 +1,8 @@
-"""Checks of arrays for the data classes; samples of sequences."""
+"""Checks of arrays for the data classes; their rows, chosen and joined; samples of sequences."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar, overload
 
 import numpy as np
@@ -36,6 +36,51 @@ def nonzero_rows(array: np.ndarray) -> np.ndarray:
     for column in array.T[1:]:
         found |= column != 0
     return np.asarray(found)
+
+
+def chosen_rows(chosen: ArrayLike | slice, count: int, of: str) -> np.ndarray:
+    """Indices of the rows that ``chosen`` names, a (count,) mask, indices or a slice, in its order.
+
+    Raises ValueError, which says what the rows are ``of``, for a mask of another length, and for indices that
+    are no rows.
+    """
+    if isinstance(chosen, slice):
+        return np.arange(count)[chosen]
+    given = np.asarray(chosen)
+    if given.dtype == bool:
+        if given.shape != (count,):
+            raise ValueError(f"a mask of {of} must have shape ({count},), got {given.shape}")
+        return np.flatnonzero(given)
+    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
+        raise ValueError(
+            f"{of} are chosen by a mask, a slice or indices (n,), got {given.dtype} of shape {given.shape}"
+        )
+    if given.size and (given.min() < -count or given.max() >= count):
+        raise ValueError(f"indices of {count:,} {of}, got {given.min()} to {given.max()}")
+    return given.astype(np.int64, copy=False)
+
+
+def joined_rows(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The arrays of meshes, by name, one part behind the other; ``faces`` number the ``vertices`` of their
+    part, and those of all parts in the result. Arrays that a part lacks are left out.
+
+    Raises ValueError for more vertices or triangles than int32 can number.
+    """
+    if len(parts) == 1:
+        return dict(parts[0])
+    for name in ("vertices", "faces"):
+        count = sum(len(part[name]) for part in parts)
+        if count > np.iinfo(np.int32).max:
+            raise ValueError(f"{count:,} {name} are more than a mesh can number")
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in names if name != "faces"}
+    joined["faces"] = np.empty((sum(len(part["faces"]) for part in parts), 3), np.int32)
+    row = first = 0
+    for part in parts:
+        faces = part["faces"]
+        np.add(faces, np.int32(first), out=joined["faces"][row : row + len(faces)])
+        row, first = row + len(faces), first + len(part["vertices"])
+    return joined
 
 
 def checked_array(name: str, value: ArrayLike, dtype: DTypeLike, shape: tuple[int | None, ...]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -22,8 +22,9 @@ class ArrayField(NamedTuple):
 
     name: str
     dtype: type[np.generic]
-    per: Literal["vertex", "face", "mesh", "base vertex", "base face"]
-    """The element that each row belongs to; "mesh": the array has no rows."""
+    per: Literal["vertex", "face", "splat", "mesh", "base vertex", "base face"]
+    """The element that each row belongs to. "splat": row i belongs to splat i of ``SplatMesh.splats``, which
+    have no gaps; declare it behind ``face_splat``. "mesh": the array has no rows."""
     columns: int | None = None
     """Length of a row; None for a single number."""
     optional: bool = False
@@ -63,6 +64,7 @@ class Binding:
         ArrayField("weights", np.float32, "vertex", 3),
         ArrayField("layers", np.int32, "vertex"),
     )
+    _OF_VERTICES: ClassVar[tuple[str, ...]] = tuple(f.name for f in FIELDS if f.per == "vertex")
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -170,11 +172,28 @@ class Binding:
         made.__dict__["_same_place"] = self._same_place
         return made
 
-    def select(self, rows: np.ndarray) -> Binding:
+    def take(self, rows: np.ndarray) -> Binding:
         """The binding of the vertices ``rows``, indices or a (v,) mask; the base stays whole."""
-        return replace(
-            self, vertex_face=self.vertex_face[rows], weights=self.weights[rows], layers=self.layers[rows]
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in self._OF_VERTICES})
+
+    def joined(self, others: Sequence[Binding]) -> Binding:
+        """The binding of these vertices and then those of ``others`` to the base that all share.
+
+        Raises ValueError for another base, or another distance between layers.
+        """
+        alike = [f.name for f in self.FIELDS if f.name not in self._OF_VERTICES]
+        for other in others:
+            same = all(np.array_equal(getattr(self, name), getattr(other, name)) for name in alike)
+            if not same or other.lift != self.lift:
+                raise ValueError(
+                    "the meshes are bound to bases that differ: join them without (binding=None), or bind"
+                    " them to one"
+                )
+        every = (self, *others)
+        rows: dict[str, Any] = {}
+        for name in self._OF_VERTICES:
+            rows[name] = np.concatenate([getattr(one, name) for one in every])
+        return replace(self, **rows)
 
 
 def check_fields(owner: Any) -> dict[str, int]:
@@ -183,6 +202,10 @@ def check_fields(owner: Any) -> dict[str, int]:
     for field in owner.FIELDS:
         value = getattr(owner, field.name)
         if value is not None or not field.optional:
+            if field.per == "splat" and "splat" not in counts:
+                if owner.splat_count is None:
+                    raise ValueError(f"{field.name} has a row for each splat: give face_splat, too")
+                counts["splat"] = owner.splat_count
             array = checked_array(field.name, value, field.dtype, field.shape(counts))
             object.__setattr__(owner, field.name, array)
             counts.setdefault(field.per, len(array))

@@ -7,6 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
+_CLEAR = 1e-6
+"""Weight of a corner of opacity 0, so that splats of nothing else have a centre, too."""
+_OPEN = 1e-12
+"""Share of the identity in the moments of a splat's motion."""
+
 
 @dataclass(frozen=True, eq=False)
 class FaceSplats:
@@ -66,3 +71,31 @@ class FaceSplats:
     def sums(self, values: np.ndarray) -> np.ndarray:
         """(s, ...) sums of ``values`` (f, ...) over the triangles of each splat."""
         return np.add.reduceat(values, self.starts) if len(self) else values[:0]
+
+    def centers(self, vertices: np.ndarray, opacities: np.ndarray) -> np.ndarray:
+        """(s, 3) float64 means of the corners of each splat, weighted by their opacity.
+
+        Concretely, a corner with ``opacities[i]`` at ``vertices[i]`` has the weight ``opacities[i] + 1e-6``.
+        """
+        corner, owner = self.faces.ravel(), np.repeat(self.of_face, 3)
+        weight = opacities[corner].astype(np.float64) + _CLEAR
+        total = np.bincount(owner, weight, len(self))
+        sums = [np.bincount(owner, weight * vertices[corner, axis], len(self)) for axis in range(3)]
+        return np.stack([column / total for column in sums], axis=1)
+
+    def rotations(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """(s, 3, 3) float64 rotation of each splat that fits best how its corners have moved, from positions
+        ``before`` (v, 3) to ``after`` (v, 3), besides a shift; least squares (Kabsch 1976).
+
+        Of rotations that fit as well as each other, as where all corners lie on a line, the smallest.
+        """
+        old, new = (points[self.faces].astype(np.float64) for points in (before, after))
+        old -= (self.sums(old.sum(axis=1)) / (3 * self.counts)[:, None])[self.of_face][:, None]
+        moments = self.sums(np.einsum("fki,fkj->fij", old, new))
+        size = np.linalg.norm(moments, axis=(1, 2))
+        # A little of the identity decides what the corners leave open.
+        moments += np.where(size > 0, _OPEN * size, 1)[:, None, None] * np.eye(3)
+        u, _, vt = np.linalg.svd(moments)
+        v = vt.transpose(0, 2, 1)
+        v[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(v))[:, None]
+        return np.asarray(v @ u.transpose(0, 2, 1))

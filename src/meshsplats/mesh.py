@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import ClassVar, Literal, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._origin import in_words, relative, zero_origin
+from meshsplats._arrays import checked_array, chosen_rows, joined_rows
+from meshsplats._origin import in_words, relative, shared_origin, zero_origin
 from meshsplats.binding import ArrayField, Binding, check_fields
 from meshsplats.face_splats import FaceSplats
 
@@ -229,31 +229,183 @@ class SplatMesh:
         vertices = relative(self.vertices, self.origin, point)
         return replace(self, vertices=vertices, binding=binding, origin=point)
 
-    def keep_faces(self, keep: np.ndarray) -> SplatMesh:
-        """The triangles of the mask ``keep`` (f,) bool, in order, without vertices that none of them uses."""
-        keep = np.asarray(keep, bool)
-        faces = self.faces[keep]
+    def take(self, faces: np.ndarray | slice) -> SplatMesh:
+        """The chosen triangles with everything that belongs to them, and without vertices that none uses.
+
+        Args:
+            faces: a mask (f,) bool, indices in any order, or a slice; ``slice(None)`` drops unused vertices.
+
+        Raises ValueError where ``face_splat`` would no longer ascend: an order of triangles that mixes splats
+        needs a mesh without it.
+        """
+        rows = chosen_rows(faces, len(self.faces), "triangles")
+        return self.with_faces(self.faces[rows], rows)
+
+    def with_faces(self, faces: np.ndarray, source: np.ndarray) -> SplatMesh:
+        """The mesh with other triangles on its vertices, without vertices that none of them uses.
+
+        Args:
+            faces: (n, 3) int vertex indices.
+            source: (n,) triangles of this mesh whose splat and depth group they take over.
+        """
         used = np.zeros(len(self.vertices), bool)
         used[faces.ravel()] = True
         renumber = np.cumsum(used, dtype=np.int32) - 1
-        rows = {"vertex": used, "face": keep}
-        kept = {
+        rows = {"vertex": used, "face": source}
+        if any(f.per == "splat" for f in self.FIELDS):
+            rows["splat"] = np.unique(self.splats.of_face[source])
+        return replace(self, **(self.rows(**rows) | {"faces": renumber[faces]}))
+
+    def vertices_of(self, faces: np.ndarray) -> np.ndarray:
+        """(v,) bool: the vertices that any of the triangles ``faces`` uses, a mask or indices."""
+        used = np.zeros(len(self.vertices), bool)
+        used[self.faces[faces].ravel()] = True
+        return used
+
+    def rows(self, **rows: np.ndarray) -> dict[str, Any]:
+        """Arguments for ``replace``: those rows of every array that has one for each ``vertex``, ``face`` or
+        ``splat``. What renumbers vertices or splats must replace the rows of all arrays that count them."""
+        found: dict[str, Any] = {
             f.name: value[rows[f.per]]
             for f in self.FIELDS
-            if f.name != "faces" and f.per in rows and (value := getattr(self, f.name)) is not None
+            if f.per in rows and (value := getattr(self, f.name)) is not None
         }
-        return replace(
-            self,
-            **kept,
-            faces=renumber[faces],
-            attributes={name: value[used] for name, value in self.attributes.items()},
-            binding=None if self.binding is None else self.binding.select(used),
+        if "vertex" in rows:
+            found["attributes"] = {name: value[rows["vertex"]] for name, value in self.attributes.items()}
+            found["binding"] = None if self.binding is None else self.binding.take(rows["vertex"])
+        return found
+
+    @staticmethod
+    def joined(parts: Sequence[SplatMesh], *, same_splats: bool = False) -> SplatMesh:
+        """One mesh of all ``parts``, at least one, vertices and triangles one part behind the other.
+
+        The parts must agree in ``blending``, ``filter_px2`` and ``up``, in the base that they are bound to,
+        and in which optional arrays and attributes they have; only ``depth_group`` may be missing in some.
+        Positions are relative to the first ``origin`` that is not zero. Depth groups stay apart.
+
+        Args:
+            parts: the meshes.
+            same_splats: ``face_splat`` of all parts are indices of one scene, which are kept; triangles are
+                sorted by them. By default each part has splats of its own, and all are counted from 0.
+
+        Raises ValueError, which names the part, where they do not agree, for bases that differ, and for more
+        vertices or triangles than int32 can number.
+        """
+        if not parts:
+            raise ValueError("there must be at least one mesh to join")
+        for number, part in enumerate(parts[1:], 1):
+            parts[0].check_alike(part, f"parts[{number}]")
+        origin = shared_origin(part.origin for part in parts)
+        parts = [part.relative_to(origin) for part in parts]
+        first = parts[0]
+        prefix = "attribute."
+        arrays: dict[str, Any] = joined_rows(
+            [
+                {f.name: value for f in first.FIELDS if (value := getattr(part, f.name)) is not None}
+                | {prefix + name: value for name, value in part.attributes.items()}
+                for part in parts
+            ]
         )
+        arrays["up"] = first.up
+        if any(part.depth_group is not None for part in parts):
+            arrays["depth_group"] = _joined_groups(parts)
+        if first.face_splat is not None and not same_splats:
+            count = np.cumsum([0, *(part.splat_count or 0 for part in parts)])
+            owners = [part.splats.of_face + start for part, start in zip(parts, count, strict=False)]
+            arrays["face_splat"] = np.concatenate(owners)
+        elif first.face_splat is not None:
+            numbers = np.concatenate([part.splats.numbers for part in parts])
+            order = np.argsort(arrays["face_splat"], kind="stable")
+            rows = {"face": order, "splat": np.unique(numbers, return_index=True)[1]}
+            for f in first.FIELDS:
+                if f.per in rows and f.name in arrays:
+                    arrays[f.name] = arrays[f.name][rows[f.per]]
+        attributes = {name: arrays.pop(prefix + name) for name in first.attributes}
+        bindings = [part.binding for part in parts[1:] if part.binding is not None]
+        binding = None if first.binding is None else first.binding.joined(bindings)
+        return replace(first, **arrays, attributes=attributes, binding=binding)
+
+    def check_alike(self, other: SplatMesh, name: str) -> None:
+        """Raises ValueError, which names the ``other`` mesh, unless both can be joined; bases may differ."""
+        for what in ("blending", "filter_px2"):
+            if (own := getattr(self, what)) != (theirs := getattr(other, what)):
+                raise ValueError(
+                    f"meshes to be joined must have the same {what}: {own!r} first, {theirs!r} in {name}"
+                )
+        if np.abs(self.up - other.up).max() > 1e-6:
+            raise ValueError(
+                f"meshes to be joined must have the same up: {self.up.tolist()} first, {other.up.tolist()} in"
+                f" {name}; turn one, or give it the other's with replace(mesh, up=...)"
+            )
+        one, two = ({part: tuple(shape) for part, shape in m._optional().items()} for m in (self, other))
+        for part in sorted(one.keys() | two.keys()):
+            if one.get(part) != two.get(part):
+                raise ValueError(
+                    f"meshes to be joined must have the same arrays: {part} is {_in_words(one.get(part))}"
+                    f" first, {_in_words(two.get(part))} in {name}; add it, or take it out, by"
+                    " replace(mesh, ...)"
+                )
+
+    def moved(
+        self, vertices: np.ndarray, *, normals: np.ndarray | None = None, binding: Binding | None = None
+    ) -> SplatMesh:
+        """The mesh with its vertices at (v, 3) ``vertices``, as after an edit, a pose or a simulation.
+
+        What has a direction turns with the splats (without ``face_splat``, with the triangles): normals, by
+        the rotation that fits best how the corners of a splat have moved.
+
+        Args:
+            vertices: the new positions, relative to ``origin``.
+            normals: (v, 3) those of the moved surface, where they are known.
+            binding: where the new positions lie on a base; None: on none.
+
+        Raises ValueError for another number of vertices, or positions that are not finite.
+        """
+        vertices = checked_array("vertices", vertices, np.float32, (len(self.vertices), 3))
+        if normals is None and self.normals is not None:
+            normals = self._turned(self.normals, vertices)
+        return replace(self, vertices=vertices, normals=normals, binding=binding)
+
+    def _turned(self, normals: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """``normals`` (v, 3), turned as the triangles around each vertex turn where vertices move to
+        ``vertices``; of their lengths."""
+        splats = self.splats
+        corner, owner = self.faces.ravel(), np.repeat(splats.of_face, 3)
+        turned = np.einsum("cij,cj->ci", splats.rotations(self.vertices, vertices)[owner], normals[corner])
+        sums = np.stack([np.bincount(corner, column, len(normals)) for column in turned.T], axis=1)
+        length = np.linalg.norm(sums, axis=1, keepdims=True)
+        wanted = np.linalg.norm(normals.astype(np.float64), axis=1, keepdims=True)
+        # A vertex of no triangle keeps its normal, and one whose triangles turn against each other.
+        kept = length <= 1e-6 * wanted
+        return np.where(kept, normals, sums * (wanted / np.where(kept, 1, length))).astype(np.float32)
+
+    def _optional(self) -> dict[str, tuple[int, ...]]:
+        """The optional arrays but ``depth_group``, attributes and binding: the shape of a row by name."""
+        found = {f.name: getattr(self, f.name) for f in self.FIELDS if f.optional and f.name != "depth_group"}
+        found |= {f"attribute {name!r}": value for name, value in self.attributes.items()}
+        shapes = {name: value.shape[1:] for name, value in found.items() if value is not None}
+        return shapes if self.binding is None else shapes | {"binding": ()}
 
     def prune(self, min_opacity: float) -> SplatMesh:
         """The mesh without triangles all of whose corners have less than ``min_opacity``, and without the
         vertices that no triangle then uses."""
-        return self.keep_faces((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
+        return self.take((self.colors[self.faces, 3] >= min_opacity).any(axis=1))
+
+
+def _joined_groups(parts: Sequence[SplatMesh]) -> np.ndarray:
+    """(f,) int64 depth groups of all parts, those of each behind those of the parts before."""
+    groups, first = [], 0
+    for part in parts:
+        own = np.full(len(part.faces), -1) if part.depth_group is None else part.depth_group.astype(np.int64)
+        groups.append(np.where(own < 0, own, own + first))
+        first += int(own.max(initial=-1)) + 1
+    return np.concatenate(groups)
+
+
+def _in_words(row: tuple[int, ...] | None) -> str:
+    if row is None:
+        return "missing"
+    return f"{row[0]} numbers wide" if row else "there"
 
 
 def checked_filter(px2: float, face_splat: np.ndarray | None) -> float:

@@ -41,7 +41,7 @@ def test_most_layers_looks_along_the_light_too():
     sideways = look_at((5, 0.1, 0.2), (0, 0, 0.2), width=20, height=20)
     assert count_layers(mesh, sideways).max() < 50
     assert 50 <= most_layers(mesh, [sideways]) <= 100  # twice where a ray meets the squares' diagonals
-    assert most_layers(mesh.keep_faces(np.zeros(len(mesh.faces), bool))) == 0
+    assert most_layers(mesh.take(np.zeros(len(mesh.faces), bool))) == 0
 
 
 def test_bounce_limit_leaves_room_and_stops_at_blenders_own():

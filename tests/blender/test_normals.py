@@ -59,7 +59,7 @@ def test_a_mesh_without_splats_and_degenerate_ones_work():
     point = replace(plain, vertices=np.zeros_like(plain.vertices))
     assert np.isfinite(shading_normals(point)).all()
     assert typical_spacing(point) > 0
-    nothing = plain.keep_faces(np.zeros(2, bool))
+    nothing = plain.take(np.zeros(2, bool))
     assert shading_normals(nothing).shape == (0, 3)
 
 

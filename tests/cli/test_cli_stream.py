@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,11 +77,17 @@ def test_parts_are_written_as_the_whole(tmp_path):
     )
     save_mesh(mesh, tmp_path / "whole.ply")
     half = mesh.face_splat < 120
-    counts = save_mesh_blocks([mesh.keep_faces(half), mesh.keep_faces(~half)], tmp_path / "parts.ply")
+    counts = save_mesh_blocks([mesh.take(half), mesh.take(~half)], tmp_path / "parts.ply")
     assert counts == (len(mesh.vertices), len(mesh.faces), mesh.splat_count)
     assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     with pytest.raises(ValueError, match=r"written as \.ply"):
         save_mesh_blocks([mesh], tmp_path / "parts.glb")
+    for wrong, message in (
+        (replace(mesh, normals=None), r"normals is 3 numbers wide first, missing in parts\[1\]"),
+        (replace(mesh, depth_group=np.zeros(len(mesh.faces), int)), "depth groups of parts"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_mesh_blocks([mesh, wrong], tmp_path / "none.ply")
     with pytest.raises(ValueError, match="no mesh to write"):
         save_mesh_blocks([], tmp_path / "none.ply")
     assert not (tmp_path / "none.ply").exists()

@@ -88,7 +88,7 @@ def test_shown_pixels_are_the_opacity_of_the_image(look):
     drawn = [render(mesh, view, background=(0, 0, 0), samples=samples) for view in views]
     alpha = np.mean([image.alpha.sum(dtype=np.float64) for image in drawn])
     np.testing.assert_allclose(shown.sum(), alpha, rtol=1e-4)
-    one = mesh.keep_faces(mesh.face_splat == 7)
+    one = mesh.take(mesh.face_splat == 7)
     alone = render(one, views[0], background=(0, 0, 0), samples=samples).alpha.sum(dtype=np.float64)
     only = visibility(one, cloud.means, cloud, views[:1], look).pixels
     np.testing.assert_allclose(only[7], alone, rtol=1e-4)
@@ -175,7 +175,7 @@ def test_a_splat_has_the_fan_of_its_level():
     for (sides, rings), triangles in zip(LEVELS, TRIANGLES, strict=True):
         even = convert(cloud, cameras=views, mode="flat", sides=sides, rings=rings)
         for splat in np.flatnonzero(counts == triangles):
-            a, b = (m.keep_faces(m.face_splat == splat) for m in (mesh, even))
+            a, b = (m.take(m.face_splat == splat) for m in (mesh, even))
             assert (a.faces == b.faces).all()
             # BLAS rounds the product of a single row otherwise than that of many.
             np.testing.assert_allclose(a.vertices, b.vertices, rtol=1e-6, atol=1e-6)

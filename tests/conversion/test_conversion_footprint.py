@@ -103,7 +103,7 @@ class TestPixelSize:
             for i in range(3)
         ]
         assert len(mesh.vertices) == 36
-        assert reach(mesh.keep_faces(mesh.face_splat == 3))[1] == pytest.approx(wide[1], rel=1e-5)
+        assert reach(mesh.take(mesh.face_splat == 3))[1] == pytest.approx(wide[1], rel=1e-5)
 
     def test_far_from_the_origin(self):
         near, far = np.float32([[0.2, 0.1, 5]]), np.array([1e4, -2e4, 3e4])
@@ -150,7 +150,7 @@ class TestFilter:
         mesh = convert(cloud, viewing_distance=20, focal=200, footprint_px2=16, **FLAT)
         for splat in range(2):
             np.testing.assert_allclose(
-                np.sort(reach(mesh.keep_faces(mesh.face_splat == splat))), [0, 0.5, 0.5], atol=1e-6
+                np.sort(reach(mesh.take(mesh.face_splat == splat))), [0, 0.5, 0.5], atol=1e-6
             )
         # A stated distance comes before the cameras.
         both = convert(

@@ -86,4 +86,4 @@ def test_part_of_the_way(cloud):
     half = partly(start, end, 0.5)
     np.testing.assert_allclose(half.vertices, start.vertices + 1, atol=1e-6)
     np.testing.assert_allclose(half.colors, start.colors / 2, atol=1e-6)
-    assert partly(start, end.keep_faces(np.arange(len(end.faces)) > 0), 0.5) is None
+    assert partly(start, end.take(np.arange(len(end.faces)) > 0), 0.5) is None

@@ -475,7 +475,7 @@ def test_what_cannot_be_tuned(scene):
     with pytest.raises(ValueError, match="no training views"):
         finetune(mesh, Dataset(()), make_config(steps=1))
     with pytest.raises(ValueError, match="no triangles"):
-        finetune(mesh.keep_faces(np.zeros(len(mesh.faces), bool)), dataset, make_config(steps=1))
+        finetune(mesh.take(np.zeros(len(mesh.faces), bool)), dataset, make_config(steps=1))
     with pytest.raises(ValueError, match="resume needs the folder"):
         RunOptions(resume=True)
 

@@ -238,7 +238,7 @@ def test_a_viewer_that_does_not_sort_draws_a_hybrid_mesh(foggy):
     dataset, mesh, _ = foggy
     hybrid = finetune(mesh, dataset, steps=48, opacity="cutoff", soft_share=0.2)
     blended = is_blended(hybrid)
-    solid, soft = hybrid.keep_faces(~blended), hybrid.keep_faces(blended)
+    solid, soft = hybrid.take(~blended), hybrid.take(blended)
     view = dataset.test[0]
     exact = render(hybrid, view.camera, background=view.background, samples=2).color
     drawn = hybrid_image(solid, soft, view.camera, background=view.background, samples=2)

@@ -177,7 +177,7 @@ def test_triangles_in_an_outline_of_too_many_corners_go_one_by_one():
 
 
 def test_an_empty_mesh_stays_empty():
-    mesh = fan(np.ones(4)).keep_faces(np.zeros(4, bool))
+    mesh = fan(np.ones(4)).take(np.zeros(4, bool))
     assert len(fewer_triangles(mesh, np.zeros(0), 0).faces) == 0
 
 

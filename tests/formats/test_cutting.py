@@ -176,7 +176,7 @@ def test_every_extra_array_survives():
     assert len(cut.faces) > 20
     assert cut.attributes.keys() == mesh.attributes.keys()
     whole = replace(mesh, colors=np.column_stack([mesh.colors[:, :3], np.ones(30)]))
-    assert_same(cut_mesh(whole, 0.4), whole.keep_faces(np.ones(60, bool)))
+    assert_same(cut_mesh(whole, 0.4), whole.take(np.ones(60, bool)))
 
 
 @pytest.mark.parametrize("cutoff", [-0.1, 1.5, np.nan])

@@ -450,7 +450,7 @@ def test_another_topology_is_refused():
 def test_dropping_faces_keeps_the_binding_of_the_others():
     prior = trained_looking(cube())
     keep = np.random.default_rng(3).random(len(prior.mesh.faces)) < 0.5
-    fewer = prior.mesh.keep_faces(keep)
+    fewer = prior.mesh.take(keep)
     np.testing.assert_array_equal(fewer.binding.positions(), fewer.vertices)
     np.testing.assert_array_equal(fewer.vertices[fewer.faces], prior.mesh.vertices[prior.mesh.faces[keep]])
 

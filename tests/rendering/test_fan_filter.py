@@ -162,7 +162,7 @@ def test_renumbered_vertices_and_other_splats():
         mesh, vertices=mesh.vertices[order], colors=mesh.colors[order], faces=place[mesh.faces]
     )
     assert_same_bits(image, render(renumbered, view))
-    alone = mesh.keep_faces(mesh.face_splat == 7)
+    alone = mesh.take(mesh.face_splat == 7)
     assert alone.filter_px2 == mesh.filter_px2
     without = replace(
         mesh,

@@ -94,7 +94,7 @@ def test_meshes_that_need_no_more():
     away = replace(fan, vertices=fan.vertices + np.float32([90, 0, 0]))
     assert needed_samples(away, small) == 2
     assert needed_samples(fan, []) == 2
-    assert needed_samples(fan.keep_faces(np.zeros(4, bool)), small) == 2
+    assert needed_samples(fan.take(np.zeros(4, bool)), small) == 2
 
 
 def test_samples_needed_are_near_those_of_many(cloud):

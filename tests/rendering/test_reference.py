@@ -272,7 +272,7 @@ def test_coplanar_layers_of_a_depth_group():
         # The truth: one face after the other painted over, from the last to the first.
         painted = np.zeros((20, 20, 3))
         for face in range(39, -1, -1):
-            single = mesh.keep_faces(np.arange(40) == face)
+            single = mesh.take(np.arange(40) == face)
             painted = render(single, camera, background=painted).color
         np.testing.assert_allclose(result.color, painted, atol=1e-12)
 
@@ -287,9 +287,9 @@ def test_a_depth_group_lies_where_its_largest_triangle_lies():
     result = render(grouped, camera, depth=True)
     assert (result.color == [0, 1, 0]).all()
     assert (result.depth == 1.75).all()
-    assert (render(grouped.keep_faces([True, False, True]), camera).color == [1, 0, 0]).all()
+    assert (render(grouped.take([True, False, True]), camera).color == [1, 0, 0]).all()
     # What is reported is a triangle's own depth.
-    np.testing.assert_allclose(render(grouped.keep_faces([True, False, True]), camera, depth=True).depth, 1.5)
+    np.testing.assert_allclose(render(grouped.take([True, False, True]), camera, depth=True).depth, 1.5)
 
 
 def test_a_depth_group_stays_within_its_vertices():

@@ -620,7 +620,7 @@ def test_splats_of_a_training_look_like_it(ball, trained):
 def test_other_meshes_do_not_become_splats(trained):
     for mesh in (
         replace(trained, face_splat=None),
-        trained.keep_faces(np.arange(len(trained.faces)) != 5),
+        trained.take(np.arange(len(trained.faces)) != 5),
     ):
         with pytest.raises(ValueError, match="not a mesh of equal fans"):
             splats_of_fans(mesh)

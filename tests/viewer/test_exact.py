@@ -253,7 +253,7 @@ def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(
     kept = np.zeros(len(shows), bool)
     kept[order[np.cumsum(vertices[order]) <= most / 16]] = True
     image = page.screenshot() / 255
-    expected = ms.render(many.keep_faces(kept[many.face_splat]), cameras[0]).color
+    expected = ms.render(many.take(kept[many.face_splat]), cameras[0]).color
     assert ms.psnr(image, expected) > 30
     assert ms.psnr(image, ms.render(many, cameras[0]).color) < 25
     # The crop box works on that part.
@@ -261,7 +261,7 @@ def test_of_a_mesh_too_large_for_the_device_the_exact_image_has_what_shows_most(
     page.still(PATIENCE)
     assert page.text("#status").startswith("exact")
     box = tuple(float(word) for word in page.text("#cropText").split()[1:])
-    part = cropped(many.keep_faces(kept[many.face_splat]), box)
+    part = cropped(many.take(kept[many.face_splat]), box)
     assert ms.psnr(page.screenshot() / 255, ms.render(part, cameras[0]).color) > 30
     assert ms.psnr(page.screenshot() / 255, ms.render(cropped(many, box), cameras[0]).color) < 25
     assert page.problems() == []

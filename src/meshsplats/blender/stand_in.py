@@ -216,11 +216,9 @@ class _Splats:
         self.of_vertex = np.maximum(splats.of_vertex, 0)  # vertices of no triangle are not drawn
         corner, owner = mesh.faces.ravel(), np.repeat(self.of_face, 3)
         weight = mesh.colors[corner, 3].astype(np.float64) + 1e-6
-        total = np.bincount(owner, weight, count)
-        self.centers = np.empty((count, 3))
+        self.centers = splats.centers(mesh.vertices, mesh.colors[:, 3])
         self.normals = np.empty((count, 3))
         for axis in range(3):
-            self.centers[:, axis] = np.bincount(owner, weight * mesh.vertices[corner, axis], count) / total
             self.normals[:, axis] = np.bincount(owner, weight * normals[corner, axis], count)
         self.normals /= np.maximum(np.linalg.norm(self.normals, axis=1, keepdims=True), 1e-12)
         self.opacity = np.zeros(count)

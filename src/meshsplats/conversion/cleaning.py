@@ -141,7 +141,7 @@ def find(scene: GaussianCloud | SplatMesh, rules: CleaningRules = FLOATERS) -> F
 def remove(scene: Scene, found: Findings) -> Scene:
     """``scene`` without the splats that ``find`` has found."""
     if isinstance(scene, SplatMesh):
-        return scene.keep_faces(found.kept[found.owner])
+        return scene.take(found.kept[found.owner])
     return scene.select(np.flatnonzero(found.kept))
 
 

@@ -183,7 +183,7 @@ class TunedCells:
     def mesh(self) -> SplatMesh:
         """The whole mesh; triangles are in the order of their splats, vertices in that of the cells."""
         parts = [part for part in self.blocks() if len(part.faces)] or list(self.blocks())[:1]
-        return _joined(parts, [_owners(part) for part in parts])
+        return SplatMesh.joined(parts, same_splats=True)
 
 
 def finetune_cells(
@@ -368,7 +368,7 @@ class _Tuning:
             config = with_changes(self.config, steps=steps)
             frozen = ~_vertices_of(mesh, len(own) + int((~done).sum()))
             tuned = self._tuned(cell, mesh, dataset, config, frozen)
-        tuned = tuned.keep_faces(_owners(tuned) < len(own))
+        tuned = tuned.take(_owners(tuned) < len(own))
         save_mesh(replace(tuned, normals=None, face_splat=own[_owners(tuned)]), self.file(cell))
         (self._folder(cell) / CHECKPOINT).unlink(missing_ok=True)
         return steps
@@ -418,18 +418,17 @@ class _Tuning:
                 few.append(self._few(cloud.select(rest), len(cloud)))
             if np.isin(theirs, done).any():
                 tuned = load_mesh(self.file(other))
-                parts.append(tuned.keep_faces(np.isin(_owners(tuned), theirs)))
+                parts.append(tuned.take(np.isin(_owners(tuned), theirs)))
         if few:
             even = replace(chosen, detail="even", min_opacity=None)
             beyond = joined([replace(one, kernel=cloud.kernel) for one in few])
             parts.append(make(beyond, cameras, even))
         # All parts but the first are numbered behind it: which of their splats is which does not matter.
         first = len(own) + len(along)
-        owners = [_owners(parts[0])]
-        for part in parts[1:]:
-            owners.append(_owners(part) + np.int32(first))
-            first = int(owners[-1].max(initial=first)) + 1
-        return _joined(parts, owners)
+        for i, part in enumerate(parts[1:], 1):
+            parts[i] = replace(part, face_splat=first + part.splats.of_face)
+            first += len(part.splats)
+        return SplatMesh.joined(parts, same_splats=True)
 
 
 def _vertices_of(mesh: SplatMesh, splats: int) -> np.ndarray:
@@ -471,34 +470,3 @@ def _views_that_show(
 def _owners(mesh: SplatMesh) -> np.ndarray:
     assert mesh.face_splat is not None  # converted from splats
     return mesh.face_splat
-
-
-def _joined(parts: Sequence[SplatMesh], owners: Sequence[np.ndarray]) -> SplatMesh:
-    """One mesh of ``parts``, with the splats of the triangles of each; triangles in the order of these."""
-    parts = [part.relative_to(parts[0].origin) for part in parts]
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    if starts[-1] > np.iinfo(np.int32).max:
-        raise ValueError(f"{starts[-1]:,} vertices are more than a mesh can number")
-    faces = np.concatenate([part.faces + np.int32(first) for part, first in zip(parts, starts, strict=False)])
-    splat = np.concatenate(list(owners)).astype(np.int32)
-    order = np.argsort(splat, kind="stable")
-    groups = [part.depth_group for part in parts]
-    depth_group = None
-    if groups[0] is not None:
-        # Layers that share a depth belong to one splat, so groups of parts are numbered one after the other.
-        shifted, first = [], 0
-        for group in groups:
-            assert group is not None
-            shifted.append(np.where(group < 0, group, group + np.int32(first)))
-            first += int(group.max(initial=-1)) + 1
-        depth_group = np.concatenate(shifted)[order]
-    return replace(
-        parts[0],
-        vertices=np.concatenate([part.vertices for part in parts]),
-        colors=np.concatenate([part.colors for part in parts]),
-        faces=faces[order],
-        face_splat=splat[order],
-        depth_group=depth_group,
-        normals=None,
-        attributes={},
-    )

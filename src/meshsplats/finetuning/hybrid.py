@@ -67,10 +67,11 @@ def with_soft_splats(
     best = best[scores[best] > 0]
     chosen = np.zeros(len(scores), bool)
     chosen[best[np.cumsum(triangles[best]) <= share * len(start.faces)]] = True
-    soft = start.keep_faces(chosen[start.face_splat])
+    soft = start.take(chosen[start.face_splat])
     colors = soft.colors.copy()
     colors[:, 3] = np.minimum(colors[:, 3], MAX_OPACITY)
-    return _joined(core.keep_faces(~chosen[core.face_splat]), replace(soft, colors=colors))
+    rest = core.take(~chosen[core.face_splat])
+    return SplatMesh.joined([rest, replace(soft, colors=colors)], same_splats=True)
 
 
 def softness(
@@ -159,21 +160,3 @@ def _least_heights(corners: np.ndarray, views: Sequence[View]) -> np.ndarray:
     count = np.isfinite(ordered).sum(axis=0)
     middle = np.take_along_axis(ordered, (np.maximum(count, 1) // 2)[None], axis=0)[0]
     return np.where(count > 0, heights * np.where(count > 0, middle, 1), np.inf)
-
-
-def _joined(core: SplatMesh, soft: SplatMesh) -> SplatMesh:
-    """The triangles of both, in the order of their splats, which they do not share."""
-    splats = np.concatenate([core.face_splat, soft.face_splat])
-    order = np.argsort(splats, kind="stable")
-    groups = None
-    if core.depth_group is not None and soft.depth_group is not None:
-        groups = np.concatenate([core.depth_group, soft.depth_group])[order]
-    return replace(
-        core,
-        vertices=np.concatenate([core.vertices, soft.vertices]),
-        faces=np.concatenate([core.faces, soft.faces + len(core.vertices)])[order],
-        colors=np.concatenate([core.colors, soft.colors]),
-        face_splat=splats[order],
-        depth_group=groups,
-        attributes={name: np.concatenate([a, soft.attributes[name]]) for name, a in core.attributes.items()},
-    )

@@ -41,7 +41,7 @@ def fewer_triangles(mesh: SplatMesh, hits: np.ndarray, most: int, fewest: int = 
     hidden = samples < fewest
     seen = ~hidden[fan]
     if seen.sum() <= most:
-        return mesh.keep_faces(seen)
+        return mesh.take(seen)
     polygons = _polygons(mesh, fan, loops)
     _, starts, counts = np.unique(fan, return_index=True, return_counts=True)
 
@@ -243,15 +243,8 @@ def _assembled(
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
     owner = owner[order]
-    result = replace(
-        mesh,
-        vertices=vertices,
-        faces=np.concatenate(faces)[order].astype(np.int32),
-        normals=None,
-        face_splat=None if mesh.face_splat is None else mesh.face_splat[starts[owner]],
-        depth_group=None if mesh.depth_group is None else mesh.depth_group[starts[owner]],
-    )
-    return result.keep_faces(np.ones(len(owner), bool))
+    grown = replace(mesh, vertices=vertices, normals=None)
+    return grown.with_faces(np.concatenate(faces)[order].astype(np.int32), starts[owner])
 
 
 def _keep_area(vertices: np.ndarray, polygon: _Polygons, rows: np.ndarray, lost: np.ndarray) -> None:

@@ -171,7 +171,7 @@ class State:
     def begin_hybrid(cls, mesh: SplatMesh, config: FinetuneConfig, threads: int | None) -> State:
         """The state before the first step with the opaque and blended triangles of ``mesh``."""
         state = cls.begin_opaque(mesh, config, threads)
-        state.solid = _solid_vertices(mesh)
+        state.solid = mesh.vertices_of(solid_faces(mesh))
         return state
 
     @classmethod
@@ -196,7 +196,7 @@ class State:
                 part = {key: arrays[f"{name}.{key}"] for key in ("mean", "square", "steps")}
                 adam.load_state(part)
             if arrays.get("solid", np.zeros(())):
-                state.solid = _solid_vertices(mesh)
+                state.solid = mesh.vertices_of(solid_faces(mesh))
             if "color_limits" in arrays:
                 state.color_limits = ColorLimits(state.mesh, arrays["color_limits"])
             if "frozen" in arrays:
@@ -387,9 +387,7 @@ class State:
         if keep.all():
             return self
         self._download()
-        used = np.zeros(len(self.mesh.vertices), bool)
-        used[self.mesh.faces[keep].ravel()] = True
-        return self.rebuild(self.result().keep_faces(keep), np.flatnonzero(used))
+        return self.rebuild(self.result().take(keep), np.flatnonzero(self.mesh.vertices_of(keep)))
 
     def rebuild(self, mesh: SplatMesh, rows: np.ndarray, sizes: np.ndarray | None = None) -> State:
         """The state of ``mesh``, whose vertex i takes over what the optimisers know of vertex ``rows[i]``.
@@ -426,13 +424,6 @@ class State:
     def _optimisers(self) -> dict[str, RowAdam]:
         found = {"positions": self._positions, "colors": self._colors}
         return found if self._exposures is None else found | {"exposure": self._exposures}
-
-
-def _solid_vertices(mesh: SplatMesh) -> np.ndarray:
-    """(v,) bool: the vertices of opaque triangles."""
-    solid = np.zeros(len(mesh.vertices), bool)
-    solid[mesh.faces[solid_faces(mesh)]] = True
-    return solid
 
 
 def _check_for_cutoff(mesh: SplatMesh, config: FinetuneConfig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -55,14 +56,15 @@ def cut_mesh(mesh: SplatMesh, cutoff: float = CUTOFF) -> SplatMesh:
     share = ((level - below) / (above - below))[:, None]
 
     def extended(values: np.ndarray) -> np.ndarray:
-        """Per vertex of ``mesh`` and then per crossing."""
+        """One row per vertex of ``mesh`` and then per crossing."""
         table = values if values.ndim == 2 else values[:, None]
         mixed = table[low] + share * (table[high].astype(np.float64) - table[low])
         result = np.concatenate([table, mixed.astype(np.float32)])
         return result if values.ndim == 2 else result[:, 0]
 
-    vertices, colors = extended(mesh.vertices), extended(mesh.colors)
-    colors[:, 3] = 1
+    fields = [f.name for f in mesh.FIELDS if f.per == "vertex" and getattr(mesh, f.name) is not None]
+    arrays: dict[str, Any] = {name: extended(getattr(mesh, name)) for name in fields}
+    arrays["colors"][:, 3] = 1
     _, b, c = corners.T
     tips = np.stack([corners[:, 0], first, second], axis=1)[one]
     quads = [np.stack(triangle, axis=1)[~one] for triangle in ((first, b, c), (first, c, second))]
@@ -70,27 +72,15 @@ def cut_mesh(mesh: SplatMesh, cutoff: float = CUTOFF) -> SplatMesh:
     faces = np.concatenate([mesh.faces[owners[0]], tips, *quads])
     owner = np.concatenate(owners)
     order = np.argsort(owner, kind="stable")
-    order = order[_has_corners(vertices, faces[order]) | (solid[owner[order]] == 3)]
+    order = order[_has_corners(arrays["vertices"], faces[order]) | (solid[owner[order]] == 3)]
     faces, owner = faces[order].astype(np.int32), owner[order]
 
-    normals = None
-    if mesh.normals is not None:
-        normals = extended(mesh.normals)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        new = np.arange(len(normals)) >= len(mesh.vertices)
-        normals = np.where(new[:, None] & (length > 0), normals / np.where(length > 0, length, 1), normals)
-    cut = replace(
-        mesh,
-        vertices=vertices,
-        faces=faces,
-        colors=colors,
-        normals=normals,
-        face_splat=None if mesh.face_splat is None else mesh.face_splat[owner],
-        depth_group=None if mesh.depth_group is None else mesh.depth_group[owner],
-        attributes={name: extended(values) for name, values in mesh.attributes.items()},
-        binding=None,
-    )
-    return cut.keep_faces(np.ones(len(faces), bool))
+    if "normals" in arrays:
+        new = arrays["normals"][len(mesh.vertices) :]
+        length = np.linalg.norm(new, axis=1, keepdims=True)
+        new /= np.where(length > 0, length, 1)
+    arrays["attributes"] = {name: extended(values) for name, values in mesh.attributes.items()}
+    return replace(mesh, **arrays, binding=None).with_faces(faces, owner)
 
 
 def _crossings(mesh: SplatMesh, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

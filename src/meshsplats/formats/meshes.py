@@ -220,14 +220,15 @@ def save_mesh_blocks(parts: Iterable[SplatMesh], path: str | os.PathLike[str]) -
     Memory holds one part at a time; the disk holds the data twice while they are put together.
 
     Args:
-        parts: meshes, each with vertex indices of its own, all with the same optional arrays.
+        parts: meshes, each with vertex indices of its own, alike as ``SplatMesh.joined`` wants them, without
+            depth groups.
         path: the file, whose name ends in .ply.
 
     Returns:
         Counts of vertices, triangles and splats.
 
     Raises:
-        ValueError: another suffix, no parts, or more than a mesh can number.
+        ValueError: another suffix, no parts, parts that differ, or more than a mesh can number.
         OSError: the file cannot be written.
     """
     need_path(path=path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -98,7 +98,7 @@ class MeshPrior:
         posed = binding.moved(positions, binding.lift if lift is None else lift)
         if lift is None and binding.lift and binding.area > 0:
             posed = binding.moved(positions, binding.lift * (posed.area / binding.area) ** 0.5)
-        return replace(self.mesh, vertices=posed.positions(), normals=posed.normals(), binding=posed)
+        return self.mesh.moved(posed.positions(), normals=posed.normals(), binding=posed)
 
     def check_topology(self, base: BaseMesh) -> None:
         """Raises ValueError unless ``base`` has the number of vertices and the triangles of this base."""

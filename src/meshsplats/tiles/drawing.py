@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import count
 from typing import Any
 
@@ -194,24 +195,19 @@ def samples_for(tileset: Tileset, cameras: Sequence[Camera], max_error: float = 
 
 def join_tiles(tileset: Tileset, tiles: Sequence[Tile]) -> SplatMesh:
     """The triangles of ``tiles`` as one mesh. ``face_splat`` numbers its splats anew."""
-    v, f = sum(tile.vertices for tile in tiles), sum(tile.triangles for tile in tiles)
-    if max(v, f) > np.iinfo(np.int32).max:
-        raise ValueError(f"{f:,} triangles are more than a mesh can number")
-    vertices, colors = np.empty((v, 3), np.float32), np.empty((v, 4), np.float32)
-    faces, owners = np.empty((f, 3), np.int32), np.empty(f, np.int32)
-    first = first_face = first_splat = 0
-    for tile in tiles:
-        mesh = tile.load()
-        if mesh.face_splat is None:
-            raise ValueError(f"{tile.content}: another program has altered the tile: it has no splat indices")
-        own, own_faces = slice(first, first + tile.vertices), slice(first_face, first_face + tile.triangles)
-        vertices[own], colors[own] = mesh.vertices, mesh.colors
-        faces[own_faces] = mesh.faces + np.int32(first)
-        steps = np.cumsum(np.diff(mesh.face_splat, prepend=mesh.face_splat[:1]) > 0, dtype=np.int32)
-        owners[own_faces] = steps + np.int32(first_splat)
-        first, first_face = first + tile.vertices, first_face + tile.triangles
-        first_splat += int(steps[-1]) + 1 if len(steps) else 0
-    return SplatMesh(vertices, faces, colors, face_splat=owners, up=tileset.up, origin=tileset.origin)
+    triangles = sum(tile.triangles for tile in tiles)
+    if triangles > np.iinfo(np.int32).max:
+        raise ValueError(f"{triangles:,} triangles are more than a mesh can number")
+    nothing = SplatMesh(np.empty((0, 3)), np.empty((0, 3), int), np.empty((0, 4)), up=tileset.up)
+    parts = [_in_tileset(tile, tileset) for tile in tiles] or [replace(nothing, origin=tileset.origin)]
+    return SplatMesh.joined(parts)
+
+
+def _in_tileset(tile: Tile, tileset: Tileset) -> SplatMesh:
+    mesh = tile.load()
+    if mesh.face_splat is None:
+        raise ValueError(f"{tile.content}: another program has altered the tile: it has no splat indices")
+    return replace(mesh, up=tileset.up, origin=tileset.origin)
 
 
 def _halves(camera: Camera, axis: int, middle: int) -> tuple[Camera, Camera]:

@@ -179,14 +179,13 @@ def select_fans(state: State, kept: np.ndarray, halved: np.ndarray | None = None
         sizes[place] *= np.sqrt(np.float32(HALF))
         sizes[len(kept) :] = sizes[place]
     faces = mesh.faces[:sides] + corners * np.arange(n, dtype=np.int32)[:, None, None]
-    grown = replace(
-        mesh,
-        vertices=positions.reshape(-1, 3),
-        faces=faces.reshape(-1, 3),
-        colors=colors.reshape(-1, 4),
-        attributes={name: values[rows] for name, values in mesh.attributes.items()},
-        face_splat=np.repeat(np.arange(n, dtype=np.int32), sides),
-    )
+    arrays = mesh.rows(vertex=rows, splat=source) | {
+        "vertices": positions.reshape(-1, 3),
+        "faces": faces.reshape(-1, 3),
+        "colors": colors.reshape(-1, 4),
+        "face_splat": np.repeat(np.arange(n, dtype=np.int32), sides),
+    }
+    grown = replace(mesh, **arrays)
     result = state.rebuild(grown, rows, sizes.ravel())
     fresh = np.concatenate([place, np.arange(len(kept), n)])
     result.restart((fresh[:, None] * corners + np.arange(corners)).ravel())

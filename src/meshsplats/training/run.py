@@ -218,7 +218,7 @@ class GrowingLoop(TrainingLoop):
         mesh = replace(super().result(), attributes={})
         assert mesh.face_splat is not None
         stray = self.near.contain(mesh)
-        return mesh.keep_faces(~stray[mesh.face_splat]) if stray.any() and not stray.all() else mesh
+        return mesh.take(~stray[mesh.face_splat]) if stray.any() and not stray.all() else mesh
 
     def _views(self) -> Sequence[View]:
         factor = image_factor(self.config, self.fraction)

@@ -143,7 +143,7 @@ def estimated_bytes(mesh: SplatMesh, splats: GaussianCloud | None = None) -> int
     radius = scene_bounds(mesh).radius
     precision = _finest(mesh, radius, BYTES_A_TRIANGLE)
     parts = np.arange(len(mesh.faces)) if mesh.face_splat is None else mesh.face_splat
-    some = mesh.keep_faces(_in_runs(parts))
+    some = mesh.take(_in_runs(parts))
     size = len(pack_mesh(some, precision, radius)) * len(mesh.faces) // len(some.faces)
     if splats is not None:
         part = splats.select(np.flatnonzero(_in_runs(np.arange(len(splats)))))
@@ -518,10 +518,9 @@ def _others(m: int, basis: list[int]) -> list[int]:
 def _sample(mesh: SplatMesh) -> SplatMesh:
     """Part of ``mesh`` from which the size of its data can be estimated."""
     if mesh.face_splat is None:
-        keep = np.arange(len(mesh.faces)) < SAMPLE
-        return mesh.keep_faces(keep)
+        return mesh.take(slice(SAMPLE))
     splats = mesh.splats
-    return mesh.keep_faces(splats.of_face % max(1, len(splats) // SAMPLE) == 0)
+    return mesh.take(splats.of_face % max(1, len(splats) // SAMPLE) == 0)
 
 
 # ---- Splats

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -215,7 +214,7 @@ def as_splat_mesh(obj: Any) -> SplatMesh:
     if priors.base_of(obj) is None:
         return found
     binding = priors.binding_of(obj)
-    return replace(found, vertices=binding.positions(), normals=binding.normals(), binding=binding)
+    return found.moved(binding.positions(), normals=binding.normals(), binding=binding)
 
 
 def _unlit_colors(data: Any) -> np.ndarray:

@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from meshsplats._arrays import joined_rows
 from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.binding import Binding
 from meshsplats.colors import linear_to_srgb
@@ -41,6 +42,10 @@ class _Piece:
         """Puts the piece into the scene, relative to ``origin``."""
         self.vertices, self.normals = self.place.applied(self.skinning, self.vertices, self.normals, origin)
         self.skinning = None
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        found = {"vertices": self.vertices, "faces": self.faces, "linear": self.linear}
+        return found if self.normals is None else found | {"normals": self.normals}
 
 
 def read_gltf(path: Path, origin: np.ndarray | None = None) -> SplatMesh:
@@ -171,26 +176,16 @@ def _join(
     note: dict[str, Any],
     origin: np.ndarray,
 ) -> SplatMesh:
-    counts = np.cumsum([0, *(len(p.vertices) for p in pieces)])
-    if counts[-1] > np.iinfo(np.int32).max:
-        raise document.error(f"{counts[-1]:,} vertices are more than a mesh can number")
-    one = len(pieces) == 1
-    linear = pieces[0].linear if one else np.concatenate([p.linear for p in pieces])
-    colors = straight_colors(linear, document.path)
+    try:
+        arrays: dict[str, Any] = joined_rows([piece.arrays() for piece in pieces])
+    except ValueError as error:
+        raise document.error(str(error)) from None
+    colors = straight_colors(arrays.pop("linear"), document.path)
     if note.get("blending") != "linear":
         colors[:, :3] = linear_to_srgb(colors[:, :3])
-    normals: np.ndarray | None = None
-    if all(p.normals is not None for p in pieces) and note.get("normals") != "computed":
-        normals = np.concatenate([p.normals for p in pieces])
-    faces = [p.faces + np.int32(start) for p, start in zip(pieces, counts[:-1], strict=True)]
-    arrays: dict[str, Any] = {
-        "vertices": pieces[0].vertices if one else np.concatenate([p.vertices for p in pieces]),
-        "faces": np.concatenate(faces),
-        "colors": colors,
-        "normals": normals,
-        "up": (0, 1, 0),
-        "origin": origin,
-    }
+    if note.get("normals") == "computed":
+        arrays.pop("normals", None)
+    arrays |= {"colors": colors, "up": (0, 1, 0), "origin": origin}
     if note:
         arrays |= {"up": note["up"], "blending": note["blending"]}
     if note and len(own["primitives"]) == 1:

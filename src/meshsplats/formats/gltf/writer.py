@@ -158,8 +158,8 @@ def _document(
     if alpha == "hybrid":
         solid = solid_faces(mesh)
         halves: tuple[tuple[SplatMesh, Alpha], ...] = (
-            (mesh.keep_faces(solid), "opaque"),
-            (_lowest_first(mesh.keep_faces(~solid)), "blend"),
+            (mesh.take(solid), "opaque"),
+            (_lowest_first(mesh.take(~solid)), "blend"),
         )
         parts = [(half, mode) for half, mode in halves if len(half.faces)]
     primitives = [_primitive(buffer, part, color_type, k) for k, (part, _) in enumerate(parts)]
@@ -190,8 +190,7 @@ def _document(
 def _lowest_first(mesh: SplatMesh) -> SplatMesh:
     """``mesh`` with its triangles in the order of their heights."""
     heights = (mesh.vertices @ mesh.up)[mesh.faces].sum(axis=1)
-    order = np.argsort(heights, kind="stable")
-    return replace(mesh, faces=mesh.faces[order], face_splat=None, depth_group=None)
+    return replace(mesh, face_splat=None, depth_group=None).take(np.argsort(heights, kind="stable"))
 
 
 def _primitive(buffer: _Buffer, mesh: SplatMesh, color_type: ColorType, material: int) -> dict[str, Any]:

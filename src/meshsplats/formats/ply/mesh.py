@@ -65,18 +65,24 @@ def write_mesh_blocks(parts: Iterable[SplatMesh], path: Path) -> tuple[int, int,
     """Writes one mesh that comes in ``parts``, each with vertex indices of its own; the file is that of
     ``write_mesh_ply`` for all of them together.
 
-    Returns counts of vertices, triangles and splats. Raises ValueError if there are no parts, or more than a
-    mesh can number.
+    Returns counts of vertices, triangles and splats. Raises ValueError if there are no parts, if they are not
+    alike (``SplatMesh.joined``) or have depth groups, and for more than a mesh can number.
     """
     vertices = faces = splats = 0
     layout: _Layout | None = None
+    empty: SplatMesh | None = None
     with (
         tempfile.TemporaryFile(dir=path.parent) as first,
         tempfile.TemporaryFile(dir=path.parent) as second,
         open(path, "wb") as file,
     ):
-        for part in parts:
-            layout = layout or _Layout(part)
+        for number, part in enumerate(parts):
+            layout, empty = layout or _Layout(part), empty or part.take(slice(0))
+            empty.check_alike(part, f"parts[{number}]")
+            if number and (part.depth_group is not None or empty.depth_group is not None):
+                raise ValueError(
+                    "depth groups of parts are not told apart: join them first, SplatMesh.joined"
+                )
             part = part.relative_to(layout.origin)
             layout.write_vertices(part, first)
             layout.write_faces(part, second, vertices)

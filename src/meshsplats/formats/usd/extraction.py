@@ -18,6 +18,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from meshsplats._arrays import joined_rows
 from meshsplats._origin import choose_origin, lost_detail, sampled, zero_origin
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
@@ -273,20 +274,14 @@ def _array(attribute: Any, dtype: type | None, at: str, what: str) -> np.ndarray
 
 
 def _joined(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    starts = np.cumsum([0, *(len(p["vertices"]) for p in pieces)])
-    if starts[-1] > np.iinfo(np.int32).max:
-        raise FileFormatError(f"{starts[-1]:,} vertices are more than a mesh can number")
     columns = max(p["linear"].shape[1] for p in pieces)
     for p in pieces:
         if p["linear"].shape[1] < columns:
             p["linear"] = np.tile(np.array([0.18, 0.18, 0.18, 1], np.float32), (len(p["vertices"]), 1))
-    joined = {name: np.concatenate([p[name] for p in pieces]) for name in ("vertices", "linear")}
-    joined["faces"] = np.concatenate(
-        [p["faces"] + np.int32(s) for p, s in zip(pieces, starts[:-1], strict=True)]
-    )
-    if all("normals" in p for p in pieces):
-        joined["normals"] = np.concatenate([p["normals"] for p in pieces])
-    return joined
+    try:
+        return joined_rows(pieces)
+    except ValueError as error:
+        raise FileFormatError(str(error)) from None
 
 
 # -- contents of our own files beyond the schemas
