@@ -21,7 +21,7 @@ import meshsplats as ms
 from meshsplats.cluster import Shared
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.finetuning.cells import CellOptions, Cells, CellScene, divide, finetune_cells
-from meshsplats.gaussians import joined
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.rendering.looks import image_of
 
 NEAR = 1.0
@@ -58,7 +58,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--width", type=int, default=200)
     given = parser.parse_args()
-    cloud = joined(list(city_blocks(given.splats, degree=0)))
+    cloud = GaussianCloud.joined(list(city_blocks(given.splats, degree=0)))
     dataset = ms.splat_dataset(cloud, train=given.views, test=12, width=given.width)
     config = ms.make_config(steps=given.steps)
     marked = near_borders(divide(cloud.means, given.cell_splats), cloud.means)

@@ -45,7 +45,7 @@ def measure(label: str, splats: int, repeat: int) -> list[str]:
     cloud = random_cloud(splats, 16 if "colors" in options else 1)
     if "cameras" in options:
         options["cameras"] = orbit(cloud, options["cameras"], width=800, height=800)
-    convert(cloud.select(np.arange(10)), **options)
+    convert(cloud.take(np.arange(10)), **options)
     before, best, busy, mesh = peak_bytes(), np.inf, np.inf, None
     for _ in range(repeat):
         mesh = None  # only one at a time

@@ -79,7 +79,7 @@ def test_each_splat_is_the_same_whatever_comes_with_it(cloud, preset):
     options = dict(preset=preset, footprint="none", min_opacity=0)
     whole = convert(cloud, **options)
     for k in range(0, COUNT, 1_111):
-        part = convert(cloud.select(np.arange(k, min(k + 5, COUNT))), **options)
+        part = convert(cloud.take(np.arange(k, min(k + 5, COUNT))), **options)
         own = (whole.face_splat >= k) & (whole.face_splat < k + 5)
         np.testing.assert_allclose(
             whole.vertices[whole.faces[own]], part.vertices[part.faces], rtol=1e-5, atol=1e-6

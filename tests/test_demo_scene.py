@@ -26,7 +26,7 @@ def part(scene: GaussianCloud, name: str) -> GaussianCloud:
     sizes = [int(demo_scene.SHARES[n.split()[0]] * len(scene)) for n in names[:-1]]
     ends = np.cumsum([0, *sizes, len(scene) - sum(sizes)])
     at = names.index(name)
-    return scene.select(np.arange(ends[at], ends[at + 1]))
+    return scene.take(np.arange(ends[at], ends[at + 1]))
 
 
 @pytest.mark.parametrize("count", [200, 1_001, 20_000])

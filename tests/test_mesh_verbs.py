@@ -7,11 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from _priors import bumpy
 
 from meshsplats import Camera, SplatMesh, render
 from meshsplats.binding import ArrayField, Binding
 from meshsplats.prior.bind import bind
-from tests._priors import bumpy
 
 LENGTHS = (2, 3, 1, 4)
 """Triangles of four splats."""

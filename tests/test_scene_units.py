@@ -199,7 +199,7 @@ def test_a_camera_file_of_a_trainer_sees_a_tiny_scene(tmp_path):
         folder = tmp_path / str(unit)
         folder.mkdir()
         cloud = splats(unit)
-        ms.save_gaussians(cloud.select(np.arange(1, 480)), folder / "ball.ply")
+        ms.save_gaussians(cloud.take(np.arange(1, 480)), folder / "ball.ply")
         pose = {"position": [0, 0, -4 * unit], "rotation": np.eye(3).tolist()}
         lens = {"id": 0, "img_name": "a", "width": 96, "height": 96, "fx": 100, "fy": 100}
         (folder / "cameras.json").write_text(json.dumps([lens | pose]))
@@ -214,7 +214,7 @@ def test_a_camera_file_of_a_trainer_sees_a_tiny_scene(tmp_path):
 
 
 def test_a_named_near_plane_that_hides_everything_is_named(tmp_path, capsys):
-    ms.save_gaussians(splats(1e-3).select(np.arange(1, 400)), tmp_path / "ball.ply")
+    ms.save_gaussians(splats(1e-3).take(np.arange(1, 400)), tmp_path / "ball.ply")
     view = replace(cameras(1e-3)[0], near=0.01)
     ms.save_cameras([view], tmp_path / "cameras.json")
     words = [str(tmp_path / "ball.ply"), "--cameras", str(tmp_path / "cameras.json")]

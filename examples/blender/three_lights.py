@@ -56,7 +56,7 @@ if asked.scene:
     cloud = ms.load_gaussians(asked.scene)
 else:
     cloud = make_scene()
-    cloud = cloud.select(cloud.means[:, 1] < -0.003)  # without the table: there will be a ground
+    cloud = cloud.take(cloud.means[:, 1] < -0.003)  # without the table: there will be a ground
 mesh = ms.convert(cloud, mode="flat")  # one flat ellipse a splat takes light best
 height = round(asked.width * 3 / 4)
 camera = ms.orbit(mesh, 1, elevation=14, azimuth=8, width=asked.width, height=height, distance=1.75)[0]

@@ -41,6 +41,13 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
+def quaternion_product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """(n, 4) Hamilton products of the quaternion ``p`` with each of ``q``; w, x, y, z."""
+    a, b, c, d = p
+    left = np.array([[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]])
+    return q @ left.T
+
+
 def direction(axes: np.ndarray, azimuth: float, elevation: float) -> np.ndarray:
     """(3,) unit vector at ``azimuth`` and ``elevation`` in degrees, from a subject outwards.
 

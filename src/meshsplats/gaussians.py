@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from meshsplats._arrays import checked_array
-from meshsplats._geometry import rotation_rows
+from meshsplats._arrays import checked_array, chosen_rows
+from meshsplats._geometry import quaternion_product, quaternions_of, rotation_rows
 from meshsplats._origin import in_words, relative, shared_origin, zero_origin
+from meshsplats.spherical_harmonics import ODD_AXES, harmonics_map
 
 Kernel = Literal["3dgs", "antialiased", "2dgs"]
 
@@ -45,6 +46,8 @@ class GaussianCloud:
     origin: np.ndarray = field(default_factory=zero_origin)
     """(3,) float64 point of the world that ``means`` are relative to: world = origin + means. Readers choose
     one where float32 is too coarse for coordinates of the world; else it is zero."""
+
+    _PER_SPLAT: ClassVar[tuple[str, ...]] = ("means", "quaternions", "scales", "opacities", "sh")
 
     def __post_init__(self) -> None:
         means = checked_array("means", self.means, np.float32, (None, 3))
@@ -111,12 +114,111 @@ class GaussianCloud:
                 matrices[:, i, j] = entry
         return matrices
 
-    def select(self, index: np.ndarray) -> GaussianCloud:
-        """The splats chosen by a boolean mask or an index array, in that order."""
+    def take(self, splats: np.ndarray | slice) -> GaussianCloud:
+        """The splats that a mask (n,) bool, indices or a slice chooses, in that order."""
+        rows = chosen_rows(splats, len(self), "splats")
         # np.take is several times as fast as indexing on rows as short as these.
-        rows = np.arange(len(self))[index]
-        fields = ("means", "quaternions", "scales", "opacities", "sh")
-        return replace(self, **{name: np.take(getattr(self, name), rows, axis=0) for name in fields})
+        arrays: dict[str, Any] = {}
+        for name in self._PER_SPLAT:
+            arrays[name] = np.take(getattr(self, name), rows, axis=0)
+        return replace(self, **arrays)
+
+    @staticmethod
+    def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
+        """One cloud of one or more, one behind the other.
+
+        Missing harmonics are zero; the kernel is '3dgs' unless all share one, ``up`` is None unless all have
+        the same, and the origin is that of the first cloud whose origin is not zero.
+        """
+        if not clouds:
+            raise ValueError("there must be at least one cloud to join")
+        if len(clouds) == 1:
+            return clouds[0]
+        sh = np.zeros((sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds), 3), np.float32)
+        start = 0
+        for cloud in clouds:
+            sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
+            start += len(cloud)
+        kernels = {cloud.kernel for cloud in clouds}
+        origin = shared_origin(cloud.origin for cloud in clouds)
+        clouds = [cloud.relative_to(origin) for cloud in clouds]
+        rest = [name for name in GaussianCloud._PER_SPLAT if name != "sh"]
+        arrays = {name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in rest}
+        return GaussianCloud(
+            **arrays,
+            sh=sh,
+            kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
+            up=shared_up([cloud.up for cloud in clouds]),
+            origin=origin,
+        )
+
+    def transformed(self, matrix: np.ndarray, *, origin: np.ndarray | None = None) -> GaussianCloud:
+        """The splats after the affine map ``matrix`` of the world: moved, turned, scaled, mirrored.
+
+        Concretely, a splat of covariance C and mean m in the world gets covariance A C A^T and mean A m + t.
+        Its colour seen from direction d becomes its earlier colour seen from U^T d, where U is the orthogonal
+        factor of A, and ``up`` turns by U. Where A is a similarity, cameras that move along see the same
+        image.
+
+        Args:
+            matrix: (4, 4) [[A, t], [0, 1]], (3, 4) [A, t], or (3, 3) A.
+            origin: (3,) float64, of the result; None: A times that of the cloud, so that ``means`` become A
+                times them plus t.
+
+        Raises ValueError for another shape or last row, and for a matrix that is singular or not finite.
+        """
+        a, shift = _affine(matrix)
+        reverses_axes = (np.abs(a) == np.eye(3)).all()
+        moved = self._mirrored(np.diag(a)) if reverses_axes else self._mapped(a)
+        mapped = a @ self.origin + 0.0
+        if origin is not None:
+            means = (self.means.astype(np.float64) @ a.T + (mapped - origin + shift)).astype(np.float32)
+            return replace(moved, means=means, origin=origin)
+        if shift.any():
+            moved = replace(moved, means=moved.means + shift.astype(np.float32))
+        return moved if (mapped == moved.origin).all() else replace(moved, origin=mapped)
+
+    def _mirrored(self, signs: np.ndarray) -> GaussianCloud:
+        """Reverses axes: only signs change, nothing is rounded."""
+        if (signs > 0).all():
+            return self
+        sign = dict(zip("xyz", signs, strict=True))
+        # M R M is a rotation again, with quaternion (w, yz x, xz y, xy z); the splat's own axes may change
+        # sign freely.
+        turn = [1, sign["y"] * sign["z"], sign["x"] * sign["z"], sign["x"] * sign["y"]]
+        harmonics = np.ones((self.sh.shape[1], 1), np.float32)
+        for i in range(len(harmonics)):
+            harmonics[i] = np.prod([sign[axis] for axis in ODD_AXES[i]])
+        return replace(
+            self,
+            means=self.means * signs.astype(np.float32),
+            quaternions=self.quaternions * np.array(turn, np.float32),
+            sh=self.sh * harmonics,
+            up=None if self.up is None else self.up * signs.astype(np.float32),
+        )
+
+    def _mapped(self, a: np.ndarray) -> GaussianCloud:
+        u, stretch, vt = np.linalg.svd(a)
+        if stretch[2] <= 1e-12 * stretch[0]:
+            raise ValueError("the transform flattens space (a singular matrix)")
+        orthogonal = u @ vt
+        # A Gaussian is symmetric, so a mirror turns its axes as the rotation does that is its negative.
+        proper = orthogonal * np.sign(np.linalg.det(orthogonal))
+        if stretch[0] <= stretch[2] * (1 + 1e-6):
+            turn = quaternions_of(proper[None])[0]
+            quaternions = quaternion_product(turn, self.quaternions.astype(np.float64))
+            scales = self.scales * np.float32(stretch.mean())
+        else:
+            # A R S = U D V^T: the new axes are the columns of U, the new scales D, largest first.
+            axes, scales, _ = np.linalg.svd(a @ (self.rotations.astype(np.float64) * self.scales[:, None]))
+            axes[:, :, 2] *= np.linalg.det(axes)[:, None]
+            quaternions = quaternions_of(axes)
+        sh = self.sh
+        if sh.shape[1] > 1:
+            sh = np.concatenate([sh[:, :1], harmonics_map(orthogonal, self.sh_degree) @ sh[:, 1:]], axis=1)
+        means = self.means.astype(np.float64) @ a.T
+        up = None if self.up is None else orthogonal @ self.up
+        return replace(self, means=means, quaternions=quaternions, scales=scales, sh=sh, up=up)
 
     def relative_to(self, origin: Sequence[float] | np.ndarray) -> GaussianCloud:
         """The same splats in the world, with coordinates relative to ``origin`` (3,)."""
@@ -126,28 +228,16 @@ class GaussianCloud:
         return replace(self, means=relative(self.means, self.origin, point), origin=point)
 
 
-def joined(clouds: Sequence[GaussianCloud]) -> GaussianCloud:
-    """One cloud of one or more: missing harmonics are zero; the kernel is '3dgs' unless all share one, up is
-    None unless all have the same, and the origin is that of the first cloud whose origin is not zero."""
-    if len(clouds) == 1:
-        return clouds[0]
-    sh = np.zeros((sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds), 3), np.float32)
-    start = 0
-    for cloud in clouds:
-        sh[start : start + len(cloud), : cloud.sh.shape[1]] = cloud.sh
-        start += len(cloud)
-    kernels = {cloud.kernel for cloud in clouds}
-    origin = shared_origin(cloud.origin for cloud in clouds)
-    return GaussianCloud(
-        means=np.concatenate([relative(cloud.means, cloud.origin, origin) for cloud in clouds]),
-        quaternions=np.concatenate([cloud.quaternions for cloud in clouds]),
-        scales=np.concatenate([cloud.scales for cloud in clouds]),
-        opacities=np.concatenate([cloud.opacities for cloud in clouds]),
-        sh=sh,
-        kernel=kernels.pop() if len(kernels) == 1 else "3dgs",
-        up=shared_up([cloud.up for cloud in clouds]),
-        origin=origin,
-    )
+def _affine(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(3, 3) linear part and (3,) shift, float64, of a map (4, 4), (3, 4) or (3, 3)."""
+    matrix = np.asarray(matrix, np.float64)
+    if matrix.shape not in ((3, 3), (3, 4), (4, 4)):
+        raise ValueError(f"the transform must have shape (4, 4), (3, 4) or (3, 3), got {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise ValueError("the transform is not finite")
+    if len(matrix) == 4 and (matrix[3] != (0, 0, 0, 1)).any():
+        raise ValueError(f"the last row of the transform must be 0 0 0 1, got {matrix[3].tolist()}")
+    return matrix[:3, :3], np.zeros(3) if matrix.shape == (3, 3) else matrix[:3, 3]
 
 
 def shared_up(ups: Sequence[np.ndarray | None]) -> np.ndarray | None:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+ODD_AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+"""Axes with whose sign each harmonic, a polynomial of degree up to 3, changes its own."""
+
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """(n, (degree + 1)^2) values at unit ``directions`` (n, 3), camera to splat, in the input's float type.
@@ -46,6 +49,22 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     values[:, 14] = _norm(105, 16) * z * (xx - yy)
     values[:, 15] = -_norm(35, 32) * x * (xx - 3 * yy)
     return values
+
+
+def harmonics_map(orthogonal: np.ndarray, degree: int) -> np.ndarray:
+    """(k - 1, k - 1) float32 map of the coefficients 1 to k - 1 under the rotation or mirror ``orthogonal``.
+
+    The functions of a degree span a space that rotations map to itself, so a least-squares fit to values in a
+    few directions is exact.
+    """
+    i = np.arange(64) + 0.5  # directions on a Fibonacci spiral
+    z, angle = 1 - i / 32, i * np.pi * (1 + 5**0.5)
+    r = np.sqrt(1 - z * z)
+    directions = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    before = sh_basis(directions @ orthogonal, degree)[:, 1:]
+    matrix = np.linalg.lstsq(sh_basis(directions, degree)[:, 1:], before, rcond=None)[0]
+    matrix[np.abs(matrix) < 1e-12] = 0
+    return matrix.astype(np.float32)
 
 
 def _norm(over: int, under: int) -> float:

@@ -28,7 +28,7 @@ from meshsplats.blender import LightOptions, SceneOptions, draw
 from meshsplats.blender.inside import meshes, rendering
 from meshsplats.cli import main
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.gaussians import joined
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.images.reading import load_image
 
 
@@ -116,7 +116,7 @@ def test_scene_stands_upright():
 
 def test_command_line_draws_the_tiles_of_a_tileset_that_the_camera_needs(tmp_path, capsys, monkeypatch):
     source = tmp_path / "city.ply"
-    save_gaussians(joined(list(city_blocks(4000, degree=0))), source)
+    save_gaussians(GaussianCloud.joined(list(city_blocks(4000, degree=0))), source)
     build_tiles(stream_gaussians(source), tmp_path / "tiles", TileOptions(max_triangles=4000))
     view = ["--width", "60", "--azimuth", "30", "--elevation", "20", "--json"]
     images = {}

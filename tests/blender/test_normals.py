@@ -14,7 +14,7 @@ from meshsplats.blender.normals import shading_normals, typical_spacing
 from meshsplats.blender.subject import lit_arrays
 from meshsplats.colors import srgb_to_linear
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.gaussians import joined
+from meshsplats.gaussians import GaussianCloud
 
 
 def angles(mesh, normals, true):
@@ -82,7 +82,7 @@ def test_lit_faces_wind_towards_their_normals_and_colours_are_linear():
 
 def test_a_street_faces_up_though_it_is_seen_better_from_below():
     """Houses hide it from most cameras above the scene, and nothing from those below it."""
-    mesh = convert(joined(list(city_blocks(6000, degree=0))), mode="flat")
+    mesh = convert(GaussianCloud.joined(list(city_blocks(6000, degree=0))), mode="flat")
     up = mesh.up.astype(np.float64)
     heights = mesh.vertices @ up
     flat = np.delete(mesh.vertices, int(np.abs(up).argmax()), axis=1)

@@ -152,7 +152,7 @@ def test_an_interrupted_run_is_resumed_from_its_configuration(splats, capsys):
 
 def test_the_command_line_wins(splats):
     assert main(["convert", splats, "-o", "a.npz", "--sides", "6", "--no-preview", "--mode", "flat"]) == 0
-    save_gaussians(few_splats().select(np.arange(9)), "nine.ply")
+    save_gaussians(few_splats().take(np.arange(9)), "nine.ply")
     again = ["convert", "nine.ply", "--config", "a.npz.config.toml", "--sides", "8", "-o", "b.npz"]
     assert main([*again, "--no-no-preview"]) == 0
     options = toml.load(Path("b.npz.config.toml"))["options"]

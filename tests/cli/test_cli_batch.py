@@ -40,10 +40,10 @@ def scans(tmp_path, monkeypatch):
     folder.mkdir()
     cloud = few_splats()
     save_gaussians(cloud, folder / "a.ply")
-    save_gaussians(cloud.select(np.arange(30)), folder / "b.compressed.ply")
+    save_gaussians(cloud.take(np.arange(30)), folder / "b.compressed.ply")
     model = folder / "chair" / "point_cloud" / "iteration_7"
     model.mkdir(parents=True)
-    save_gaussians(cloud.select(np.arange(20)), model / "point_cloud.ply")
+    save_gaussians(cloud.take(np.arange(20)), model / "point_cloud.ply")
     (folder / "broken.ply").write_bytes((folder / "a.ply").read_bytes()[:700])
     (folder / "notes.txt").write_text("ignored")
     (folder / ".hidden.ply").write_bytes(b"")

@@ -243,7 +243,7 @@ def test_a_part_is_drawn(splats, tmp_path):
     save_cameras([camera], tmp_path / "camera.json")
     options = ["--cameras", tmp_path / "camera.json", "--crop", *box, "--as-splats"]
     assert run(splats, "-o", tmp_path / "part.png", *options) == 0
-    part = cloud.select(np.flatnonzero(inside))
+    part = cloud.take(np.flatnonzero(inside))
     drawn = render_splats(part, camera, background=(1, 1, 1)).color
     with Image.open(tmp_path / "part.png") as image:
         np.testing.assert_array_equal(np.asarray(image), to_bytes(drawn))

@@ -312,7 +312,7 @@ class TestInvariance:
         order = np.random.default_rng(seed).permutation(40)
         before, after = (
             convert(cloud, **self.OPTIONS[which]),
-            convert(cloud.select(order), **self.OPTIONS[which]),
+            convert(cloud.take(order), **self.OPTIONS[which]),
         )
         for place, splat in enumerate(order):
             old, new = corners_of(before, splat), corners_of(after, place)

@@ -19,7 +19,7 @@ def small_blocks(monkeypatch):
 
 
 def in_blocks(cloud, size=5000):
-    return [cloud.select(np.arange(i, min(i + size, len(cloud)))) for i in range(0, len(cloud), size)]
+    return [cloud.take(np.arange(i, min(i + size, len(cloud)))) for i in range(0, len(cloud), size)]
 
 
 def with_strays(n, strays):

@@ -99,8 +99,7 @@ class TestPixelSize:
         cloud = cloud_at([[0, 0, 1], [0, 0, 2], [0, 0, 4], [0, 0, -9]])
         mesh = convert(cloud, cameras=[ahead()], footprint_px2=100, **FLAT)
         wide = [
-            reach(convert(cloud.select([i]), cameras=[ahead()], footprint_px2=100, **FLAT))[1]
-            for i in range(3)
+            reach(convert(cloud.take([i]), cameras=[ahead()], footprint_px2=100, **FLAT))[1] for i in range(3)
         ]
         assert len(mesh.vertices) == 36
         assert reach(mesh.take(mesh.face_splat == 3))[1] == pytest.approx(wide[1], rel=1e-5)

@@ -105,7 +105,7 @@ class TestSelection:
 
     def test_nothing_left(self):
         with pytest.raises(ValueError, match="no splats"):
-            convert(row_of([0.5]).select(np.zeros(1, bool)))
+            convert(row_of([0.5]).take(np.zeros(1, bool)))
         with pytest.raises(ValueError, match=r"greatest opacity is 0\.3, below min_opacity 0\.5"):
             convert(row_of([0.3, 0.2]), min_opacity=0.5)
         with pytest.raises(ValueError, match="none of the 2 splats has a visible area"):

@@ -90,7 +90,7 @@ def test_limits_leave_out_what_shows_least(scene):
     cloud, close, _ = scene
     best = convert(cloud, cameras=close, max_splats=len(cloud) // 2, budget="drop")
     rest = np.setdiff1d(np.arange(len(cloud)), best.face_splat)
-    worst = convert(cloud.select(rest), cameras=close)
+    worst = convert(cloud.take(rest), cameras=close)
     assert likeness(best, cloud, close) > likeness(worst, cloud, close) + 3
 
 
@@ -105,7 +105,7 @@ def test_kernels():
     assert right > wrong + 3
     flat = np.take_along_axis(cloud.scales, np.argsort(-cloud.scales, axis=1), axis=1)
     order = cloud.scales[:, 2] <= cloud.scales[:, :2].min(axis=1)
-    surfels = replace(cloud, scales=flat * [1, 1, 0], kernel="2dgs").select(order)
+    surfels = replace(cloud, scales=flat * [1, 1, 0], kernel="2dgs").take(order)
     assert len(surfels) > 1000
     filtered = likeness(convert(surfels, **options), surfels, cameras, "splats")
     assert filtered > likeness(convert(surfels, preset="paper"), surfels, cameras, "splats") + 1

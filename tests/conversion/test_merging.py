@@ -90,7 +90,7 @@ class TestByHand:
         np.testing.assert_allclose(simplify(thin, 1, low_pass=np.array([9.0, 0])).means[0, 0], 1.5, rtol=1e-6)
 
     def test_identical_splats_become_one(self):
-        cloud = random_cloud(1).select(np.zeros(7, int))
+        cloud = random_cloud(1).take(np.zeros(7, int))
         cloud = replace(cloud, opacities=np.full(7, 0.02))
         one = simplify(cloud, 1, low_pass=0.1)
         np.testing.assert_allclose(one.means, cloud.means[:1], rtol=1e-6)
@@ -115,7 +115,7 @@ class TestByHand:
         assert left[2] == [0.25, 20.25, 40.5]
 
     def test_many_opaque_layers_are_one(self):
-        cloud = random_cloud(1).select(np.zeros(50, int))
+        cloud = random_cloud(1).take(np.zeros(50, int))
         one = simplify(replace(cloud, opacities=np.ones(50)), 1, low_pass=0)
         assert one.opacities[0] == 1
         np.testing.assert_allclose(one.means, cloud.means[:1], rtol=1e-6)
@@ -158,14 +158,13 @@ class TestLaws:
 
     @given(st.integers(0, 10_000))
     def test_moved_turned_and_scaled_splats_give_moved_turned_and_scaled_results(self, seed):
-        from meshsplats.formats._orientation import transformed
 
         rng = np.random.default_rng(seed)
         cloud = random_cloud(40, seed)
         turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         turn *= np.sign(np.linalg.det(turn))
         size, shift = float(np.exp(rng.normal())), rng.normal(size=3)
-        moved = transformed(cloud, turn)
+        moved = cloud.transformed(turn)
         moved = replace(moved, means=moved.means * size + shift, scales=moved.scales * size)
         few = simplify(cloud, 12, low_pass=0.05)
         same = simplify(moved, 12, low_pass=0.05 * size)
@@ -178,8 +177,8 @@ class TestLaws:
     def test_the_order_of_splats_does_not_matter(self, seed):
         cloud = random_cloud(50, seed)
         shuffled = np.random.default_rng(seed).permutation(50)
-        a, b = simplify(cloud, 15, low_pass=0.1), simplify(cloud.select(shuffled), 15, low_pass=0.1)
-        a, b = (c.select(np.lexsort(c.means.T)) for c in (a, b))
+        a, b = simplify(cloud, 15, low_pass=0.1), simplify(cloud.take(shuffled), 15, low_pass=0.1)
+        a, b = (c.take(np.lexsort(c.means.T)) for c in (a, b))
         np.testing.assert_allclose(a.means, b.means, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(a.opacities, b.opacities, rtol=1e-5)
 
@@ -376,7 +375,7 @@ class TestPictures:
         cameras = orbit(cloud, 3, width=200, height=200)
         count = len(cloud) // 4
         importance = cloud.opacities * mean_shadow(disc_areas(cloud.scales))
-        dropped = cloud.select(np.argsort(-importance)[:count])
+        dropped = cloud.take(np.argsort(-importance)[:count])
         merged = simplify(cloud, count, cameras=cameras)
         assert likeness(merged, cloud, cameras) > likeness(dropped, cloud, cameras) + 5
 

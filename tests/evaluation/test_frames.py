@@ -47,7 +47,7 @@ def moved(scale: float = 1, turn: np.ndarray | None = None, shift: float = 0) ->
 def thinned(count: int) -> Callable:
     def make(cloud: GaussianCloud) -> GaussianCloud:
         rows = np.random.default_rng(0).choice(len(cloud), count, replace=False)
-        return cloud.select(np.sort(rows))
+        return cloud.take(np.sort(rows))
 
     return make
 

@@ -40,14 +40,14 @@ from meshsplats.finetuning.cells import CellOptions, CellScene, divide, finetune
 from meshsplats.finetuning.checkpoint import OtherRunError
 from meshsplats.finetuning.journal import Journal
 from meshsplats.finetuning.run import held_out_scores
-from meshsplats.gaussians import joined
+from meshsplats.gaussians import GaussianCloud
 
 COUNT, MOST = 3000, 1100
 CONFIG = make_config(steps=60)
 
 
 def scene():
-    cloud = joined(list(city_blocks(COUNT, degree=0)))
+    cloud = GaussianCloud.joined(list(city_blocks(COUNT, degree=0)))
     return CellScene(cloud, splat_dataset(cloud, train=20, test=4, width=56, zooms=(1,), threads=1))
 
 
@@ -387,7 +387,7 @@ def test_the_command_has_the_same_bits_on_a_cluster(kind, tmp_path):
     save_gaussian_blocks(city_blocks(1000, degree=0), splats, 1000)
     words = ["finetune", str(splats), "--steps", "12", "--cell-splats", "500", "--threads", "1"]
     if kind == "photographs":
-        cloud = joined(list(city_blocks(1000, degree=0)))
+        cloud = GaussianCloud.joined(list(city_blocks(1000, degree=0)))
         cameras = orbit(cloud, 6, width=40, height=40, elevation=30)
         images = [render_splats(cloud, camera, background=(1, 1, 1)).color for camera in cameras]
         write_photographs(tmp_path / "data", cameras, images)

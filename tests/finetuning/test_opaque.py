@@ -208,7 +208,7 @@ def foggy():
     center, size = cloud.means.mean(axis=0), cloud.means.std(axis=0)
     n = 15
     fog = replace(
-        cloud.select(np.zeros(n, int)),
+        cloud.take(np.zeros(n, int)),
         means=(center + 2 * size * rng.normal(size=(n, 3))).astype(np.float32),
         scales=np.full((n, 3), 0.6 * size.mean(), np.float32),
         opacities=np.full(n, 0.3, np.float32),

@@ -42,7 +42,6 @@ from meshsplats.formats.gltf.scene import rotation_matrix
 from meshsplats.formats.gltf.writer import up_quaternion
 from meshsplats.formats.meshes import save_mesh_blocks
 from meshsplats.formats.tensors import gaussians_from_tensors
-from meshsplats.gaussians import joined
 
 FAR = np.array([500_000.0, 4_500_000.0, 100.0])
 """A place in a UTM zone."""
@@ -127,7 +126,7 @@ def test_joined_clouds_have_one_origin(tmp_path):
     far = load_gaussians(write_ply(tmp_path / "far.ply", [splat_table(values, DOUBLES)]))
     other = far.relative_to(far.origin + np.array([3, 0, -2]))
     assert (other.origin != far.origin).any()
-    both = joined([replace(far.select(np.arange(0)), origin=np.zeros(3)), far, other])
+    both = GaussianCloud.joined([replace(far.take(np.arange(0)), origin=np.zeros(3)), far, other])
     np.testing.assert_array_equal(both.origin, far.origin)
     np.testing.assert_allclose(places(both), np.tile(near + FAR, (2, 1)), atol=1e-6)
     assert "origin 500000 4500000 100" in repr(far)
@@ -298,7 +297,7 @@ def test_our_splats_come_back_exactly(tmp_path):
     again = load_gaussians(tmp_path / "b.ply")
     np.testing.assert_array_equal(again.origin, cloud.origin)
     np.testing.assert_array_equal(again.means, cloud.means)
-    parts = [cloud.select(np.arange(100)), cloud.select(np.arange(100, 300)).relative_to(FAR)]
+    parts = [cloud.take(np.arange(100)), cloud.take(np.arange(100, 300)).relative_to(FAR)]
     save_gaussian_blocks(parts, tmp_path / "c.ply", 300, degree=1)
     np.testing.assert_allclose(places(load_gaussians(tmp_path / "c.ply")), places(cloud), atol=1e-6)
     text = (tmp_path / "b.ply").read_bytes().replace(b"meshsplats origin 500000.1", b"meshsplats origin here")

@@ -12,7 +12,7 @@ from conftest import shared_data
 
 from meshsplats import DataWarning, FileFormatError, load_gaussians, save_gaussians, stream_gaussians
 from meshsplats.cli import main
-from meshsplats.gaussians import joined
+from meshsplats.gaussians import GaussianCloud
 
 COUNT = 3000
 
@@ -82,7 +82,7 @@ def test_activated_values_are_named_and_read(tmp_path, which, span):
     np.testing.assert_allclose(cloud.scales, expected.scales, rtol=1e-5)
     np.testing.assert_allclose(cloud.opacities, expected.opacities, atol=step + 1e-6)
     np.testing.assert_allclose(cloud.colors, expected.colors, atol=step + 1e-6)
-    blocks = joined(list(stream_gaussians(path, activated=which, block=64)))
+    blocks = GaussianCloud.joined(list(stream_gaussians(path, activated=which, block=64)))
     np.testing.assert_array_equal(blocks.opacities, cloud.opacities)
     np.testing.assert_array_equal(blocks.sh, cloud.sh)
 

@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshsplats import FileFormatError, GaussianCloud, load_gaussians
-from meshsplats.formats._orientation import transformed
 
 RUB = np.diag([1.0, -1, -1])
 LUF = np.diag([-1.0, -1, 1])
@@ -68,9 +67,9 @@ def some_cloud(n=20, degree=3, seed=0, kernel="3dgs"):
 )
 def test_reversed_axes(degree, signs):
     cloud = some_cloud(degree=degree)
-    turned = transformed(cloud, np.diag(signs))
+    turned = cloud.transformed(np.diag(signs))
     assert_mapped(cloud, turned, np.diag(signs), tolerance=1e-6)
-    back = transformed(turned, np.diag(signs))
+    back = turned.transformed(np.diag(signs))
     for name in ("means", "quaternions", "sh"):
         np.testing.assert_array_equal(
             getattr(back, name), getattr(cloud, name)
@@ -90,12 +89,12 @@ def test_maps(seed, kind, degree):
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = a, rng.normal(size=3)
     cloud = some_cloud(degree=degree, seed=seed)
-    assert_mapped(cloud, transformed(cloud, matrix), a, matrix[:3, 3])
+    assert_mapped(cloud, cloud.transformed(matrix), a, matrix[:3, 3])
 
 
 def test_flat_axis_stays_the_third():
     cloud = some_cloud(kernel="2dgs")
-    stretched = transformed(cloud, np.diag([1.0, 2, 3]))
+    stretched = cloud.transformed(np.diag([1.0, 2, 3]))
     assert_mapped(cloud, stretched, np.diag([1.0, 2, 3]))
     assert (stretched.scales[:, 2] <= 1e-7 * stretched.scales[:, 0]).all()
     assert stretched.kernel == "2dgs"
@@ -106,13 +105,13 @@ def test_splats_along_the_axes_are_stretched():
     cloud = some_cloud()
     cloud.quaternions[:] = [1, 0, 0, 0]
     cloud.scales[:] = [1, 2, 3]
-    assert_mapped(cloud, transformed(cloud, np.diag([1, 1.5, 2])), np.diag([1, 1.5, 2]))
+    assert_mapped(cloud, cloud.transformed(np.diag([1, 1.5, 2])), np.diag([1, 1.5, 2]))
 
 
 @pytest.mark.parametrize("matrix", [np.diag([1.0, 1, 0]), np.full((3, 3), np.nan), np.diag([1, np.inf, 1])])
 def test_impossible_maps_are_refused(matrix):
     with pytest.raises(ValueError, match="the transform"):
-        transformed(some_cloud(), matrix)
+        some_cloud().transformed(matrix)
 
 
 # -- files

@@ -11,7 +11,7 @@ from _splat_files import random_splats, splat_table, write_ply
 
 from meshsplats import DataWarning, FileFormatError, load_gaussians, stream_gaussians
 from meshsplats.cli import main
-from meshsplats.gaussians import SH_C0, joined
+from meshsplats.gaussians import SH_C0, GaussianCloud
 
 
 def spacetime(n=40, seed=0, **more):
@@ -86,7 +86,7 @@ def test_blocks_are_the_whole(tmp_path):
     with pytest.warns(DataWarning, match="move in time"):
         whole = load_gaussians(path)
     with pytest.warns(DataWarning, match="move in time"):
-        parts = joined(list(stream_gaussians(path, block=32)))
+        parts = GaussianCloud.joined(list(stream_gaussians(path, block=32)))
     for name in ("means", "quaternions", "scales", "opacities", "sh"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
 

@@ -25,7 +25,7 @@ from meshsplats.cli import main
 from meshsplats.colors import linear_to_srgb
 from meshsplats.conversion.streaming import convert_blocks
 from meshsplats.formats.gaussians import save_gaussian_blocks
-from meshsplats.gaussians import SH_C0, joined
+from meshsplats.gaussians import SH_C0
 from meshsplats.spherical_harmonics import sh_basis
 
 BRUSH = "Exported from Brush"
@@ -145,9 +145,9 @@ def test_up_survives_saving_joining_and_selecting(tmp_path):
         else:
             save_gaussians(cloud, path)
         np.testing.assert_allclose(load_gaussians(path).up, up, atol=1e-6)
-    np.testing.assert_allclose(joined([cloud, cloud.select(np.arange(3))]).up, up, atol=1e-6)
+    np.testing.assert_allclose(GaussianCloud.joined([cloud, cloud.take(np.arange(3))]).up, up, atol=1e-6)
     other = load_gaussians(file_with(tmp_path))
-    assert joined([cloud, other]).up is None
+    assert GaussianCloud.joined([cloud, other]).up is None
 
 
 def test_z_up_is_written_as_other_programs_read_it(tmp_path):
@@ -217,7 +217,7 @@ def test_third_scales_of_2dgs_splats_mean_nothing(tmp_path):
     solid = load_gaussians(path, kernel="3dgs")  # its third scales count
     np.testing.assert_allclose(solid.scales, expected_cloud(random_splats(50, 0))["scales"], rtol=1e-6)
     np.testing.assert_array_equal(
-        joined(list(stream_gaussians(path, block=16, kernel="3dgs"))).scales, solid.scales
+        GaussianCloud.joined(list(stream_gaussians(path, block=16, kernel="3dgs"))).scales, solid.scales
     )
 
 
@@ -251,7 +251,7 @@ def test_linear_colours_become_display_colours(tmp_path):
         cloud = load_gaussians(path)
     np.testing.assert_allclose(0.5 + SH_C0 * cloud.sh[:, 0], linear_to_srgb(linear), atol=2e-6)
     with pytest.warns(DataWarning, match="colours are linear"):
-        blocks = joined(list(stream_gaussians(path, block=16)))
+        blocks = GaussianCloud.joined(list(stream_gaussians(path, block=16)))
     np.testing.assert_array_equal(blocks.sh, cloud.sh)
 
 

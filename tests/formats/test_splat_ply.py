@@ -330,7 +330,7 @@ def test_saving_refuses_what_cannot_be_read(tmp_path):
     with pytest.raises(ValueError, match=r"\.ply"):
         save_gaussians(cloud, tmp_path / "a.spz")
     with pytest.raises(ValueError, match="empty"):
-        save_gaussians(cloud.select(np.zeros(3, bool)), tmp_path / "a.ply")
+        save_gaussians(cloud.take(np.zeros(3, bool)), tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
 
 

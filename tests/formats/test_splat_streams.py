@@ -273,7 +273,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path, kind):
 
 def test_blocks_are_written_as_the_whole(tmp_path):
     cloud = make_scene(500)
-    parts = [cloud.select(np.arange(i, min(i + 120, 500))) for i in range(0, 500, 120)]
+    parts = [cloud.take(np.arange(i, min(i + 120, 500))) for i in range(0, 500, 120)]
     save_gaussians(cloud, tmp_path / "whole.ply")
     save_gaussian_blocks(iter(parts), tmp_path / "parts.ply", 500, degree=3)
     assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()

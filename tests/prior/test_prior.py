@@ -488,7 +488,7 @@ def test_a_binding_checks_itself(changes, message):
 def test_a_mesh_checks_its_binding():
     mesh = bind(cube(), layers=1).mesh
     with pytest.raises(ValueError, match="binding must bind 36 vertices"):
-        replace(mesh, binding=mesh.binding.select(np.arange(35)))
+        replace(mesh, binding=mesh.binding.take(np.arange(35)))
     with pytest.raises(ValueError, match="bound to one face"):
         replace(mesh, faces=mesh.faces[:, [0, 1, 2]] + np.array([[0, 0, 0]] * 11 + [[-3, 0, 0]]))
 

@@ -154,7 +154,7 @@ def test_a_sample_stops_before_the_splat_that_would_darken_it():
     result = render_splats(stack, camera)
     assert result.fragments == 2
     assert result.alpha[0, 0] == pytest.approx(1 - 0.0004, abs=1e-7)
-    without = render_splats(stack.select(np.array([0, 1, 3])), camera)
+    without = render_splats(stack.take(np.array([0, 1, 3])), camera)
     assert without.fragments == 3
     assert without.alpha[0, 0] == pytest.approx(1 - 0.00036, abs=1e-7)
 
@@ -285,7 +285,7 @@ def test_splat_laws(kernel, seed):
     rng = np.random.default_rng(seed)
     expected = render_splats(cloud, camera)
     if len(np.unique(cloud.means[:, 2])) == len(cloud):
-        same(render_splats(cloud.select(rng.permutation(len(cloud))), camera), expected)
+        same(render_splats(cloud.take(rng.permutation(len(cloud))), camera), expected)
     on_black = render_splats(cloud, camera, background=BLACK)
     np.testing.assert_allclose(
         expected.color, on_black.color + (1 - on_black.alpha)[..., None], rtol=0, atol=1e-12
@@ -328,7 +328,7 @@ def test_bad_options_are_refused():
 
 
 def test_no_splats():
-    empty = one_splat().select(np.zeros(1, bool))
+    empty = one_splat().take(np.zeros(1, bool))
     image = np.random.default_rng(0).random((11, 13, 3))
     result = render_splats(empty, random_camera(), background=image, samples=2)
     np.testing.assert_allclose(result.color, image, atol=1e-15)

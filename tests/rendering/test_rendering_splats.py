@@ -120,7 +120,7 @@ def test_nothing_to_draw(kernel):
     cloud = splats(1, kernel=kernel)
     background = np.random.default_rng(0).random((29, 37, 3)).astype(np.float32)
     for nothing in (
-        cloud.select(np.zeros(0, int)),
+        cloud.take(np.zeros(0, int)),
         replace(cloud, means=cloud.means * -1),
         replace(cloud, opacities=np.zeros(30)),
     ):
@@ -138,7 +138,7 @@ def test_centres_nearer_than_the_near_plane_are_left_out(kernel):
     for near, drawn in [(0.999, [0, 1]), (1.0, [0, 1]), (1.001, [1]), (2.001, [])]:
         image = assert_splats_are_exact(cloud, camera(near=near))
         assert (image.fragments > 0) == (len(drawn) > 0)
-        assert_same_bits(image, render_splats(cloud.select(np.array(drawn, int)), camera(near=near)))
+        assert_same_bits(image, render_splats(cloud.take(np.array(drawn, int)), camera(near=near)))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -159,7 +159,7 @@ def test_real_splats(kernel):
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_a_part_of_a_real_image(kernel):
     cloud = load_gaussians(shared_data("splats/guitar_sh0.ply"))
-    cloud = replace(cloud.select(np.arange(0, len(cloud), 23)), kernel=kernel)
+    cloud = replace(cloud.take(np.arange(0, len(cloud), 23)), kernel=kernel)
     view = load_cameras(shared_data("cameras/guitar_close.json"))[0]
     view = replace(view, width=40, height=40, cx=view.cx - 180, cy=view.cy - 180)
     assert assert_splats_are_exact(cloud, view).alpha.max() > 0.5
@@ -173,7 +173,7 @@ def test_a_part_of_a_real_image(kernel):
 def test_order_does_not_matter(seed, kernel):
     cloud = splats(seed, 200, kernel=kernel)
     order = np.random.default_rng(seed).permutation(200)
-    assert_same_bits(render_splats(cloud, camera()), render_splats(cloud.select(order), camera()))
+    assert_same_bits(render_splats(cloud, camera()), render_splats(cloud.take(order), camera()))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

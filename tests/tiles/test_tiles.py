@@ -185,7 +185,7 @@ def test_the_geometric_error_is_how_far_splats_are_moved(splats, tmp_path):
     fields = {name: getattr(cloud, name) for name in ("quaternions", "opacities", "sh")}
     cloud = type(cloud)(means, scales=np.full((n, 3), 0.5), **fields | {"opacities": np.full(n, 0.9)})
     order = rng.permutation(n)
-    save_gaussian_blocks([cloud.select(order)], tmp_path / "rows.ply", n)
+    save_gaussian_blocks([cloud.take(order)], tmp_path / "rows.ply", n)
     options = TileOptions(max_triangles=8 * 512, conversion=ConversionOptions(footprint="none"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(building, "SHARE", 2)

@@ -597,7 +597,7 @@ def test_fans_become_the_splats_that_they_were_made_of(trained):
         scales=np.sort(rng.uniform(0.05, 0.3, cloud.scales.shape), axis=1) * [0, 1, 1],
         opacities=rng.uniform(0.1, 0.7, len(cloud)),
         kernel="2dgs",
-    ).select(np.arange(100))
+    ).take(np.arange(100))
     # Fans drop the smallest axis, whichever it is.
     flat = replace(flat, kernel="3dgs")
     again = splats_of_fans(fans_of(flat, 8))

@@ -144,7 +144,7 @@ def test_the_page_writes_the_uniform_of_the_python_host(browser, cameras):
 def layered(cloud: ms.GaussianCloud, camera: ms.Camera) -> ms.SplatMesh:
     """Flat fans, each with another one of other colours just before it, both at the depth of one plane: so
     those behind are drawn in front, as their faces come first."""
-    flat = ms.convert(cloud.select(np.arange(0, len(cloud), 2)), preset="paper")
+    flat = ms.convert(cloud.take(np.arange(0, len(cloud), 2)), preset="paper")
     towards = camera.center - flat.vertices
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     colors = np.concatenate([flat.colors, flat.colors])

@@ -427,9 +427,7 @@ class Convert(Command):
             raise ValueError(f"{job.source}: none of the {source.count:,} splats is left")
         kernel = kernels.pop() if len(kernels) == 1 else "3dgs"
         origin = source.origin if self.origin == "keep" else np.zeros(3)
-        kept = (
-            replace(block.select(worth_drawing(block, self.conversion)), origin=origin) for block in source
-        )
+        kept = (replace(block.take(worth_drawing(block, self.conversion)), origin=origin) for block in source)
         with self._recorded(job):
             save_gaussian_blocks(kept, job.outputs[0], count, degree=degree, kernel=kernel, up=source.up)
         seconds = round(time.perf_counter() - start, 4)

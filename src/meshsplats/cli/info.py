@@ -137,7 +137,7 @@ def _in_time(path: Path) -> dict[str, Any]:
 def _splats(cloud: GaussianCloud) -> dict[str, Any]:
     from meshsplats.conversion import convert
 
-    sample = cloud.select(np.arange(0, len(cloud), -(-len(cloud) // SAMPLE)))
+    sample = cloud.take(np.arange(0, len(cloud), -(-len(cloud) // SAMPLE)))
     try:
         tried = convert(sample)
     except ValueError:  # nothing visible

@@ -113,7 +113,7 @@ def convert(
     if chosen.colors == "degree0" and cloud.sh_degree:
         part = replace(part, sh=part.sh[:, :1])
     if len(rows) < len(cloud):
-        part = part.select(rows)
+        part = part.take(rows)
     chosen, count = within_limits(given, chosen, len(part))
     whole = part
     if chosen.budget == "merge" and count < len(part):

@@ -142,7 +142,7 @@ def remove(scene: Scene, found: Findings) -> Scene:
     """``scene`` without the splats that ``find`` has found."""
     if isinstance(scene, SplatMesh):
         return scene.take(found.kept[found.owner])
-    return scene.select(np.flatnonzero(found.kept))
+    return scene.take(np.flatnonzero(found.kept))
 
 
 def cropped(scene: Scene, box: Sequence[float] | None) -> Scene:

@@ -26,7 +26,7 @@ from meshsplats.cameras.framing import guess_up
 from meshsplats.conversion.footprint import CameraCoverage, pixel_sizes, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
-from meshsplats.gaussians import GaussianCloud, joined
+from meshsplats.gaussians import GaussianCloud
 
 NEIGHBOURS = 8
 """Nearest splats with which each may be merged at first; a merged one has the neighbours of both. With 16,
@@ -115,11 +115,11 @@ def simplify_in_blocks(
     ends = np.rint(np.cumsum(visible) / max(sum(visible), 1) * most).astype(np.int64)
     shares = np.diff(ends, prepend=0)
     parts = [
-        simplify(cloud.select(rows), int(share), low_pass=low_pass[rows], threads=threads)
+        simplify(cloud.take(rows), int(share), low_pass=low_pass[rows], threads=threads)
         for rows, share in zip(blocks, shares, strict=True)
         if share
     ]
-    return simplify(joined(parts), count, threads=threads)
+    return simplify(GaussianCloud.joined(parts), count, threads=threads)
 
 
 def _blocks(means: np.ndarray, rows: np.ndarray, most: int) -> list[np.ndarray]:
@@ -346,10 +346,10 @@ def _merged(
     """One splat for each group."""
     sizes = np.bincount(group)
     first = np.unique(group, return_index=True)[1]
-    result = cloud.select(first)
+    result = cloud.take(first)
     changed = np.flatnonzero(sizes > 1)
     rows = np.flatnonzero(sizes[group] > 1)
-    part = replace(cloud, sh=cloud.sh[:, :1]).select(rows)
+    part = replace(cloud, sh=cloud.sh[:, :1]).take(rows)
     index = np.zeros(len(sizes), np.int64)
     index[changed] = np.arange(len(changed))
     own = index[group[rows]]

@@ -57,7 +57,7 @@ def choose_splats(
         rows = rows[most_important(importance, max_splats)]
     if not len(rows):
         raise ValueError(f"none of the {len(cloud)} splats is left: all are fainter than {min_opacity:.4g}")
-    return cloud.select(rows)
+    return cloud.take(rows)
 
 
 def within(cloud: GaussianCloud, crop: Sequence[float] | None, min_opacity: float | None) -> np.ndarray:

@@ -28,7 +28,7 @@ from meshsplats.conversion.footprint import (
 )
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
 from meshsplats.conversion.selection import within
-from meshsplats.gaussians import GaussianCloud, Kernel, joined
+from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
@@ -87,13 +87,13 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
     samples, near_origin = [], []
     passed = 0
     for block in source:
-        part = replace(block.select(worth_drawing(block, options)), kernel=kernel)
-        samples.append(flattened(part).select(np.arange(-passed % step, len(part), step)))
+        part = replace(block.take(worth_drawing(block, options)), kernel=kernel)
+        samples.append(flattened(part).take(np.arange(-passed % step, len(part), step)))
         near_origin.append(part.means[-passed % distance :: distance])
         passed += len(part)
     if passed != kept:
         raise ValueError(f"the splats changed while they were read: {kept:,} before, {passed:,} now")
-    sample = joined(samples)
+    sample = GaussianCloud.joined(samples)
     warn_of_strays(sample, low, high, largest)
     return Survey(kept, kernel, low, high, sample, step, origin_of(np.concatenate(near_origin)))
 
@@ -255,9 +255,7 @@ class _Piece:
         if len(index) == len(self.rows):
             return self
         own: dict[str, Any] = {name: np.take(getattr(self.fans, name), index, axis=0) for name in _PER_SPLAT}
-        return _Piece(
-            self.cloud.select(index), self.rows[index], self.colors[index], self.fans._replace(**own)
-        )
+        return _Piece(self.cloud.take(index), self.rows[index], self.colors[index], self.fans._replace(**own))
 
     @staticmethod
     def together(pieces: Sequence[_Piece]) -> _Piece:
@@ -267,7 +265,7 @@ class _Piece:
             name: np.concatenate([getattr(p.fans, name) for p in pieces]) for name in _PER_SPLAT
         }
         return _Piece(
-            joined([p.cloud for p in pieces]),
+            GaussianCloud.joined([p.cloud for p in pieces]),
             np.concatenate([p.rows for p in pieces]),
             np.concatenate([p.colors for p in pieces]),
             pieces[0].fans._replace(**own),
@@ -303,18 +301,18 @@ def _aligned(
     for block in source:
         rows = worth_drawing(block, options)
         if len(rows):
-            part = replace(block.select(rows), kernel=kernel)
+            part = replace(block.take(rows), kernel=kernel)
             held.append(part if options.colors == "cameras" else flattened(part))
             numbers.append((rows + passed).astype(np.int32))
             count += len(rows)
         passed += len(block)
         while count >= BLOCK:
-            cloud, own = joined(held), np.concatenate(numbers)
-            yield cloud.select(np.arange(BLOCK)), own[:BLOCK]
-            held, numbers = [cloud.select(np.arange(BLOCK, count))], [own[BLOCK:]]
+            cloud, own = GaussianCloud.joined(held), np.concatenate(numbers)
+            yield cloud.take(np.arange(BLOCK)), own[:BLOCK]
+            held, numbers = [cloud.take(np.arange(BLOCK, count))], [own[BLOCK:]]
             count -= BLOCK
     if count:
-        yield joined(held), np.concatenate(numbers)
+        yield GaussianCloud.joined(held), np.concatenate(numbers)
 
 
 def _median_seen(

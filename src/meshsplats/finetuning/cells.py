@@ -39,7 +39,7 @@ from meshsplats.finetuning.journal import CHECKPOINT, Journal
 from meshsplats.finetuning.run import Progress, RunOptions, finetune
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
-from meshsplats.gaussians import GaussianCloud, joined
+from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering.backward import visible_pixels
 
@@ -343,7 +343,7 @@ class _Tuning:
         """Writes the splats that stand for ``cell``."""
         scene = self.scene.get()
         own = scene.cells(self.options.splats).own(cell)
-        save_gaussians(self._few(scene.cloud.select(own), len(scene.cloud)), self.coarse_file(cell))
+        save_gaussians(self._few(scene.cloud.take(own), len(scene.cloud)), self.coarse_file(cell))
 
     def _few(self, part: GaussianCloud, every: int) -> GaussianCloud:
         """``part`` of ``every`` splats, merged."""
@@ -403,7 +403,7 @@ class _Tuning:
         cloud, look = scene.cloud, scene.dataset.look
         chosen = replace(self.options.conversion or ConversionOptions(), crop=None)
         make = partial(starting_mesh, preset=self.options.preset, look=look)
-        parts = [make(cloud.select(np.concatenate([own, along])), cameras, chosen)]
+        parts = [make(cloud.take(np.concatenate([own, along])), cameras, chosen)]
         margin = np.concatenate([along, done])
         few: list[GaussianCloud] = []
         for other in range(len(cells.low)):
@@ -415,13 +415,13 @@ class _Tuning:
                 continue
             rest = np.setdiff1d(cells.own(other), theirs, assume_unique=True)
             if len(rest):
-                few.append(self._few(cloud.select(rest), len(cloud)))
+                few.append(self._few(cloud.take(rest), len(cloud)))
             if np.isin(theirs, done).any():
                 tuned = load_mesh(self.file(other))
                 parts.append(tuned.take(np.isin(_owners(tuned), theirs)))
         if few:
             even = replace(chosen, detail="even", min_opacity=None)
-            beyond = joined([replace(one, kernel=cloud.kernel) for one in few])
+            beyond = GaussianCloud.joined([replace(one, kernel=cloud.kernel) for one in few])
             parts.append(make(beyond, cameras, even))
         # All parts but the first are numbered behind it: which of their splats is which does not matter.
         first = len(own) + len(along)

@@ -20,7 +20,7 @@ from meshsplats._kinds import described, each, need, need_path, require_path
 from meshsplats._origin import choose_origin, sampled
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._display import display_cloud, say_converted
-from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z, transformed
+from meshsplats.formats._orientation import HALF_TURN_X, HALF_TURN_Z
 from meshsplats.formats._validation import Budget
 from meshsplats.formats.gltf.splats import read_splat_gltf
 from meshsplats.formats.ply.activated import Activated, checked_activated
@@ -123,7 +123,7 @@ def load_gaussians(
             cloud = read_streamed_sog(found, strict=strict, origin=own)
         else:
             cloud = read_splat_gltf(found, strict=strict, origin=own)
-    cloud = transformed(reading.of_kernel(cloud), _to_y_down(kind, axes, stored))
+    cloud = reading.of_kernel(cloud).transformed(_to_y_down(kind, axes, stored))
     return cloud if point is None else cloud.relative_to(point)
 
 
@@ -170,7 +170,7 @@ class _Reading:
     def finished(self, cloud: GaussianCloud, reader: SplatReader) -> GaussianCloud:
         """Splats of ``reader`` with display colours and up, those that are visible at the instant."""
         if reader.instant is not None:
-            cloud = cloud.select(cloud.opacities >= VISIBLE)
+            cloud = cloud.take(cloud.opacities >= VISIBLE)
         if reader.linear:
             cloud = display_cloud(cloud)
         return cloud if reader.up is None else replace(cloud, up=reader.up)
@@ -291,14 +291,14 @@ class SplatStream:
                 for block in reader.blocks(self.block, strict=self.strict, origin=own):
                     block = reading.of_kernel(reading.finished(block, reader))
                     if len(block):
-                        yield transformed(block, to_y_down)
+                        yield block.transformed(to_y_down)
         if kind == "gltf":
             whole = read_splat_gltf(path, strict=self.strict, origin=own)
         if whole is not None:
             whole = whole.relative_to(own)
             for start in range(0, len(whole), self.block):
                 part = np.arange(start, min(start + self.block, len(whole)))
-                yield transformed(reading.of_kernel(whole.select(part)), to_y_down)
+                yield reading.of_kernel(whole.take(part)).transformed(to_y_down)
 
     @property
     def reading(self) -> list[Any]:

@@ -357,7 +357,7 @@ class _Build:
         passed = 0
         for block in self._source:
             rows = worth_drawing(block, self._conversion)
-            yield records_of(block.select(rows), (rows + passed).astype(np.int32))
+            yield records_of(block.take(rows), (rows + passed).astype(np.int32))
             passed += len(block)
             if passed > np.iinfo(np.int32).max:
                 raise ValueError(f"{passed:,} splats are more than tiles can number")

@@ -146,7 +146,7 @@ def estimated_bytes(mesh: SplatMesh, splats: GaussianCloud | None = None) -> int
     some = mesh.take(_in_runs(parts))
     size = len(pack_mesh(some, precision, radius)) * len(mesh.faces) // len(some.faces)
     if splats is not None:
-        part = splats.select(np.flatnonzero(_in_runs(np.arange(len(splats)))))
+        part = splats.take(np.flatnonzero(_in_runs(np.arange(len(splats)))))
         size += len(pack_splats(part)) * len(splats) // len(part)
     return size
 

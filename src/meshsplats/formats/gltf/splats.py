@@ -17,7 +17,7 @@ import numpy as np
 from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning
 from meshsplats.formats._display import display_cloud, say_converted
-from meshsplats.formats._orientation import HALF_TURN_Z, transformed
+from meshsplats.formats._orientation import HALF_TURN_Z
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.reader import objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
@@ -54,7 +54,7 @@ def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = Non
     clouds = []
     for cloud, matrix in placed:
         try:
-            clouds.append(transformed(cloud, matrix, origin if origin.any() else None))
+            clouds.append(cloud.transformed(matrix[:3], origin=origin if origin.any() else None))
         except ValueError as error:
             raise document.error(f"a node's transform cannot be applied to splats: {error}") from None
     return joined_within(clouds, document.budget)
@@ -81,7 +81,7 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
             view = _object(document, nested, name).get("bufferView")
             data, _ = document.view_bytes(view, name)
             spz = read_spz(data, document.path, document.budget, strict=strict, origin=zero_origin())
-            return transformed(spz.cloud, HALF_TURN_Z @ spz.to_y_down)
+            return spz.cloud.transformed(HALF_TURN_Z @ spz.to_y_down)
     if (shape := splatting.get("kernel", "ellipse")) != "ellipse":
         warnings.warn(
             f"{document.path}: splats of the kernel {str(shape)[:40]!r}, which is not known here; they are"

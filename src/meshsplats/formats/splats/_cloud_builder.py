@@ -12,7 +12,7 @@ import numpy as np
 from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget, warn_of_lost_detail
-from meshsplats.gaussians import GaussianCloud, Kernel, joined
+from meshsplats.gaussians import GaussianCloud, Kernel
 
 
 class SplatRows(NamedTuple):
@@ -225,7 +225,7 @@ def joined_within(clouds: Sequence[GaussianCloud], budget: Budget) -> GaussianCl
     if len(clouds) > 1:
         count, width = sum(map(len, clouds)), max(cloud.sh.shape[1] for cloud in clouds)
         budget.spend(4 * (11 + 3 * width) * count, f"its {count:,} splats together")
-    return joined(clouds)
+    return GaussianCloud.joined(clouds)
 
 
 def decode_smallest_three(out: np.ndarray, small: np.ndarray, largest: np.ndarray) -> None:
