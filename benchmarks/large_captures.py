@@ -32,7 +32,7 @@ from _common import Report, areas, arguments, images, mean_psnr, run
 
 import meshsplats as ms
 from meshsplats.rendering.viewers import viewer_images
-from meshsplats.viewer.quantise import unpack_mesh
+from meshsplats.viewer.unpacking import unpack_mesh
 
 VIEWS, SIDE = 2, 800
 MESH_BEGINS = '<script type="text/plain" id="mesh">'

@@ -25,7 +25,7 @@ def random_mesh(rng, vertices=9, faces=12, *, extras=True, blending="display"):
                 "": rng.normal(size=(vertices, 2)),
             },
         }
-    return SplatMesh(
+    mesh = SplatMesh(
         rng.normal(size=(vertices, 3)) * 100,
         rng.integers(0, vertices, (faces, 3)),
         rng.random((vertices, 4)),
@@ -33,6 +33,9 @@ def random_mesh(rng, vertices=9, faces=12, *, extras=True, blending="display"):
         blending=blending,
         **more,
     )
+    # So that every format is asked for every array that a mesh can have.
+    assert not extras or all(getattr(mesh, field.name) is not None for field in mesh.FIELDS)
+    return mesh
 
 
 def assert_same(got, mesh, color_error=0.0):
@@ -40,7 +43,7 @@ def assert_same(got, mesh, color_error=0.0):
     np.testing.assert_array_equal(got.vertices, mesh.vertices)
     np.testing.assert_array_equal(got.faces, mesh.faces)
     assert np.abs(got.colors - mesh.colors).max(initial=0) <= color_error
-    for name in ("face_splat", "depth_group", "normals"):
+    for name in (field.name for field in mesh.FIELDS if field.optional):
         if getattr(mesh, name) is None:
             assert getattr(got, name) is None
         else:

@@ -28,6 +28,18 @@ def test_a_vertex_of_two_splats_is_noticed():
     splats = FaceSplats(shared, SPLATS.face_splat, 13)
     assert splats.share_vertices
     assert splats.of_vertex[3] == 1  # the last one
+    assert np.flatnonzero(splats.shared).tolist() == [3]
+    assert not SPLATS.shared.any()
+
+
+def test_a_part_of_the_splats():
+    part = SPLATS.part(slice(1, 3))
+    assert part.starts.tolist() == [0, 1]
+    assert part.numbers.tolist() == [4, 9]
+    np.testing.assert_array_equal(part.faces, FACES[2:])
+    assert len(SPLATS.part(slice(2, 100))) == 1
+    assert len(SPLATS.part(slice(3, 9))) == 0
+    assert FaceSplats(FACES, None, 13).part(slice(1, 4)).numbers.tolist() == [0, 1, 2]
 
 
 def test_without_splats_each_triangle_counts_as_one():

@@ -64,9 +64,23 @@ class FaceSplats:
         return owner
 
     @property
+    def shared(self) -> np.ndarray:
+        """(v,) bool: the vertices that several splats use."""
+        first = np.full(self.vertex_count, -1)
+        first[self.faces[::-1]] = self.of_face[::-1, None]
+        return first != self.of_vertex
+
+    @property
     def share_vertices(self) -> bool:
         """Whether two splats use the same vertex."""
         return bool((self.of_vertex[self.faces] != self.of_face[:, None]).any())
+
+    def part(self, splats: slice) -> FaceSplats:
+        """The splats of a slice with step 1, counted from 0, and their triangles."""
+        start, stop, _ = splats.indices(len(self))
+        own = slice(self.starts[start], self.ends[stop - 1]) if start < stop else slice(0)
+        numbers = None if self.face_splat is None else self.face_splat[own]
+        return FaceSplats(self.faces[own], numbers, self.vertex_count)
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """(s, ...) sums of ``values`` (f, ...) over the triangles of each splat."""

@@ -21,7 +21,7 @@ from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians
 from meshsplats.formats.meshes import save_mesh
-from meshsplats.viewer.quantise import unpack_mesh
+from meshsplats.viewer.unpacking import unpack_mesh
 
 
 @pytest.fixture(scope="module")

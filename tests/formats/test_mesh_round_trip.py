@@ -1,7 +1,8 @@
 """Saved meshes come back as they were."""
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -10,9 +11,18 @@ from _splats import few_splats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats import DataWarning, SplatMesh, load_gaussians, load_mesh, save_gaussians, save_mesh
-from meshsplats.binding import Binding
-from meshsplats.formats import meshes
+from meshsplats import (
+    DataWarning,
+    FileFormatError,
+    SplatMesh,
+    load_gaussians,
+    load_mesh,
+    save_gaussians,
+    save_mesh,
+)
+from meshsplats.binding import ArrayField, Binding
+from meshsplats.formats import meshes, npz
+from meshsplats.formats.gltf import reader
 from meshsplats.formats.gltf import writer as glb
 from meshsplats.formats.ply import header
 from meshsplats.formats.sniff import identify
@@ -28,6 +38,36 @@ def test_round_trip(tmp_path_factory, suffix, seed, extras, blending):
     path = tmp_path_factory.mktemp("mesh") / f"mesh{suffix}"
     save_mesh(mesh, path)
     assert_same(load_mesh(path), mesh, 1 / 10_000 if suffix == ".glb" else 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Shining(SplatMesh):
+    """With one more array, a row for each splat."""
+
+    shine: np.ndarray | None = None
+
+    FIELDS: ClassVar = (*SplatMesh.FIELDS, ArrayField("shine", np.float32, "splat", 2, optional=True))
+    EXTRAS: ClassVar = (*SplatMesh.EXTRAS, FIELDS[-1])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".glb"])
+def test_an_array_of_splats_that_is_declared_comes_back(tmp_path, monkeypatch, suffix):
+    monkeypatch.setattr(npz, "SplatMesh", Shining)
+    monkeypatch.setattr(reader, "SplatMesh", Shining)
+    monkeypatch.setitem(npz._NAMES, "shine", "shine")
+    mesh = random_mesh(np.random.default_rng(7))
+    rows = np.random.default_rng(8).random((mesh.splat_count, 2))
+    mesh = Shining(**vars(mesh), shine=rows)
+    path = tmp_path / f"m{suffix}"
+    save_mesh(mesh, path)
+    assert_same(load_mesh(path), mesh, 1 / 10_000)
+    fewer = {name: a for name, a in mesh.arrays().items() if name != "face_splat"}
+    if suffix == ".npz":
+        names = {"colors": "vertex_colors"}
+        for cut in (fewer, mesh.arrays() | {"shine": rows[:-1]}):
+            np.savez(path, **{names.get(name, name.replace(".", "_", 1)): a for name, a in cut.items()})
+            with pytest.raises(FileFormatError, match="shine"):
+                load_mesh(path)
 
 
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".usdc", ".usda", ".obj"])

@@ -17,8 +17,9 @@ from test_page import HOSTILE, block
 import meshsplats as ms
 from meshsplats.conversion.cleaning import cropped
 from meshsplats.demo_scene import make_scene
+from meshsplats.viewer.packing import pack_splats
 from meshsplats.viewer.page import PageOptions, _read, make_page
-from meshsplats.viewer.quantise import pack_splats, unpack_mesh
+from meshsplats.viewer.unpacking import unpack_mesh
 
 NO_WEBGPU = "Object.defineProperty(Navigator.prototype, 'gpu', { get: () => undefined });"
 WIDTH, HEIGHT = 200, 160

@@ -16,7 +16,7 @@ from _pages import cameras_fixture, cloud_fixture, mesh_fixture  # noqa: F401 - 
 import meshsplats as ms
 from meshsplats.viewer import page as pages
 from meshsplats.viewer.page import PageOptions, make_page, script
-from meshsplats.viewer.quantise import unpack_mesh
+from meshsplats.viewer.unpacking import unpack_mesh
 from meshsplats.webgpu import kernels
 
 HOSTILE = '</script><script>alert(1)</script><img src=x onerror="alert(2)">{{script}}<!--'

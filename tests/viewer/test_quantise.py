@@ -15,17 +15,10 @@ from meshsplats.cameras.framing import scene_bounds
 from meshsplats.demo_scene import make_scene
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer import quantise
-from meshsplats.viewer.quantise import (
-    FINER,
-    PRECISIONS,
-    Precision,
-    estimated_bytes,
-    pack_mesh,
-    pack_splats,
-    quantise_mesh,
-    unpack_mesh,
-)
+from meshsplats.viewer.packing import FINER, Precision, pack_mesh, pack_splats
+from meshsplats.viewer.quantise import PRECISIONS, estimated_bytes, quantise_mesh
 from meshsplats.viewer.streams import Packer, Unpacker
+from meshsplats.viewer.unpacking import unpack_mesh
 
 
 def in_order_of_use(mesh: SplatMesh) -> SplatMesh:

@@ -66,24 +66,30 @@ def compare_images(
     return Comparison(comparison.l1, comparison.ssim, result)
 
 
+class AdamStep(NamedTuple):
+    """A step of Adam."""
+
+    rate: float
+    """Learning rate with its bias corrections."""
+    betas: tuple[float, float]
+    eps: float
+    scale: np.ndarray | None = None
+    """(v,) float32 factors of the rate, row by row."""
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    """Smallest and largest value afterwards."""
+
+
 def adam_rows(
     values: np.ndarray,
-    mean: np.ndarray,
-    square: np.ndarray,
+    moments: tuple[np.ndarray, np.ndarray],
     gradient: np.ndarray,
     rows: np.ndarray | None,
-    *,
-    step: float,
-    betas: tuple[float, float],
-    eps: float,
-    scale: np.ndarray | None = None,
-    bounds: tuple[float, float] = (-np.inf, np.inf),
+    step: AdamStep,
     threads: int | None = None,
 ) -> None:
-    """Changes ``values`` and the moments ``mean`` and ``square`` in place, all (v, k) float32.
+    """Changes ``values`` and the ``moments``, mean and mean square, in place; all (v, k) float32.
 
-    ``rows`` is an increasing int32 array of row indices, a (v,) bool mask, or None for every row. ``step`` is
-    the learning rate with its bias corrections, ``scale`` (v,) float32 multiplies it row by row.
+    ``rows`` is an increasing int32 array of row indices, a (v,) bool mask, or None for every row.
 
     Raises ValueError, before anything changes, if row indices are out of range or do not increase.
     """
@@ -94,19 +100,19 @@ def adam_rows(
         columns=values.shape[1],
         threads=threads or processors(),
         values=pointer(values),
-        mean=pointer(mean),
-        square=pointer(square),
+        mean=pointer(moments[0]),
+        square=pointer(moments[1]),
         gradient=pointer(gradient),
-        scale=pointer(scale),
+        scale=pointer(step.scale),
         chosen=pointer(chosen),
         chosen_count=0 if chosen is None else len(chosen),
         mask=pointer(mask),
-        step=step,
-        one_minus_beta1=1 - betas[0],
-        one_minus_beta2=1 - betas[1],
-        epsilon=eps,
-        low=bounds[0],
-        high=bounds[1],
+        step=step.rate,
+        one_minus_beta1=1 - step.betas[0],
+        one_minus_beta2=1 - step.betas[1],
+        epsilon=step.eps,
+        low=step.bounds[0],
+        high=step.bounds[1],
     )
     run("ms_adam_rows", adam)
 
@@ -132,52 +138,52 @@ def round_fans(fans: np.ndarray, share: float, threads: int | None = None) -> No
     run("ms_round_fans", struct)
 
 
-def edge_gradients(
-    screen: np.ndarray,
-    faces: np.ndarray,
-    colors: np.ndarray,
-    beyond: np.ndarray,
-    front: np.ndarray,
-    image: np.ndarray,
-    gradient: np.ndarray,
-    *,
-    near: float,
-    cutoff: float,
-    threads: int | None = None,
-) -> np.ndarray:
+class OpaqueImage(NamedTuple):
+    """Opaque triangles, and their image with s x s samples to a pixel."""
+
+    screen: np.ndarray
+    """(v, 3) float64 x and y in samples, and depth."""
+    faces: np.ndarray
+    """(f, 3) int32"""
+    colors: np.ndarray
+    """(v, 4) float32"""
+    beyond: np.ndarray
+    """(f, 3) int32, that of ``corners_beyond`` in rendering/edges.py."""
+    front: np.ndarray
+    """(h s, w s) int32 triangle in front at each sample, -1 for none."""
+    color: np.ndarray
+    """(h s, w s, 3) float32 there."""
+    near: float
+    """Least depth; triangles with a vertex in front of it get no gradient."""
+    cutoff: float
+    """Least opacity that is drawn."""
+
+
+def edge_gradients(image: OpaqueImage, gradient: np.ndarray, threads: int | None = None) -> np.ndarray:
     """(v, 2) float64 gradient of a loss with respect to the vertices' positions in an image of opaque
     triangles, in samples, by the motion of visible edges.
 
-    The result has the same bits with any number of ``threads`` (all processors by default).
-
-    Args:
-        screen: (v, 3) float64 x and y in samples, and depth.
-        faces, colors: (f, 3) int32 and (v, 4) float32, those of the mesh.
-        beyond: (f, 3) int32, that of ``corners_beyond`` in rendering/edges.py.
-        front: (h s, w s) int32 triangle in front at each of the s x s samples of a pixel, -1 for none.
-        image: (h s, w s, 3) float32 colour there.
-        gradient: (h, w, 3) float32 gradient of the loss with respect to the colour of each pixel.
-        near: least depth; triangles with a vertex in front of it get nothing.
-        cutoff: least opacity that is drawn.
+    ``gradient`` is that of the loss with respect to the colour of each pixel, (h, w, 3) float32. The result
+    has the same bits with any number of ``threads`` (all processors by default).
     """
     height, width = gradient.shape[:2]
-    result = np.zeros((len(screen), 2))
+    result = np.zeros((len(image.screen), 2))
     struct = EdgesStruct(
         width=width,
         height=height,
-        samples=front.shape[0] // height,
+        samples=image.front.shape[0] // height,
         threads=threads or processors(),
-        vertex_count=len(screen),
-        face_count=len(faces),
-        screen=pointer(screen),
-        colors=pointer(colors),
-        faces=pointer(faces),
-        beyond=pointer(beyond),
-        front=pointer(front),
-        color=pointer(image),
+        vertex_count=len(image.screen),
+        face_count=len(image.faces),
+        screen=pointer(image.screen),
+        colors=pointer(image.colors),
+        faces=pointer(image.faces),
+        beyond=pointer(image.beyond),
+        front=pointer(image.front),
+        color=pointer(image.color),
         gradient=pointer(gradient),
-        near=near,
-        cutoff=cutoff,
+        near=image.near,
+        cutoff=image.cutoff,
         result=pointer(result),
     )
     run("ms_edge_gradients", struct)

@@ -110,25 +110,23 @@ def unit(vectors: np.ndarray, instead: np.ndarray) -> np.ndarray:
 def _splats(mesh: SplatMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of the n splats: centres (n, 3), weights (n,), area times opacity, and (n, 3, 3) sums of weight times
     normal times normal over their triangles."""
-    starts = mesh.splats.starts
-    weights = np.empty(len(starts))
-    centers = np.empty((len(starts), 3))
-    spread = np.empty((len(starts), 3, 3))
-    for begin in range(0, len(starts), _CHUNK):
+    splats = mesh.splats
+    weights = np.empty(len(splats))
+    centers = np.empty((len(splats), 3))
+    spread = np.empty((len(splats), 3, 3))
+    for begin in range(0, len(splats), _CHUNK):
         some = slice(begin, begin + _CHUNK)
-        first = starts[begin]
-        last = starts[begin + _CHUNK] if begin + _CHUNK < len(starts) else len(mesh.faces)
-        faces, heads = mesh.faces[first:last], starts[some] - first
-        corners = mesh.vertices[faces].astype(np.float64)
+        part = splats.part(some)
+        corners = mesh.vertices[part.faces].astype(np.float64)
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         double = np.linalg.norm(cross, axis=1)
-        weight = 0.5 * double * mesh.colors[faces, 3].mean(axis=1) + 1e-300  # nothing divides by zero
+        weight = 0.5 * double * mesh.colors[part.faces, 3].mean(axis=1) + 1e-300  # nothing divides by zero
         normal = cross / np.maximum(double, 1e-300)[:, None]
-        weights[some] = np.add.reduceat(weight, heads)
-        centroids = np.add.reduceat(weight[:, None] * corners.mean(axis=1), heads)
+        weights[some] = part.sums(weight)
+        centroids = part.sums(weight[:, None] * corners.mean(axis=1))
         centers[some] = centroids / weights[some, None]
         products = normal[:, :, None] * normal[:, None, :]
-        spread[some] = np.add.reduceat(weight[:, None, None] * products, heads)
+        spread[some] = part.sums(weight[:, None, None] * products)
     return centers, weights / weights.max(), spread / weights.max()
 
 

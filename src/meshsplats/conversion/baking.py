@@ -12,6 +12,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks
 from meshsplats.conversion.footprint import FRAMING_PIXELS, FRAMING_VIEWS, CameraCoverage
+from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import SplatMesh, checked_filter
 
 MIN_VARIANCE = 1e-4
@@ -72,21 +73,19 @@ def bake_filter(
     splats = mesh.splats
     if splats.share_vertices:
         raise ValueError("two splats share a vertex: the filter moves each splat's vertices on their own")
-    starts, ends, owner = splats.starts, splats.ends, splats.of_vertex
-    means = np.empty((len(starts), 3))
-    axes = np.empty((len(starts), 3, 3))
-    variances = np.empty((len(starts), 3))
-    for part in chunks(len(starts), _CHUNK):
-        faces = mesh.faces[starts[part.start] : ends[part.stop - 1]]
-        found = _shapes(mesh, faces, starts[part] - starts[part.start])
-        means[part], axes[part], variances[part] = found
+    owner = splats.of_vertex
+    means = np.empty((len(splats), 3))
+    axes = np.empty((len(splats), 3, 3))
+    variances = np.empty((len(splats), 3))
+    for part in chunks(len(splats), _CHUNK):
+        means[part], axes[part], variances[part] = _shapes(mesh, splats.part(part))
     if cameras:
         sizes = CameraCoverage(means.astype(np.float32), cameras).pixel_sizes().astype(np.float64)
         if not (sizes > 0).any():
             raise ValueError(f"none of the {len(cameras)} cameras sees any splat of the mesh")
         sizes = np.where(sizes > 0, sizes, np.median(sizes[sizes > 0]))
     else:
-        sizes = np.full(len(starts), float(pixel))  # type: ignore[arg-type]
+        sizes = np.full(len(splats), float(pixel))  # type: ignore[arg-type]
     added = (variance * sizes**2)[:, None]
     least = variances + MIN_VARIANCE * added
     flat = variances <= FLAT_SHARE * variances.max(axis=1, keepdims=True)
@@ -102,10 +101,8 @@ def bake_filter(
     return replace(mesh, vertices=vertices, filter_px2=0.0, binding=None)
 
 
-def _shapes(
-    mesh: SplatMesh, faces: np.ndarray, starts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Moments of the opacity of n splats, whose triangles ``faces`` (f, 3) begin at indices ``starts`` (n,).
+def _shapes(mesh: SplatMesh, splats: FaceSplats) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Moments of the opacity of n ``splats`` of ``mesh``.
 
     The integral of opacity, linear in a triangle, and its moments are polynomials of the corners; a constant
     factor that all share is left out.
@@ -113,13 +110,9 @@ def _shapes(
     Returns:
         (n, 3) means, (n, 3, 3) principal axes as columns, and (n, 3) variances along them.
     """
-    counts = np.diff(np.append(starts, len(faces)))
-
-    def total(values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(values, starts)
-
+    faces, counts, total = splats.faces, splats.counts, splats.sums
     corners = mesh.vertices[faces].astype(np.float64)
-    origin = corners[starts, 0]
+    origin = corners[splats.starts, 0]
     corners -= np.repeat(origin, counts, axis=0)[:, None]
     opacity = mesh.colors[faces, 3].astype(np.float64) + OPACITY_BIAS
     whole = opacity.sum(axis=1)

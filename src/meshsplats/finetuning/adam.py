@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from meshsplats._core.kernels import adam_rows
+from meshsplats._core.kernels import AdamStep, adam_rows
 
 
 class RowAdam:
@@ -107,20 +107,8 @@ class RowAdam:
         selected = None if rows is None else _mask_or_indices(rows, len(self._array))
         if selected is not None and selected.dtype not in (bool, np.int32):
             raise TypeError(f"rows must be a bool mask or int32 indices, got {selected.dtype}")
-        step = self.next_rate(self.lr)
-        adam_rows(
-            self._array,
-            self.mean,
-            self.square,
-            array,
-            selected,
-            step=step,
-            betas=self.betas,
-            eps=self.eps,
-            scale=self.scale,
-            bounds=self.bounds,
-            threads=self.threads,
-        )
+        step = AdamStep(self.next_rate(self.lr), self.betas, self.eps, self.scale, self.bounds)
+        adam_rows(self._array, (self.mean, self.square), array, selected, step, self.threads)
         self.steps += 1
         _bump_version(self._values)
 

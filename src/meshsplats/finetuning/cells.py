@@ -433,9 +433,7 @@ class _Tuning:
 
 def _vertices_of(mesh: SplatMesh, splats: int) -> np.ndarray:
     """(v,) bool: the vertices of the first ``splats``."""
-    found = np.zeros(len(mesh.vertices), bool)
-    found[mesh.faces[_owners(mesh) < splats]] = True
-    return found
+    return mesh.vertices_of(_owners(mesh) < splats)
 
 
 def _views_that_see(points: np.ndarray, views: Sequence[View]) -> list[View]:

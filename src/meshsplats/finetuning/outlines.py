@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from meshsplats.face_splats import FaceSplats
 from meshsplats.mesh import SplatMesh
 
 BEHIND = 0.1
@@ -35,8 +36,7 @@ def fewer_triangles(mesh: SplatMesh, hits: np.ndarray, most: int, fewest: int = 
         most: number of triangles.
         fewest: fans that are in front at fewer samples go in any case.
     """
-    splat = np.arange(len(mesh.faces)) if mesh.face_splat is None else mesh.face_splat
-    fan, loops = _fans(mesh.faces, splat)
+    fan, loops = _fans(mesh.splats)
     samples = np.bincount(fan, hits, len(loops))
     hidden = samples < fewest
     seen = ~hidden[fan]
@@ -65,12 +65,13 @@ def fewer_triangles(mesh: SplatMesh, hits: np.ndarray, most: int, fewest: int = 
     return _assembled(mesh, fan, starts, polygons, taken)
 
 
-def _fans(faces: np.ndarray, splat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fans(splats: FaceSplats) -> tuple[np.ndarray, np.ndarray]:
     """(f,) index of the fan of each triangle, in the order of their first triangles; and (fans, n) the vertex
     indices around each fan, then -1."""
-    connected = _connected(faces, splat)
+    faces = splats.faces
+    connected = _connected(faces, splats.of_face)
     _, fan = np.unique(connected, return_inverse=True)
-    loops = _loops(faces, splat, fan)
+    loops = _loops(splats, fan)
     single = loops[fan, 0] < 0
     present, result = np.unique(np.where(single, np.arange(len(faces)), connected), return_inverse=True)
     around = np.full((len(present), loops.shape[1]), -1)
@@ -130,16 +131,13 @@ def _polygons(mesh: SplatMesh, fan: np.ndarray, loops: np.ndarray) -> list[_Poly
     return result
 
 
-def _loops(faces: np.ndarray, splat: np.ndarray, fan: np.ndarray) -> np.ndarray:
+def _loops(splats: FaceSplats, fan: np.ndarray) -> np.ndarray:
     """(fans, 3 or more) vertex indices around each fan, then -1; only -1 where there is no single loop or a
     vertex belongs to several splats."""
-    count, vertices = int(fan.max(initial=-1)) + 1, int(faces.max(initial=-1)) + 1
+    faces, vertices = splats.faces, splats.vertex_count
+    count = int(fan.max(initial=-1)) + 1
     regular = np.ones(count, bool)
-    owner = np.full(vertices, -1)
-    owner[faces[::-1]] = splat[::-1, None]  # the first one
-    regular[fan[(owner[faces] != splat[:, None]).any(axis=1)]] = False
-    owner[faces] = splat[:, None]  # the last one
-    regular[fan[(owner[faces] != splat[:, None]).any(axis=1)]] = False
+    regular[fan[splats.shared[faces].any(axis=1)]] = False
 
     tails, heads = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
     keys = tails * vertices + heads

@@ -112,17 +112,10 @@ def edge_gradients(
     drawn = depth >= near
     scale = np.where(drawn, 1 / np.where(drawn, depth, 1), 0)[:, None] * [fine.fx, fine.fy]
     screen = np.column_stack([points[:, :2] * scale + [fine.cx, fine.cy], depth])
-    moved = scale * kernels.edge_gradients(
-        screen,
-        mesh.faces,
-        mesh.colors,
-        corners_beyond(mesh.faces) if beyond is None else beyond,
-        front.faces,
-        front.color,
-        gradient,
-        near=near,
-        cutoff=cutoff,
-        threads=threads,
+    beyond = corners_beyond(mesh.faces) if beyond is None else beyond
+    image = kernels.OpaqueImage(
+        screen, mesh.faces, mesh.colors, beyond, front.faces, front.color, near, cutoff
     )
+    moved = scale * kernels.edge_gradients(image, gradient, threads)
     along = -(moved * points[:, :2]).sum(axis=1) / np.where(drawn, depth, 1)
     return (np.column_stack([moved, along]) @ rotation).astype(np.float32)

@@ -25,7 +25,8 @@ from meshsplats.cameras.framing import guess_up, scene_bounds, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
-from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, pack_splats, quantise_mesh
+from meshsplats.viewer.packing import pack_splats
+from meshsplats.viewer.quantise import QuantisedMesh, estimated_bytes, quantise_mesh
 from meshsplats.webgpu import device, frames, kernels
 
 MODULES = ("scene.js", "camera.js", "controls.js", "crop.js", "sorted.js", "exact.js", "app.js")

@@ -238,9 +238,12 @@ def _restore(
     result: dict[str, Any] = {}
     lost: list[str] = []
     v = len(colors)
+    counts = {"vertex": v, "face": f}
     for field in SplatMesh.EXTRAS:
         if field.name in note:
-            shape = field.shape({"vertex": v, "face": f})
+            if field.per == "splat":
+                counts["splat"] = len(np.unique(result.get("face_splat", ())))
+            shape = field.shape(counts)
             values = _raw(document, dict_or_empty(note[field.name]), field.dtype, shape)
             if values is None:
                 lost.append(field.name)

@@ -1,5 +1,5 @@
 // The packed scene: base64 text, gzip, rows of whole numbers, and what they decode to. Python writes it
-// (streams.py, quantise.py); both sides compute with the same numbers in the same order.
+// (streams.py, packing.py); both sides compute with the same numbers in the same order.
 
 export const MAGIC = "MSplat01";
 
