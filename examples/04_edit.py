@@ -26,13 +26,12 @@ print(f"{ball_faces.sum():,} of {len(mesh.faces):,} triangles belong to the ball
 
 # Lift the ball and dye it: vertices and colours are arrays.
 vertices, colors = mesh.vertices.copy(), mesh.colors.copy()
-ball_vertices = np.unique(mesh.faces[ball_faces])
+ball_vertices = mesh.vertices_of(ball_faces)
 vertices[ball_vertices] -= [0, 0.7, 0]  # y points down
 colors[ball_vertices, :3] = colors[ball_vertices, :3][:, [2, 1, 0]]
-lifted = replace(mesh, vertices=vertices, colors=colors)
 
 # Height above the table as a vertex attribute, interpolated and blended as colour is.
-lifted = replace(lifted, attributes={"height": -vertices[:, 1]})
+lifted = replace(mesh.moved(vertices), colors=colors, attributes={"height": -vertices[:, 1]})
 camera = ms.orbit(mesh, 1, elevation=20, width=320, height=320)[0]
 drawn = ms.render(lifted, camera, depth=True, attributes=["height"], samples=2)
 

@@ -93,7 +93,7 @@ for step in range(steps):
         # Prune triangles that are hardly visible, and their vertices in the optimisers.
         mesh = replace(mesh, vertices=vertices.detach().numpy(), colors=colors.detach().numpy())
         keep = visible_pixels(vertices, colors)[mesh.faces].sum(axis=1) > 0.2
-        rows = np.unique(mesh.faces[keep])
+        rows = np.flatnonzero(mesh.vertices_of(keep))
         mesh = mesh.take(keep)
         vertices, colors = leaves(mesh)
         moving, painting = moving.select(vertices, rows), painting.select(colors, rows)
