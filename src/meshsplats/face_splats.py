@@ -67,7 +67,8 @@ class FaceSplats:
     def shared(self) -> np.ndarray:
         """(v,) bool: the vertices that several splats use."""
         first = np.full(self.vertex_count, -1)
-        first[self.faces[::-1]] = self.of_face[::-1, None]
+        # Flat copies: through a view of reversed rows, NumPy may go forwards.
+        first[self.faces[::-1].ravel()] = np.repeat(self.of_face[::-1], 3)
         return first != self.of_vertex
 
     @property

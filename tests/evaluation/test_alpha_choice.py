@@ -27,8 +27,7 @@ def shell(radius: float, opacity: float, rgb, n: int = 500) -> GaussianCloud:
 
 
 def joined(*clouds: GaussianCloud) -> SplatMesh:
-    names = ("means", "quaternions", "scales", "opacities", "sh")
-    return convert(GaussianCloud(*(np.concatenate([getattr(c, n) for c in clouds]) for n in names)))
+    return convert(GaussianCloud.joined(clouds))
 
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)

@@ -10,7 +10,7 @@ from _rendering import camera
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshsplats.finetuning.outlines import BEHIND, MAX_CORNERS, MAX_GROWTH, fewer_triangles
+from meshsplats.finetuning.outlines import BEHIND, MAX_CORNERS, MAX_GROWTH, _fans, fewer_triangles
 from meshsplats.mesh import SplatMesh
 from meshsplats.rendering import render
 
@@ -29,13 +29,7 @@ def fan(radii, middle=(0.0, 0.0, 5.0), rim=(0.2, 0.4, 0.6), tip=None, splat=0) -
 
 
 def joined(*fans: SplatMesh) -> SplatMesh:
-    starts = np.cumsum([0, *(len(f.vertices) for f in fans)])
-    return SplatMesh(
-        np.concatenate([f.vertices for f in fans]),
-        np.concatenate([f.faces + start for f, start in zip(fans, starts, strict=False)]),
-        np.concatenate([f.colors for f in fans]),
-        face_splat=np.concatenate([f.face_splat for f in fans]),
-    )
+    return SplatMesh.joined(fans, same_splats=True)
 
 
 def corners(mesh: SplatMesh, faces=...) -> list:
@@ -51,6 +45,16 @@ def signed_areas(mesh: SplatMesh) -> np.ndarray:
 
 def per_splat(mesh: SplatMesh, count: int) -> list[int]:
     return np.bincount(mesh.face_splat, minlength=count).tolist()
+
+
+def test_fans_that_share_a_vertex_are_single_triangles():
+    apart = joined(*(fan(np.ones(4), (3 * k, 0, 5), splat=k) for k in range(3)))
+    faces = apart.faces.copy()
+    faces[faces == 8] = 3  # a corner of the second fan is one of the first
+    order, around = _fans(replace(apart, faces=faces).splats)
+    assert order.tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 8, 8]
+    assert (around[:8, :3] == faces[:8]).all()
+    assert len(_fans(apart.splats)[1]) == 3
 
 
 def test_a_mesh_within_its_budget_stays():
