@@ -286,13 +286,18 @@ def test_a_vertex_of_two_triangles_takes_the_mean_of_their_turns():
     np.testing.assert_allclose(found, [[-half, 0, half], [0, 0, 1], [-half, 0, half], [-1, 0, 0]], atol=1e-6)
 
 
-def test_splats_on_a_line_turn_no_more_than_they_must():
-    corners = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [7, 7, 7]], float)
-    line = SplatMesh(corners, [[0, 1, 2]], np.ones((4, 4)), normals=np.tile([0, 0, 2.0], (4, 1)))
-    turned = line.moved(corners[:, [1, 0, 2]])  # from x to y
-    np.testing.assert_allclose(turned.normals, line.normals, atol=1e-5)
-    point = line.moved(np.zeros((4, 3)))
-    np.testing.assert_allclose(point.normals, line.normals, atol=1e-6)
+@pytest.mark.parametrize("seed", range(5))
+def test_splats_on_a_line_turn_no_more_than_they_must(seed):
+    rng = np.random.default_rng(seed)
+    (a, b), normals = unit(rng.normal(size=(2, 3))), rng.normal(size=(4, 3))
+    along = np.array([0, 1, 3, 7.0])[:, None]
+    line = SplatMesh(along * a, [[0, 1, 2]], np.ones((4, 4)), normals=normals)
+    axis = np.cross(a, b)
+    # The shortest rotation from a to b, of Rodrigues' formula; the last vertex has no triangle.
+    wanted = normals * (a @ b) + np.cross(axis, normals) + np.outer(normals @ axis, axis) / (1 + a @ b)
+    np.testing.assert_allclose(line.moved(along * b).normals[:3], wanted[:3], atol=1e-4)
+    np.testing.assert_allclose(line.moved(along * b).normals[3], normals[3], atol=1e-6)
+    np.testing.assert_allclose(line.moved(np.zeros((4, 3))).normals, normals, atol=1e-6)
 
 
 def test_moved_checks_positions_and_leaves_the_base():

@@ -9,7 +9,7 @@ import numpy as np
 
 _CLEAR = 1e-6
 """Weight of a corner of opacity 0, so that splats of nothing else have a centre, too."""
-_OPEN = 1e-12
+_OPEN = 1e-10
 """Share of the identity in the moments of a splat's motion."""
 
 
