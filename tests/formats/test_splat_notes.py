@@ -192,7 +192,7 @@ def test_the_kernel_can_be_named(tmp_path, capsys):
     assert re.search(r"^kernel +3dgs$", told.out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("words", [["--kernel", "2dgs"], ["--time", "1"], ["--activated", "scales"]])
+@pytest.mark.parametrize("words", [["--kernel", "2dgs"], ["--time", "1"], ["--set", "activated=scales"]])
 def test_options_for_splats_are_refused_for_meshes(tmp_path, capsys, words):
     mesh = tmp_path / "m.npz"
     assert main(["convert", str(file_with(tmp_path)), "-o", str(mesh), "--no-sidecar"]) == 0

@@ -119,7 +119,7 @@ class Finetune(TrainingCommand):
     """The tuned mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
     preset: Annotated[Literal["default", "paper"], tyro.conf.arg(metavar="NAME")] = "default"
     """default: best quality at equal time. paper: the text of the MeshSplats paper."""
-    start: Literal["same", "default", "paper"] = "same"
+    start: tyro.conf.Fixed[Literal["same", "default", "paper"]] = "same"
     """Conversion of splats; same: that of --preset. default: an ellipse of 5 to 32 triangles a splat. paper:
     the paper's conversion."""
     conversion: StartOptions = field(default_factory=StartOptions)

@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from meshsplats._files.atomic import atomic_path, write_bytes, write_text
 from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
-from meshsplats._options import check_choices
+from meshsplats._options import check_options
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
 from meshsplats.cameras.trajectories import orbit
@@ -85,7 +85,7 @@ class TileOptions:
 
     def resolved(self) -> ConversionOptions:
         """The checked options of the conversion. Raises ValueError."""
-        check_choices(self, {"alpha": get_args(TilesAlpha), "place": ("world", "local")})
+        check_options(self)
         chosen = (self.conversion or ConversionOptions()).resolved(self.preset, has_cameras=False)
         refuse_whole(chosen)
         if chosen.footprint == "filter":
