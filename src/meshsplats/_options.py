@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 import difflib
 import inspect
+import math
 import textwrap
 import types
 from collections.abc import Collection, Iterable
@@ -22,7 +23,10 @@ from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 M = TypeVar("M")
+NUMBERS = (int, float, np.integer, np.floating)
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,11 @@ class Range:
 
     low: float
     high: float
+
+    def __str__(self) -> str:
+        if self.high == math.inf:
+            return f"of at least {self.low:.7g}"
+        return f"from {self.low:.7g} to {self.high:.7g}"
 
 
 class Advanced:
@@ -118,9 +127,7 @@ class Setting:
             number = isinstance(value, types) and not isinstance(value, bool)
             if not number or not limits.low <= value <= limits.high or (whole and int(value) != value):
                 what = "a whole number" if whole else "a number"
-                raise ValueError(
-                    f"{self.name} must be {what} from {limits.low:g} to {limits.high:g}, got {value!r}"
-                )
+                raise ValueError(f"{self.name} must be {what} {limits}, got {value!r}")
 
 
 def settings(kind: type) -> dict[str, Setting]:
@@ -181,7 +188,7 @@ def docstrings(kind: type) -> dict[str, str]:
 
 
 def check_options(
-    options: object, *, given: Collection[str] | None = None, types: tuple[type, ...] = (int, float)
+    options: object, *, given: Collection[str] | None = None, types: tuple[type, ...] = NUMBERS
 ) -> None:
     """Checks a dataclass of options by what its fields declare.
 

@@ -79,8 +79,8 @@ class Blender(Command):
 
     Without --lit, the image is that of `meshsplats render`. With --lit, sun and sky light the splats, which
     cast shadows and are seen in mirrors and through glass. Splats are converted to a mesh first, with
-    default settings; with --lit, to one flat ellipse per splat (convert --set mode=flat), which takes light best.
-    Needs Blender's module bpy in an environment of its own, or an installed Blender (--executable).
+    default settings; with --lit, to one flat ellipse per splat (convert --set mode=flat), which takes light
+    best. Needs Blender's module bpy in an environment of its own, or an installed Blender (--executable).
     """
 
     COMMON = (

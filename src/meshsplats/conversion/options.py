@@ -132,7 +132,7 @@ class ConversionOptions:
         return full
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
-        check_options(self, given=given, types=(int, float, np.integer, np.floating))
+        check_options(self, given=given)
         if self.mode == "3d" and self.sides % 4:  # type: ignore[operator]
             raise ValueError(f"sides must be a multiple of 4 in mode '3d', got {self.sides}")
         if self.mode == "crossed" and self.sides % 2:  # type: ignore[operator]

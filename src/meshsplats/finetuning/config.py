@@ -142,7 +142,7 @@ class FinetuneConfig:
     number of threads, unless the length is given in minutes."""
 
     def __post_init__(self) -> None:
-        check_options(self)
+        check_options(self, types=(int, float))  # what JSON can hold
         if self.opacity == "cutoff":
             self._check_cutoff()
         given = [name for name in LENGTHS if getattr(self, name) is not None]
@@ -211,7 +211,7 @@ PRESETS: Mapping[str, FinetuneConfig] = {
     "paper": _PAPER,
 }
 """default: the best in our measurements at equal time. paper: the values in the text of arXiv 2502.07754,
-with the colour learning rate of its code, since the text gives none. ``docs/finetuning.md`` has the table."""
+with the colour learning rate of its code, since the text gives none. ``docs/options.md`` has the table."""
 
 
 class FinetuneChanges(TypedDict, total=False):
