@@ -79,9 +79,8 @@ def test_help_names_options_by_their_flags(capsys):
     text = " ".join(printed_help("blender", "--help-all", capsys).replace("│", " ").split())
     assert "Radiance of the even sky; not used with --hdri." in text
     text = " ".join(printed_help("finetune", "--help-all", capsys).replace("│", " ").split())
-    assert (
-        "--cutoff 0..1 Least opacity that is drawn. Only with opacity 'cutoff'. (default preset: 0.2)" in text
-    )
+    cutoff = "--cutoff 0..1 Least opacity that is drawn. Only with opacity 'cutoff'."
+    assert f"{cutoff} (default: 0.2; paper: 0.2)" in text
 
 
 @pytest.mark.parametrize(("name", "most"), [("finetune", 45), ("convert", 30), ("train", 30), ("prior", 45)])

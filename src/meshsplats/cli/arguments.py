@@ -177,6 +177,17 @@ def as_cli_options(
     return make_dataclass(options.__name__, parts, bases=(options,), namespace=namespace, frozen=True)
 
 
+def of_presets(presets: Mapping[str, object]) -> Callable[[str], str]:
+    """``defaults`` of ``as_cli_options``: the values that the presets have, where any has one."""
+
+    def defaults(name: str) -> str:
+        values = {preset: getattr(options, name) for preset, options in presets.items()}
+        known = [f"{preset}: {value}" for preset, value in values.items() if value is not None]
+        return f"({'; '.join(known)})" if known else ""
+
+    return defaults
+
+
 def _placeholder(setting: Setting) -> str:
     """What stands for the value of an option in the help: its choices, a narrow range, or its type."""
     if setting.choices:

@@ -21,7 +21,7 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli.arguments import Command, as_cli_options, spelled
+from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.batch import Job, check_file, check_folder, is_batch, jobs, sources, without_results
 from meshsplats.cli.common import (
     Count,
@@ -58,6 +58,7 @@ from meshsplats.cli.messages import (
 )
 from meshsplats.cli.records import CONFIGURATION, beside, changes_since, write_configuration
 from meshsplats.conversion import ConversionOptions, convert, simplify
+from meshsplats.conversion.options import PRESETS
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
@@ -88,8 +89,9 @@ if TYPE_CHECKING:
 else:
     ConvertOptions = as_cli_options(
         ConversionOptions,
-        "Default: the value of the preset.",
+        "In parentheses: the values of the presets.",
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
+        defaults=of_presets(PRESETS),
     )
 
 

@@ -80,7 +80,7 @@ if TYPE_CHECKING:
 else:
     StartOptions = as_cli_options(
         ConversionOptions,
-        "The mesh at the start. Default: the value of the preset.",
+        "The mesh at the start.",
         without=("look",),  # that of the targets
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )

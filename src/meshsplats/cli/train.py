@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 else:
     GrowingOptions = as_cli_options(
         TrainConfig,
-        "Default: see docs/training.md.",
+        "The optimisation, and the growth of the set of fans.",
         without=("preset", *LENGTHS),
         defaults=lambda name: f"(default: {getattr(TrainConfig, name)})",
         checked=False,

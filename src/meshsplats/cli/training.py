@@ -17,7 +17,7 @@ import tyro
 
 from meshsplats._files.locks import locked
 from meshsplats.camera import Camera
-from meshsplats.cli.arguments import Command, as_cli_options, spelled
+from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.common import (
     Count,
     Number,
@@ -47,7 +47,7 @@ from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
 from meshsplats.finetuning.baseline import SizeScores
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
-from meshsplats.finetuning.config import LENGTHS, with_changes
+from meshsplats.finetuning.config import LENGTHS, PRESETS, with_changes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu.device import open_device
@@ -74,12 +74,12 @@ class Display(Protocol):
     def __call__(self, progress: Progress) -> None: ...
 
 
-def tuning_options(default_of: Callable[[str], str]) -> type[FinetuneConfig]:
-    """The configuration of an optimisation as command-line options. ``default_of``: the end of an option's
-    help."""
+def tuning_options(about: str, default_of: Callable[[str], str]) -> type[FinetuneConfig]:
+    """The configuration of an optimisation as command-line options. ``about``: their description;
+    ``default_of``: the end of an option's help."""
     return as_cli_options(
         FinetuneConfig,
-        "Default: the value of the preset.",
+        about,
         without=("preset", *LENGTHS),
         defaults=default_of,
         checked=False,
@@ -89,7 +89,7 @@ def tuning_options(default_of: Callable[[str], str]) -> type[FinetuneConfig]:
 if TYPE_CHECKING:
     TuningOptions = FinetuneConfig
 else:
-    TuningOptions = tuning_options(lambda name: f"(default preset: {getattr(FinetuneConfig, name)})")
+    TuningOptions = tuning_options("In parentheses: the values of the presets.", of_presets(PRESETS))
 
 
 @dataclass(frozen=True)

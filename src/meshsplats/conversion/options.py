@@ -28,71 +28,67 @@ THICK = 0.25
 
 @dataclass(frozen=True)
 class ConversionOptions:
-    """The options of ``convert``. None: the preset's value."""
+    """The options of ``convert``. None: the value of the preset, in ``PRESETS`` and ``docs/options.md``."""
 
     mode: Annotated[Mode | None, Advanced] = None
     """flat: one ellipse in the plane of the two largest axes of each splat. crossed: a second one at right
     angles to it, along the longest axis, so that no splat vanishes edge-on; a splat flatter than
-    ``flat_below`` is one finer ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3.
-    Default: crossed; paper: flat."""
+    ``flat_below`` is one finer ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3."""
     rim_radius: Annotated[float | None, Range(0.1, 10), Advanced] = None
-    """Radius of the rim in standard deviations. Default: calibrated; paper: 2.7."""
+    """Radius of the rim in standard deviations. Default: calibrated."""
     sides: Annotated[int | None, Range(3, 64), Advanced] = None
-    """Sides of an ellipse; with one ring, also the triangles of its fan (3d: a multiple of 4; crossed:
-    even). Default: 8 for flat, else 4; paper: 8."""
+    """Sides of an ellipse; with one ring, also the triangles of its fan (3d: a multiple of 4; crossed: even).
+    Default: 8 for flat, else 4."""
     rim_opacity: Annotated[float | None, Range(0, 1), Advanced] = None
-    """Opacity of the rim as a fraction of the splat's. Default: 0; paper: 0.2."""
+    """Opacity of the rim as a fraction of the splat's."""
     center_opacity: Annotated[float | None, Range(1e-3, 2), Advanced] = None
     """Opacity of the centre as a multiple of the splat's; the product is clamped to 1. Default:
-    calibrated; paper: 1."""
+    calibrated."""
     rings: Annotated[int | None, Range(1, 4), Advanced] = None
-    """Rings of vertices in an ellipse; the last is the rim. More rings follow the Gaussian more
-    closely: 2 rings make 3 * sides triangles. Default and paper: 1."""
+    """Rings of vertices in an ellipse; the last is the rim. More rings follow the Gaussian more closely: 2
+    rings make 3 * sides triangles."""
     detail: Annotated[Detail | None, Advanced] = None
     """Level of detail. even: every splat has the same number of triangles. cameras: that number on average, 3
     to 80 for each splat; most where the splat is large in the cameras' images and a plain fan would look
     wrong, none where it is hidden inside a solid. It implies mode 'flat' and needs one ring. Fine-tuning
-    begins with it. Default and paper: even."""
+    begins with it."""
     flat_below: Annotated[float | None, Range(0, 1), With(mode="crossed", detail="cameras"), Advanced] = None
     """crossed: a splat whose smallest standard deviation (with its footprint) is at most this fraction of the
-    middle one becomes one ellipse of twice as many triangles. Default: 0.15. detail 'cameras': a
-    splat that is thicker than that and gets 24 triangles or more becomes a star, ellipses in 6 or 10 planes,
-    which looks alike from everywhere. Default there: 0.25; 1: no stars."""
+    middle one becomes one ellipse of twice as many triangles. detail 'cameras': a splat that is thicker than
+    that and gets 24 triangles or more becomes a star, ellipses in 6 or 10 planes, which looks alike from
+    everywhere. Default there: 0.25; 1: no stars."""
     compensation: Annotated[float | None, Range(0, 1), Advanced] = None
     """1: opacities are scaled so that the ellipses of a splat have the same opacity times area as the splat,
-    averaged over all directions. 0: opacities stay. Between: a power of that factor. Default: 1; paper:
-    0."""
+    averaged over all directions. 0: opacities stay. Between: a power of that factor."""
     look: Look | None = None
     """How the mesh should look. area: each pixel is the mean over its area, for programs that take several
     samples a pixel: Blender, engines with MSAA, ray tracers. splats: as a 3DGS viewer shows the splats at the
-    image size of the cameras or the framing; fans are then wider, and blur in larger images. Default and
-    paper: area."""
+    image size of the cameras or the framing; fans are then wider, and blur in larger images."""
     footprint: Annotated[Footprint | None, Advanced] = None
     """Source of the size of a pixel at each splat, for the low-pass filter that splats were trained with.
     cameras: the given cameras. framing: images of 1000 pixels from all sides that just hold the subject, with
     finer pixels for very dense splats. distance: ``viewing_distance``. filter: the mesh gets a filter of its
     own (``SplatMesh.filter_px2``) instead, which is right at every size but which only this project's
     renderer applies; for splats of kernel '3dgs'. none: no filter, for a model trained without one. Default:
-    cameras if there are any, else distance if it is given, else framing; paper: none."""
+    cameras if there are any, else distance if it is given, else framing."""
     footprint_px2: Annotated[
         float | None, Range(0, 100), With(footprint=("cameras", "framing", "distance", "filter")), Advanced
     ] = None
-    """Variance of that filter in square pixels. Every standard deviation s becomes
-    sqrt(s^2 + v * pixel^2), or max(s, sqrt(v) * pixel) for splats of kernel '2dgs', with v this variance.
-    Default: 0.05 for the look 'area', against sampling noise; for 'splats' 0.5, or 0.4 for splats of kernel
-    'antialiased' and 0.3 for '2dgs'. With ``footprint`` filter: ``SplatMesh.filter_px2``, by default 0.3
-    as in 3DGS."""
+    """Variance of that filter in square pixels. Every standard deviation s becomes sqrt(s^2 + v * pixel^2),
+    or max(s, sqrt(v) * pixel) for splats of kernel '2dgs', with v this variance. Default: 0.05 for the look
+    'area', against sampling noise; for 'splats' 0.5, or 0.4 for splats of kernel 'antialiased' and 0.3 for
+    '2dgs'. With ``footprint`` filter: ``SplatMesh.filter_px2``, by default 0.3 as in 3DGS."""
     viewing_distance: Annotated[float | None, Range(1e-30, 1e30), With(footprint="distance"), Advanced] = None
     """Distance from which the mesh will be seen, scene units."""
     focal: Annotated[float | None, Range(1e-3, 1e9), With(footprint="distance"), Advanced] = None
-    """Focal length, in pixels, of images from ``viewing_distance``. Default: 1000, which is 1000 pixels over
-    53 degrees."""
+    """Focal length, in pixels, of images from ``viewing_distance``. A value of 1000 is 53 degrees over 1000
+    pixels."""
     min_opacity: Annotated[float | None, Range(0, 1), Advanced] = None
-    """Leave out splats of less opacity than this; above 0, also splats without area. Default: 1/255,
-    below which splats are invisible; paper: 0."""
+    """Leave out splats of less opacity than this; above 0, also splats without area. Splats below 1/255 are
+    invisible."""
     shrink_faint: Annotated[bool | None, Advanced] = None
     """Make faint splats smaller: 3DGS cuts them off where their opacity falls below 1/255, which leaves the
-    share 1 - 1 / (255 opacity) of their area. Default: yes; paper: no."""
+    share 1 - 1 / (255 opacity) of their area."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 in scene units: leave out splats whose centre is outside."""
     max_splats: Annotated[int | None, Range(1, 2**31 - 1)] = None
@@ -103,11 +99,10 @@ class ConversionOptions:
     budget: Annotated[Budget | None, Advanced] = None
     """How to keep to ``max_splats`` and ``max_triangles``. merge: merge similar splats. drop: keep only the
     most important ones, by opacity times area in the images of the cameras (splats that no camera sees count
-    as at the median distance), or in scene units without cameras; this tears holes. Default and paper:
-    merge."""
+    as at the median distance), or in scene units without cameras; this tears holes."""
     colors: Annotated[Colors | None, Advanced] = None
     """degree0: the view-independent part of the colour. cameras: where splats have spherical harmonics, the
-    mean of the colours that the cameras see. Default and paper: degree0."""
+    mean of the colours that the cameras see."""
 
     def resolved(self, preset: str, *, has_cameras: bool) -> ConversionOptions:
         """A checked copy with the preset's values in place of None.

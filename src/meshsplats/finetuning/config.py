@@ -112,21 +112,21 @@ class FinetuneConfig:
     anneal_share: Annotated[float, Range(0, 1), With(opacity="cutoff"), Advanced] = 0.5
     """Opacities turn from blended to cut over this initial fraction of the run."""
     expected_share: Annotated[float, Range(0, 1), With(opacity="cutoff"), Advanced] = 0.5
-    """Share of the loss, from the end of the annealing on, that is l2_weight times the
-    expected square error of images in which each fragment is opaque with its opacity as probability. It makes
-    layers agree with the target one by one, not only in their mean."""
+    """Share of the loss, from the end of the annealing on, that is l2_weight times the expected square error
+    of images in which each fragment is opaque with its opacity as probability. It makes layers agree with the
+    target one by one, not only in their mean."""
     settle_share: Annotated[float | None, Range(0, 1), With(opacity="cutoff"), Advanced] = None
-    """Before this last fraction of the run, triangles that the training views do not show
-    are removed. None: 0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
+    """Before this last fraction of the run, triangles that the training views do not show are removed. None:
+    0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
     hidden_hits: Annotated[int, Range(0, 10**9), With(opacity="cutoff"), Advanced] = 1
-    """Triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
-    a pixel, are removed. 0: none."""
+    """Triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples a pixel, are
+    removed. 0: none."""
     opaque_share: Annotated[float, Range(0, 1), With(opacity="cutoff")] = 1.0
-    """Largest number of opaque triangles, as a fraction of the number at the start. Splats
-    become polygons of fewer corners, down to one triangle; the least visible ones go. 1: all stay."""
+    """Largest number of opaque triangles, as a fraction of the number at the start. Splats become polygons of
+    fewer corners, down to one triangle; the least visible ones go. 1: all stay."""
     soft_share: Annotated[float, Range(0, 1), With(opacity="cutoff")] = 0.0
-    """Faint splats that opaque triangles cannot replace stay blended, with up to this
-    fraction of the number of triangles at the start. 0: none."""
+    """Faint splats that opaque triangles cannot replace stay blended, with up to this fraction of the number
+    of triangles at the start. 0: none."""
     soft_phase: Annotated[float, Range(0.01, 0.99), With("soft_share"), Advanced] = 0.3
     """With soft_share: last fraction of the run, in which the blended triangles are optimised together with
     the cut ones. The shares above are then fractions of the phase before."""
