@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from meshsplats._options import Range, check_options
+from meshsplats._options import Advanced, Range, check_options
 
 Engine = Literal["cycles", "eevee"]
 Ground = Literal["plane", "catcher", "none"]
@@ -27,21 +27,21 @@ class LightOptions:
     elevation, degrees."""
     sun_strength: Annotated[float, Range(0, 1e6)] = 2.5
     """Irradiance of a surface that faces the sun, W/m^2; at pi, a white one has radiance 1. 0: no sun."""
-    sun_size: Annotated[float, Range(0, 180)] = 2.0
+    sun_size: Annotated[float, Range(0, 180), Advanced] = 2.0
     """Degrees that the sun's disc spans: the larger, the softer shadows are."""
-    sun_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
+    sun_color: Annotated[tuple[float, float, float], "RGB", Advanced] = (1.0, 1.0, 1.0)
     """Colour of sunlight: linear R G B, 0 to 1; ``sun_strength`` is multiplied by it."""
-    fill: Annotated[float, Range(0, 1e6)] = 0.0
+    fill: Annotated[float, Range(0, 1e6), Advanced] = 0.0
     """Irradiance of a second, soft sun that stands low on the other side, W/m^2. 0: there is none."""
     sky: Annotated[float, Range(0, 1e6)] = 0.35
     """Radiance of the even sky; not used with ``hdri``."""
-    sky_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
+    sky_color: Annotated[tuple[float, float, float], "RGB", Advanced] = (1.0, 1.0, 1.0)
     """Colour of that sky: linear R G B, 0 to 1; ``sky`` is multiplied by it."""
     hdri: Path | None = None
     """Environment image (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
-    hdri_strength: Annotated[float, Range(0, 1e6)] = 1.0
+    hdri_strength: Annotated[float, Range(0, 1e6), Advanced] = 1.0
     """Factor on the environment image."""
-    hdri_rotation: Annotated[float, Range(-1e6, 1e6)] = 0.0
+    hdri_rotation: Annotated[float, Range(-1e6, 1e6), Advanced] = 0.0
     """Degrees that the environment is rotated about the up direction."""
     ground: Ground = "plane"
     """Ground under the subject: a grey plane that fades into the background; a catcher, visible only where
@@ -53,12 +53,12 @@ class LightOptions:
     """A mirror behind the subject."""
     glass: bool = False
     """A glass ball beside the subject."""
-    roughness: Annotated[float, Range(0, 1)] = 1.0
+    roughness: Annotated[float, Range(0, 1), Advanced] = 1.0
     """Roughness of the splats' surface; visible with ``specular``."""
-    specular: Annotated[float, Range(0, 1)] = 0.0
+    specular: Annotated[float, Range(0, 1), Advanced] = 0.0
     """Highlights of the splats' surface; 0.5 is plastic. Splats have highlights of their own baked
     in."""
-    bounces: Annotated[int, Range(0, 64)] = 4
+    bounces: Annotated[int, Range(0, 64), Advanced] = 4
     """Most scattering events of a light path; layers that it passes through do not count."""
 
     @property

@@ -66,7 +66,7 @@ else:
     LightArguments = as_cli_options(
         LightOptions,
         "Light and surroundings of lit images. Lengths are relative to the subject. Defaults: --lights sun.",
-        metavars={"sun": "AZIMUTH ELEVATION", "sun_color": "R G B", "sky_color": "R G B", "hdri": "FILE"},
+        metavars={"sun": "AZIMUTH ELEVATION", "hdri": "FILE"},
         defaults=_default_light,
         flags=True,
     )
