@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -32,6 +33,7 @@ class Baking:
     degrees Celsius."""
     minutes: Annotated[int | None, Range(1, 1000), Advanced] = None
     mode: Literal["fan", "grill", "steam"] = "fan"
+    loaves: Annotated[int, Range(1, math.inf)] = 1
     glaze: bool = False
     coats: Annotated[int, Range(1, 5), With("glaze")] = 1
     """Layers of egg."""
@@ -56,6 +58,7 @@ class Toasting(Baking):
         ({"heat": None}, "heat must be a number from 50 to 250, got None"),
         ({"heat": "hot"}, "heat must be a number from 50 to 250, got 'hot'"),
         ({"minutes": 1.5}, "minutes must be a whole number from 1 to 1000, got 1.5"),
+        ({"loaves": float("inf")}, "loaves must be a whole number of at least 1, got inf"),
         ({"mode": "boil"}, "mode must be one of fan, grill, steam, got 'boil'"),
         ({"glaze": 1}, "glaze must be True or False, got 1"),
         ({"coats": 2}, "coats has no effect without glaze"),
@@ -83,7 +86,7 @@ def test_a_field_that_is_declared_again_keeps_its_range():
 def test_a_fixed_option_and_those_that_need_another_value_of_it_cannot_be_changed():
     with pytest.raises(ValueError, match="mode must be 'grill' for toast: bake the rest"):
         Toasting(mode="steam")
-    assert set(reachable(Toasting)) == {"heat", "minutes", "glaze", "coats"}
+    assert set(reachable(Toasting)) == {"heat", "minutes", "loaves", "glaze", "coats"}
     assert set(reachable(Baking)) == {field.name for field in fields(Baking)}
 
 

@@ -93,7 +93,8 @@ def _others() -> Iterator[list[str]]:
 def _setting(kind: type, path: tuple[str, ...]) -> Setting:
     for group in path[:-1]:
         kind = settings(kind)[group].kinds[0]
-    return settings(kind)[path[-1]]
+    library = next((base for base in kind.__mro__[1:] if base.__name__ == kind.__name__), kind)
+    return settings(library)[path[-1]]  # which has the default
 
 
 def _command(name: str) -> type:

@@ -86,10 +86,15 @@ class Setting:
     """Whether it may be None."""
     default: Any
     """``dataclasses.MISSING`` where there is none."""
-    help: str
-    """The docstring of the field in one line."""
     marks: tuple[Any, ...]
     """What else stands in ``Annotated``, in the nearest class that says it."""
+    owner: type
+    """Its class."""
+
+    @property
+    def help(self) -> str:
+        """The docstring of the field in one line."""
+        return docstrings(self.owner).get(self.name, "")
 
     @property
     def text(self) -> str:
@@ -125,7 +130,7 @@ class Setting:
         if limits is not None:
             whole = int in self.kinds
             number = isinstance(value, types) and not isinstance(value, bool)
-            if not number or not limits.low <= value <= limits.high or (whole and int(value) != value):
+            if not number or not limits.low <= value <= limits.high or (whole and value % 1 != 0):
                 what = "a whole number" if whole else "a number"
                 raise ValueError(f"{self.name} must be {what} {limits}, got {value!r}")
 
@@ -139,7 +144,7 @@ def settings(kind: type) -> dict[str, Setting]:
 @cache
 def _declared(kind: type) -> dict[str, Setting]:
     found = {}
-    texts, parts = docstrings(kind), {part.name: part for part in fields(kind)}
+    parts = {part.name: part for part in fields(kind)}
     marks: dict[str, dict[type, Any]] = {name: {} for name in parts}
     hints: dict[str, Any] = {}
     for base in kind.__mro__:
@@ -159,8 +164,8 @@ def _declared(kind: type) -> dict[str, Setting]:
             kinds=inner,
             optional=type(None) in every,
             default=part.default if part.default_factory is MISSING else part.default_factory(),
-            help=texts.get(name, ""),
             marks=tuple(marks[name].values()),
+            owner=kind,
         )
     return found
 
@@ -170,6 +175,7 @@ def alternatives(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
 
 
+@cache
 def docstrings(kind: type) -> dict[str, str]:
     """The docstrings of a dataclass' fields and of those of its bases, each in one line: the string under a
     field, which Python itself does not keep."""
