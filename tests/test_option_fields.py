@@ -47,6 +47,7 @@ class Baking:
 class Toasting(Baking):
     mode: Annotated[Literal["fan", "grill", "steam"], Fixed("for toast: bake the rest")] = "grill"
     heat: float = 220.0
+    minutes: Annotated[int | None, Range(1, 10)] = None
 
 
 @pytest.mark.parametrize(
@@ -76,7 +77,10 @@ def test_values_that_a_field_allows():
     Baking(mode="steam", water=0)
 
 
-def test_a_field_that_is_declared_again_keeps_its_range():
+def test_a_field_that_is_declared_again_keeps_its_range_or_has_another():
+    with pytest.raises(ValueError, match="minutes must be a whole number from 1 to 10, got 20"):
+        Toasting(minutes=20)
+    assert settings(Toasting)["minutes"].advanced
     with pytest.raises(ValueError, match="heat must be a number from 50 to 250"):
         Toasting(heat=900)
     assert settings(Toasting)["heat"].default == 220
