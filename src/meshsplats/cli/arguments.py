@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import re
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import tyro
 
-from meshsplats._options import Range, Setting, alternatives, did_you_mean, reachable, settings
+from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
 from meshsplats.cli import toml
 from meshsplats.cli.messages import OK, UsageError, flag, say
+from meshsplats.cli.values import converted, from_text, short
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
@@ -218,7 +218,7 @@ def _taken_apart(words: Sequence[str]) -> Line:
         name, equals, value = text.partition("=")
         name = name.replace("-", "_")
         if not equals or not name:
-            raise UsageError(f"--set takes NAME=VALUE, got {_short(text)}")
+            raise UsageError(f"--set takes NAME=VALUE, got {short(text)}")
         if name in settings:
             raise UsageError(f"--set {name} is given twice")
         settings[name] = value
@@ -243,26 +243,10 @@ def _read_settings(
         if flag(key) in flags:
             raise UsageError(f"give {flag(key)} or --set {key}, not both")
         try:
-            values[key] = _converted(_from_text(text, options[key].hint), options[key].hint, Path())
+            values[key] = converted(from_text(text, options[key].hint), options[key].hint, Path())
         except TypeError as error:
-            raise UsageError(f"--set: {key} must be {error}, got {_short(text)}") from None
+            raise UsageError(f"--set: {key} must be {error}, got {short(text)}") from None
     return values
-
-
-def _from_text(text: str, hint: Any) -> Any:
-    """``text`` as a configuration file would have it for an option of this type; as it is if it does not fit.
-    Lists have commas."""
-    for kind in alternatives(hint):
-        if get_origin(kind) is tuple:
-            return [_from_text(part, get_args(kind)[0]) for part in text.split(",")]
-        if get_origin(kind) is Literal and (fitting := [c for c in get_args(kind) if str(c) == text]):
-            return fitting[0]
-        if kind is bool and text.lower() in ("true", "false"):
-            return text.lower() == "true"
-        if kind in (int, float):
-            with suppress(ValueError):
-                return kind(text)
-    return text
 
 
 def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
@@ -317,11 +301,11 @@ def _read(command: type[Command], file: Path, name: str) -> tuple[dict[str, Any]
     record = toml.load(file)
     _refuse_unknown(record, TABLES, f"{file}: no such table or key")
     if record.get("command", name) != name:
-        raise UsageError(f"{file}: of the command {_short(record['command'])}, not {name}")
+        raise UsageError(f"{file}: of the command {short(record['command'])}, not {name}")
     table, resolved = record.get("options", {}), record.get("resolved", {})
     for title, part in (("options", table), ("resolved", resolved)):
         if not isinstance(part, dict):
-            raise UsageError(f"{file}: {title} must be a table, got {_short(part)}")
+            raise UsageError(f"{file}: {title} must be a table, got {short(part)}")
     options = options_of(command)
     for option in INVOCATION:
         if option in table:
@@ -332,9 +316,9 @@ def _read(command: type[Command], file: Path, name: str) -> tuple[dict[str, Any]
         if key == "input" and value in ("-", ["-"]):
             continue  # standard input has to be named again
         try:
-            values[key] = _converted(value, options[key].hint, file.parent)
+            values[key] = converted(value, options[key].hint, file.parent)
         except TypeError as error:
-            raise UsageError(f"{file}: {key} must be {error}, got {_short(value)}") from None
+            raise UsageError(f"{file}: {key} must be {error}, got {short(value)}") from None
     return values, resolved
 
 
@@ -342,7 +326,7 @@ def _refuse_unknown(table: Mapping[str, Any], known: Collection[str], problem: s
     for key in table:
         if key not in known:
             hint = did_you_mean(key[:60], known)
-            raise UsageError(f"{problem} {_short(key)}" + (f"; {hint}" if hint else ""))
+            raise UsageError(f"{problem} {short(key)}" + (f"; {hint}" if hint else ""))
 
 
 def _warn_of_changes(
@@ -358,7 +342,7 @@ def _warn_of_changes(
         plain = list(value) if isinstance(value, tuple) else value
         if key in recorded and not isinstance(value, Path) and plain != recorded[key]:
             say(
-                f"warning: {file}: {key} is {_short(plain)} now, and was {_short(recorded[key])}:"
+                f"warning: {file}: {key} is {short(plain)} now, and was {short(recorded[key])}:"
                 " [resolved] is a record; values are set under [options]"
             )
             return
@@ -378,90 +362,3 @@ def _filled(command: type[T], values: Mapping[str, Any]) -> T:
         elif part.default is MISSING and part.default_factory is MISSING:
             arguments[part.name] = tyro.MISSING
     return command(**arguments)
-
-
-def _converted(value: Any, hint: Any, folder: Path) -> Any:
-    """``value`` of a file in ``folder`` as an option of the type ``hint``. A TypeError says what it must
-    be."""
-    problems = []
-    for kind in alternatives(hint):
-        if kind is type(None):
-            continue
-        try:
-            return _as_kind(value, kind, folder)
-        except TypeError as error:
-            problems.append(str(error))
-    raise TypeError(" or ".join(problems))
-
-
-def _as_kind(value: Any, kind: Any, folder: Path) -> Any:
-    if get_origin(kind) is Literal:
-        choices = get_args(kind)
-        if value in choices and type(value) in map(type, choices):
-            return value
-        raise TypeError("one of " + ", ".join(map(str, choices)))
-    if get_origin(kind) is tuple:
-        return _as_tuple(value, get_args(kind), folder)
-    if kind is bool and isinstance(value, bool):
-        return value
-    whole = isinstance(value, int) and not isinstance(value, bool) and value.bit_length() < 64
-    if kind is int and whole:
-        return value
-    if kind is float and (whole or isinstance(value, float)):
-        return float(value)
-    if kind in (str, Path) and isinstance(value, str) and "\0" not in value:
-        return value if kind is str else resolve(value, folder)
-    raise TypeError(_KINDS[kind])
-
-
-_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path"}
-
-
-def _as_tuple(value: Any, kinds: tuple[Any, ...], folder: Path) -> tuple[Any, ...]:
-    endless = kinds[-1] is Ellipsis
-    if not isinstance(value, list) or (not endless and len(value) != len(kinds)):
-        raise TypeError("a list" if endless else f"a list of {len(kinds)} values")
-    try:
-        parts = [_converted(v, kinds[0 if endless else i], folder) for i, v in enumerate(value)]
-    except TypeError as error:
-        raise TypeError(f"a list, each {error}") from None
-    return tuple(parts)
-
-
-def _short(value: Any) -> str:
-    """``value`` for a message, in printable characters."""
-    if isinstance(value, dict):
-        return "a table"
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    if isinstance(value, int) and value.bit_length() > 64:
-        return "more than 64 bits"
-    text = ascii(value) if isinstance(value, str) else str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-# ---- Paths in configuration files are relative to the file's folder, so that it works from everywhere
-
-
-def resolve(text: str, folder: Path) -> Path:
-    """The path ``text`` of a file in ``folder``, seen from the working folder."""
-    path = Path(text)
-    if path.is_absolute():
-        return path
-    whole = os.path.normpath(os.path.join(os.path.realpath(folder), text))
-    return Path(whole if folder.is_absolute() else _relative(whole, os.path.realpath(".")))
-
-
-def relative_to(path: Path, folder: Path) -> str:
-    """``path``, relative to the working folder, for a file in ``folder``. Absolute ones stay."""
-    if path.is_absolute():
-        return str(path)
-    whole = os.path.join(os.path.realpath(path.parent), path.name)
-    return Path(_relative(whole, os.path.realpath(folder))).as_posix()
-
-
-def _relative(path: str, start: str) -> str:
-    try:
-        return os.path.relpath(path, start)
-    except ValueError:  # another drive
-        return path

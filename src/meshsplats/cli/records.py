@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats.cli import toml
-from meshsplats.cli.arguments import INVOCATION, Command, options_of, relative_to, spelled
+from meshsplats.cli.arguments import INVOCATION, Command, options_of, spelled
 from meshsplats.cli.messages import UsageError, shown_path
+from meshsplats.cli.values import relative_to
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
