@@ -36,7 +36,10 @@ meshsplats finetune scene.ply -o tuned.npz --minutes 5 --set ssim_weight=0.6 --s
 ```
 
 ```python
-ms.finetune(mesh, data, minutes=5, ssim_weight=0.6)
+import meshsplats as ms
+
+config = ms.make_config(minutes=5, ssim_weight=0.6)
+mesh = ms.convert(ms.load_gaussians("scene.ply"), sides=6)
 ```
 
 Lists have commas: `--set crop=-1,-1,-1,1,1,1`. Where a default is empty, the text names it, or there is none.

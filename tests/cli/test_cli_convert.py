@@ -67,10 +67,10 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
 
 def test_options_reach_the_conversion(splats, tmp_path):
     options = {"mode": "flat", "sides": 6, "rings": 2, "max_splats": 20, "crop": (-1.0, -1, -1, 1, 1, 1)}
-    flags = [f"--{name.replace('_', '-')}" for name in options]
     given = []
-    for flag, value in zip(flags, options.values(), strict=True):
-        given += [flag, *(value if isinstance(value, tuple) else (value,))]
+    for name, value in options.items():
+        text = ",".join(map(str, value)) if isinstance(value, tuple) else value
+        given += ["--set", f"{name}={text}"]
     assert run(splats, "-o", tmp_path / "mesh.npz", "--no-preview", *given) == 0
     expected = convert(load_gaussians(splats), **options)
     mesh = load_mesh(tmp_path / "mesh.npz")
@@ -312,7 +312,7 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
-    assert "--alpha mask or hybrid, and --compression are for .glb" in capsys.readouterr().err
+    assert "--alpha mask or hybrid, --compression and --set color_type are for .glb" in capsys.readouterr().err
 
 
 def test_previews_of_large_meshes_are_quick(splats, tmp_path, monkeypatch):

@@ -200,7 +200,10 @@ def test_options_for_splats_are_refused_for_meshes(tmp_path, capsys, words):
     outputs += [["render", str(mesh), "-o", str(tmp_path / "m.png")]]
     for command in outputs:
         assert main([*command, *words]) == 2
-        assert f"holds no splats: {words[0]} would have no effect" in capsys.readouterr().err
+        assert (
+            f"holds no splats: {words[0].replace('--set', '--set activated')} would have no effect"
+            in capsys.readouterr().err
+        )
 
 
 def test_third_scales_of_2dgs_splats_mean_nothing(tmp_path):
