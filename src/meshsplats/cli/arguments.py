@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -263,7 +264,8 @@ def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
         if everything:
             notes.append("Paths in it are relative to its folder. Options on the command line win.")
     if others and (everything or not hidden):
-        print(f"--set NAME=VALUE sets further options: {', '.join(others)}. See docs/options.md.")
+        text = f"--set NAME=VALUE sets further options (docs/options.md): {', '.join(others)}."
+        print(textwrap.fill(text, 80, break_on_hyphens=False))
     if notes:
         print(" ".join(notes))
 
