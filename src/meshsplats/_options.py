@@ -1,56 +1,237 @@
-"""Checks that dataclasses of options share: ranges, choices, names."""
+"""Options as fields of dataclasses: what a field declares, checks of values, misspelt names.
+
+Name, type, default, range and help of an option stand in one place, its field:
+
+    ssim_weight: Annotated[float, Range(0, 1), Advanced] = 0.4
+    '''Weight of SSIM against L1 in the loss.'''
+
+Checks, the options of the command line and ``docs/options.md`` follow from it. Numbers of type int are whole;
+a ``Literal`` lists choices; what may be None has ``| None``.
+"""
 
 from __future__ import annotations
 
+import ast
 import difflib
-from collections.abc import Collection, Iterable, Mapping
+import inspect
+import math
+import textwrap
+import types
+from collections.abc import Collection, Iterable
+from dataclasses import MISSING, dataclass, fields
+from functools import cache
+from itertools import pairwise
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-Range = tuple[str, float, float, bool]
-"""Name of an option, its least and greatest value, and whether it must be a whole number."""
+import numpy as np
+
+M = TypeVar("M")
+NUMBERS = (int, float, np.integer, np.floating)
 
 
-def check_ranges(
-    options: object,
-    ranges: Iterable[Range],
-    *,
-    types: tuple[type, ...] = (int, float),
-    optional: Collection[str] | None = None,
+@dataclass(frozen=True)
+class Range:
+    """Least and greatest value of a number, both included."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        if self.high == math.inf:
+            return f"of at least {self.low:.7g}"
+        return f"from {self.low:.7g} to {self.high:.7g}"
+
+
+class Advanced:
+    """Marks options that few people set: they have no flag of their own (``--set NAME=VALUE``)."""
+
+
+class With:
+    """Marks an option that has an effect only with others: ``With("soft_share")`` where that is neither 0 nor
+    None nor False, ``With(opacity="cutoff")`` where it has this value, or one of a tuple of values. One of
+    several conditions is enough."""
+
+    def __init__(self, *names: str, **values: Any) -> None:
+        self.names = names
+        self.values = {k: v if isinstance(v, tuple) else (v,) for k, v in values.items()}
+
+    def __str__(self) -> str:
+        return " or ".join(
+            [*self.names, *(f"{name} {value!r}" for name, known in self.values.items() for value in known)]
+        )
+
+    def met(self, options: object) -> bool:
+        """Whether the option has an effect among these."""
+        return any(getattr(options, name) for name in self.names) or any(
+            getattr(options, name) in known for name, known in self.values.items()
+        )
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Marks an option of a base class that must keep its default."""
+
+    why: str
+    """End of a sentence: why, and what to do."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """An option, as its field declares it."""
+
+    name: str
+    kinds: tuple[Any, ...]
+    """Its types, without None."""
+    optional: bool
+    """Whether it may be None."""
+    default: Any
+    """``dataclasses.MISSING`` where there is none."""
+    marks: tuple[Any, ...]
+    """What else stands in ``Annotated``, in the nearest class that says it."""
+    owner: type
+    """Its class."""
+
+    @property
+    def help(self) -> str:
+        """The docstring of the field in one line."""
+        return docstrings(self.owner).get(self.name, "")
+
+    @property
+    def text(self) -> str:
+        """``help``, and what the option needs to have an effect."""
+        condition = self.mark(With)
+        return self.help if condition is None else f"{self.help} Only with {condition}."
+
+    def mark(self, kind: type[M]) -> M | None:
+        """Its mark of this kind."""
+        return next((mark for mark in self.marks if isinstance(mark, kind)), None)
+
+    @property
+    def advanced(self) -> bool:
+        return Advanced in self.marks
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """The values of a ``Literal``; none for other types."""
+        only = self.kinds[0] if len(self.kinds) == 1 else None
+        return get_args(only) if get_origin(only) is Literal else ()
+
+    def check(self, value: Any, types: tuple[type, ...]) -> None:
+        """ValueError for a value that the field does not allow. ``types``: those of numbers."""
+        fixed, limits = self.mark(Fixed), self.mark(Range)
+        if fixed is not None and value != self.default:
+            raise ValueError(f"{self.name} must be {self.default!r} {fixed.why}")
+        if value is None and self.optional:
+            return
+        if self.choices and value not in self.choices:
+            raise ValueError(f"{self.name} must be one of {', '.join(self.choices)}, got {value!r}")
+        if bool in self.kinds and not isinstance(value, bool):
+            raise ValueError(f"{self.name} must be True or False, got {value!r}")
+        if limits is not None:
+            whole = int in self.kinds
+            number = isinstance(value, types) and not isinstance(value, bool)
+            if not number or not limits.low <= value <= limits.high or (whole and value % 1 != 0):
+                what = "a whole number" if whole else "a number"
+                raise ValueError(f"{self.name} must be {what} {limits}, got {value!r}")
+
+
+def settings(kind: type) -> dict[str, Setting]:
+    """The fields of a dataclass by their names. A field that is declared again keeps the marks of its base
+    classes of which it has none of its own."""
+    return _declared(kind)
+
+
+@cache
+def _declared(kind: type) -> dict[str, Setting]:
+    found = {}
+    parts = {part.name: part for part in fields(kind)}
+    marks: dict[str, dict[type, Any]] = {name: {} for name in parts}
+    hints: dict[str, Any] = {}
+    for base in kind.__mro__:
+        own = inspect.get_annotations(base)
+        for name, hint in get_type_hints(base, include_extras=True).items() if own else ():
+            if name not in own or name not in parts or get_origin(hint) is ClassVar:
+                continue
+            kind_of, *more = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+            hints.setdefault(name, kind_of)
+            for mark in more:
+                marks[name].setdefault(mark if isinstance(mark, type) else type(mark), mark)
+    for name, part in parts.items():
+        every = alternatives(hints[name])
+        inner = tuple(option for option in every if option is not type(None))
+        found[name] = Setting(
+            name=name,
+            kinds=inner,
+            optional=type(None) in every,
+            default=part.default if part.default_factory is MISSING else part.default_factory(),
+            marks=tuple(marks[name].values()),
+            owner=kind,
+        )
+    return found
+
+
+def alternatives(hint: Any) -> tuple[Any, ...]:
+    """The types of a union; else the type itself."""
+    return get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+
+
+@cache
+def docstrings(kind: type) -> dict[str, str]:
+    """The docstrings of a dataclass' fields and of those of its bases, each in one line: the string under a
+    field, which Python itself does not keep."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        try:
+            source = textwrap.dedent(inspect.getsource(base))
+        except (OSError, TypeError):  # made at run time, or built in
+            continue
+        for node, text in pairwise(ast.parse(source).body[0].body):  # type: ignore[attr-defined]
+            if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
+                continue
+            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                found[node.target.id] = " ".join(str(text.value.value).split())
+    return found
+
+
+def check_options(
+    options: object, *, given: Collection[str] | None = None, types: tuple[type, ...] = NUMBERS
 ) -> None:
-    """Checks the numbers among ``options``.
+    """Checks a dataclass of options by what its fields declare.
 
     Args:
-        options: an object with one attribute for each name in ``ranges``.
-        ranges: the limits, both included.
-        types: accepted types; bool is never a number.
-        optional: names whose value may be None; None: all of them.
+        options: the options.
+        given: names of those that were set; by default those that differ from their defaults.
+        types: accepted types of numbers; bool is never one.
 
     Raises:
-        ValueError: a value that is no number, out of range, or not whole where it must be.
+        ValueError: a value of the wrong type, out of range, or without effect.
     """
-    for name, low, high, whole in ranges:
+    for name, setting in settings(type(options)).items():
         value = getattr(options, name)
-        if value is None and (optional is None or name in optional):
-            continue
-        number = isinstance(value, types) and not isinstance(value, bool)
-        if not number or not low <= value <= high or (whole and int(value) != value):
-            what = "a whole number" if whole else "a number"
-            raise ValueError(f"{name} must be {what} from {low:g} to {high:g}, got {value!r}")
+        setting.check(value, types)
+        condition = setting.mark(With)
+        is_given = value != setting.default if given is None else name in given
+        if condition is not None and is_given and not condition.met(options):
+            got = " and ".join(f"{other} {getattr(options, other)!r}" for other in condition.values)
+            raise ValueError(f"{name} has no effect without {condition}" + (f", got {got}" if got else ""))
 
 
-def check_choices(options: object, choices: Mapping[str, Collection[str]]) -> None:
-    """ValueError unless each option that ``choices`` names has one of the values listed there."""
-    for name, known in choices.items():
-        value = getattr(options, name)
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+def reachable(kind: type) -> dict[str, Setting]:
+    """The options of ``kind`` that can be changed: not those that are fixed, nor those for another value of a
+    fixed one."""
+    every = settings(kind)
 
+    def possible(condition: With) -> bool:
+        return any(every[name].mark(Fixed) is None for name in condition.names) or any(
+            every[name].mark(Fixed) is None or every[name].default in known
+            for name, known in condition.values.items()
+        )
 
-def check_flags(options: object, names: Iterable[str]) -> None:
-    """ValueError unless the options ``names`` are True or False."""
-    for name in names:
-        value = getattr(options, name)
-        if not isinstance(value, bool):
-            raise ValueError(f"{name} must be True or False, got {value!r}")
+    return {
+        name: setting
+        for name, setting in every.items()
+        if setting.mark(Fixed) is None and ((condition := setting.mark(With)) is None or possible(condition))
+    }
 
 
 def did_you_mean(name: str, known: Collection[str]) -> str:

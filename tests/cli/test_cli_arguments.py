@@ -6,13 +6,15 @@ import importlib
 import os
 import re
 from pathlib import Path
+from typing import Literal, get_args, get_origin
 
 import numpy as np
 import pytest
 from _splats import few_splats
 
+from meshsplats._options import alternatives
 from meshsplats.cli import COMMANDS, main, toml
-from meshsplats.cli.arguments import INVOCATION, Command, options_of
+from meshsplats.cli.arguments import INVOCATION, Command, _read_settings, _taken_apart, options_of
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.formats.gaussians import save_gaussians
 
@@ -50,7 +52,8 @@ def splats(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
     kind = command(name)
-    every, common = set(options_of(kind)), set(kind.COMMON)
+    options = options_of(kind)
+    every, common = {name for name in options if options[name].has_flag}, set(kind.COMMON)
     assert common <= every
     positional = {"compare": {"splats", "mesh"}, "evaluate": {"mesh"}}.get(name, {"input"})
 
@@ -60,9 +63,12 @@ def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
     whole = printed_help(name, "--help-all", capsys)
     assert "``" not in whole
     assert flags_in(whole) == flags(every)
+    others = [name for name in options if name not in every]
+    listed = f"--set NAME=VALUE sets further options (docs/options.md): {', '.join(others)}."
+    assert (listed in " ".join(whole.split())) == bool(others)
     short = printed_help(name, "--help", capsys)
     assert flags_in(short) == flags(common or every)
-    last = short.splitlines()[-1]
+    last = short.splitlines()[-1]  # --config, and how many more there are
     hidden = len(every - common) if common else 0
     assert (f"{hidden} more options: --help-all." in last) == bool(hidden)
     assert ("--config FILE" in last) == kind.CONFIGURABLE
@@ -70,7 +76,17 @@ def test_help_shows_the_common_options_and_help_all_shows_all(name, capsys):
 
 def test_help_names_options_by_their_flags(capsys):
     text = " ".join(printed_help("convert", "--help", capsys).replace("│", " ").split())
-    assert "see --budget. In mode 'flat', unless --sides, --rings, --rim-radius or --center-opacity" in text
+    assert "--max-triangles N Largest number" in text
+    text = " ".join(printed_help("blender", "--help-all", capsys).replace("│", " ").split())
+    assert "Radiance of the even sky; not used with --hdri." in text
+    text = " ".join(printed_help("finetune", "--help-all", capsys).replace("│", " ").split())
+    cutoff = "--cutoff 0..1 Least opacity that is drawn. Only with opacity 'cutoff'."
+    assert f"{cutoff} (default: 0.2; paper: 0.2)" in text
+
+
+@pytest.mark.parametrize(("name", "most"), [("finetune", 45), ("convert", 30), ("train", 30), ("prior", 45)])
+def test_commands_have_few_options(name, most, capsys):
+    assert len(set(re.findall(r"--[a-z][a-z0-9-]+", printed_help(name, "--help-all", capsys)))) <= most
 
 
 def test_the_help_of_finetune_fits_a_screen(capsys):
@@ -88,7 +104,7 @@ def content(path: str) -> bytes:
 @pytest.mark.parametrize(
     ("arguments", "result"),
     [
-        (["finetune", "in/scene.ply", *SMALL, "--seed", "3", "--sides", "6"], "made.npz"),
+        (["finetune", "in/scene.ply", *SMALL, "--seed", "3", "--set", "sides=6"], "made.npz"),
         (
             ["convert", "in/scene.ply", "--preset", "paper", "--crop", "-1", "-1", "-1", "9", "9", "9"],
             "made.glb",
@@ -146,14 +162,17 @@ def test_an_interrupted_run_is_resumed_from_its_configuration(splats, capsys):
     assert main(["finetune", splats, "-o", "made.npz", *SMALL]) == 0
     again = ["finetune", "--config", "made.npz.run/command.toml", "--resume", "--force"]
     assert main([*again, "--steps", "4"]) == 0
-    assert main([*again, "--steps", "5", "--sides", "6"]) == 1
-    assert "--sides was not given and is 6" in capsys.readouterr().err
+    assert main([*again, "--steps", "5", "--set", "sides=6"]) == 1
+    assert "--set sides was not given and is 6" in capsys.readouterr().err
 
 
 def test_the_command_line_wins(splats):
-    assert main(["convert", splats, "-o", "a.npz", "--sides", "6", "--no-preview", "--mode", "flat"]) == 0
+    assert (
+        main(["convert", splats, "-o", "a.npz", "--set", "sides=6", "--no-preview", "--set", "mode=flat"])
+        == 0
+    )
     save_gaussians(few_splats().take(np.arange(9)), "nine.ply")
-    again = ["convert", "nine.ply", "--config", "a.npz.config.toml", "--sides", "8", "-o", "b.npz"]
+    again = ["convert", "nine.ply", "--config", "a.npz.config.toml", "--set", "sides=8", "-o", "b.npz"]
     assert main([*again, "--no-no-preview"]) == 0
     options = toml.load(Path("b.npz.config.toml"))["options"]
     assert (options["input"], options["sides"], options["mode"]) == (["nine.ply"], 8, "flat")
@@ -166,6 +185,70 @@ def test_one_option_of_an_exclusive_group_replaces_another(splats):
     options = toml.load(Path("b.ply.config.toml"))["options"]
     assert options["share"] == 0.5
     assert "count" not in options
+
+
+# ---- --set NAME=VALUE
+
+
+def test_an_option_without_a_flag_is_set_by_its_name(splats):
+    settings = ["rings=2", "center-opacity=1", "shrink_faint=False", "crop=-9,-9,-9,9,9,9"]
+    words = [word for setting in settings for word in ("--set", setting)]
+    assert main(["convert", splats, "-o", "a.npz", "--no-preview", *words]) == 0
+    options = toml.load(Path("a.npz.config.toml"))["options"]
+    assert (options["rings"], options["center_opacity"], options["shrink_faint"]) == (2, 1.0, False)
+    assert options["crop"] == [-9, -9, -9, 9, 9, 9]
+    again = ["convert", "--config", "a.npz.config.toml", "-o", "b.npz", "--set=rings=3"]  # which wins
+    assert main(again) == 0
+    options = toml.load(Path("b.npz.config.toml"))["options"]
+    assert (options["rings"], options["center_opacity"]) == (3, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--set", "beta3=0.5"], "--set: finetune has no option 'beta3'; did you mean 'beta2'?"),
+        (["--set", "beta1"], "--set takes NAME=VALUE, got 'beta1'"),
+        (["--set"], "--set takes NAME=VALUE, got ''"),
+        (["--set", "=3"], "--set takes NAME=VALUE, got '=3'"),
+        (["--set", "beta1=high"], "--set: beta1 must be a number, got 'high'"),
+        (["--set", "rings=1.5"], "--set: rings must be a whole number, got '1.5'"),
+        (["--set", "soft_edges=1"], "--set: soft_edges must be true or false, got '1'"),
+        (["--set", "mode=round"], "--set: mode must be one of crossed, flat, 3d, got 'round'"),
+        (["--set", "crop=1,2"], "--set: crop must be a list of 6 values, got '1,2'"),
+        (["--set", "beta1=2"], "beta1 must be a number from 0 to 0.99999, got 2.0"),
+        (["--set", "beta1=nan"], "beta1 must be a number from 0 to 0.99999, got nan"),
+        (["--set", "beta1=0.5", "--set", "beta1=0.6"], "--set beta1 is given twice"),
+        (["--steps", "3", "--set", "steps=4"], "give --steps or --set steps, not both"),
+        (["--beta1", "0.5"], "--beta1 is not an option of its own: write --set beta1=VALUE"),
+        (["--rim-radius=2"], "--rim-radius is not an option of its own: write --set rim_radius=VALUE"),
+    ],
+)
+def test_wrong_settings_end_in_one_clear_line(splats, capsys, words, message):
+    assert main(["finetune", splats, "-o", "t.npz", *words]) in (1, 2)
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert f"meshsplats: error: {message}" in err
+    assert os.listdir() == ["in"]
+
+
+def test_every_option_without_a_flag_can_be_set():
+    """Whatever its type: its default is understood, written as --set has it."""
+    for name in COMMANDS:
+        kind = command(name)
+        for option, found in options_of(kind).items():
+            texts = {bool: "true", int: "1", float: "1", str: "text", Path: "a.txt"}
+            if not found.has_flag:
+                value = sample(found.hint, texts)
+                words = ["in", "-o", "out", "--set", f"{option}={value}"]
+                assert _taken_apart(words).settings == {option: value}
+                assert _read_settings(kind, {option: value}, (), name)[option] is not None
+
+
+def sample(hint, texts) -> str:
+    kind = next(kind for kind in alternatives(hint) if kind is not type(None))
+    if get_origin(kind) is tuple:
+        return ",".join(sample(part, texts) for part in get_args(kind) if part is not Ellipsis)
+    return str(get_args(kind)[0]) if get_origin(kind) is Literal else texts[kind]
 
 
 def test_a_configuration_written_by_hand(splats, capsys):

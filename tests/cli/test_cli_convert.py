@@ -67,10 +67,10 @@ def test_mesh_preview_and_configuration(splats, tmp_path, capsys, suffix):
 
 def test_options_reach_the_conversion(splats, tmp_path):
     options = {"mode": "flat", "sides": 6, "rings": 2, "max_splats": 20, "crop": (-1.0, -1, -1, 1, 1, 1)}
-    flags = [f"--{name.replace('_', '-')}" for name in options]
     given = []
-    for flag, value in zip(flags, options.values(), strict=True):
-        given += [flag, *(value if isinstance(value, tuple) else (value,))]
+    for name, value in options.items():
+        text = ",".join(map(str, value)) if isinstance(value, tuple) else value
+        given += ["--set", f"{name}={text}"]
     assert run(splats, "-o", tmp_path / "mesh.npz", "--no-preview", *given) == 0
     expected = convert(load_gaussians(splats), **options)
     mesh = load_mesh(tmp_path / "mesh.npz")
@@ -110,7 +110,7 @@ def test_json(splats, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("options", "look"),
-    [([], "area"), (["--look", "splats"], "splats"), (["--footprint", "filter"], "splats")],
+    [([], "area"), (["--look", "splats"], "splats"), (["--set", "footprint=filter"], "splats")],
 )
 def test_fidelity_is_that_of_the_look_that_was_chosen(splats, tmp_path, capsys, options, look):
     out = tmp_path / "mesh.npz"
@@ -216,12 +216,12 @@ def test_a_part_is_shown_not_compared_with_the_whole(splats, tmp_path, capsys):
         (["-o", "mesh.stl"], 2, ".glb"),
         (["-o", "mesh"], 2, ".glb"),
         (["-o", "mesh.npz", "--lit"], 2, "--lit"),
-        (["-o", "mesh.npz", "--color-type", "float32"], 2, "--color-type"),
+        (["-o", "mesh.npz", "--set", "color_type=float32"], 2, "--set color_type"),
         (["-o", "mesh.npz", "--preset", "best"], 2, "--preset"),
         ([], 2, "output"),
         (["-o", "mesh.npz", "--up", "w"], 1, "--up"),
-        (["-o", "mesh.npz", "--sides", "2"], 1, "sides"),
-        (["-o", "mesh.npz", "--footprint", "cameras"], 1, "cameras"),
+        (["-o", "mesh.npz", "--set", "sides=2"], 1, "sides"),
+        (["-o", "mesh.npz", "--set", "footprint=cameras"], 1, "cameras"),
         (["-o", "mesh.npz", "--cameras", "none.json"], 1, "none.json: No such file"),
         (["-o", "no/such/mesh.npz"], 1, os.path.join("no", "such")),
     ],
@@ -247,7 +247,7 @@ def test_splats_as_splats(splats, tmp_path, capsys):
     cloud = load_gaussians(splats)
     box = (-1.0, -1.0, -1.0, 1.0, 1.5, 2.0)
     out = tmp_path / "part.ply"
-    assert run(splats, "-o", out, "--as-splats", "--crop", *box, "--min-opacity", 0.5) == 0
+    assert run(splats, "-o", out, "--as-splats", "--crop", *box, "--set", "min_opacity=0.5") == 0
     kept = (cloud.means >= box[:3]).all(1) & (cloud.means <= box[3:]).all(1) & (cloud.opacities >= 0.5)
     assert 3 < kept.sum() < 37
     part = load_gaussians(out)
@@ -265,8 +265,8 @@ def test_splats_as_splats(splats, tmp_path, capsys):
             "--as-splats",
             "--max-splats",
             5,
-            "--budget",
-            "drop",
+            "--set",
+            "budget=drop",
             "--no-preview",
         )
         == 0
@@ -288,8 +288,8 @@ def test_splats_as_splats(splats, tmp_path, capsys):
         ("a.glb", [], "--as-splats writes .ply"),
         ("a.ply", ["--lit"], "--lit: for a mesh"),
         ("a.ply", ["--data", "nowhere"], "--data: for a mesh"),
-        ("a.ply", ["--data", "nowhere", "--max-splats", "3", "--budget", "drop"], "--data: for a mesh"),
-        ("a.ply", ["--preset", "paper", "--rings", "2"], "--preset, --rings: for a mesh"),
+        ("a.ply", ["--data", "nowhere", "--max-splats", "3", "--set", "budget=drop"], "--data: for a mesh"),
+        ("a.ply", ["--preset", "paper", "--set", "rings=2"], "--preset, --set rings: for a mesh"),
     ],
 )
 def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options, printed):
@@ -299,7 +299,7 @@ def test_options_that_splats_do_not_have(splats, tmp_path, capsys, name, options
 
 
 def test_no_splats_left(splats, tmp_path, capsys):
-    assert run(splats, "-o", tmp_path / "a.ply", "--as-splats", "--min-opacity", 0.99) == 1
+    assert run(splats, "-o", tmp_path / "a.ply", "--as-splats", "--set", "min_opacity=0.99") == 1
     assert "all are fainter than 0.99" in capsys.readouterr().err
     assert not (tmp_path / "a.ply").exists()
 
@@ -312,7 +312,7 @@ def test_alpha_reaches_the_file(splats, tmp_path, capsys):
     assert document["materials"][0]["alphaMode"] == "MASK"
     assert document["materials"][0]["alphaCutoff"] == 0.2
     assert run(splats, "-o", tmp_path / "m.npz", "--alpha", "mask") == 2
-    assert "--alpha mask or hybrid, and --compression are for .glb" in capsys.readouterr().err
+    assert "mask or hybrid, --compression and --set color_type are for .glb" in capsys.readouterr().err
 
 
 def test_previews_of_large_meshes_are_quick(splats, tmp_path, monkeypatch):
@@ -446,18 +446,18 @@ def test_hybrid_is_for_meshes_with_solid_triangles(splats, tmp_path, capsys):
     assert "holds splats" in capsys.readouterr().err
     assert run(source, "-o", tmp_path / "b.npz", "--alpha", "hybrid") == 2
     assert "are for .glb" in capsys.readouterr().err
-    assert run(source, "-o", tmp_path / "b.glb", "--alpha", "hybrid", "--cutoff", "0.3") == 2
+    assert run(source, "-o", tmp_path / "b.glb", "--alpha", "hybrid", "--set", "cutoff=0.3") == 2
     assert not (tmp_path / "b.glb").exists()
 
 
 def test_opaque_triangles_in_every_format(splats, tmp_path, capsys):
     for name in ("m.glb", "m.ply"):
         out = tmp_path / name
-        assert run(splats, "-o", out, "--alpha", "opaque", "--cutoff", "0.3", "--no-preview") == 0
+        assert run(splats, "-o", out, "--alpha", "opaque", "--set", "cutoff=0.3", "--no-preview") == 0
         assert (load_mesh(out).colors[:, 3] == 1).all()
         assert f"{len(load_mesh(out).faces):,} triangles" in capsys.readouterr().out
     assert run(tmp_path / "m.ply", "-o", tmp_path / "a.npz", "--alpha", "opaque", "--no-preview") == 0
     assert len(load_mesh(tmp_path / "a.npz").faces) == len(load_mesh(tmp_path / "m.ply").faces)
     capsys.readouterr()
-    assert run(splats, "-o", tmp_path / "b.glb", "--cutoff", "0.3") == 2
-    assert "--cutoff is for --alpha opaque or mask" in capsys.readouterr().err
+    assert run(splats, "-o", tmp_path / "b.glb", "--set", "cutoff=0.3") == 2
+    assert "--set cutoff is for --alpha opaque or mask" in capsys.readouterr().err

@@ -60,7 +60,7 @@ def run(*arguments) -> int:
 
 def test_from_the_splat_file_alone(splats, tmp_path, capsys):
     out = tmp_path / "tuned.npz"
-    assert run(splats, "-o", out, *SMALL, "--steps", "12", "--report-every", "6", "--json") == 0
+    assert run(splats, "-o", out, *SMALL, "--steps", "12", "--set", "report_every=6", "--json") == 0
     printed = capsys.readouterr()
     result = json.loads(printed.out)
     assert result["steps"] == 12
@@ -110,7 +110,7 @@ def test_the_next_command_scores_as_it_was_trained_on_photographs(splats, tmp_pa
     [
         ["--sh-degree", "0"],
         ["--axes", "y-up"],
-        ["--width", "40", "--distance", "0.4", "0.6"],
+        ["--width", "40", "--set", "distance=0.4,0.6"],
         ["--cameras", "nine.json"],
     ],
 )
@@ -130,7 +130,7 @@ def test_the_next_command_scores_as_it_was_trained_on_splats(tmp_path, capsys, o
     ("kernel", "options", "filtered"),
     [
         ("3dgs", [], True),
-        ("3dgs", ["--footprint", "none"], False),
+        ("3dgs", ["--set", "footprint=none"], False),
         ("antialiased", [], False),
         ("3dgs", ["--preset", "paper"], False),
     ],
@@ -203,7 +203,7 @@ def test_cameras_of_a_model_folder_give_way_to_a_placement(tmp_path):
     (folder / "point_cloud/iteration_7").mkdir(parents=True)
     save_gaussians(cloud, folder / "point_cloud/iteration_7/point_cloud.ply")
     save_cameras(orbit(cloud, 9, width=48, height=48, elevation=50), folder / "cameras.json")
-    for name, options in (("own", []), ("placed", ["--distance", "0.5", "0.5"])):
+    for name, options in (("own", []), ("placed", ["--set", "distance=0.5,0.5"])):
         out = tmp_path / f"{name}.npz"
         assert run(folder, "-o", out, "--views", "4", "--width", "32", "--steps", "1", *options) == 0
     held = [load_cameras(tmp_path / f"{name}.npz.run/held_out.cameras.json") for name in ("own", "placed")]
@@ -279,13 +279,13 @@ def test_from_photographs_with_options_of_the_tuning(splats, tmp_path, capsys):
     cameras = orbit(cloud, 9, width=32, height=32)
     data = write_photographs(tmp_path / "photos", cameras, [render_splats(cloud, c).color for c in cameras])
     out = tmp_path / "tuned.ply"
-    options = ("--preset", "paper", "--epochs", "2", "--exposure", "True", "--seed", "3", "--sides", "4")
+    options = ("--preset", "paper", "--epochs", "2", "--exposure", "True", "--seed", "3", "--set", "sides=4")
     assert run(splats, "-o", out, "--data", data, *options) == 0
     assert "7 training views, 2 held out" in capsys.readouterr().err
     config = toml.load(tmp_path / "tuned.ply.config.toml")["resolved"]
     assert config == without_none(make_config("paper", epochs=2, exposure=True, seed=3).to_dict())
     mesh = load_mesh(out)
-    assert len(mesh.faces) == 300 * 4  # --sides went to the conversion
+    assert len(mesh.faces) == 300 * 4  # sides went to the conversion
     again = tmp_path / "again.npz"
     assert run(out, "-o", again, "--data", data, "--steps", "2") == 0  # a mesh is tuned further
     assert len(load_mesh(again).faces) == len(mesh.faces)
@@ -306,7 +306,7 @@ def test_given_cameras_are_where_the_targets_are_drawn_from(splats, tmp_path, ca
         (["--data", "d", "--views", "9"], 2, "--views has no effect with --data"),
         (["--downscale", "2"], 2, "--downscale has no effect with splats"),
         (["--resume"], 1, "no checkpoint at"),
-        (["--color-rate", "7"], 1, "color_rate must be a number"),
+        (["--set", "color_rate=7"], 1, "color_rate must be a number"),
         (["--data", "nowhere"], 1, "no such data set"),
         (["--held-out", "-1"], 1, "at least 1 training view"),
     ],
@@ -354,7 +354,7 @@ def test_neither_torch_nor_safetensors_is_needed(splats, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_run_goes_on(splats, tmp_path, capsys, number):
     out = tmp_path / "tuned.npz"
-    arguments = [str(splats), "-o", str(out), *SMALL, "--steps", "40", "--report-every", "1"]
+    arguments = [str(splats), "-o", str(out), *SMALL, "--steps", "40", "--set", "report_every=1"]
     command = [sys.executable, "-m", "meshsplats", "finetune", *arguments]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
@@ -429,7 +429,7 @@ def test_a_hybrid_mesh_for_engines(splats, tmp_path):
 
 def test_the_result_is_never_below_the_conversion(splats, tmp_path, capsys):
     """Rates that ruin a mesh: what is written is what ``convert`` makes, with its score and a sentence."""
-    out, ruinous = tmp_path / "t.npz", ("--color-rate", "1", "--position-rate", "9")
+    out, ruinous = tmp_path / "t.npz", ("--set", "color_rate=1", "--set", "position_rate=9")
     assert run(splats, "-o", out, *SMALL, "--steps", "4", *ruinous) == 0
     printed = capsys.readouterr().out
     assert "the conversion is written: after 4 steps, the mesh was worse at 16, 32, 64, 128 px" in printed
@@ -459,7 +459,7 @@ def test_dense_clouds_begin_as_their_conversion(splats, tmp_path, capsys):
     record = json.loads((tmp_path / "t.npz.run" / "start.json").read_text())
     assert record == {"max_splats": None, "images": None, "brief_steps": 72}
     # A mesh that the user's own options make is not replaced.
-    assert run(splats, "-o", tmp_path / "t.npz", *dense, "--steps", "2", "--mode", "flat") == 0
+    assert run(splats, "-o", tmp_path / "t.npz", *dense, "--steps", "2", "--set", "mode=flat") == 0
     assert json.loads((tmp_path / "t.npz.run" / "start.json").read_text())["brief_steps"] is None
 
 
@@ -494,17 +494,17 @@ def test_the_setup_is_shown_in_phases(splats, tmp_path, capsys):
 def test_meshes_stand_as_asked_however_they_came_about(tmp_path):
     """Tuned from fans, begun as the conversion, and replaced by it."""
     save_gaussians(make_scene(300), tmp_path / "s.ply")
-    ruinous = ("--color-rate", "1", "--position-rate", "9")
+    ruinous = ("--set", "color_rate=1", "--set", "position_rate=9")
     for options in ((), ("--width", "16"), ruinous):
         words = (tmp_path / "s.ply", "-o", tmp_path / "t.npz", *SMALL, "--steps", "3", "--up", "z", "--force")
         assert run(*words, *options) == 0
         np.testing.assert_allclose(load_mesh(tmp_path / "t.npz").up, (0, 0, 1), atol=1e-6)
 
 
-@pytest.mark.parametrize("option", ["--colors", "--detail", "--footprint"])
+@pytest.mark.parametrize("option", ["colors", "detail", "footprint"])
 def test_conversion_options_that_need_cameras(splats, tmp_path, option, monkeypatch):
     monkeypatch.setattr("meshsplats.cli.finetune.TIMED_SPLATS", 1)
-    words = (splats, "-o", tmp_path / "t.npz", *SMALL, option, "cameras", "--force")
+    words = (splats, "-o", tmp_path / "t.npz", *SMALL, "--set", f"{option}=cameras", "--force")
     assert run(*words, "--steps", "3") == 0
     assert run(*words, "--minutes", "0.02") == 0
 

@@ -98,7 +98,7 @@ def write_scene(folder: Path, move: np.ndarray) -> Scene:
     ]
     (folder / "colmap" / "sparse" / "0" / "points3D.txt").write_text("\n".join(spots))
     scene = Scene(folder, move)
-    scene.run("convert splats.ply -o mesh.npz --footprint filter --no-sidecar")
+    scene.run("convert splats.ply -o mesh.npz --set footprint=filter --no-sidecar")
     tuning = "--steps 1 --layers 1 --views 4 --held-out 1 --width 24"
     scene.run(f"prior base.obj --splats splats.ply -o prior.npz {tuning}")
     return scene

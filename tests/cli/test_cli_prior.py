@@ -36,7 +36,7 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(scene):
     out = scene / "prior.npz"
-    options = ["--steps", "30", "--triangles", "4", "--report-every", "10", "--json"]
+    options = ["--steps", "30", "--triangles", "4", "--set", "report_every=10", "--json"]
     options += ["--layers", "2", "--spacing", "0"]
     assert run("prior", scene / "base.obj", "--data", scene / "photos", "-o", out, *options) == 0
     return out

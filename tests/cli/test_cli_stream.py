@@ -26,7 +26,12 @@ def run(*arguments) -> int:
 
 @pytest.mark.parametrize(
     "options",
-    [(), ("--preset", "paper"), ("--crop", -0.5, -2, -2, 2, 2, 2), ("--as-splats", "--min-opacity", 0.9)],
+    [
+        (),
+        ("--preset", "paper"),
+        ("--crop", -0.5, -2, -2, 2, 2, 2),
+        ("--as-splats", "--set", "min_opacity=0.9"),
+    ],
     ids=str,
 )
 def test_the_file_is_the_same(splats, tmp_path, capsys, options):

@@ -46,23 +46,6 @@ def test_presets_are_pinned():
     assert PRESETS["default"] == FinetuneConfig()
 
 
-def test_the_documented_table_has_the_presets_values():
-    text = (ROOT / "docs" / "finetuning.md").read_text(encoding="utf-8")
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in text.splitlines()
-        if line.startswith("| `")
-    ]
-    table = {row[0].strip("`"): row[1:3] for row in rows}
-    names = [name for name in FinetuneConfig.__dataclass_fields__ if name != "preset"]
-    assert set(names) <= set(table)
-    for name in names:
-        for cell, preset in zip(table[name], ("paper", "default"), strict=True):
-            value = getattr(PRESETS[preset], name)
-            shown = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-            assert cell == shown, f"{name} of {preset}"
-
-
 def test_a_length_takes_the_place_of_the_presets():
     assert make_config("paper", steps=7).total_steps(100) == 7
     assert make_config("paper").total_steps(100) == 1500

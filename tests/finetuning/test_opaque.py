@@ -160,8 +160,8 @@ def test_a_vertex_with_a_gradient_of_its_colour_alone_moves(scene):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"exposure": True}, "exposure is for opacity 'blended'"),
-        ({"opacity_decay": 0.1}, "opacity_decay is for opacity 'blended'"),
+        ({"exposure": True}, "exposure has no effect without opacity 'blended', got opacity 'cutoff'"),
+        ({"opacity_decay": 0.1}, "opacity_decay has no effect without opacity 'blended'"),
         ({"blending": "linear"}, "opaque triangles are not blended"),
         ({"opaque_share": 0.5, "anneal_share": 0.6}, "annealing must end before the mesh settles"),
         ({"l2_weight": 0.0}, "expected_share is a share of l2_weight"),

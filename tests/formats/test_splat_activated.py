@@ -75,7 +75,7 @@ def test_activated_values_are_named_and_read(tmp_path, which, span):
     plain = ball()
     path = saved(tmp_path / "a.ply", activated(plain, *which, span=span))
     (message,) = said(path)
-    assert f"--activated {' '.join(which)} (activated={which}) reads it right" in message
+    assert f"--set activated={','.join(which)} (activated={which}) reads it right" in message
     assert said(path, activated=which) == []
     cloud, expected = load_gaussians(path, activated=which), load_gaussians(saved(tmp_path / "b.ply", plain))
     step = 0.5 / span if span > 1 else 1e-6
@@ -157,9 +157,9 @@ def test_commands_take_it(tmp_path, capsys):
     out = tmp_path / "m.npz"
     assert main(["convert", str(path), "-o", str(out), "--no-sidecar"]) == 0
     told = capsys.readouterr()
-    assert "--activated scales opacities" in told.err
-    words = ["--activated", "scales", "opacities"]
+    assert "--set activated=scales,opacities" in told.err
+    words = ["--set", "activated=scales,opacities"]
     assert main(["convert", str(path), "-o", str(out), "--force", "--no-sidecar", *words]) == 0
     told = capsys.readouterr()
     assert "activated" not in told.err
-    assert "--activated scales opacities" in told.out  # the next command reads it in the same way
+    assert "--set activated=scales,opacities" in told.out  # the next command reads it in the same way

@@ -192,7 +192,7 @@ def test_the_kernel_can_be_named(tmp_path, capsys):
     assert re.search(r"^kernel +3dgs$", told.out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("words", [["--kernel", "2dgs"], ["--time", "1"], ["--activated", "scales"]])
+@pytest.mark.parametrize("words", [["--kernel", "2dgs"], ["--time", "1"], ["--set", "activated=scales"]])
 def test_options_for_splats_are_refused_for_meshes(tmp_path, capsys, words):
     mesh = tmp_path / "m.npz"
     assert main(["convert", str(file_with(tmp_path)), "-o", str(mesh), "--no-sidecar"]) == 0
@@ -200,7 +200,10 @@ def test_options_for_splats_are_refused_for_meshes(tmp_path, capsys, words):
     outputs += [["render", str(mesh), "-o", str(tmp_path / "m.png")]]
     for command in outputs:
         assert main([*command, *words]) == 2
-        assert f"holds no splats: {words[0]} would have no effect" in capsys.readouterr().err
+        assert (
+            f"holds no splats: {words[0].replace('--set', '--set activated')} would have no effect"
+            in capsys.readouterr().err
+        )
 
 
 def test_third_scales_of_2dgs_splats_mean_nothing(tmp_path):

@@ -459,7 +459,7 @@ def test_bad_input_is_refused_before_the_work(ball, tmp_path):
         train_config(sides=2)
     with pytest.raises(ValueError, match="opacity must be 'blended'"):
         train_config(opacity="cutoff")
-    with pytest.raises(ValueError, match="blending 'linear' is not for training"):
+    with pytest.raises(ValueError, match="blending must be 'mesh' while training"):
         train_config(blending="linear")
     for name, value in (("prune_opacity", 0.1), ("prune_epochs", 2)):
         with pytest.raises(ValueError, match=f"{name} must be"):

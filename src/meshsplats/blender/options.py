@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
+
+from meshsplats._options import Advanced, Range, check_options
 
 Engine = Literal["cycles", "eevee"]
 Ground = Literal["plane", "catcher", "none"]
@@ -22,41 +25,41 @@ class LightOptions:
     sun: tuple[float, float] = (-50.0, 45.0)
     """Direction of the sun: azimuth (0 behind the viewer of the front, 90 on that viewer's right) and
     elevation, degrees."""
-    sun_strength: float = 2.5
+    sun_strength: Annotated[float, Range(0, 1e6)] = 2.5
     """Irradiance of a surface that faces the sun, W/m^2; at pi, a white one has radiance 1. 0: no sun."""
-    sun_size: float = 2.0
+    sun_size: Annotated[float, Range(0, 180), Advanced] = 2.0
     """Degrees that the sun's disc spans: the larger, the softer shadows are."""
-    sun_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
+    sun_color: Annotated[tuple[float, float, float], "RGB", Advanced] = (1.0, 1.0, 1.0)
     """Colour of sunlight: linear R G B, 0 to 1; ``sun_strength`` is multiplied by it."""
-    fill: float = 0.0
+    fill: Annotated[float, Range(0, 1e6), Advanced] = 0.0
     """Irradiance of a second, soft sun that stands low on the other side, W/m^2. 0: there is none."""
-    sky: float = 0.35
+    sky: Annotated[float, Range(0, 1e6)] = 0.35
     """Radiance of the even sky; not used with ``hdri``."""
-    sky_color: Annotated[tuple[float, float, float], "RGB"] = (1.0, 1.0, 1.0)
+    sky_color: Annotated[tuple[float, float, float], "RGB", Advanced] = (1.0, 1.0, 1.0)
     """Colour of that sky: linear R G B, 0 to 1; ``sky`` is multiplied by it."""
     hdri: Path | None = None
     """Environment image (.hdr or .exr, equirectangular) that lights the scene and is mirrored in it."""
-    hdri_strength: float = 1.0
+    hdri_strength: Annotated[float, Range(0, 1e6), Advanced] = 1.0
     """Factor on the environment image."""
-    hdri_rotation: float = 0.0
+    hdri_rotation: Annotated[float, Range(-1e6, 1e6), Advanced] = 0.0
     """Degrees that the environment is rotated about the up direction."""
     ground: Ground = "plane"
     """Ground under the subject: a grey plane that fades into the background; a catcher, visible only where
     shadows fall (Cycles); or none."""
-    exposure: float = 0.35
-    """Brightness added for display, in stops, -20 to 20: with 0.35, a white plate that faces the viewer looks
+    exposure: Annotated[float, Range(-20, 20)] = 0.35
+    """Brightness added for display, in stops: with 0.35, a white plate that faces the viewer looks
     white. Values of an .exr and the background do not change."""
     mirror: bool = False
     """A mirror behind the subject."""
     glass: bool = False
     """A glass ball beside the subject."""
-    roughness: float = 1.0
-    """Roughness of the splats' surface, 0 to 1; visible with ``specular``."""
-    specular: float = 0.0
-    """Highlights of the splats' surface, 0 to 1; 0.5 is plastic. Splats have highlights of their own baked
+    roughness: Annotated[float, Range(0, 1), Advanced] = 1.0
+    """Roughness of the splats' surface; visible with ``specular``."""
+    specular: Annotated[float, Range(0, 1), Advanced] = 0.0
+    """Highlights of the splats' surface; 0.5 is plastic. Splats have highlights of their own baked
     in."""
-    bounces: int = 4
-    """Most scattering events of a light path, 0 to 64; layers that it passes through do not count."""
+    bounces: Annotated[int, Range(0, 64), Advanced] = 4
+    """Most scattering events of a light path; layers that it passes through do not count."""
 
     @property
     def fill_direction(self) -> tuple[float, float]:
@@ -65,29 +68,13 @@ class LightOptions:
 
     def check(self) -> None:
         """Raises ValueError for a value out of range, FileNotFoundError for a missing environment image."""
+        check_options(self)
         azimuth, elevation = self.sun
         if not (np.isfinite(azimuth) and -90 <= elevation <= 90):
             raise ValueError(f"sun must be an azimuth and an elevation of -90 to 90 degrees, got {self.sun}")
-        for name, low, high in [
-            ("sun_strength", 0, 1e6),
-            ("sun_size", 0, 180),
-            ("fill", 0, 1e6),
-            ("sky", 0, 1e6),
-            ("exposure", -20, 20),
-            ("hdri_strength", 0, 1e6),
-            ("hdri_rotation", -1e6, 1e6),
-            ("roughness", 0, 1),
-            ("specular", 0, 1),
-            ("bounces", 0, 64),
-        ]:
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {value}")
         for name in ("sun_color", "sky_color"):
             if not all(0 <= value <= 1 for value in getattr(self, name)):
                 raise ValueError(f"{name} must be linear RGB in [0, 1], got {getattr(self, name)}")
-        if self.ground not in get_args(Ground):
-            raise ValueError(f"ground must be one of {', '.join(get_args(Ground))}, got {self.ground!r}")
         if self.hdri is not None:
             check_environment(self.hdri)
 
@@ -117,27 +104,22 @@ class SceneOptions:
     """None: unlit colours, the image of ``meshsplats.render``. Otherwise lit by these."""
     engine: Engine = "cycles"
     """cycles: exact order and ray-traced light. eevee: fast; triangles are sorted for each camera."""
-    samples: int = 1
+    samples: Annotated[int, Range(1, 65536)] = 1
     """Unlit: side of the grid of samples in each pixel, as in ``render``. Lit: samples per pixel."""
     background: Annotated[tuple[float, float, float] | None, "RGB"] = (1.0, 1.0, 1.0)
     """Display RGB behind everything; None: transparent. An environment image replaces it."""
     denoise: bool = False
     """Cycles, lit: remove noise with OpenImageDenoise."""
-    threads: int | None = None
+    threads: Annotated[int | None, Range(1, math.inf)] = None
     """At most this many; default: all processors."""
 
     def check(self) -> None:
         """Raises ValueError for values out of range and choices that contradict each other."""
-        if self.engine not in get_args(Engine):
-            raise ValueError(f"engine must be one of {', '.join(get_args(Engine))}, got {self.engine!r}")
-        top = 16 if self.light is None else 65536
-        if not 1 <= self.samples <= top:
-            what = "the side of the sample grid" if self.light is None else "the number of samples per pixel"
-            raise ValueError(f"samples is {what}, 1 to {top}, got {self.samples}")
+        check_options(self)
+        if self.light is None and self.samples > 16:
+            raise ValueError(f"samples of unlit images is the side of the grid, 1 to 16, got {self.samples}")
         if self.background is not None and not all(0 <= v <= 1 for v in self.background):
             raise ValueError(f"background must be RGB in [0, 1], got {self.background}")
-        if self.threads is not None and self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
         if self.denoise and (self.light is None or self.engine != "cycles"):
             raise ValueError("denoise is for lit images in Cycles: others have no noise, or another kind")
         if self.light is not None:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
-import os
 import re
 import textwrap
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from itertools import pairwise
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
 import tyro
 
-from meshsplats._options import did_you_mean
+from meshsplats._options import Range, Setting, did_you_mean, reachable, settings
 from meshsplats.cli import toml
 from meshsplats.cli.messages import OK, UsageError, flag, say
+from meshsplats.cli.values import converted, from_text, short
 
 T = TypeVar("T")
 C = TypeVar("C", bound="Command")
@@ -28,7 +25,7 @@ INVOCATION = ("cluster", "executable", "force", "json", "resume", "skip_existing
 run programs, here or on a cluster, and --json, --resume and --skip-existing belong to a single call."""
 TABLES = ("command", "version", "invocation", "options", "resolved", "result")
 """Tables and keys of a configuration file. Only ``options`` is read."""
-_MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+_MARKERS = (tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed, tyro.conf.FlagCreatePairsOff)
 
 
 class Command:
@@ -58,6 +55,9 @@ class Option:
     path: tuple[str, ...]
     """Names of the groups and of the field."""
     hint: Any
+    has_flag: bool
+    """Whether it has a flag of its own. Fields that are ``tyro.conf.Fixed`` have none: --set or a
+    configuration file sets them."""
 
     def value(self, command: object) -> Any:
         for name in self.path:
@@ -65,53 +65,75 @@ class Option:
         return command
 
 
+@dataclass(frozen=True)
+class Line:
+    """The words of a command line, without --config and --set."""
+
+    words: list[str]
+    config: Path | None
+    settings: dict[str, str]
+    """The texts of --set NAME=VALUE."""
+
+
 def parse(command: type[C], prog: str, words: Sequence[str]) -> C:
     """The command that ``words`` describe.
 
     Raises:
         SystemExit: after --help (0), or for words that are not understood (2), which has been printed.
-        UsageError: for a configuration file that is wrong.
+        UsageError: for --set or a configuration file that is wrong.
         ValueError: --threads is below 1.
     """
-    made = _parsed(command, prog, words)
+    made = _parsed(command, prog, _taken_apart(words))
     option = options_of(command).get("threads")
     if option is not None and (count := option.value(made)) is not None and count < 1:
         raise ValueError(f"--threads must be at least 1, got {count}")  # before the work: images come last
     return made
 
 
-def _parsed(command: type[C], prog: str, words: Sequence[str]) -> C:
-    words, file = _without_config(words)
-    if any(word in words for word in ("-h", "--help", "--help-all")):
-        _print_help(command, prog, everything="--help-all" in words)
+def _parsed(command: type[C], prog: str, line: Line) -> C:
+    if any(word in line.words for word in ("-h", "--help", "--help-all")):
+        _print_help(command, prog, everything="--help-all" in line.words)
         raise SystemExit(OK)
-    if file is None:
-        return tyro.cli(command, prog=prog, args=words, config=_MARKERS)
-    if not command.CONFIGURABLE:
-        raise UsageError("--config has no effect here: this command writes no configuration")
-    values, resolved = _read(command, file, prog.rpartition(" ")[2])
-    _warn_of_changes(command, file, values, resolved)
-    on_line = {word.partition("=")[0].lstrip("-").replace("-", "_") for word in words if word[:2] == "--"}
+    flags = {word.partition("=")[0] for word in line.words if word[:2] == "--"}
+    _refuse_flags_of_settings(command, flags)
+    if line.config is None and not line.settings:
+        return tyro.cli(command, prog=prog, args=line.words, config=_MARKERS)
+    name = prog.rpartition(" ")[2]
+    given = _read_settings(command, line.settings, flags, name)
+    values: dict[str, Any] = {}
+    if line.config is not None:
+        if not command.CONFIGURABLE:
+            raise UsageError("--config has no effect here: this command writes no configuration")
+        values, resolved = _read(command, line.config, name)
+        _warn_of_changes(command, line.config, values, resolved)
     for group in command.EXCLUSIVE:
-        if on_line & set(group):
-            values = {name: value for name, value in values.items() if name not in group}
+        if any(flag(option) in flags or option in given for option in group):
+            values = {option: value for option, value in values.items() if option not in group}
     # --no-FLAG clears a flag that the file sets.
-    return tyro.cli(command, prog=prog, args=words, default=_filled(command, values), config=_MARKERS[:1])
+    default = _filled(command, values | given)
+    return tyro.cli(command, prog=prog, args=line.words, default=default, config=_MARKERS[:2])
 
 
 def options_of(command: type) -> dict[str, Option]:
     """The options of ``command`` by their names, those of its groups included."""
     found: dict[str, Option] = {}
-    hints = get_type_hints(command)
+    hints, marked = get_type_hints(command), get_type_hints(command, include_extras=True)
     for part in fields(command):
         hint = hints[part.name]
         if is_dataclass(hint):
             assert isinstance(hint, type)
             for name, inner in options_of(hint).items():
-                found[name] = Option((part.name, *inner.path), inner.hint)
+                found[name] = Option((part.name, *inner.path), inner.hint, inner.has_flag)
         elif hint is not object:
-            found[part.name] = Option((part.name,), hint)
+            has_flag = tyro.conf.Fixed not in getattr(marked[part.name], "__metadata__", ())
+            found[part.name] = Option((part.name,), hint, has_flag)
     return found
+
+
+def spelled(command: type, name: str) -> str:
+    """The option ``name`` of ``command`` for a message: its flag, or how --set has it."""
+    option = options_of(command).get(name)
+    return flag(name) if option is None or option.has_flag else f"--set {name}"
 
 
 def as_cli_options(
@@ -125,109 +147,147 @@ def as_cli_options(
     checked: bool = True,
 ) -> type[T]:
     """A library's dataclass of options as a group of the command line, where each may be left out and is then
-    None. Their docstrings are the help.
+    None. Help, placeholders and whether an option has a flag follow from its fields (``_options.settings``).
 
     Args:
         options: the dataclass.
         about: description of the group.
-        without: names of options that the command line lacks.
-        metavars: placeholders for values; by default N, X or the choices.
+        without: names of options that the command lacks, beside those that cannot be changed.
+        metavars: placeholders for values; by default the choices, the range, N or X.
         defaults: the end of an option's help, by its name.
         flags: booleans are flags and False by default.
         checked: whether values are checked at once, by ``__post_init__``.
     """
-    hints: dict[str, Any] = {}
-    values: dict[str, Any] = {} if checked else {"__post_init__": lambda self: None}
-    for name, hint in get_type_hints(options).items():
-        kind = _alternatives(hint)[0]
-        values[name] = None
-        if name in without:
-            hints[name] = tyro.conf.Suppress[object]
-        elif kind is bool and flags:
-            hints[name], values[name] = bool, False
+    known = reachable(options)
+    parts: list[tuple[str, Any, Any]] = []
+    hints = get_type_hints(options)
+    for name, setting in settings(options).items():
+        start: Any = None
+        hint: Any = hints[name] | None
+        if name in without or name not in known:
+            hint = tyro.conf.Suppress[object]
+        elif setting.advanced:
+            hint = Annotated[hint, tyro.conf.Fixed]
+        elif bool in setting.kinds and flags:
+            hint, start = bool, False
         else:
-            choices = "{" + ",".join(map(str, get_args(kind))) + "}"
-            placeholders = {int: "N", float: "X", bool: "{True,False}"}
-            metavar = metavars.get(name) or placeholders.get(kind, choices)
-            argument = tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))
-            hints[name] = Annotated[hint | None, argument]
-    made = type(options.__name__, (options,), {"__annotations__": hints, "__doc__": about, **values})
-    return dataclass(frozen=True)(made)
+            metavar = metavars.get(name) or _placeholder(setting)
+            hint = Annotated[hint, tyro.conf.arg(metavar=metavar, help_behavior_hint=defaults(name))]
+        parts.append((name, hint, start))
+    namespace = {"__doc__": about} | ({} if checked else {"__post_init__": lambda self: None})
+    return make_dataclass(options.__name__, parts, bases=(options,), namespace=namespace, frozen=True)
 
 
-def _without_config(words: Sequence[str]) -> tuple[list[str], Path | None]:
-    """``words`` without --config, and its file."""
+def of_presets(presets: Mapping[str, object]) -> Callable[[str], str]:
+    """``defaults`` of ``as_cli_options``: the values that the presets have, where any has one."""
+
+    def defaults(name: str) -> str:
+        values = {preset: getattr(options, name) for preset, options in presets.items()}
+        known = [f"{preset}: {value}" for preset, value in values.items() if value is not None]
+        return f"({'; '.join(known)})" if known else ""
+
+    return defaults
+
+
+def _placeholder(setting: Setting) -> str:
+    """What stands for the value of an option in the help: its choices, a narrow range, or its type."""
+    if setting.choices:
+        return "{" + ",".join(map(str, setting.choices)) + "}"
+    limits = setting.mark(Range)
+    if limits is not None and limits.high <= 100:
+        return f"{limits.low:g}..{limits.high:g}"
+    return {int: "N", float: "X", bool: "{True,False}"}.get(setting.kinds[0], "VALUE")
+
+
+def _taken_apart(words: Sequence[str]) -> Line:
+    """``words`` with --config and --set taken out."""
     rest: list[str] = []
-    file: str | None = None
+    found: dict[str, list[str]] = {"--config": [], "--set": []}
     remaining = iter(words)
     for word in remaining:
         name, equals, value = word.partition("=")
-        if name != "--config":
+        if name in found:
+            found[name].append(value if equals else next(remaining, ""))
+        else:
             rest.append(word)
-            continue
-        if file is not None:
-            raise UsageError("give one --config")
-        file = value if equals else next(remaining, "")
-        if not file:
-            raise UsageError("--config needs a file")
-    return rest, None if file is None else Path(file)
+    if len(found["--config"]) > 1:
+        raise UsageError("give one --config")
+    if "" in found["--config"]:
+        raise UsageError("--config needs a file")
+    settings: dict[str, str] = {}
+    for text in found["--set"]:
+        name, equals, value = text.partition("=")
+        name = name.replace("-", "_")
+        if not equals or not name:
+            raise UsageError(f"--set takes NAME=VALUE, got {short(text)}")
+        if name in settings:
+            raise UsageError(f"--set {name} is given twice")
+        settings[name] = value
+    return Line(rest, Path(found["--config"][0]) if found["--config"] else None, settings)
+
+
+def _refuse_flags_of_settings(command: type[Command], flags: Collection[str]) -> None:
+    """UsageError for an option that has no flag, but is given as one."""
+    for name, option in options_of(command).items():
+        if not option.has_flag and flag(name) in flags:
+            raise UsageError(f"{flag(name)} is not an option of its own: write --set {name}=VALUE")
+
+
+def _read_settings(
+    command: type[Command], texts: Mapping[str, str], flags: Collection[str], name: str
+) -> dict[str, Any]:
+    """The values of --set NAME=VALUE."""
+    options = options_of(command)
+    _refuse_unknown(texts, options, f"--set: {name} has no option")
+    values = {}
+    for key, text in texts.items():
+        if flag(key) in flags:
+            raise UsageError(f"give {flag(key)} or --set {key}, not both")
+        try:
+            values[key] = converted(from_text(text, options[key].hint), options[key].hint, Path())
+        except TypeError as error:
+            raise UsageError(f"--set: {key} must be {error}, got {short(text)}") from None
+    return values
 
 
 def _print_help(command: type[Command], prog: str, *, everything: bool) -> None:
     options, common = options_of(command), command.COMMON
-    hidden = [] if everything or not common else [name for name in options if name not in common]
-    shown = _described(command, [name for name in options if name not in hidden], options)
+    flags = [name for name, option in options.items() if option.has_flag]
+    hidden = [] if everything or not common else [name for name in flags if name not in common]
+    shown = _described(command, [name for name in flags if name not in hidden], flags)
     with suppress(SystemExit):
         tyro.cli(shown, prog=prog, args=["--help"], config=_MARKERS)
+    others = [name for name, option in options.items() if not option.has_flag]
     notes = [f"{len(hidden)} more options: --help-all."] if hidden else []
     if command.CONFIGURABLE:
         notes.append("--config FILE takes options from the NAME.config.toml of an earlier run.")
         if everything:
             notes.append("Paths in it are relative to its folder. Options on the command line win.")
+    if others and (everything or not hidden):
+        text = f"--set NAME=VALUE sets further options (docs/options.md): {', '.join(others)}."
+        print(textwrap.fill(text, 80, break_on_hyphens=False))
     if notes:
         print(" ".join(notes))
 
 
-def _described(command: type[T], shown: Collection[str], options: Collection[str]) -> type[T]:
-    """``command`` with help for the options ``shown``; the others are hidden. ``options``: names of all."""
-    hints: dict[str, Any] = {}
-    values: dict[str, Any] = {}
-    texts = _docstrings(command)
-    for name, hint in get_type_hints(command, include_extras=True).items():
-        part = command.__dataclass_fields__.get(name)  # type: ignore[attr-defined]
-        if part is None or get_origin(hint) is ClassVar:
-            continue
+def _described(command: type[T], shown: Collection[str], flags: Collection[str]) -> type[T]:
+    """``command`` with help for the options ``shown``; the others are hidden. ``flags``: names of all that
+    have one."""
+    parts: list[tuple[str, Any, Any]] = []
+    known, hints = settings(command), get_type_hints(command, include_extras=True)
+    for part in fields(command):  # type: ignore[arg-type]
+        hint, name = hints[part.name], part.name
         if is_dataclass(hint):
-            hints[name] = _described(hint, shown, options)  # type: ignore[arg-type]
-            values[name] = field(default_factory=hints[name])
+            group = _described(hint, shown, flags)  # type: ignore[arg-type]
+            parts.append((name, group, field(default_factory=group)))
             continue
-        if part.default is not MISSING:
-            values[name] = part.default
         if name not in shown:
             hint = Annotated[hint, tyro.conf.Suppress]
-        elif name in texts:  # else its type has the help, for options of several commands
-            hint = Annotated[hint, tyro.conf.arg(help=_with_flags(texts[name], options))]
-        hints[name] = hint
-    made = type(
-        command.__name__, (command,), {"__annotations__": hints, "__doc__": command.__doc__, **values}
-    )
-    return dataclass(frozen=True)(made)
-
-
-def _docstrings(kind: type) -> dict[str, str]:
-    """The docstrings of a dataclass' fields, each in one line. (Tyro keeps the line breaks of the source.)"""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        try:
-            source = textwrap.dedent(inspect.getsource(base))
-        except (OSError, TypeError):  # made at run time, or built in
-            continue
-        for node, text in pairwise(ast.parse(source).body[0].body):  # type: ignore[attr-defined]
-            if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)):
-                continue
-            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                found[node.target.id] = " ".join(str(text.value.value).split())
-    return found
+        elif known[name].help:  # else its type has the help, for options of several commands
+            hint = Annotated[hint, tyro.conf.arg(help=_with_flags(known[name].text, flags))]
+        parts.append((name, hint, field() if part.default is MISSING else part.default))
+    namespace = {"__doc__": command.__doc__}
+    return make_dataclass(command.__name__, parts, bases=(command,), namespace=namespace, frozen=True)
 
 
 def _with_flags(text: str, options: Collection[str]) -> str:
@@ -243,11 +303,11 @@ def _read(command: type[Command], file: Path, name: str) -> tuple[dict[str, Any]
     record = toml.load(file)
     _refuse_unknown(record, TABLES, f"{file}: no such table or key")
     if record.get("command", name) != name:
-        raise UsageError(f"{file}: of the command {_short(record['command'])}, not {name}")
+        raise UsageError(f"{file}: of the command {short(record['command'])}, not {name}")
     table, resolved = record.get("options", {}), record.get("resolved", {})
     for title, part in (("options", table), ("resolved", resolved)):
         if not isinstance(part, dict):
-            raise UsageError(f"{file}: {title} must be a table, got {_short(part)}")
+            raise UsageError(f"{file}: {title} must be a table, got {short(part)}")
     options = options_of(command)
     for option in INVOCATION:
         if option in table:
@@ -258,9 +318,9 @@ def _read(command: type[Command], file: Path, name: str) -> tuple[dict[str, Any]
         if key == "input" and value in ("-", ["-"]):
             continue  # standard input has to be named again
         try:
-            values[key] = _converted(value, options[key].hint, file.parent)
+            values[key] = converted(value, options[key].hint, file.parent)
         except TypeError as error:
-            raise UsageError(f"{file}: {key} must be {error}, got {_short(value)}") from None
+            raise UsageError(f"{file}: {key} must be {error}, got {short(value)}") from None
     return values, resolved
 
 
@@ -268,7 +328,7 @@ def _refuse_unknown(table: Mapping[str, Any], known: Collection[str], problem: s
     for key in table:
         if key not in known:
             hint = did_you_mean(key[:60], known)
-            raise UsageError(f"{problem} {_short(key)}" + (f"; {hint}" if hint else ""))
+            raise UsageError(f"{problem} {short(key)}" + (f"; {hint}" if hint else ""))
 
 
 def _warn_of_changes(
@@ -284,7 +344,7 @@ def _warn_of_changes(
         plain = list(value) if isinstance(value, tuple) else value
         if key in recorded and not isinstance(value, Path) and plain != recorded[key]:
             say(
-                f"warning: {file}: {key} is {_short(plain)} now, and was {_short(recorded[key])}:"
+                f"warning: {file}: {key} is {short(plain)} now, and was {short(recorded[key])}:"
                 " [resolved] is a record; values are set under [options]"
             )
             return
@@ -304,95 +364,3 @@ def _filled(command: type[T], values: Mapping[str, Any]) -> T:
         elif part.default is MISSING and part.default_factory is MISSING:
             arguments[part.name] = tyro.MISSING
     return command(**arguments)
-
-
-def _converted(value: Any, hint: Any, folder: Path) -> Any:
-    """``value`` of a file in ``folder`` as an option of the type ``hint``. A TypeError says what it must
-    be."""
-    problems = []
-    for kind in _alternatives(hint):
-        try:
-            return _as_kind(value, kind, folder)
-        except TypeError as error:
-            problems.append(str(error))
-    raise TypeError(" or ".join(problems))
-
-
-def _as_kind(value: Any, kind: Any, folder: Path) -> Any:
-    if get_origin(kind) is Literal:
-        choices = get_args(kind)
-        if value in choices and type(value) in map(type, choices):
-            return value
-        raise TypeError("one of " + ", ".join(map(str, choices)))
-    if get_origin(kind) is tuple:
-        return _as_tuple(value, get_args(kind), folder)
-    if kind is bool and isinstance(value, bool):
-        return value
-    whole = isinstance(value, int) and not isinstance(value, bool) and value.bit_length() < 64
-    if kind is int and whole:
-        return value
-    if kind is float and (whole or isinstance(value, float)):
-        return float(value)
-    if kind in (str, Path) and isinstance(value, str) and "\0" not in value:
-        return value if kind is str else resolve(value, folder)
-    raise TypeError(_KINDS[kind])
-
-
-_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path"}
-
-
-def _as_tuple(value: Any, kinds: tuple[Any, ...], folder: Path) -> tuple[Any, ...]:
-    endless = kinds[-1] is Ellipsis
-    if not isinstance(value, list) or (not endless and len(value) != len(kinds)):
-        raise TypeError("a list" if endless else f"a list of {len(kinds)} values")
-    try:
-        parts = [_converted(v, kinds[0 if endless else i], folder) for i, v in enumerate(value)]
-    except TypeError as error:
-        raise TypeError(f"a list, each {error}") from None
-    return tuple(parts)
-
-
-def _alternatives(hint: Any) -> tuple[Any, ...]:
-    """The types of a union, without None."""
-    if get_origin(hint) in (Union, types.UnionType):
-        return tuple(part for part in get_args(hint) if part is not type(None))
-    return (hint,)
-
-
-def _short(value: Any) -> str:
-    """``value`` for a message, in printable characters."""
-    if isinstance(value, dict):
-        return "a table"
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    if isinstance(value, int) and value.bit_length() > 64:
-        return "more than 64 bits"
-    text = ascii(value) if isinstance(value, str) else str(value)
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-# ---- Paths in configuration files are relative to the file's folder, so that it works from everywhere
-
-
-def resolve(text: str, folder: Path) -> Path:
-    """The path ``text`` of a file in ``folder``, seen from the working folder."""
-    path = Path(text)
-    if path.is_absolute():
-        return path
-    whole = os.path.normpath(os.path.join(os.path.realpath(folder), text))
-    return Path(whole if folder.is_absolute() else _relative(whole, os.path.realpath(".")))
-
-
-def relative_to(path: Path, folder: Path) -> str:
-    """``path``, relative to the working folder, for a file in ``folder``. Absolute ones stay."""
-    if path.is_absolute():
-        return str(path)
-    whole = os.path.join(os.path.realpath(path.parent), path.name)
-    return Path(_relative(whole, os.path.realpath(folder))).as_posix()
-
-
-def _relative(path: str, start: str) -> str:
-    try:
-        return os.path.relpath(path, start)
-    except ValueError:  # another drive
-        return path

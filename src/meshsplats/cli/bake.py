@@ -30,8 +30,8 @@ class Bake(Command):
     """Applies the low-pass filter of a mesh to its triangles, for viewers, engines and Blender, which have no
     such filter.
 
-    'convert --footprint filter' makes such meshes. The result is right for these views and this image size;
-    nearer it is soft, farther away thin.
+    'convert --set footprint=filter' makes such meshes. The result is right for these views and this image
+    size; nearer it is soft, farther away thin.
     """
 
     COMMON = (

@@ -66,7 +66,7 @@ else:
     LightArguments = as_cli_options(
         LightOptions,
         "Light and surroundings of lit images. Lengths are relative to the subject. Defaults: --lights sun.",
-        metavars={"sun": "AZIMUTH ELEVATION", "sun_color": "R G B", "sky_color": "R G B", "hdri": "FILE"},
+        metavars={"sun": "AZIMUTH ELEVATION", "hdri": "FILE"},
         defaults=_default_light,
         flags=True,
     )
@@ -79,8 +79,8 @@ class Blender(Command):
 
     Without --lit, the image is that of `meshsplats render`. With --lit, sun and sky light the splats, which
     cast shadows and are seen in mirrors and through glass. Splats are converted to a mesh first, with
-    default settings; with --lit, to one flat ellipse per splat (convert --mode flat), which takes light best.
-    Needs Blender's module bpy in an environment of its own, or an installed Blender (--executable).
+    default settings; with --lit, to one flat ellipse per splat (convert --set mode=flat), which takes light
+    best. Needs Blender's module bpy in an environment of its own, or an installed Blender (--executable).
     """
 
     COMMON = (

@@ -23,6 +23,7 @@ from meshsplats.camera import MAX_SIDE, Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import guess_up, warn_of_strays
 from meshsplats.cameras.trajectories import dome, look_around, orbit
+from meshsplats.cli.arguments import spelled
 from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import WHITE, Dataset
@@ -84,11 +85,9 @@ class SplatOptions:
     """Kernel that the splats were trained with; auto: as the file says."""
     time: Number = None
     """Splats that move in time: the instant to show, in the file's unit. Default: one in the middle."""
-    activated: Annotated[
-        tuple[Literal["scales", "opacities", "colors"], ...], tyro.conf.arg(help_behavior_hint="")
-    ] = ()
+    activated: tyro.conf.Fixed[tuple[Literal["scales", "opacities", "colors"], ...]] = ()
     """Values that a .ply stores as they are, where logarithms, logits and harmonics belong."""
-    strict: bool = False
+    strict: tyro.conf.Fixed[bool] = False
     """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
     def load(
@@ -135,7 +134,7 @@ class SplatOptions:
         """UsageError for options that have no effect on ``path``, which is not a file of splats."""
         given = [name for name in ("kernel", "time", "activated") if name in self._changed]
         if given:
-            flags = ", ".join(map(flag, given))
+            flags = ", ".join(spelled(type(self), name) for name in given)
             raise UsageError(f"{shown_path(path)} holds no splats: {flags} would have no effect")
 
     @property
@@ -157,7 +156,7 @@ class SplatOptions:
         words = ["--axes", self.axes] if self.axes != "auto" else []
         words += ["--kernel", self.kernel] if self.kernel != "auto" else []
         words += ["--time", f"{self.time:g}"] if self.time is not None else []
-        return words + (["--activated", *self.activated] if self.activated else [])
+        return words + (["--set", f"activated={','.join(self.activated)}"] if self.activated else [])
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,13 @@ from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli.arguments import Command, as_cli_options
+from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.batch import Job, check_file, check_folder, is_batch, jobs, sources, without_results
 from meshsplats.cli.common import (
     Count,
     File,
     Folder,
     Missing,
-    Number,
     Origin,
     Output,
     SplatOptions,
@@ -53,13 +52,13 @@ from meshsplats.cli.messages import (
     command_line,
     error_record,
     exit_code,
-    flag,
     one_line,
     say,
     shown_path,
 )
 from meshsplats.cli.records import CONFIGURATION, beside, changes_since, write_configuration
 from meshsplats.conversion import ConversionOptions, convert, simplify
+from meshsplats.conversion.options import PRESETS
 from meshsplats.conversion.selection import choose_splats
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.errors import DataWarning, FileFormatError
@@ -90,8 +89,9 @@ if TYPE_CHECKING:
 else:
     ConvertOptions = as_cli_options(
         ConversionOptions,
-        "Default: the value of the preset.",
+        "In parentheses: the values of the presets.",
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
+        defaults=of_presets(PRESETS),
     )
 
 
@@ -140,20 +140,20 @@ class Convert(Command):
     smooth: bool = False
     """With --lit: normals of the surface that the splats form, in place of the triangles' own, which look
     mottled under light."""
-    color_type: Literal["uint16", "float32"] = "uint16"
+    color_type: tyro.conf.Fixed[Literal["uint16", "float32"]] = "uint16"
     """.glb: storage of colours."""
     alpha: Literal["auto", "blend", "mask", "opaque", "hybrid"] = "auto"
     """auto: for .glb, blend or mask, whichever is nearer to the sorted image in viewers that do not sort, by
     a few images of both; else blend. blend: the viewer blends true opacities; mask (.glb): it draws as solid
-    what has at least --cutoff; opaque: solid triangles, cut there; hybrid (.glb), for a mesh of finetune
-    --soft-share: solid and blended triangles apart."""
-    cutoff: Number = None
+    what has at least ``cutoff``; opaque: solid triangles, cut there; hybrid (.glb), for a mesh of finetune
+    with soft_share: solid and blended triangles apart."""
+    cutoff: tyro.conf.Fixed[float | None] = None
     """--alpha opaque, mask: least opacity that is drawn, 0 to 1. Default: 0.2."""
     compression: Literal["none", "meshopt"] = "none"
     """.glb: meshopt: about a fifth of the size, for viewers; needs the program gltfpack."""
     as_splats: bool = False
     """Write splats, not a mesh: a float .ply in the layout of the 3DGS code, of all splats or of those that
-    --crop, --min-opacity and --max-splats leave."""
+    --crop, --max-splats and min_opacity leave."""
     fidelity: Count = None
     """Compare the mesh with its splats in N views, of the cameras or around it, and print PSNR and SSIM."""
     stream: bool = False
@@ -233,10 +233,10 @@ class Convert(Command):
             raise UsageError("--smooth has no effect without --lit")
         only_glb = self.color_type != "uint16" or self.alpha in _GLB_ALPHA or self.compression != "none"
         if not glb and only_glb:
-            raise UsageError("--color-type, --alpha mask or hybrid, and --compression are for .glb files")
+            raise UsageError("--alpha mask or hybrid, --compression and --set color_type are for .glb files")
         if self.cutoff is not None:
             if self.alpha not in ("opaque", "mask"):
-                raise UsageError("--cutoff is for --alpha opaque or mask")
+                raise UsageError("--set cutoff is for --alpha opaque or mask")
             checked_cutoff(self.cutoff)
         if self.data is not None and self.cameras is not None:
             raise UsageError("give --cameras or --data, not both")
@@ -264,7 +264,7 @@ class Convert(Command):
             idle += [name for name in ("cameras", "data") if getattr(self, name) is not None]
         idle += [name for name, value in explicit.items() if value is not None and name not in _SELECTION]
         if idle:
-            flags = ", ".join(map(flag, idle))
+            flags = ", ".join(spelled(type(self), name) for name in idle)
             raise UsageError(f"{flags}: for a mesh, no effect with --as-splats")
         self.conversion.resolved("paper", has_cameras=False)
 
@@ -522,7 +522,7 @@ class Convert(Command):
         idle += ["preset"] if self.preset != "default" else []
         idle += [name for name, value in asdict(self.conversion).items() if value is not None]
         if idle:
-            flags = ", ".join(map(flag, idle))
+            flags = ", ".join(spelled(type(self), name) for name in idle)
             raise UsageError(f"{job.shown} is a mesh: {flags} would have no effect, as they are for splats")
         self.reading.refuse_for(job.source)
         times = [time.perf_counter()]

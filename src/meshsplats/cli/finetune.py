@@ -80,7 +80,7 @@ if TYPE_CHECKING:
 else:
     StartOptions = as_cli_options(
         ConversionOptions,
-        "The mesh at the start. Default: the value of the preset.",
+        "The mesh at the start.",
         without=("look",),  # that of the targets
         metavars={"crop": "X0 Y0 Z0 X1 Y1 Z1"},
     )
@@ -119,7 +119,7 @@ class Finetune(TrainingCommand):
     """The tuned mesh: .npz or .ply, which keep everything; .glb, .usdc, .obj."""
     preset: Annotated[Literal["default", "paper"], tyro.conf.arg(metavar="NAME")] = "default"
     """default: best quality at equal time. paper: the text of the MeshSplats paper."""
-    start: Literal["same", "default", "paper"] = "same"
+    start: tyro.conf.Fixed[Literal["same", "default", "paper"]] = "same"
     """Conversion of splats; same: that of --preset. default: an ellipse of 5 to 32 triangles a splat. paper:
     the paper's conversion."""
     conversion: StartOptions = field(default_factory=StartOptions)

@@ -37,7 +37,9 @@ SUFFIXES = (".npz", ".glb")
 if TYPE_CHECKING:
     PriorTuningOptions = FinetuneConfig
 else:
-    PriorTuningOptions = tuning_options(lambda name: f"(default: {getattr(prior_config(), name)})")
+    PriorTuningOptions = tuning_options(
+        "The optimisation.", lambda name: f"(default: {getattr(prior_config(), name)})"
+    )
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from meshsplats.cli import toml
-from meshsplats.cli.arguments import INVOCATION, Command, options_of, relative_to
-from meshsplats.cli.messages import UsageError, flag, shown_path
+from meshsplats.cli.arguments import INVOCATION, Command, options_of, spelled
+from meshsplats.cli.messages import UsageError, shown_path
+from meshsplats.cli.values import relative_to
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
@@ -72,7 +73,10 @@ def changes_since(path: Path, name: str, command: Command, idle: Collection[str]
     now = {key: value for key, value in today["options"].items() if value is not None}
     same = partial(_same, path.parent)
     changed = [key for key in sorted({*now, *before} - set(idle)) if not same(before.get(key), now.get(key))]
-    found = [f"{flag(key)} was {_shown(before.get(key))} and is {_shown(now.get(key))}" for key in changed]
+    found = [
+        f"{spelled(type(command), key)} was {_shown(before.get(key))} and is {_shown(now.get(key))}"
+        for key in changed
+    ]
     version = toml.load(path).get("version")
     if version != today["version"]:
         found.append(f"MeshSplats was {version} and is {today['version']}")

@@ -11,8 +11,9 @@ import tyro
 
 from meshsplats.camera import Camera
 from meshsplats.cameras.files import load_cameras
+from meshsplats.cli.arguments import spelled
 from meshsplats.cli.common import Count, File, Folder, Missing, Text, cameras_beside, parse_up
-from meshsplats.cli.messages import UsageError, flag
+from meshsplats.cli.messages import UsageError
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset
 from meshsplats.finetuning.config import FEWEST_VIEWS
@@ -41,7 +42,7 @@ class TargetOptions:
     """Without --data: number of further images, for scores."""
     width: int = 400
     """Without --data: side of the images in pixels."""
-    distance: tuple[float, float] = (0.9, 1.1)
+    distance: tyro.conf.Fixed[tuple[float, float]] = (0.9, 1.1)
     """Without --data: nearest and farthest camera outside, as multiples of the distance from which the
     sphere with 90 % of the splats' opacity just fits the image."""
     placement: Literal["auto", "object", "surrounded", "inside"] = "auto"
@@ -70,10 +71,10 @@ class TargetOptions:
         names, source = (idle, "--data") if self.data is not None else (of_data, "splats")
         for name in names:
             if self._is_set(name):
-                raise UsageError(f"{flag(name)} has no effect with {source}")
+                raise UsageError(f"{spelled(type(self), name)} has no effect with {source}")
         for name in PLACING:
             if self.cameras is not None and self._is_set(name):
-                raise UsageError(f"--{name} has no effect with --cameras")
+                raise UsageError(f"{spelled(type(self), name)} has no effect with --cameras")
         if self.views is not None and self.views < 1:
             raise UsageError(f"--views must be at least 1, got {self.views}")
         if not self.cache >= 0:

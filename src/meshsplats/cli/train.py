@@ -24,9 +24,9 @@ from meshsplats.datasets.views import Dataset
 from meshsplats.evaluation.backgrounds import BLACK, Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, RunOptions
 from meshsplats.finetuning.checkpoint import Checkpoint
-from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS, OF_CUTOFF
+from meshsplats.finetuning.config import BACKGROUNDS, LENGTHS
 from meshsplats.finetuning.step import samples_of
-from meshsplats.training.config import FIXED, TrainConfig, train_config
+from meshsplats.training.config import TrainConfig, train_config
 from meshsplats.training.run import SO_FAR, check_training_memory, train
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 else:
     GrowingOptions = as_cli_options(
         TrainConfig,
-        "Default: see docs/training.md.",
-        without=("preset", "blending", *LENGTHS, *FIXED, *OF_CUTOFF),
+        "The optimisation, and the growth of the set of fans.",
+        without=("preset", *LENGTHS),
         defaults=lambda name: f"(default: {getattr(TrainConfig, name)})",
         checked=False,
     )

@@ -17,7 +17,7 @@ import tyro
 
 from meshsplats._files.locks import locked
 from meshsplats.camera import Camera
-from meshsplats.cli.arguments import Command, as_cli_options
+from meshsplats.cli.arguments import Command, as_cli_options, of_presets, spelled
 from meshsplats.cli.common import (
     Count,
     Number,
@@ -32,7 +32,7 @@ from meshsplats.cli.common import (
     say_origin,
     size_of,
 )
-from meshsplats.cli.messages import UsageError, flag, say
+from meshsplats.cli.messages import UsageError, say
 from meshsplats.cli.records import (
     CONFIGURATION,
     PREVIEW,
@@ -47,7 +47,7 @@ from meshsplats.evaluation.backgrounds import Background
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, RunOptions
 from meshsplats.finetuning.baseline import SizeScores
 from meshsplats.finetuning.checkpoint import Checkpoint, OtherRunError, planned_length
-from meshsplats.finetuning.config import LENGTHS, with_changes
+from meshsplats.finetuning.config import LENGTHS, PRESETS, with_changes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.webgpu.device import open_device
@@ -74,12 +74,12 @@ class Display(Protocol):
     def __call__(self, progress: Progress) -> None: ...
 
 
-def tuning_options(default_of: Callable[[str], str]) -> type[FinetuneConfig]:
-    """The configuration of an optimisation as command-line options. ``default_of``: the end of an option's
-    help."""
+def tuning_options(about: str, default_of: Callable[[str], str]) -> type[FinetuneConfig]:
+    """The configuration of an optimisation as command-line options. ``about``: their description;
+    ``default_of``: the end of an option's help."""
     return as_cli_options(
         FinetuneConfig,
-        "Default: the value of the preset.",
+        about,
         without=("preset", *LENGTHS),
         defaults=default_of,
         checked=False,
@@ -89,7 +89,7 @@ def tuning_options(default_of: Callable[[str], str]) -> type[FinetuneConfig]:
 if TYPE_CHECKING:
     TuningOptions = FinetuneConfig
 else:
-    TuningOptions = tuning_options(lambda name: f"(default preset: {getattr(FinetuneConfig, name)})")
+    TuningOptions = tuning_options("In parentheses: the values of the presets.", of_presets(PRESETS))
 
 
 @dataclass(frozen=True)
@@ -248,9 +248,9 @@ class TrainingCommand(Command):
     """Continue an interrupted run; with --force also one that has ended, for longer."""
     target: TargetOptions = field(default_factory=TargetOptions)
     tuning: TuningOptions = field(default_factory=TuningOptions)
-    report_every: int = 100
+    report_every: tyro.conf.Fixed[int] = 100
     """Steps between two scores on held-out views."""
-    preview_every: int = 500
+    preview_every: tyro.conf.Fixed[int] = 500
     """Steps between two previews; after each quarter of a short run. 0: none."""
     threads: Count = None
     """Maximum number of threads. Default: all processors."""
@@ -402,7 +402,8 @@ class TrainingCommand(Command):
         if not differ:
             return OtherRunError(f"{error}. No option differs, so the files themselves have changed")
         changes = ", ".join(
-            f"{flag(key)} was {_in_words(before.get(key))} and is {_in_words(now[key])}" for key in differ
+            f"{spelled(type(self), key)} was {_in_words(before.get(key))} and is {_in_words(now[key])}"
+            for key in differ
         )
         return OtherRunError(f"{error}. Options that differ: {changes}")
 

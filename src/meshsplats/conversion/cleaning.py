@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 
 from meshsplats._cells import Cells
 from meshsplats._geometry import spacing
+from meshsplats._options import Range, check_options
 from meshsplats.cameras.framing import scene_bounds
 from meshsplats.conversion.fans import semi_axes
 from meshsplats.conversion.selection import inside
@@ -29,32 +31,23 @@ class CleaningRules:
 
     crop: tuple[float, float, float, float, float, float] | None = None
     """Centre outside the box x0 y0 z0 x1 y1 z1, in the coordinates of the file."""
-    min_opacity: float | None = None
-    """Opacity below this, 0 to 1."""
-    max_distance: float | None = None
+    min_opacity: Annotated[float | None, Range(0, 1)] = None
+    """Opacity below this."""
+    max_distance: Annotated[float | None, Range(0, math.inf)] = None
     """Farther from the middle than this many radii of the subject. Within one radius lie nine tenths of its
     opacity."""
-    max_size: float | None = None
+    max_size: Annotated[float | None, Range(0, math.inf)] = None
     """Longer, from its middle to an end, than this many radii of the subject. 1000 removes what no camera can
     have seen whole."""
-    sparse: float | None = None
-    """Fewer neighbours than this share of the median, 0 to 1. 0.05 removes single floaters and thin
+    sparse: Annotated[float | None, Range(0, 1)] = None
+    """Fewer neighbours than this share of the median. 0.05 removes single floaters and thin
     clouds."""
-    min_part: float | None = None
-    """In a part that touches nothing else and has less than this share of all opacity, 0 to 1. 0.01 removes
+    min_part: Annotated[float | None, Range(0, 1)] = None
+    """In a part that touches nothing else and has less than this share of all opacity. 0.01 removes
     clumps in the air."""
 
     def __post_init__(self) -> None:
-        for name, top in [
-            ("min_opacity", 1),
-            ("max_distance", np.inf),
-            ("max_size", np.inf),
-            ("sparse", 1),
-            ("min_part", 1),
-        ]:
-            value = getattr(self, name)
-            if value is not None and not 0 <= value <= top:
-                raise ValueError(f"{name} must lie between 0 and {top}, got {value}")
+        check_options(self)
         if self.crop is not None:
             low, high = np.array(self.crop[:3]), np.array(self.crop[3:])
             if not (np.isfinite(self.crop).all() and (low < high).all()):

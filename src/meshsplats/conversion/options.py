@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Literal, TypedDict, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, TypedDict
 
 import numpy as np
 
-from meshsplats._options import Range, check_choices, check_flags, check_names, check_ranges
+from meshsplats._options import Advanced, Range, With, check_names, check_options
 from meshsplats.rendering.looks import Look
 
 if TYPE_CHECKING:
@@ -28,84 +28,81 @@ THICK = 0.25
 
 @dataclass(frozen=True)
 class ConversionOptions:
-    """The options of ``convert``. None: the preset's value."""
+    """The options of ``convert``. None: the value of the preset, in ``PRESETS`` and ``docs/options.md``."""
 
-    mode: Mode | None = None
+    mode: Annotated[Mode | None, Advanced] = None
     """flat: one ellipse in the plane of the two largest axes of each splat. crossed: a second one at right
     angles to it, along the longest axis, so that no splat vanishes edge-on; a splat flatter than
-    ``flat_below`` is one finer ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3.
-    Default: crossed; paper: flat."""
-    rim_radius: float | None = None
-    """Radius of the rim in standard deviations, 0.1 to 10. Default: calibrated; paper: 2.7."""
-    sides: int | None = None
-    """Sides of an ellipse; with one ring, also the triangles of its fan: 3 to 64 (3d: a multiple of 4;
-    crossed: even). Default: 8 for flat, else 4; paper: 8."""
-    rim_opacity: float | None = None
-    """Opacity of the rim as a fraction of the splat's, 0 to 1. Default: 0; paper: 0.2."""
-    center_opacity: float | None = None
-    """Opacity of the centre as a multiple of the splat's, above 0 to 2; the product is clamped to 1. Default:
-    calibrated; paper: 1."""
-    rings: int | None = None
-    """Rings of vertices in an ellipse, 1 to 4; the last is the rim. More rings follow the Gaussian more
-    closely: 2 rings make 3 * sides triangles. Default and paper: 1."""
-    detail: Detail | None = None
+    ``flat_below`` is one finer ellipse instead. 3d: three ellipses in the planes of axes 1-2, 2-3 and 1-3."""
+    rim_radius: Annotated[float | None, Range(0.1, 10), Advanced] = None
+    """Radius of the rim in standard deviations. Default: calibrated."""
+    sides: Annotated[int | None, Range(3, 64), Advanced] = None
+    """Sides of an ellipse; with one ring, also the triangles of its fan (3d: a multiple of 4; crossed: even).
+    Default: 8 for flat, else 4."""
+    rim_opacity: Annotated[float | None, Range(0, 1), Advanced] = None
+    """Opacity of the rim as a fraction of the splat's."""
+    center_opacity: Annotated[float | None, Range(1e-3, 2), Advanced] = None
+    """Opacity of the centre as a multiple of the splat's; the product is clamped to 1. Default:
+    calibrated."""
+    rings: Annotated[int | None, Range(1, 4), Advanced] = None
+    """Rings of vertices in an ellipse; the last is the rim. More rings follow the Gaussian more closely: 2
+    rings make 3 * sides triangles."""
+    detail: Annotated[Detail | None, Advanced] = None
     """Level of detail. even: every splat has the same number of triangles. cameras: that number on average, 3
     to 80 for each splat; most where the splat is large in the cameras' images and a plain fan would look
     wrong, none where it is hidden inside a solid. It implies mode 'flat' and needs one ring. Fine-tuning
-    begins with it. Default and paper: even."""
-    flat_below: float | None = None
+    begins with it."""
+    flat_below: Annotated[float | None, Range(0, 1), With(mode="crossed", detail="cameras"), Advanced] = None
     """crossed: a splat whose smallest standard deviation (with its footprint) is at most this fraction of the
-    middle one becomes one ellipse of twice as many triangles, 0 to 1. Default: 0.15. detail 'cameras': a
-    splat that is thicker than that and gets 24 triangles or more becomes a star, ellipses in 6 or 10 planes,
-    which looks alike from everywhere. Default there: 0.25; 1: no stars."""
-    compensation: float | None = None
+    middle one becomes one ellipse of twice as many triangles. detail 'cameras': a splat that is thicker than
+    that and gets 24 triangles or more becomes a star, ellipses in 6 or 10 planes, which looks alike from
+    everywhere. Default there: 0.25; 1: no stars."""
+    compensation: Annotated[float | None, Range(0, 1), Advanced] = None
     """1: opacities are scaled so that the ellipses of a splat have the same opacity times area as the splat,
-    averaged over all directions. 0: opacities stay. Between: a power of that factor. Default: 1; paper:
-    0."""
+    averaged over all directions. 0: opacities stay. Between: a power of that factor."""
     look: Look | None = None
     """How the mesh should look. area: each pixel is the mean over its area, for programs that take several
     samples a pixel: Blender, engines with MSAA, ray tracers. splats: as a 3DGS viewer shows the splats at the
-    image size of the cameras or the framing; fans are then wider, and blur in larger images. Default and
-    paper: area."""
-    footprint: Footprint | None = None
+    image size of the cameras or the framing; fans are then wider, and blur in larger images."""
+    footprint: Annotated[Footprint | None, Advanced] = None
     """Source of the size of a pixel at each splat, for the low-pass filter that splats were trained with.
     cameras: the given cameras. framing: images of 1000 pixels from all sides that just hold the subject, with
     finer pixels for very dense splats. distance: ``viewing_distance``. filter: the mesh gets a filter of its
     own (``SplatMesh.filter_px2``) instead, which is right at every size but which only this project's
     renderer applies; for splats of kernel '3dgs'. none: no filter, for a model trained without one. Default:
-    cameras if there are any, else distance if it is given, else framing; paper: none."""
-    footprint_px2: float | None = None
-    """Variance of that filter in square pixels, 0 to 100. Every standard deviation s becomes
-    sqrt(s^2 + v * pixel^2), or max(s, sqrt(v) * pixel) for splats of kernel '2dgs', with v this variance.
-    Default: 0.05 for the look 'area', against sampling noise; for 'splats' 0.5, or 0.4 for splats of kernel
-    'antialiased' and 0.3 for '2dgs'. With ``footprint`` filter: ``SplatMesh.filter_px2``, by default 0.3
-    as in 3DGS."""
-    viewing_distance: float | None = None
-    """Distance from which the mesh will be seen, scene units; for ``footprint`` distance."""
-    focal: float | None = None
-    """Focal length, in pixels, of images from ``viewing_distance``. Default: 1000, which is 1000 pixels over
-    53 degrees."""
-    min_opacity: float | None = None
-    """Leave out splats of less opacity than this, 0 to 1; above 0, also splats without area. Default: 1/255,
-    below which splats are invisible; paper: 0."""
-    shrink_faint: bool | None = None
+    cameras if there are any, else distance if it is given, else framing."""
+    footprint_px2: Annotated[
+        float | None, Range(0, 100), With(footprint=("cameras", "framing", "distance", "filter")), Advanced
+    ] = None
+    """Variance of that filter in square pixels. Every standard deviation s becomes sqrt(s^2 + v * pixel^2),
+    or max(s, sqrt(v) * pixel) for splats of kernel '2dgs', with v this variance. Default: 0.05 for the look
+    'area', against sampling noise; for 'splats' 0.5, or 0.4 for splats of kernel 'antialiased' and 0.3 for
+    '2dgs'. With ``footprint`` filter: ``SplatMesh.filter_px2``, by default 0.3 as in 3DGS."""
+    viewing_distance: Annotated[float | None, Range(1e-30, 1e30), With(footprint="distance"), Advanced] = None
+    """Distance from which the mesh will be seen, scene units."""
+    focal: Annotated[float | None, Range(1e-3, 1e9), With(footprint="distance"), Advanced] = None
+    """Focal length, in pixels, of images from ``viewing_distance``. A value of 1000 is 53 degrees over 1000
+    pixels."""
+    min_opacity: Annotated[float | None, Range(0, 1), Advanced] = None
+    """Leave out splats of less opacity than this; above 0, also splats without area. Splats below 1/255 are
+    invisible."""
+    shrink_faint: Annotated[bool | None, Advanced] = None
     """Make faint splats smaller: 3DGS cuts them off where their opacity falls below 1/255, which leaves the
-    share 1 - 1 / (255 opacity) of their area. Default: yes; paper: no."""
+    share 1 - 1 / (255 opacity) of their area."""
     crop: tuple[float, float, float, float, float, float] | None = None
     """Box x0 y0 z0 x1 y1 z1 in scene units: leave out splats whose centre is outside."""
-    max_splats: int | None = None
+    max_splats: Annotated[int | None, Range(1, 2**31 - 1)] = None
     """Largest number of splats: see ``budget``."""
-    max_triangles: int | None = None
+    max_triangles: Annotated[int | None, Range(1, 2**31 - 1)] = None
     """Largest number of triangles: see ``budget``. In mode 'flat', unless ``sides``, ``rings``,
     ``rim_radius`` or ``center_opacity`` is given, splats first get fewer triangles each, at least 4."""
-    budget: Budget | None = None
+    budget: Annotated[Budget | None, Advanced] = None
     """How to keep to ``max_splats`` and ``max_triangles``. merge: merge similar splats. drop: keep only the
     most important ones, by opacity times area in the images of the cameras (splats that no camera sees count
-    as at the median distance), or in scene units without cameras; this tears holes. Default and paper:
-    merge."""
-    colors: Colors | None = None
+    as at the median distance), or in scene units without cameras; this tears holes."""
+    colors: Annotated[Colors | None, Advanced] = None
     """degree0: the view-independent part of the colour. cameras: where splats have spherical harmonics, the
-    mean of the colours that the cameras see. Default and paper: degree0."""
+    mean of the colours that the cameras see."""
 
     def resolved(self, preset: str, *, has_cameras: bool) -> ConversionOptions:
         """A checked copy with the preset's values in place of None.
@@ -130,18 +127,11 @@ class ConversionOptions:
         return full
 
     def _check(self, given: set[str], has_cameras: bool) -> None:
-        check_choices(self, _CHOICES)
-        check_ranges(self, _RANGES, types=(int, float, np.integer, np.floating))
-        check_flags(self, ("shrink_faint",))
+        check_options(self, given=given)
         if self.mode == "3d" and self.sides % 4:  # type: ignore[operator]
             raise ValueError(f"sides must be a multiple of 4 in mode '3d', got {self.sides}")
         if self.mode == "crossed" and self.sides % 2:  # type: ignore[operator]
             raise ValueError(f"sides must be even in mode 'crossed', got {self.sides}")
-        if "flat_below" in given and self.mode != "crossed" and self.detail != "cameras":
-            raise ValueError(
-                f"flat_below is for mode 'crossed' and for detail='cameras', got mode {self.mode!r} and"
-                f" detail {self.detail!r}"
-            )
         if self.detail == "cameras":
             if not has_cameras:
                 raise ValueError("detail='cameras' needs cameras: give some, or choose even")
@@ -156,11 +146,6 @@ class ConversionOptions:
             )
         if self.footprint == "distance" and self.viewing_distance is None:
             raise ValueError("footprint='distance' needs viewing_distance, in scene units")
-        if self.footprint != "distance" and given & {"viewing_distance", "focal"}:
-            named = " and ".join(sorted(given & {"viewing_distance", "focal"}))
-            raise ValueError(f"{named} is for footprint='distance', got footprint={self.footprint!r}")
-        if self.footprint == "none" and "footprint_px2" in given:
-            raise ValueError("footprint_px2 is the variance of the footprint, but footprint is 'none'")
         if self.colors == "cameras" and not has_cameras:
             raise ValueError("colors='cameras' needs cameras")
         if self.crop is not None:
@@ -170,31 +155,6 @@ class ConversionOptions:
                     f"crop must be x0 y0 z0 x1 y1 z1 with each minimum <= its maximum, got {self.crop}"
                 )
 
-
-_CHOICES = {
-    "mode": get_args(Mode),
-    "look": get_args(Look),
-    "footprint": get_args(Footprint),
-    "colors": get_args(Colors),
-    "detail": get_args(Detail),
-    "budget": get_args(Budget),
-}
-
-_RANGES: list[Range] = [
-    ("rim_radius", 0.1, 10, False),
-    ("sides", 3, 64, True),
-    ("rim_opacity", 0, 1, False),
-    ("center_opacity", 1e-3, 2, False),
-    ("rings", 1, 4, True),
-    ("flat_below", 0, 1, False),
-    ("compensation", 0, 1, False),
-    ("footprint_px2", 0, 100, False),
-    ("viewing_distance", 1e-30, 1e30, False),
-    ("focal", 1e-3, 1e9, False),
-    ("min_opacity", 0, 1, False),
-    ("max_splats", 1, 2**31 - 1, True),
-    ("max_triangles", 1, 2**31 - 1, True),
-]
 
 PRESETS = {
     "default": ConversionOptions(

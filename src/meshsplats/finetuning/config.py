@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-from meshsplats._options import Range, check_choices, check_flags, check_names, check_ranges
+from meshsplats._options import Advanced, Range, With, check_names, check_options
 from meshsplats.datasets.splat_targets import ZOOMS
 from meshsplats.rendering.looks import Look
 
@@ -44,125 +44,113 @@ class FinetuneConfig:
 
     preset: str = "default"
     """Name of the preset that these values started from, for the record."""
-    epochs: float | None = None
+    epochs: Annotated[float | None, Range(0, 1e6)] = None
     """Length in epochs: passes over all training views. Exactly one of epochs, steps and minutes is given."""
-    steps: int | None = 1000
+    steps: Annotated[int | None, Range(0, 10**9)] = 1000
     """Length in steps, of one view each."""
-    minutes: float | None = None
+    minutes: Annotated[float | None, Range(0, 1e5)] = None
     """Length in minutes, including what came before (reading, converting, rendering the targets). The only
     length whose result depends on the machine's speed."""
-    color_rate: float = 0.02
+    color_rate: Annotated[float, Range(1e-9, 1), Advanced] = 0.02
     """Adam's learning rate of red, green, blue and opacity, in [0, 1]: about how much one step changes
     them."""
-    position_rate: float = 0.02
+    position_rate: Annotated[float, Range(0, 10), Advanced] = 0.02
     """Adam's learning rate of the vertex positions, in ``position_unit``. 0: positions are fixed."""
-    position_unit: Unit = "splat"
+    position_unit: Annotated[Unit, Advanced] = "splat"
     """Unit of ``position_rate``. splat: the size of the splat that a vertex belongs to. scene: scene units,
     as in the paper."""
-    soft_edges: bool = True
+    soft_edges: Annotated[bool, Advanced] = True
     """Keep opacities of 0 on the boundary of the mesh, such as the rims of fans, at 0. Visible edges get no
     gradient that would move them back, and opacities, which are clamped at 0, would drift upwards there."""
-    final_share: float = 0.1
+    final_share: Annotated[float, Range(1e-6, 1), Advanced] = 0.1
     """Exponential decay: both learning rates fall to this fraction of their initial value over the run."""
-    rate_steps: int = 250
+    rate_steps: Annotated[int, Range(0, 10**9), Advanced] = 250
     """In runs of more steps than this, multiply the learning rate of positions, and the final fraction of
     both, by ``sqrt(rate_steps / steps)``: the step size that a short run needs is noise in a long one. 0:
     learning rates do not depend on the number of steps."""
-    color_step_decay: float = 1.0
+    color_step_decay: Annotated[float, Range(0.5, 1), Advanced] = 1.0
     """Additional decay of the colour learning rate: its factor per step, whatever the length of the run."""
-    beta1: float = 0.5
+    beta1: Annotated[float, Range(0, 0.99999), Advanced] = 0.5
     """Adam's decay rate of the first moment. Low: successive views show other vertices, or other sides."""
-    beta2: float = 0.9
+    beta2: Annotated[float, Range(0, 0.9999999), Advanced] = 0.9
     """Adam's decay rate of the second moment. Low: a vertex is seen tens of times, not thousands."""
-    epsilon: float = 1e-15
+    epsilon: Annotated[float, Range(1e-30, 1), Advanced] = 1e-15
     """Adam's epsilon, added to the denominator. With ``position_unit`` 'splat', positions have 1e-15: their
     gradients depend on the unit of the scene."""
-    ssim_weight: float = 0.4
-    """Weight of SSIM against L1 in the loss, 0 to 1."""
-    l2_weight: float = 10.0
+    ssim_weight: Annotated[float, Range(0, 1), Advanced] = 0.4
+    """Weight of SSIM against L1 in the loss."""
+    l2_weight: Annotated[float, Range(0, 1000), Advanced] = 10.0
     """Weight of the mean squared difference (L2) in the loss."""
     background: BackgroundMode = "mixed"
     """Background of images with alpha. random: a new colour in every step, so that empty regions become
     transparent. mixed: random in every fourth step, otherwise the background of the data set, on which images
     are shown and evaluated. Photographs without alpha always use the background of the data set."""
-    opacity_decay: float = 0.0
+    opacity_decay: Annotated[float, Range(0, 0.5), With(opacity="blended"), Advanced] = 0.0
     """Share of its opacity that a vertex loses in each step whose view reaches it. It falls as the colour
     learning rate does. Opacities stay high only where the views keep them there: what floats in front of
     surfaces fades, and what is hidden behind others gets gradients. For opacity 'blended'."""
-    exposure: bool = False
+    exposure: Annotated[bool, With(opacity="blended")] = False
     """For photographs: fit a gain and an offset per colour channel for each training image, so that exposure
     differences are not baked into the mesh. Their means over all images stay 1 and 0."""
-    exposure_rate: float = 0.002
+    exposure_rate: Annotated[float, Range(1e-9, 1), With("exposure"), Advanced] = 0.002
     """Adam's learning rate of these gains and offsets."""
-    prune_epochs: float = 5.0
+    prune_epochs: Annotated[float, Range(0, 1e6), Advanced] = 5.0
     """Epochs between two prunings of the mesh. 0: no pruning."""
-    prune_opacity: float = 1 / 255
+    prune_opacity: Annotated[float, Range(0, 1), Advanced] = 1 / 255
     """Prune triangles whose corners all have less opacity than this, and the vertices that no triangle then
     uses."""
     blending: Literal["mesh", "display", "linear"] = "mesh"
     """Colour space in which triangles are blended. mesh: that of the mesh. display: display values. linear:
     linear light, for exports to engines that light or blend in linear light."""
-    samples: int | None = None
+    samples: Annotated[int | None, Range(1, 16)] = None
     """Samples along each side of a pixel. None: 2 for images that are means over each pixel's area, including
     photographs; 1 for images of a splat viewer (``Dataset.look``)."""
     opacity: Literal["blended", "cutoff"] = "blended"
     """blended: translucent triangles. cutoff: opaque ones, for game engines."""
-    cutoff: float = 0.2
-    """opacity 'cutoff': least opacity that is drawn."""
-    anneal_share: float = 0.5
-    """opacity 'cutoff': opacities turn from blended to cut over this initial fraction of the run."""
-    expected_share: float = 0.5
-    """opacity 'cutoff': share of the loss, from the end of the annealing on, that is l2_weight times the
-    expected square error of images in which each fragment is opaque with its opacity as probability. It makes
-    layers agree with the target one by one, not only in their mean."""
-    settle_share: float | None = None
-    """opacity 'cutoff': before this last fraction of the run, triangles that the training views do not show
-    are removed. None: 0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
-    hidden_hits: int = 1
-    """opacity 'cutoff': triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples
-    a pixel, are removed. 0: none."""
-    opaque_share: float = 1.0
-    """opacity 'cutoff': largest number of opaque triangles, as a fraction of the number at the start. Splats
-    become polygons of fewer corners, down to one triangle; the least visible ones go. 1: all stay."""
-    soft_share: float = 0.0
-    """opacity 'cutoff': faint splats that opaque triangles cannot replace stay blended, with up to this
-    fraction of the number of triangles at the start. 0: none."""
-    soft_phase: float = 0.3
+    cutoff: Annotated[float, Range(0, 1), With(opacity="cutoff")] = 0.2
+    """Least opacity that is drawn."""
+    anneal_share: Annotated[float, Range(0, 1), With(opacity="cutoff"), Advanced] = 0.5
+    """Opacities turn from blended to cut over this initial fraction of the run."""
+    expected_share: Annotated[float, Range(0, 1), With(opacity="cutoff"), Advanced] = 0.5
+    """Share of the loss, from the end of the annealing on, that is l2_weight times the expected square error
+    of images in which each fragment is opaque with its opacity as probability. It makes layers agree with the
+    target one by one, not only in their mean."""
+    settle_share: Annotated[float | None, Range(0, 1), With(opacity="cutoff"), Advanced] = None
+    """Before this last fraction of the run, triangles that the training views do not show are removed. None:
+    0.15, or 0.5 with opaque_share, whose triangles change their shapes then."""
+    hidden_hits: Annotated[int, Range(0, 10**9), With(opacity="cutoff"), Advanced] = 1
+    """Triangles in front at fewer samples than this of 64 training views, of 2 x 2 samples a pixel, are
+    removed. 0: none."""
+    opaque_share: Annotated[float, Range(0, 1), With(opacity="cutoff")] = 1.0
+    """Largest number of opaque triangles, as a fraction of the number at the start. Splats become polygons of
+    fewer corners, down to one triangle; the least visible ones go. 1: all stay."""
+    soft_share: Annotated[float, Range(0, 1), With(opacity="cutoff")] = 0.0
+    """Faint splats that opaque triangles cannot replace stay blended, with up to this fraction of the number
+    of triangles at the start. 0: none."""
+    soft_phase: Annotated[float, Range(0.01, 0.99), With("soft_share"), Advanced] = 0.3
     """With soft_share: last fraction of the run, in which the blended triangles are optimised together with
     the cut ones. The shares above are then fractions of the phase before."""
-    point_share: float = 0.4
+    point_share: Annotated[float, Range(0, 1), Advanced] = 0.4
     """For rendered images that are means over each pixel's area: for this initial fraction of the run, train
     on the values at the pixel centres, at one sample per pixel. This is faster and shows detail finer than a
     pixel without averaging. 0: train on means only."""
-    one_sample_share: float = 0.0
+    one_sample_share: Annotated[float, Range(0, 1), Advanced] = 0.0
     """For photographs: for this initial fraction of the run, draw one sample per pixel, which takes half the
     time."""
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     """Seed of the order of the views and of random backgrounds. The same seed gives the same bits, with any
     number of threads, unless the length is given in minutes."""
 
     def __post_init__(self) -> None:
-        check_ranges(self, _RANGES, optional=(*LENGTHS, "samples", "settle_share"))
-        check_choices(self, _CHOICES)
-        check_flags(self, ("exposure", "soft_edges"))
+        check_options(self, types=(int, float))  # what JSON can hold
         if self.opacity == "cutoff":
             self._check_cutoff()
-        else:
-            for f in fields(self):
-                if f.name in OF_CUTOFF and getattr(self, f.name) != f.default:
-                    raise ValueError(f"{f.name} has no effect without opacity 'cutoff'")
         given = [name for name in LENGTHS if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of {', '.join(LENGTHS)}, got {' and '.join(given) or 'none of them'}")
 
     def _check_cutoff(self) -> None:
         """ValueError for options that have no meaning, or were never tried, without blending."""
-        for name, standard in (
-            ("exposure", False),
-            ("opacity_decay", 0.0),
-        ):
-            if getattr(self, name) != standard:
-                raise ValueError(f"{name} is for opacity 'blended', not for 'cutoff'")
         if self.blending == "linear":
             raise ValueError("blending 'linear' is for opacity 'blended': opaque triangles are not blended")
         if self.expected_share and not self.l2_weight:
@@ -172,8 +160,6 @@ class FinetuneConfig:
                 f"with opaque_share, the annealing must end before the mesh settles, but anneal_share"
                 f" {self.anneal_share:g} and settle_share {self.settling:g} add up to more than 1: lower one"
             )
-        if not self.soft_share and self.soft_phase != FinetuneConfig.soft_phase:
-            raise ValueError("soft_phase has no effect without soft_share")
 
     @property
     def settling(self) -> float:
@@ -196,57 +182,6 @@ class FinetuneConfig:
         """All fields, for JSON."""
         return asdict(self)
 
-
-OF_CUTOFF = (
-    "cutoff",
-    "anneal_share",
-    "expected_share",
-    "settle_share",
-    "hidden_hits",
-    "opaque_share",
-    "soft_share",
-    "soft_phase",
-)
-"""Options of opacity 'cutoff'."""
-
-_CHOICES = {
-    "position_unit": get_args(Unit),
-    "background": get_args(BackgroundMode),
-    "blending": ("mesh", "display", "linear"),
-    "opacity": ("blended", "cutoff"),
-}
-
-_RANGES: list[Range] = [
-    ("epochs", 0, 1e6, False),
-    ("steps", 0, 10**9, True),
-    ("minutes", 0, 1e5, False),
-    ("color_rate", 1e-9, 1, False),
-    ("position_rate", 0, 10, False),
-    ("final_share", 1e-6, 1, False),
-    ("rate_steps", 0, 10**9, True),
-    ("color_step_decay", 0.5, 1, False),
-    ("beta1", 0, 0.99999, False),
-    ("beta2", 0, 0.9999999, False),
-    ("epsilon", 1e-30, 1, False),
-    ("ssim_weight", 0, 1, False),
-    ("l2_weight", 0, 1000, False),
-    ("opacity_decay", 0, 0.5, False),
-    ("exposure_rate", 1e-9, 1, False),
-    ("prune_epochs", 0, 1e6, False),
-    ("prune_opacity", 0, 1, False),
-    ("samples", 1, 16, True),
-    ("cutoff", 0, 1, False),
-    ("anneal_share", 0, 1, False),
-    ("expected_share", 0, 1, False),
-    ("settle_share", 0, 1, False),
-    ("hidden_hits", 0, 10**9, True),
-    ("opaque_share", 0, 1, False),
-    ("soft_share", 0, 1, False),
-    ("soft_phase", 0.01, 0.99, False),
-    ("point_share", 0, 1, False),
-    ("one_sample_share", 0, 1, False),
-    ("seed", 0, 2**63 - 1, True),
-]
 
 _PAPER = FinetuneConfig(
     preset="paper",
@@ -276,7 +211,7 @@ PRESETS: Mapping[str, FinetuneConfig] = {
     "paper": _PAPER,
 }
 """default: the best in our measurements at equal time. paper: the values in the text of arXiv 2502.07754,
-with the colour learning rate of its code, since the text gives none. ``docs/finetuning.md`` has the table."""
+with the colour learning rate of its code, since the text gives none. ``docs/options.md`` has the table."""
 
 
 class FinetuneChanges(TypedDict, total=False):

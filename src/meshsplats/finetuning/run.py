@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
 from meshsplats._arrays import checked_array, subsample
 from meshsplats._kinds import need, need_path
+from meshsplats._options import Range, check_options
 from meshsplats._origin import need_one_origin
 from meshsplats.datasets.views import CACHE_BYTES, Dataset, View
 from meshsplats.evaluation.comparison import images_of_view
@@ -41,7 +43,7 @@ from meshsplats.finetuning.state import State
 from meshsplats.finetuning.step import kept_faces, make_step, samples_of
 from meshsplats.formats.cutting import cut_mesh
 from meshsplats.mesh import SplatMesh
-from meshsplats.rendering.api import Device, check_device
+from meshsplats.rendering.api import Device
 from meshsplats.webgpu.device import open_device
 
 if TYPE_CHECKING:
@@ -81,35 +83,28 @@ class RunOptions:
     """Folder for checkpoint, metrics, previews and configuration. None: nothing is written."""
     resume: bool = False
     """Resume from the checkpoint in ``folder``."""
-    report_every: int = 100
+    report_every: Annotated[int, Range(0, math.inf)] = 100
     """Steps between two scores on held-out views. 0: only at the end."""
-    preview_every: int = 500
+    preview_every: Annotated[int, Range(0, math.inf)] = 500
     """Steps between two preview images; also one after each quarter of the run. 0: none."""
-    checkpoint_seconds: float = 30.0
+    checkpoint_seconds: Annotated[float, Range(0, math.inf)] = 30.0
     """Seconds between two checkpoints."""
-    threads: int | None = None
+    threads: Annotated[int | None, Range(1, math.inf)] = None
     """Maximum number of threads. None: all processors."""
     device: Device = "cpu"
     """Where images are rendered, and gradients computed: 'cpu' or 'gpu'. Opacity 'cutoff' needs 'cpu'."""
-    spent: float = 0.0
+    spent: Annotated[float, Range(0, math.inf)] = 0.0
     """Seconds already spent. They count towards ``minutes``."""
-    reserve: float = 0.0
+    reserve: Annotated[float, Range(0, math.inf)] = 0.0
     """Seconds that the caller needs afterwards. They count, too."""
-    cache_bytes: int = CACHE_BYTES
+    cache_bytes: Annotated[int, Range(0, math.inf)] = CACHE_BYTES
     """Limit of the data set's image cache, for the memory estimate."""
 
     def __post_init__(self) -> None:
         if self.folder is not None:
             need_path(folder=self.folder)
             object.__setattr__(self, "folder", Path(self.folder))
-        for name in ("report_every", "preview_every"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must be a number of steps, >= 0, got {getattr(self, name)}")
-        if not self.checkpoint_seconds > 0:
-            raise ValueError(f"checkpoint_seconds must be positive, got {self.checkpoint_seconds}")
-        if self.threads is not None and self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
-        check_device(self.device)
+        check_options(self)
         if self.resume and self.folder is None:
             raise ValueError("resume needs the folder of the run")
 

@@ -8,20 +8,21 @@ quarter, and its geometric error says how far the merged ones lie from those of 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from meshsplats._files.atomic import atomic_path, write_bytes, write_text
 from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
-from meshsplats._options import check_choices
+from meshsplats._options import Range, check_options
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
 from meshsplats.cameras.trajectories import orbit
@@ -63,7 +64,7 @@ _MERGED = np.dtype([*RECORD.descr, ("spread", "<f8")])
 class TileOptions:
     """Options of ``build_tiles``."""
 
-    max_triangles: int = MAX_TRIANGLES
+    max_triangles: Annotated[int, Range(1, math.inf)] = MAX_TRIANGLES
     """Largest number of triangles of a tile."""
     preset: Preset = "default"
     """Preset of the conversion."""
@@ -85,13 +86,13 @@ class TileOptions:
 
     def resolved(self) -> ConversionOptions:
         """The checked options of the conversion. Raises ValueError."""
-        check_choices(self, {"alpha": get_args(TilesAlpha), "place": ("world", "local")})
+        check_options(self)
         chosen = (self.conversion or ConversionOptions()).resolved(self.preset, has_cameras=False)
         refuse_whole(chosen)
         if chosen.footprint == "filter":
             raise ValueError("footprint='filter' is for this project's renderer, tiles are for others")
         least = triangles_each(chosen)
-        if isinstance(self.max_triangles, bool) or self.max_triangles < 8 * least:
+        if self.max_triangles < 8 * least:
             raise ValueError(
                 f"max_triangles of a tile must be at least {8 * least}, got {self.max_triangles!r}"
             )
