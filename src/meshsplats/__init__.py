@@ -58,8 +58,9 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.autograd import rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
-    from meshsplats.tiles.building import TileOptions, build_tiles
+    from meshsplats.tiles.building import build_tiles
     from meshsplats.tiles.drawing import render_tiles, tiles_mesh
+    from meshsplats.tiles.options import TileOptions
     from meshsplats.tiles.tileset import Tileset
     from meshsplats.training import TrainConfig, train, train_config
     from meshsplats.viewer.page import PageOptions, make_page
@@ -106,8 +107,9 @@ _HOME = {
     "meshsplats.rendering.autograd": ("rasterize",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
-    "meshsplats.tiles.building": ("TileOptions", "build_tiles"),
+    "meshsplats.tiles.building": ("build_tiles",),
     "meshsplats.tiles.drawing": ("render_tiles", "tiles_mesh"),
+    "meshsplats.tiles.options": ("TileOptions",),
     "meshsplats.tiles.tileset": ("Tileset",),
     "meshsplats.training": ("TrainConfig", "train", "train_config"),
     "meshsplats.viewer.page": ("PageOptions", "make_page"),
