@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import struct
 import tracemalloc
 import warnings
 
@@ -35,9 +36,10 @@ from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.benchmarks import find_input
 from meshsplats.formats import _validation
-from meshsplats.formats.gaussians import splat_file, subject_name
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.ply import compressed_splats, table
+from meshsplats.formats.splat_paths import splat_file, subject_name
+from meshsplats.formats.splats import _spz_streams
 from meshsplats.formats.splats import dot_splat as dot_splat_module
 from meshsplats.formats.splats import sog as sog_module
 from meshsplats.formats.splats import spz as spz_module
@@ -89,7 +91,7 @@ def small_chunks(monkeypatch):
     """Readers take a few splats at a time."""
     for module in (dot_splat_module, sog_module, spz_module):
         monkeypatch.setattr(module, "_AT_ONCE", 70)
-    monkeypatch.setattr(spz_module, "_PIECE", 100)
+    monkeypatch.setattr(_spz_streams, "_PIECE", 100)
     monkeypatch.setattr(compressed_splats, "_CHUNKS_AT_ONCE", 1)
     monkeypatch.setattr(table, "CHUNK_BYTES", 8000)
 
@@ -260,7 +262,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path, kind):
         path.write_bytes(record.tobytes())
     else:
         body = b"".join(rng.integers(0, 256, size * 10 * n, np.uint8).tobytes() for size in (9, 1, 3, 3, 4))
-        header = spz_module.struct.pack("<4sIIBBBB", b"NGSP", 3, 10 * n, 0, 12, 0, 0)
+        header = struct.pack("<4sIIBBBB", b"NGSP", 3, 10 * n, 0, 12, 0, 0)
         path.write_bytes(gzip.compress(header + body, 1, mtime=0))
     warnings.simplefilter("ignore", DataWarning)
     tracemalloc.start()

@@ -84,7 +84,7 @@ ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
 
 
 if TYPE_CHECKING:
-    from meshsplats.formats.gaussians import SplatStream
+    from meshsplats.formats.streaming import SplatStream
 
     ConvertOptions = ConversionOptions
 else:

@@ -29,8 +29,8 @@ from meshsplats.conversion.driver import worth_drawing
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.streaming import Survey, survey
 from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, choose_by_views
-from meshsplats.formats.gaussians import SplatStream
 from meshsplats.formats.gltf.writer import change_alpha
+from meshsplats.formats.streaming import SplatStream
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles.buckets import BUCKET, Buckets, Cube, records_of
 from meshsplats.tiles.drawing import choose_tiles, join_tiles
