@@ -119,6 +119,15 @@ def test_blocks_are_the_splats_of_the_file(tmp_path, small_chunks, name):
     assert_same(turned, load_gaussians(tmp_path / name, axes="y-up"))
 
 
+@pytest.mark.parametrize("name", FILES)
+def test_blocks_are_the_splats_of_the_file_for_any_origin(tmp_path, name):
+    FILES[name](tmp_path / name)
+    origin = [1000.1, -2000.3, 0.7]
+    cloud = load_gaussians(tmp_path / name, origin=origin)
+    np.testing.assert_array_equal(cloud.origin, origin)
+    assert_same(list(stream_gaussians(tmp_path / name, block=100, origin=origin)), cloud)
+
+
 def test_a_streamed_scene_comes_part_by_part(tmp_path, small_chunks):
     parts = {name: random_splats(n=150, degree=0, seed=i) for i, name in enumerate("ab")}
     leaves = [{0: ("a", 10, 120)}, {0: ("b", 0, 150)}]
