@@ -7,10 +7,14 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
+from meshsplats.formats.splat_formats import splat_suffixes
+
 from .settings import CHOICES, Choices, SceneChoice, copy_choices, draw_choices
 from .work import Modal, Work, settle
 
-SUFFIXES = (".ply", ".splat", ".spz", ".sog", ".npz", ".glb", ".gltf")
+SUFFIXES = (*splat_suffixes(), ".npz")
+ENDS = tuple(dict.fromkeys(f".{suffix.rpartition('.')[2]}" for suffix in SUFFIXES))
+"""Their last parts, by which Blender knows a dropped file."""
 CHAIN = "levels.json"
 """Table of a chain of levels of detail, as ``meshsplats levels`` writes it."""
 
@@ -76,7 +80,7 @@ class MeshSplatsFileHandler(bpy.types.FileHandler):
     bl_idname = "IMPORT_FH_meshsplats"
     bl_label = "Gaussian Splats"
     bl_import_operator = ImportMeshSplats.bl_idname
-    bl_file_extensions = ";".join([*SUFFIXES, ".json"])
+    bl_file_extensions = ";".join([*ENDS, ".json"])
 
     @classmethod
     def poll_drop(cls, context):
@@ -84,7 +88,7 @@ class MeshSplatsFileHandler(bpy.types.FileHandler):
 
 
 def menu(self, context):
-    self.layout.operator(ImportMeshSplats.bl_idname, text="Gaussian Splats (.ply, .splat, .spz, .sog, ...)")
+    self.layout.operator(ImportMeshSplats.bl_idname, text=f"Gaussian Splats ({', '.join(ENDS[:4])}, ...)")
 
 
 def register():

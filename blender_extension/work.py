@@ -85,7 +85,7 @@ class Work:
         from pathlib import Path
 
         from meshsplats.blender.levels import is_chain, read_chain
-        from meshsplats.formats.gaussians import subject_name
+        from meshsplats.formats.splat_paths import subject_name
 
         if not is_chain(Path(path)):
             return Result(path, subject_name(Path(path)), (self._prepared(path, index, 1.0),))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from meshsplats import save_gaussian_blocks
 from meshsplats.demo_scene.city import city_blocks
-from meshsplats.tiles.building import TileOptions
+from meshsplats.tiles.options import TileOptions
 
 COUNT = 12_000
 SMALL = TileOptions(max_triangles=4096)

@@ -32,7 +32,7 @@ from meshsplats.cluster import ANY_PORT, Shared, Workers, _with_warnings, open_w
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import ClusterError, DataWarning, FileFormatError, MissingDependencyError
 from meshsplats.finetuning.memory import available_memory
-from meshsplats.tiles import building
+from meshsplats.tiles import building, making
 from meshsplats.tiles.building import build_tiles
 
 
@@ -260,12 +260,12 @@ def build_and_die(folder, build, cell):
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_tiles_outlive_a_killed_worker(splats, scheduler, tmp_path, monkeypatch):
     build_tiles(stream_gaussians(splats), tmp_path / "here", SMALL)
-    build = building._build_cell
+    build = building.build_cell
 
     def deadly_build(tiles, cell):
         return build_and_die(tmp_path, partial(build, tiles), cell)
 
-    monkeypatch.setattr(building, "_build_cell", deadly_build)
+    monkeypatch.setattr(building, "build_cell", deadly_build)
     with open_workers(scheduler) as workers:
         build_tiles(stream_gaussians(splats), tmp_path / "there", SMALL, workers=workers)
     assert (tmp_path / "died").exists()
@@ -347,7 +347,7 @@ def test_a_killed_command_with_workers_is_resumed(splats, tmp_path):
 TILES = """
 import sys
 from meshsplats import open_workers, stream_gaussians
-from meshsplats.tiles import building
+from meshsplats.tiles import building, making
 if __name__ == "__main__":
     building.BUCKET = 3000
     with open_workers("local") as workers:
@@ -361,7 +361,7 @@ if __name__ == "__main__":
 LIMITED = """
 import resource, signal, sys
 from meshsplats import stream_gaussians
-from meshsplats.tiles import building
+from meshsplats.tiles import building, making
 building.BUCKET = 3000
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), -1))
@@ -421,7 +421,7 @@ def test_tiles_go_on_after_the_disk_of_a_worker_was_full(splats, small_disk, tmp
 
 
 def test_tiles_say_that_the_disk_is_full_after_the_tiles_of_a_cell(splats, small_disk, monkeypatch):
-    keep = building._Tiles.keep
+    keep = making.TileWriter.keep
 
     def on_a_full_disk(tiles, cell, nodes, merged):
         if merged.nbytes > 16384:  # more than a buffer takes
@@ -430,7 +430,7 @@ def test_tiles_say_that_the_disk_is_full_after_the_tiles_of_a_cell(splats, small
         keep(tiles, cell, nodes, merged)
 
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
-    monkeypatch.setattr(building._Tiles, "keep", on_a_full_disk)
+    monkeypatch.setattr(making.TileWriter, "keep", on_a_full_disk)
     with pytest.raises(OSError, match="no space left") as caught:
         build_tiles(stream_gaussians(splats), small_disk / "tiles", SMALL)
     assert caught.value.errno == errno.ENOSPC

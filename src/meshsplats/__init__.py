@@ -40,14 +40,9 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     )
     from meshsplats.formats.base_meshes import load_base
     from meshsplats.formats.cutting import cut_mesh
-    from meshsplats.formats.gaussians import (
-        SplatStream,
-        load_gaussians,
-        save_gaussian_blocks,
-        save_gaussians,
-        stream_gaussians,
-    )
+    from meshsplats.formats.gaussians import load_gaussians, save_gaussian_blocks, save_gaussians
     from meshsplats.formats.meshes import load_mesh, save_mesh, save_mesh_blocks
+    from meshsplats.formats.streaming import SplatStream, stream_gaussians
     from meshsplats.formats.tensors import gaussians_from_tensors, gaussians_to_tensors
     from meshsplats.gaussians import GaussianCloud
     from meshsplats.images.writing import save_image
@@ -58,8 +53,9 @@ if TYPE_CHECKING:  # what editors and type checkers see; _HOME says the same at 
     from meshsplats.rendering.autograd import rasterize
     from meshsplats.rendering.looks import draw_splats
     from meshsplats.rendering.samples import needed_samples
-    from meshsplats.tiles.building import TileOptions, build_tiles
+    from meshsplats.tiles.building import build_tiles
     from meshsplats.tiles.drawing import render_tiles, tiles_mesh
+    from meshsplats.tiles.options import TileOptions
     from meshsplats.tiles.tileset import Tileset
     from meshsplats.training import TrainConfig, train, train_config
     from meshsplats.viewer.page import PageOptions, make_page
@@ -92,10 +88,9 @@ _HOME = {
     ),
     "meshsplats.formats.base_meshes": ("load_base",),
     "meshsplats.formats.cutting": ("cut_mesh",),
-    "meshsplats.formats.gaussians": (
-        *("SplatStream", "load_gaussians", "save_gaussian_blocks", "save_gaussians", "stream_gaussians"),
-    ),
+    "meshsplats.formats.gaussians": ("load_gaussians", "save_gaussian_blocks", "save_gaussians"),
     "meshsplats.formats.meshes": ("load_mesh", "save_mesh", "save_mesh_blocks"),
+    "meshsplats.formats.streaming": ("SplatStream", "stream_gaussians"),
     "meshsplats.formats.tensors": ("gaussians_from_tensors", "gaussians_to_tensors"),
     "meshsplats.gaussians": ("GaussianCloud",),
     "meshsplats.images.writing": ("save_image",),
@@ -106,8 +101,9 @@ _HOME = {
     "meshsplats.rendering.autograd": ("rasterize",),
     "meshsplats.rendering.looks": ("draw_splats",),
     "meshsplats.rendering.samples": ("needed_samples",),
-    "meshsplats.tiles.building": ("TileOptions", "build_tiles"),
+    "meshsplats.tiles.building": ("build_tiles",),
     "meshsplats.tiles.drawing": ("render_tiles", "tiles_mesh"),
+    "meshsplats.tiles.options": ("TileOptions",),
     "meshsplats.tiles.tileset": ("Tileset",),
     "meshsplats.training": ("TrainConfig", "train", "train_config"),
     "meshsplats.viewer.page": ("PageOptions", "make_page"),

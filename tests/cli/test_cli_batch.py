@@ -20,8 +20,9 @@ from meshsplats.cli import main, toml
 from meshsplats.cli.batch import jobs
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
-from meshsplats.formats.gaussians import load_gaussians, save_gaussians, subject_name
+from meshsplats.formats.gaussians import load_gaussians, save_gaussians
 from meshsplats.formats.meshes import load_mesh, save_mesh
+from meshsplats.formats.splat_paths import subject_name
 
 
 def run(*arguments) -> int:

@@ -290,7 +290,7 @@ def test_tilesets_stand_in_the_world(scenes, capsys):
 
 def test_a_tileset_is_resumed_where_it_stands(scenes, tmp_path, monkeypatch):
     """The journal names the origin: with another one, the parts would not fit."""
-    from meshsplats.formats.gaussians import stream_gaussians
+    from meshsplats.formats.streaming import stream_gaussians
     from meshsplats.tiles.building import JOURNAL, TileOptions, build_tiles, partial_folder
 
     source = stream_gaussians(scenes[1].folder / "splats.ply")

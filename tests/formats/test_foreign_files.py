@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 import zipfile
+from contextlib import closing
 from pathlib import Path
 
 import _splat_encoders as encode
@@ -23,8 +24,8 @@ import meshsplats as ms
 from meshsplats import load_gaussians, load_mesh
 from meshsplats.cli import main
 from meshsplats.errors import FileFormatError
-from meshsplats.formats._zipped import BoundedReader, ZippedFile
-from meshsplats.formats.gaussians import splat_format
+from meshsplats.formats._zipped import Archive, BoundedReader
+from meshsplats.formats.gaussians import format_of
 from meshsplats.formats.sniff import identify
 
 SPLATS = random_splats(7, degree=1)
@@ -80,7 +81,7 @@ def test_the_only_splats_in_an_archive_are_read(tmp_path, kind, method):
     blocks = list(ms.stream_gaussians(path, block=3))
     np.testing.assert_array_equal(np.concatenate([block.means for block in blocks]), cloud.means)
     assert identify(path) == "splats"
-    assert splat_format(path) == kind
+    assert format_of(path) == kind
     with pytest.raises(FileFormatError, match=f"splats in a zip archive .*scene.{kind}.*, no mesh"):
         load_mesh(path)
 
@@ -121,7 +122,7 @@ def test_large_splats_are_read_piece_by_piece(tmp_path, monkeypatch):
     for method in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         path = zipped(tmp_path / "many.zip", {"many.ply": data}, method)
         same(load_gaussians(path), load_gaussians(tmp_path / "many.ply"))
-        with ZippedFile(path, "many.ply") as file:
+        with closing(Archive(path)) as archive, archive.open("many.ply") as file:
             assert file.read() == data
             assert file.seek(0, io.SEEK_END) == len(data)
             assert file.read(1) == b""

@@ -12,7 +12,7 @@ import pytest
 from _splat_files import assert_same_cloud, expected_cloud, random_splats, splat_table, write_ply
 
 from meshsplats import DataWarning, FileFormatError, load_gaussians, stream_gaussians
-from meshsplats.formats.gaussians import splat_format
+from meshsplats.formats.gaussians import format_of
 from meshsplats.formats.sniff import identify
 
 DEGREES = [0, 1, 2, 3]
@@ -54,7 +54,7 @@ def test_compressed_ply(tmp_path, degree, order, n):
     values = some_splats(n, degree)
     path = tmp_path / "a.ply"
     path.write_bytes(encode.compressed_ply(values, order))
-    assert splat_format(path) == "compressed.ply"
+    assert format_of(path) == "compressed.ply"
     span = [np.ptp(values[key]) for key in values]
     # 10 and 11 bits over the range of a chunk; 8 bits for colours; 1/32 for harmonics.
     close(
@@ -144,7 +144,7 @@ def test_compressed_ply_by_hand(tmp_path):
 def test_dot_splat(tmp_path, name):
     values = some_splats(700, degree=0)
     (tmp_path / name).write_bytes(encode.dot_splat(values))
-    assert splat_format(tmp_path / name) == "splat"
+    assert format_of(tmp_path / name) == "splat"
     cloud = load_gaussians(tmp_path / name, strict=True)
     dc = HALF_BYTE / encode.C0
     close(cloud, values, quaternions=0.008, opacities=HALF_BYTE, dc=dc)
@@ -166,7 +166,7 @@ def test_dot_splat_refuses_negative_scales(tmp_path):
 def test_spz(tmp_path, version, degree):
     values = some_splats(degree=degree)
     (tmp_path / "a.spz").write_bytes(encode.spz(values, version))
-    assert splat_format(tmp_path / "a.spz") == "spz"
+    assert format_of(tmp_path / "a.spz") == "spz"
     cloud = load_gaussians(tmp_path / "a.spz", strict=True, axes="y-down")
     spz_close(cloud, values, version)
 
@@ -271,7 +271,7 @@ def test_sog(tmp_path, version, degree, form):
     else:
         path = put(tmp_path / "scene", files)
         path = path if form == "folder" else path / "meta.json"
-    assert splat_format(path) == "sog"
+    assert format_of(path) == "sog"
     cloud = load_gaussians(path, strict=True)
 
     def step(*names):
@@ -367,7 +367,7 @@ def test_a_sog_folder_that_names_its_generator_is_no_gltf(tmp_path):
     files = encode.sog(some_splats(9), extra={"asset": {"generator": "splat-transform v0.16.0"}})
     folder = put(tmp_path / "s", files)
     for path in (folder, folder / "meta.json"):
-        assert splat_format(path) == "sog"
+        assert format_of(path) == "sog"
         assert len(load_gaussians(path, strict=True)) == 9
 
 
@@ -390,7 +390,7 @@ def test_streamed_sog_is_read_place_by_place_in_the_finest_level(tmp_path):
         assert np.array_equal(cloud.sh[:3], parts[0].sh[:3])
         assert np.array_equal(cloud.sh[7:9, :1], parts[1].sh[1:3])
         assert (cloud.sh[7:9, 1:] == 0).all()
-    assert splat_format(folder) == "streamed sog"
+    assert format_of(folder) == "streamed sog"
     assert identify(folder / "lod-meta.json") == "splats"
 
 
@@ -417,7 +417,7 @@ def test_gltf(tmp_path, degree, kind):
     values = some_splats(degree=degree)
     path = tmp_path / f"a.{kind}"
     path.write_bytes(encode.gltf(encode.splat_accessors(values), kind=kind))
-    assert splat_format(path) == "gltf"
+    assert format_of(path) == "gltf"
     close(load_gaussians(path, strict=True, axes="y-down"), values)
 
 
@@ -479,7 +479,7 @@ def test_gltf_joins_the_splats_of_all_nodes(tmp_path):
 def test_what_is_not_read_is_named_by_all_who_meet_it(tmp_path, name, data, message):
     path = tmp_path / name
     path.write_bytes(data)
-    for ask in (load_gaussians, identify, splat_format):
+    for ask in (load_gaussians, identify, format_of):
         with pytest.raises(FileFormatError, match=message):
             ask(path)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import struct
 import tracemalloc
 import warnings
 
@@ -35,9 +36,10 @@ from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.evaluation.benchmarks import find_input
 from meshsplats.formats import _validation
-from meshsplats.formats.gaussians import splat_file, subject_name
 from meshsplats.formats.meshes import save_mesh
 from meshsplats.formats.ply import compressed_splats, table
+from meshsplats.formats.splat_paths import splat_file, subject_name
+from meshsplats.formats.splats import _spz_streams
 from meshsplats.formats.splats import dot_splat as dot_splat_module
 from meshsplats.formats.splats import sog as sog_module
 from meshsplats.formats.splats import spz as spz_module
@@ -89,7 +91,7 @@ def small_chunks(monkeypatch):
     """Readers take a few splats at a time."""
     for module in (dot_splat_module, sog_module, spz_module):
         monkeypatch.setattr(module, "_AT_ONCE", 70)
-    monkeypatch.setattr(spz_module, "_PIECE", 100)
+    monkeypatch.setattr(_spz_streams, "_PIECE", 100)
     monkeypatch.setattr(compressed_splats, "_CHUNKS_AT_ONCE", 1)
     monkeypatch.setattr(table, "CHUNK_BYTES", 8000)
 
@@ -115,6 +117,15 @@ def test_blocks_are_the_splats_of_the_file(tmp_path, small_chunks, name):
     assert_same(list(stream), cloud)  # again
     turned = list(stream_gaussians(tmp_path / name, block=100, axes="y-up"))
     assert_same(turned, load_gaussians(tmp_path / name, axes="y-up"))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_blocks_are_the_splats_of_the_file_for_any_origin(tmp_path, name):
+    FILES[name](tmp_path / name)
+    origin = [1000.1, -2000.3, 0.7]
+    cloud = load_gaussians(tmp_path / name, origin=origin)
+    np.testing.assert_array_equal(cloud.origin, origin)
+    assert_same(list(stream_gaussians(tmp_path / name, block=100, origin=origin)), cloud)
 
 
 def test_a_streamed_scene_comes_part_by_part(tmp_path, small_chunks):
@@ -260,7 +271,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path, kind):
         path.write_bytes(record.tobytes())
     else:
         body = b"".join(rng.integers(0, 256, size * 10 * n, np.uint8).tobytes() for size in (9, 1, 3, 3, 4))
-        header = spz_module.struct.pack("<4sIIBBBB", b"NGSP", 3, 10 * n, 0, 12, 0, 0)
+        header = struct.pack("<4sIIBBBB", b"NGSP", 3, 10 * n, 0, 12, 0, 0)
         path.write_bytes(gzip.compress(header + body, 1, mtime=0))
     warnings.simplefilter("ignore", DataWarning)
     tracemalloc.start()

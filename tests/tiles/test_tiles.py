@@ -33,7 +33,7 @@ from meshsplats.cli import main
 from meshsplats.conversion import ConversionOptions
 from meshsplats.demo_scene.city import city_blocks
 from meshsplats.evaluation.viewers import AlphaChoice
-from meshsplats.tiles import buckets, building
+from meshsplats.tiles import buckets, building, making
 from meshsplats.tiles import tileset as tilesets
 from meshsplats.tiles.building import TileOptions, build_tiles
 from meshsplats.tiles.drawing import choose_tiles, reaches, render_tiles, screen_error, tiles_mesh
@@ -188,7 +188,7 @@ def test_the_geometric_error_is_how_far_splats_are_moved(splats, tmp_path):
     save_gaussian_blocks([cloud.take(order)], tmp_path / "rows.ply", n)
     options = TileOptions(max_triangles=8 * 512, conversion=ConversionOptions(footprint="none"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "SHARE", 2)
+        patch.setattr(making, "SHARE", 2)
         build_tiles(stream_gaussians(tmp_path / "rows.ply"), tmp_path / "tiles", options)
     root = Tileset(tmp_path / "tiles").root
     assert root.splats == n // 2
@@ -207,7 +207,7 @@ def test_threads_and_blocks_do_not_matter(splats, tileset, tmp_path):
 def test_a_run_that_fails_anywhere_is_resumed(splats, tileset, tmp_path, monkeypatch):
     """An error at one file after the other, until a run comes to its end."""
     out = tmp_path / "tiles"
-    save = building.save_mesh
+    save = making.save_mesh
     add = Journal.add
     left = [0]
 
@@ -220,7 +220,7 @@ def test_a_run_that_fails_anywhere_is_resumed(splats, tileset, tmp_path, monkeyp
 
         return run
 
-    monkeypatch.setattr(building, "save_mesh", counted(save))
+    monkeypatch.setattr(making, "save_mesh", counted(save))
     monkeypatch.setattr(Journal, "add", counted(add))
     runs, errors = 0, []
     while not out.exists():
@@ -376,11 +376,11 @@ def test_what_a_run_refuses(splats, tileset, tmp_path):
 
 def test_another_scene_or_other_options_are_not_mixed(splats, tmp_path, monkeypatch):
     out = tmp_path / "tiles"
-    save = building.save_mesh
-    monkeypatch.setattr(building, "save_mesh", lambda *a, **o: (_ for _ in ()).throw(KeyboardInterrupt))
+    save = making.save_mesh
+    monkeypatch.setattr(making, "save_mesh", lambda *a, **o: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         build_tiles(stream_gaussians(splats), out, SMALL)
-    monkeypatch.setattr(building, "save_mesh", save)
+    monkeypatch.setattr(making, "save_mesh", save)
     with pytest.raises(FileExistsError, match="left from an earlier run"):
         build_tiles(stream_gaussians(splats), out, SMALL)
     with pytest.raises(ValueError, match="started with other options"):

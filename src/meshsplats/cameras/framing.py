@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -93,6 +94,42 @@ def scene_bounds(scene: Framable) -> Bounds:
 
     Raises ValueError for a scene without points, or if points (n, 3) have another shape or are not finite.
     """
+    extent = _Extent.of(scene)
+    points, weights, distance, radius = extent.points, extent.weights, extent.distance, extent.radius
+    limit = SURROUNDINGS * weighted_quantile(distance, weights, 0.5)
+    subject = distance <= limit if limit > 0 else np.ones(len(points), bool)
+    subject[subject] = _without_floaters(points[subject], weights[subject], APART * radius)
+    return Bounds(extent.center, radius, points[subject], weights[subject], extent.sizes[subject])
+
+
+class _Extent(NamedTuple):
+    """A sample of a scene, with its surroundings and floaters; fields as in ``Bounds``."""
+
+    center: np.ndarray
+    radius: float
+    points: np.ndarray
+    weights: np.ndarray
+    sizes: np.ndarray
+    distance: np.ndarray
+    """(k,) float64 of the points from ``center``."""
+
+    @classmethod
+    def of(cls, scene: Framable) -> _Extent:
+        """Raises ValueError as ``scene_bounds``."""
+        points, weights, sizes = _sample(scene)
+        center = np.array([weighted_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
+        distance = np.linalg.norm(points - center, axis=1)
+        radius = weighted_quantile(distance, weights, 0.9)
+        if radius == 0:
+            # Nearly all points are in one spot: use the largest distance, or else the size of the splats.
+            radius = float(distance.max())
+        if radius == 0:
+            radius = float(sizes.max()) or 1.0
+        return cls(center, radius, points, weights, sizes, distance)
+
+
+def _sample(scene: Framable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(k, 3) points, (k,) weights and (k,) sizes of a sample of a scene, float64."""
     if isinstance(scene, GaussianCloud):
         points, weights = scene.means, scene.opacities
     elif isinstance(scene, SplatMesh):
@@ -113,18 +150,7 @@ def scene_bounds(scene: Framable) -> Bounds:
         sizes = 2 * np.median(scene.scales[::step].astype(np.float64), axis=1)
     if weights.sum() == 0:
         weights = np.ones(len(points))
-    center = np.array([weighted_quantile(points[:, axis], weights, 0.5) for axis in range(3)])
-    distance = np.linalg.norm(points - center, axis=1)
-    radius = weighted_quantile(distance, weights, 0.9)
-    if radius == 0:
-        # Nearly all points are in one spot: use the largest distance, or else the size of the splats.
-        radius = float(distance.max())
-    if radius == 0:
-        radius = float(sizes.max()) or 1.0
-    limit = SURROUNDINGS * weighted_quantile(distance, weights, 0.5)
-    subject = distance <= limit if limit > 0 else np.ones(len(points), bool)
-    subject[subject] = _without_floaters(points[subject], weights[subject], APART * radius)
-    return Bounds(center, radius, points[subject], weights[subject], sizes[subject])
+    return points, weights, sizes
 
 
 def warn_of_strays(scene: GaussianCloud | SplatMesh, low: np.ndarray, high: np.ndarray, size: float) -> None:
@@ -135,12 +161,12 @@ def warn_of_strays(scene: GaussianCloud | SplatMesh, low: np.ndarray, high: np.n
         low, high: (3,) least and greatest coordinates of all centres.
         size: largest standard deviation of all splats.
     """
-    bounds = scene_bounds(scene)
+    extent = _Extent.of(scene)
     with np.errstate(over="ignore"):
-        away = float(np.maximum(np.abs(low - bounds.center), np.abs(high - bounds.center)).max())
-    if max(away, size) <= STRAY * bounds.radius:
+        away = float(np.maximum(np.abs(low - extent.center), np.abs(high - extent.center)).max())
+    if max(away, size) <= STRAY * extent.radius:
         return
-    radii = f"about 10^{round(np.log10(max(away, size) / bounds.radius))} radii"
+    radii = f"about 10^{round(np.log10(max(away, size) / extent.radius))} radii"
     what = f"lie {radii} away from the rest" if away >= size else f"are {radii} of the scene large"
     warnings.warn(
         f"some splats {what}: 'meshsplats clean' removes such strays",

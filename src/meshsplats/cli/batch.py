@@ -16,12 +16,10 @@ from meshsplats.cli.common import check_mesh_suffix, check_outputs, file_of
 from meshsplats.cli.messages import UsageError, shown_path
 from meshsplats.cli.records import CONFIGURATION, PREVIEW, beside, recorded_options
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.gaussians import SPLAT_SUFFIXES, files_named, splat_file, subject_name
 from meshsplats.formats.meshes import MESH_SUFFIXES
 from meshsplats.formats.sniff import identify
-
-INPUT_SUFFIXES = (*MESH_SUFFIXES, *SPLAT_SUFFIXES)
-"""Names of inputs in a folder."""
+from meshsplats.formats.splat_formats import splat_suffixes
+from meshsplats.formats.splat_paths import files_named, splat_file, subject_name
 
 
 @dataclass(frozen=True)
@@ -272,7 +270,7 @@ def _inside(folder: Path) -> list[Path]:
         for path in folder.iterdir()
         if path.is_dir() and not path.name.startswith(".") and _is_splats(path)
     ]
-    found = sorted([*models, *files_named(folder, INPUT_SUFFIXES)])
+    found = sorted([*models, *files_named(folder, (*MESH_SUFFIXES, *splat_suffixes()))])
     if not found:
         splat_file(folder)  # says what is wrong
     return found

@@ -30,12 +30,13 @@ from meshsplats.datasets.views import WHITE, Dataset
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.evaluation.backgrounds import Background
 from meshsplats.formats.sniff import identify
+from meshsplats.formats.splat_formats import listed, y_up_suffixes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
 if TYPE_CHECKING:
     from meshsplats.evaluation.viewers import AlphaChoice
-    from meshsplats.formats.gaussians import SplatStream
+    from meshsplats.formats.streaming import SplatStream
     from meshsplats.tiles.tileset import Tileset
 
 T = TypeVar("T")
@@ -74,13 +75,18 @@ NAMED_COLORS: dict[str, tuple[float, float, float]] = {
 }
 
 
+_AXES = (
+    "Direction of the y axis in the file; auto: as its format prescribes, up in"
+    f" {listed(y_up_suffixes(), 'and')}, else down. After reading, y points down. Some programs write SPZ"
+    " with y down: if the image is upside down, give y-down."
+)
+
+
 @dataclass(frozen=True)
 class SplatOptions:
     """How splat files are read."""
 
-    axes: Literal["auto", "y-down", "y-up"] = "auto"
-    """Direction of the y axis in the file; auto: as its format prescribes. After reading, y points down. Some
-    programs write SPZ with y down: if the image is upside down, give y-down."""
+    axes: Annotated[Literal["auto", "y-down", "y-up"], tyro.conf.arg(help=_AXES)] = "auto"
     kernel: Literal["auto", "3dgs", "antialiased", "2dgs"] = "auto"
     """Kernel that the splats were trained with; auto: as the file says."""
     time: Number = None
@@ -123,7 +129,7 @@ class SplatOptions:
         self, path: Path | Sequence[Path], origin: Sequence[float] | None = None, *, up: str | None = None
     ) -> SplatStream:
         """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` as for ``load``."""
-        from meshsplats.formats.gaussians import stream_gaussians
+        from meshsplats.formats.streaming import stream_gaussians
 
         stream = stream_gaussians(path, origin=origin, **self._arguments)
         if up is None and (told := stream.up) is not None:
@@ -528,7 +534,7 @@ def check_outputs(
 
 def file_of(source: Path) -> Path:
     """The file that is read where ``source`` is a folder."""
-    from meshsplats.formats.gaussians import splat_file
+    from meshsplats.formats.splat_paths import splat_file
 
     try:
         return splat_file(source) if source.is_dir() else source

@@ -83,7 +83,7 @@ ENGINE_GAIN = "7 to 10 dB in minutes, on three scenes"
 
 
 if TYPE_CHECKING:
-    from meshsplats.formats.gaussians import SplatStream
+    from meshsplats.formats.streaming import SplatStream
 
     ConvertOptions = ConversionOptions
 else:
@@ -413,7 +413,7 @@ class Convert(Command):
 
     def _stream_splats(self, job: Job) -> dict[str, Any]:
         """The splats of ``job`` as a .ply, in blocks."""
-        from meshsplats.conversion.streaming import worth_drawing
+        from meshsplats.conversion.driver import worth_drawing
         from meshsplats.formats.gaussians import save_gaussian_blocks
 
         start = time.perf_counter()

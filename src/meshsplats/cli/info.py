@@ -26,8 +26,9 @@ from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.image_files import PhotoFile
 from meshsplats.datasets.layouts import Layout, find_layout
 from meshsplats.errors import FileFormatError
-from meshsplats.formats.gaussians import moving_splats, splat_file, splat_format
+from meshsplats.formats.gaussians import format_of, moving_splats
 from meshsplats.formats.sniff import identify
+from meshsplats.formats.splat_paths import splat_file
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.tiles import is_tileset
@@ -71,7 +72,7 @@ def describe(path: Path, reading: SplatOptions) -> dict[str, Any]:
     if layout is not None:
         found |= _photographs(path, layout)
     elif kind == "splats":
-        found |= {"format": splat_format(path)} | _in_time(path) | _splats(reading.load(path, quiet=True))
+        found |= {"format": format_of(path)} | _in_time(path) | _splats(reading.load(path, quiet=True))
         if cameras := cameras_beside(path, np.zeros(3)):
             found |= {"cameras": len(cameras), "up_by_cameras": _rounded(guess_up(None, cameras))}
     elif kind == "mesh":

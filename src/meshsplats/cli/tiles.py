@@ -34,7 +34,7 @@ from meshsplats.conversion import ConversionOptions
 from meshsplats.errors import ClusterError
 
 if TYPE_CHECKING:
-    from meshsplats.tiles.building import TileOptions
+    from meshsplats.tiles.options import TileOptions
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Tiles(Command):
 
     def _checked(self) -> TileOptions:
         """The options of the library; UsageError or ValueError where they are wrong."""
-        from meshsplats.tiles.building import TileOptions
+        from meshsplats.tiles.options import TileOptions
 
         if not self.input:
             raise UsageError("give a splat file or a folder of them")

@@ -7,6 +7,7 @@ deviation below sqrt(1/2) px. A mesh has no such filter: its triangles must be w
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +18,8 @@ from meshsplats.cameras.framing import SAMPLE
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.conversion.chunks import chunks, thin_product
 from meshsplats.conversion.options import ConversionOptions
-from meshsplats.gaussians import SH_C0, GaussianCloud
+from meshsplats.conversion.selection import flattened
+from meshsplats.gaussians import SH_C0, GaussianCloud, Kernel
 from meshsplats.spherical_harmonics import sh_basis
 
 FILTER_PX2: dict[str, dict[str, float]] = {
@@ -180,37 +182,108 @@ def _from_monomials(degree: int) -> np.ndarray:
     return np.linalg.lstsq(values, sh_basis(directions, degree), rcond=None)[0].astype(np.float32)
 
 
-def pixel_sizes(
-    cloud: GaussianCloud, options: ConversionOptions, coverage: CameraCoverage | None, up: np.ndarray
-) -> np.ndarray | None:
-    """(n,) size of a pixel at each splat in scene units, by ``options.footprint``; None for 'none' and
-    'filter'.
+@dataclass(frozen=True, eq=False)
+class SceneSample:
+    """What the conversion of a part needs to know of the whole scene."""
 
-    Splats that no camera sees take the median of the others. ``up`` (3,) is the axis of the cameras of
-    'framing'.
-    """
-    if options.footprint in ("none", "filter"):
-        return None
-    if options.footprint == "distance":
-        pixel = options.viewing_distance / options.focal  # type: ignore[operator]
-        return np.full(len(cloud), pixel, np.float32)
-    if options.footprint == "framing":
-        side = FRAMING_PIXELS
-        coverage = CameraCoverage(cloud.means, orbit(cloud, FRAMING_VIEWS, width=side, height=side, up=up))
-    if coverage is None:
-        raise ValueError("footprint='cameras' needs cameras")
-    sizes = coverage.pixel_sizes()
-    seen = sizes > 0
-    if not seen.any():
-        raise ValueError(none_seen(coverage.cameras, cloud.means, len(cloud)))
-    sizes = np.where(seen, sizes, np.median(sizes[seen]))
-    if options.footprint == "framing":
+    kept: int
+    """Count of the splats that are converted: inside the crop box and opaque enough."""
+    kernel: Kernel
+    sample: GaussianCloud
+    """Every ``step``-th of the kept splats, of degree 0; its origin is that of all splats."""
+    step: int
+    origin: np.ndarray
+    """(3,) float64 as ``CameraCoverage.origin`` of all of them, in their coordinates."""
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud) -> SceneSample:
+        """That of splats in memory, all of which are kept."""
         step = -(-len(cloud) // SAMPLE)
-        np.minimum(sizes, largest_pixel(cloud.means[::step], step), out=sizes)
-    return sizes
+        sample = flattened(cloud).take(np.arange(0, len(cloud), step))
+        return cls(len(cloud), cloud.kernel, sample, step, origin_of(cloud.means[:: origin_step(len(cloud))]))
 
 
-def none_seen(cameras: Sequence[Camera], means: np.ndarray, count: int) -> str:
+class SceneViews:
+    """What cameras see of a scene: the size of a pixel at any of its splats, and their mean colours.
+
+    Args:
+        scene: a sample of it.
+        options: resolved ones.
+        cameras: where the mesh will be seen from, for what follows them.
+        up: (3,) unit vector, the axis of the cameras of 'framing'.
+        whole: all splats will be asked for at once, not in blocks.
+    """
+
+    def __init__(
+        self,
+        scene: SceneSample,
+        options: ConversionOptions,
+        cameras: Sequence[Camera] | None,
+        up: np.ndarray,
+        *,
+        whole: bool = False,
+    ) -> None:
+        self._scene, self._options, self._given = scene, options, cameras or ()
+        self._largest = np.float32(np.inf)
+        self.is_none = options.footprint in ("none", "filter")
+        """Whether there is no footprint."""
+        self.unseen: np.float32 | None = None
+        """At splats that no camera sees: the median pixel of the others, of the sample at first. None: of
+        those that are asked for."""
+        self._cameras: list[Camera] = []
+        if cameras and "cameras" in (options.footprint, options.colors):
+            self._cameras = self._placed(cameras)
+        self._measuring = self._cameras
+        if options.footprint == "framing":
+            side = FRAMING_PIXELS
+            self._measuring = self._placed(orbit(scene.sample, FRAMING_VIEWS, width=side, height=side, up=up))
+            self._largest = _largest_pixel(scene.sample.means, scene.step)
+        if self.has_unseen and not whole:
+            self.unseen = self._median(self.seen(scene.sample.means))
+
+    @property
+    def has_unseen(self) -> bool:
+        """Whether splats may be outside all images."""
+        return self._options.footprint in ("framing", "cameras")
+
+    def pixel_sizes(self, means: np.ndarray) -> np.ndarray | None:
+        """(n,) float32 size of a pixel at each of ``means`` (n, 3) in scene units; None for 'none' and
+        'filter'."""
+        if self.is_none:
+            return None
+        if not self.has_unseen:
+            pixel = self._options.viewing_distance / self._options.focal  # type: ignore[operator]
+            return np.full(len(means), pixel, np.float32)
+        sizes = self.seen(means)
+        unseen = self._median(sizes) if self.unseen is None else self.unseen
+        sizes = np.where(sizes > 0, sizes, unseen)
+        return np.minimum(sizes, self._largest, out=sizes)
+
+    def seen(self, means: np.ndarray) -> np.ndarray:
+        """(n,) float32 sizes in scene units, 0 where no camera sees the splat."""
+        return CameraCoverage(means, self._measuring, self._scene.origin).pixel_sizes()
+
+    def colors(self, cloud: GaussianCloud) -> np.ndarray:
+        """(n, 3) display RGB of ``cloud``: the mean over the cameras, if that is asked for, else of degree 0
+        or what the harmonics say."""
+        if self._options.colors != "cameras" or not self._cameras or not cloud.sh_degree:
+            return cloud.colors
+        return CameraCoverage(cloud.means, self._cameras, self._scene.origin).mean_colors(cloud.sh)
+
+    def _placed(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """Those of ``cameras`` that count, with the near planes that they have in front of the scene."""
+        some = [cameras[i] for i in spread_indices(len(cameras), MAX_CAMERAS)]
+        return [camera.with_near_plane(self._scene.sample.means) for camera in some]
+
+    def _median(self, sizes: np.ndarray) -> np.float32:
+        seen = sizes[sizes > 0]
+        if not len(seen):
+            cameras = self._given if self._options.footprint == "cameras" else self._measuring
+            raise ValueError(_none_seen(cameras, self._scene.sample.means, self._scene.kept))
+        return np.float32(np.median(seen))
+
+
+def _none_seen(cameras: Sequence[Camera], means: np.ndarray, count: int) -> str:
     """What to say where ``cameras`` see none of ``count`` splats, some of which are at ``means`` (n, 3)."""
     reason = hiding_near_plane(cameras, means)
     reason = f"{reason}." if reason else "are they of one scene?"
@@ -220,7 +293,7 @@ def none_seen(cameras: Sequence[Camera], means: np.ndarray, count: int) -> str:
     )
 
 
-def largest_pixel(means: np.ndarray, step: int) -> np.float32:
+def _largest_pixel(means: np.ndarray, step: int) -> np.float32:
     """Largest pixel for 'framing', scene units, by ``means`` (n, 3) of every ``step``-th splat."""
     # One point in ``step`` lies sqrt(step) times as far from the next, on a surface.
     typical = np.median(spacing(means)) / np.sqrt(step)

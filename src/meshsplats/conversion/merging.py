@@ -23,7 +23,7 @@ from meshsplats._geometry import quaternions_of
 from meshsplats._kinds import need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import guess_up
-from meshsplats.conversion.footprint import CameraCoverage, pixel_sizes, widen
+from meshsplats.conversion.footprint import SceneSample, SceneViews, widen
 from meshsplats.conversion.options import ConversionOptions
 from meshsplats.conversion.selection import disc_areas, mean_shadow
 from meshsplats.gaussians import GaussianCloud
@@ -219,8 +219,8 @@ def nearest(points: np.ndarray, count: int, threads: int | None = None) -> tuple
 def _usual_low_pass(cloud: GaussianCloud, cameras: Sequence[Camera] | None) -> np.ndarray:
     px2 = 0.5 if cloud.kernel == "2dgs" else FILTER_PX2
     source = ConversionOptions(footprint="cameras" if cameras else "framing")
-    coverage = CameraCoverage(cloud.means, cameras) if cameras else None
-    pixel = pixel_sizes(cloud, source, coverage, guess_up(cloud, cameras))
+    views = SceneViews(SceneSample.of(cloud), source, cameras, guess_up(cloud, cameras), whole=True)
+    pixel = views.pixel_sizes(cloud.means)
     assert pixel is not None
     return np.sqrt(px2) * pixel
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -69,6 +70,11 @@ def within(cloud: GaussianCloud, crop: Sequence[float] | None, min_opacity: floa
     if min_opacity:
         keep &= cloud.opacities >= min_opacity
     return keep
+
+
+def flattened(cloud: GaussianCloud) -> GaussianCloud:
+    """``cloud`` with its harmonics of degree 0 alone."""
+    return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
 
 
 def inside(points: np.ndarray, box: Sequence[float], origin: np.ndarray) -> np.ndarray:

@@ -8,26 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from meshsplats._kinds import each, need, need_all
 from meshsplats.camera import Camera
 from meshsplats.cameras.framing import SAMPLE, guess_up, unit_up, warn_of_strays
-from meshsplats.cameras.trajectories import orbit
-from meshsplats.conversion import Fans, filter_of
-from meshsplats.conversion.footprint import (
-    FRAMING_PIXELS,
-    FRAMING_VIEWS,
-    CameraCoverage,
-    largest_pixel,
-    none_seen,
-    origin_of,
-    origin_step,
-)
+from meshsplats.conversion.driver import Driver, Piece, drawn_part, filter_of, worth_drawing
+from meshsplats.conversion.footprint import SceneSample, SceneViews, origin_of, origin_step
 from meshsplats.conversion.options import ConversionOptions, Preset, make_options
-from meshsplats.conversion.selection import within
+from meshsplats.conversion.selection import flattened
 from meshsplats.gaussians import GaussianCloud, Kernel
 from meshsplats.mesh import SplatMesh
 
@@ -42,21 +33,13 @@ the same numbers as in a conversion of the whole."""
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
-    """What the conversion of a part needs to know of the whole scene."""
+class Survey(SceneSample):
+    """A sample of a scene, and its bounds."""
 
-    kept: int
-    """Count of the splats that are converted: inside the crop box and opaque enough."""
-    kernel: Kernel
     low: np.ndarray
     """(3,) float64 least coordinates of the centres that are kept."""
     high: np.ndarray
     """(3,) float64 greatest ones."""
-    sample: GaussianCloud
-    """Every ``step``-th of the kept splats, of degree 0; its origin is that of all splats."""
-    step: int
-    origin: np.ndarray
-    """(3,) float64 as ``CameraCoverage.origin`` of all of them, in their coordinates."""
 
 
 def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Survey:
@@ -87,85 +70,15 @@ def survey(source: Iterable[GaussianCloud], options: ConversionOptions) -> Surve
     samples, near_origin = [], []
     passed = 0
     for block in source:
-        part = replace(block.take(worth_drawing(block, options)), kernel=kernel)
-        samples.append(flattened(part).take(np.arange(-passed % step, len(part), step)))
+        part = replace(flattened(block).take(worth_drawing(block, options)), kernel=kernel)
+        samples.append(part.take(np.arange(-passed % step, len(part), step)))
         near_origin.append(part.means[-passed % distance :: distance])
         passed += len(part)
     if passed != kept:
         raise ValueError(f"the splats changed while they were read: {kept:,} before, {passed:,} now")
     sample = GaussianCloud.joined(samples)
     warn_of_strays(sample, low, high, largest)
-    return Survey(kept, kernel, low, high, sample, step, origin_of(np.concatenate(near_origin)))
-
-
-def worth_drawing(block: GaussianCloud, options: ConversionOptions) -> np.ndarray:
-    """(k,) rows of the splats that are inside the crop box and opaque enough, ascending."""
-    return np.flatnonzero(within(block, options.crop, options.min_opacity))
-
-
-def flattened(cloud: GaussianCloud) -> GaussianCloud:
-    """``cloud`` with its harmonics of degree 0 alone."""
-    return replace(cloud, sh=cloud.sh[:, :1]) if cloud.sh_degree else cloud
-
-
-class ScenePixels:
-    """Size of a pixel at any splat of a surveyed scene, as a conversion of the whole has it.
-
-    Args:
-        scene: the survey.
-        options: resolved ones.
-        cameras: where the mesh will be seen from, for ``footprint='cameras'``.
-        up: (3,) unit vector.
-    """
-
-    def __init__(
-        self,
-        scene: Survey,
-        options: ConversionOptions,
-        cameras: Sequence[Camera] | None,
-        up: np.ndarray,
-    ) -> None:
-        self._fixed: np.float32 | None = None
-        self._cameras: Sequence[Camera] = cameras or ()
-        self._origin, self._largest = scene.origin, np.float32(np.inf)
-        self.unseen = np.float32(1)
-        """At splats that no camera sees: the median pixel of the others, of the sample at first."""
-        self.is_none = options.footprint in ("none", "filter")
-        if self.is_none:
-            return
-        if options.footprint == "distance":
-            self._fixed = np.float32(options.viewing_distance / options.focal)  # type: ignore[operator]
-            return
-        if options.footprint == "framing":
-            side = FRAMING_PIXELS
-            self._cameras = orbit(scene.sample, FRAMING_VIEWS, width=side, height=side, up=up)
-            self._largest = largest_pixel(scene.sample.means, scene.step)
-        sizes = self.seen(scene.sample.means)
-        if not (sizes > 0).any():
-            raise ValueError(none_seen(self._cameras, scene.sample.means, scene.kept))
-        self.unseen = np.median(sizes[sizes > 0])
-
-    @property
-    def has_unseen(self) -> bool:
-        """Whether splats may be outside all images."""
-        return not self.is_none and self._fixed is None
-
-    def coverage(self, means: np.ndarray) -> CameraCoverage:
-        return CameraCoverage(means, self._cameras, self._origin)
-
-    def seen(self, means: np.ndarray) -> np.ndarray:
-        """(n,) float32 sizes in scene units, 0 where no camera sees the splat."""
-        return self.coverage(means).pixel_sizes()
-
-    def at(self, means: np.ndarray) -> np.ndarray | None:
-        """(n,) float32 sizes at ``means`` (n, 3); None without a footprint."""
-        if self.is_none:
-            return None
-        if self._fixed is not None:
-            return np.full(len(means), self._fixed, np.float32)
-        sizes = self.seen(means)
-        sizes = np.where(sizes > 0, sizes, self.unseen)
-        return np.minimum(sizes, self._largest, out=sizes)
+    return Survey(kept, kernel, sample, step, origin_of(np.concatenate(near_origin)), low, high)
 
 
 def convert_blocks(
@@ -200,36 +113,21 @@ def convert_blocks(
     refuse_whole(chosen)
     scene = survey(source, chosen)
     direction = guess_up(scene.sample, cameras) if up is None else unit_up(up)
-    cameras = [camera.with_near_plane(scene.sample.means) for camera in cameras or ()]
-    filter_px2 = filter_of(scene.kernel, chosen)
-    pixels = ScenePixels(scene, chosen, cameras, direction)
-    if pixels.has_unseen:
-        pixels.unseen = _median_seen(source, chosen, pixels)
+    views = SceneViews(scene, chosen, cameras, direction)
+    if views.has_unseen:
+        views.unseen = _median_seen(source, chosen, views) or views.unseen
+    driver = Driver(chosen, views, direction, scene.sample.origin, filter_of(scene.kernel, chosen))
 
-    def pieces() -> Iterator[_Piece]:
+    def pieces() -> Iterator[Piece]:
         for block, rows in _aligned(source, chosen, scene.kernel):
-            fans = Fans.of(block, chosen, pixels.at(block.means))
-            colors = block.colors
-            if cameras and chosen.colors == "cameras" and block.sh_degree:
-                colors = CameraCoverage(block.means, cameras, scene.origin).mean_colors(block.sh)
-            keep = fans.areas[:, 0] > 0 if chosen.min_opacity else np.ones(len(block), bool)
-            yield _Piece(flattened(block), rows, colors, fans).select(np.flatnonzero(keep))
+            piece = driver.piece(block, rows)
+            piece = replace(piece, cloud=flattened(piece.cloud))
+            yield piece.select(np.flatnonzero(driver.has_area(piece)))
 
     done = 0
     for piece in _cut(pieces()):
         done += len(piece.rows)
-        vertices, faces, rgba, owners = piece.fans.build(
-            piece.cloud, piece.rows, piece.colors, chosen.compensation
-        )
-        yield SplatMesh(
-            vertices,
-            faces,
-            rgba,
-            face_splat=owners,
-            up=direction,
-            filter_px2=filter_px2,
-            origin=scene.sample.origin,
-        )
+        yield driver.mesh(piece)
     if not done:
         raise ValueError(f"none of the {scene.kept:,} splats has a visible area")
 
@@ -242,53 +140,20 @@ def refuse_whole(options: ConversionOptions) -> None:
         raise ValueError("detail='cameras' needs all splats in memory: use convert")
 
 
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """Splats, each with its row among all, and their fans."""
-
-    cloud: GaussianCloud
-    rows: np.ndarray
-    colors: np.ndarray
-    fans: Fans
-
-    def select(self, index: np.ndarray) -> _Piece:
-        if len(index) == len(self.rows):
-            return self
-        own: dict[str, Any] = {name: np.take(getattr(self.fans, name), index, axis=0) for name in _PER_SPLAT}
-        return _Piece(self.cloud.take(index), self.rows[index], self.colors[index], self.fans._replace(**own))
-
-    @staticmethod
-    def together(pieces: Sequence[_Piece]) -> _Piece:
-        if len(pieces) == 1:
-            return pieces[0]
-        own: dict[str, Any] = {
-            name: np.concatenate([getattr(p.fans, name) for p in pieces]) for name in _PER_SPLAT
-        }
-        return _Piece(
-            GaussianCloud.joined([p.cloud for p in pieces]),
-            np.concatenate([p.rows for p in pieces]),
-            np.concatenate([p.colors for p in pieces]),
-            pieces[0].fans._replace(**own),
-        )
-
-
-_PER_SPLAT = tuple(name for name in Fans._fields if name != "shapes")
-
-
-def _cut(pieces: Iterable[_Piece]) -> Iterator[_Piece]:
+def _cut(pieces: Iterable[Piece]) -> Iterator[Piece]:
     """The splats of ``pieces`` in pieces of ``BLOCK``; the last may be shorter."""
-    held: list[_Piece] = []
+    held: list[Piece] = []
     count = 0
     for piece in pieces:
         held.append(piece)
         count += len(piece.rows)
         while count >= BLOCK:
-            whole = _Piece.together(held)
+            whole = Piece.together(held)
             yield whole.select(np.arange(BLOCK))
             held = [whole.select(np.arange(BLOCK, count))]
             count -= BLOCK
     if count:
-        yield _Piece.together(held)
+        yield Piece.together(held)
 
 
 def _aligned(
@@ -301,8 +166,7 @@ def _aligned(
     for block in source:
         rows = worth_drawing(block, options)
         if len(rows):
-            part = replace(block.take(rows), kernel=kernel)
-            held.append(part if options.colors == "cameras" else flattened(part))
+            held.append(replace(drawn_part(block, rows, options), kernel=kernel))
             numbers.append((rows + passed).astype(np.int32))
             count += len(rows)
         passed += len(block)
@@ -316,9 +180,9 @@ def _aligned(
 
 
 def _median_seen(
-    source: Iterable[GaussianCloud], options: ConversionOptions, pixels: ScenePixels
-) -> np.float32:
-    """The median size of a pixel at the splats that cameras see, exactly.
+    source: Iterable[GaussianCloud], options: ConversionOptions, views: SceneViews
+) -> np.float32 | None:
+    """The median size of a pixel at the splats that cameras see, exactly; None where they see all or none.
 
     Sizes are positive floats, whose bits are in the order of their values: a histogram of the upper half of
     the bits and one of the lower half for the two bins in the middle find them in two passes.
@@ -328,7 +192,7 @@ def _median_seen(
 
     def blocks() -> Iterator[np.ndarray]:
         for block, _ in _aligned(source, flat, "3dgs"):
-            yield pixels.seen(block.means)
+            yield views.seen(block.means)
 
     upper = np.zeros(1 << 16, np.int64)
     unseen = 0
@@ -337,7 +201,7 @@ def _median_seen(
         unseen += int((sizes == 0).sum())
     total = int(upper.sum())
     if not total or not unseen:
-        return pixels.unseen
+        return None
     places = sorted({(total - 1) // 2, total // 2})
     ends = np.cumsum(upper)
     bins = [int(np.searchsorted(ends, place, side="right")) for place in places]

@@ -23,8 +23,8 @@ from meshsplats.evaluation.backgrounds import (
 )
 from meshsplats.evaluation.report import SSIM_CONVENTION, Report, evaluate
 from meshsplats.evaluation.strips import markdown_table
-from meshsplats.formats.gaussians import SPLAT_SUFFIXES
 from meshsplats.formats.meshes import MESH_SUFFIXES
+from meshsplats.formats.splat_formats import splat_suffixes
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 
@@ -71,13 +71,11 @@ BENCHMARKS: Mapping[str, Benchmark] = {
 is held out, and splats are compared at degree 0. The background is the one that each scene's splats were
 trained with. The 7 scenes of Mip-NeRF 360 are the public ones; the other two are available on request."""
 
-_SUFFIXES = (".npz", ".glb", ".gltf", *MESH_SUFFIXES, *SPLAT_SUFFIXES)
-"""How inputs may end; of several, the first is taken."""
-
 
 def find_input(folder: Path, scene: str) -> Path | None:
-    """Mesh, splats or model folder of ``scene`` in ``folder``: ``scene.npz``, ``scene.ply`` or ``scene/``."""
-    for suffix in _SUFFIXES:
+    """Mesh, splats or model folder of ``scene`` in ``folder``: ``scene.npz``, ``scene.ply`` or ``scene/``;
+    of several, the first."""
+    for suffix in (".npz", ".glb", ".gltf", *MESH_SUFFIXES, *splat_suffixes()):
         if (folder / (scene + suffix)).is_file():
             return folder / (scene + suffix)
     return folder / scene if (folder / scene).is_dir() else None

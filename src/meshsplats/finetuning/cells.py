@@ -29,7 +29,7 @@ from meshsplats.camera import Camera
 from meshsplats.cluster import Shared, Workers
 from meshsplats.conversion import ConversionOptions
 from meshsplats.conversion.merging import simplify
-from meshsplats.conversion.streaming import flattened
+from meshsplats.conversion.selection import flattened
 from meshsplats.datasets.views import Dataset, ImageCache, View
 from meshsplats.datasets.windows import window_of
 from meshsplats.finetuning.checkpoint import OtherRunError, cloud_digest, dataset_fingerprint

@@ -6,13 +6,12 @@ import io
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
-from meshsplats._foreign import BROKEN_ZIP, foreign_archive
+from meshsplats._foreign import BROKEN_ZIP
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
 
-_SUFFIXES = (".ply", ".spz", ".splat")
 _PIECE = 1 << 20
 _MAX_TRIED = 64
 """Of files that are named like splats, only this many are opened to see whether they are."""
@@ -37,36 +36,50 @@ class BoundedReader(io.BufferedReader):
 
 
 class Archive:
-    """A zip archive and the names of the files in it, without those that macOS adds."""
+    """A zip archive, opened; its directory is read once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._raw = BoundedReader(path)
         try:
-            with BoundedReader(path) as file, zipfile.ZipFile(file) as archive:
-                infos = archive.infolist()
+            self._zip = zipfile.ZipFile(self._raw)
         except BROKEN_ZIP as error:
+            self._raw.close()
             raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
-        named = [info.filename for info in infos if not info.filename.endswith("/")]
+        named = [name for name in self._zip.namelist() if not name.endswith("/")]
         self.names = [name for name in named if not _is_hidden(name)]
+        """Of the files in it, without those that macOS adds."""
+
+    def close(self) -> None:
+        self._zip.close()
+        self._raw.close()
 
     @property
     def has_meta(self) -> bool:
         """Whether it may be a SOG file."""
         return any(name.rsplit("/", 1)[-1] == "meta.json" for name in self.names)
 
-    def candidates(self) -> list[str]:
-        """The files in it whose names are those of splats."""
-        return [name for name in self.names if name.lower().endswith(_SUFFIXES)][:_MAX_TRIED]
+    def named(self, suffixes: tuple[str, ...]) -> list[str]:
+        """The files in it whose names end in one of ``suffixes``; not too many."""
+        return [name for name in self.names if name.lower().endswith(suffixes)][:_MAX_TRIED]
 
-    def refusal(self) -> FileFormatError:
-        """Why nothing in it is read."""
-        if what := foreign_archive(self.path, self.names):
-            return FileFormatError(f"{self.path}: {what}")
-        listed = ", ".join(sorted(self.names)[:5])[:200] or "nothing"
-        return FileFormatError(
-            f"{self.path}: a zip archive without meta.json is no SOG file, and no .ply, .spz or .splat is in"
-            f" it (it holds {listed})"
-        )
+    def open(self, name: str) -> BinaryIO:
+        """A file in it, unpacked while it is read; not beyond the archive's own being open."""
+        return cast(BinaryIO, ZippedFile(self._zip, self.path, name))
+
+    def bytes(self, name: str, limit: int) -> bytes:
+        """The whole of a file in it, at most ``limit`` bytes; else FileFormatError."""
+        pieces, left = [], limit + 1
+        try:
+            with self._zip.open(name) as file:
+                while left and (piece := file.read(min(left, _PIECE))):
+                    pieces.append(piece)
+                    left -= len(piece)
+        except BROKEN_ZIP as e:
+            raise FileFormatError(f"{self.path}: cannot unpack {name[:60]!r}: {str(e)[:120]}") from None
+        if not left:
+            raise FileFormatError(f"{self.path}: {name[:60]!r} unpacks to over {limit:,} bytes; refused")
+        return b"".join(pieces)
 
 
 def _is_hidden(name: str) -> bool:
@@ -79,24 +92,21 @@ class ZippedFile(io.RawIOBase):
     Decompression bombs are refused by the size that the archive states, beyond which nothing is unpacked.
     """
 
-    def __init__(self, path: Path, name: str) -> None:
+    def __init__(self, archive: zipfile.ZipFile, path: Path, name: str) -> None:
         self._where = f"{path}: {name[:200]!r}"
         self._at_end = False
-        self._raw = BoundedReader(path)
+        self._file: Any = io.BytesIO()
         try:
-            self._archive = zipfile.ZipFile(self._raw)
-            info = self._archive.getinfo(name)
+            info = archive.getinfo(name)
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 # LZMA may claim gigabytes for its dictionary.
                 raise NotImplementedError(f"it is compressed by method {info.compress_type}, not by deflate")
-            self._file: Any = self._archive.open(info)
+            self._file = archive.open(info)
             self._length = info.file_size
             Budget(path).spend(self._length, f"{name[:200]!r} in it")
-        except FileFormatError:
-            self._raw.close()
-            raise
         except (KeyError, *BROKEN_ZIP) as error:
-            self._raw.close()
+            if isinstance(error, FileFormatError):
+                raise
             raise FileFormatError(f"{self._where} cannot be unpacked: {str(error)[:120]}") from None
 
     def readable(self) -> bool:
@@ -137,8 +147,6 @@ class ZippedFile(io.RawIOBase):
     def close(self) -> None:
         if not self.closed:
             self._file.close()
-            self._archive.close()
-            self._raw.close()
         super().close()
 
     def _guarded(self, read: Any, argument: Any) -> Any:

@@ -13,10 +13,10 @@ import numpy as np
 from meshsplats._kinds import need_path
 from meshsplats.base_mesh import BaseMesh, Texture
 from meshsplats.errors import FileFormatError, NoColorsWarning, NoTextureWarning
+from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.textures import gltf_textures
 from meshsplats.formats.meshes import load_mesh
 from meshsplats.formats.obj.textures import obj_coordinates, obj_textures
-from meshsplats.formats.sniff import Content
 from meshsplats.mesh import SplatMesh
 
 

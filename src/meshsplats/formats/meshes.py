@@ -15,7 +15,7 @@ from meshsplats._files.atomic import atomic_path
 from meshsplats._foreign import foreign, foreign_archive
 from meshsplats._kinds import each, need, need_path
 from meshsplats.errors import DataWarning, FileFormatError
-from meshsplats.formats._zipped import Archive
+from meshsplats.formats.content import Content
 from meshsplats.formats.cutting import CUTOFF, cut_mesh
 from meshsplats.formats.gltf.compressed import Compression, write_compressed_glb
 from meshsplats.formats.gltf.reader import read_gltf
@@ -23,7 +23,7 @@ from meshsplats.formats.gltf.writer import Alpha, ColorType, write_glb
 from meshsplats.formats.npz import read_npz, write_npz
 from meshsplats.formats.obj.mesh import read_obj, write_obj
 from meshsplats.formats.ply.mesh import read_mesh_ply, write_mesh_blocks, write_mesh_ply
-from meshsplats.formats.sniff import Content
+from meshsplats.formats.sniff import content_of
 from meshsplats.formats.usd.reader import read_usd
 from meshsplats.formats.usd.writer import write_usd
 from meshsplats.mesh import SplatMesh, checked_cutoff
@@ -82,7 +82,11 @@ def load_mesh(
 
 
 def _read(source: Path, point: np.ndarray | None) -> SplatMesh:
-    content = Content(source)
+    with content_of(source) as content:
+        return _mesh_in(content, source, point)
+
+
+def _mesh_in(content: Content, source: Path, point: np.ndarray | None) -> SplatMesh:
     content.refuse_empty()
     if content.member is not None:
         raise FileFormatError(f"{source}: splats in a zip archive ({content.member[:200]}), no mesh")
@@ -91,7 +95,7 @@ def _read(source: Path, point: np.ndarray | None) -> SplatMesh:
             raise FileFormatError(
                 f"{source}: .usdz packages are not read; unpack it: usdcat in.usdz -o out.usdc"
             )
-        if source.suffix.lower() != ".npz" and (what := foreign_archive(source, Archive(source).names)):
+        if source.suffix.lower() != ".npz" and (what := foreign_archive(source, content.archive.names)):
             raise FileFormatError(f"{source}: {what}")
         return read_npz(source, point)
     if content.container == "ply":

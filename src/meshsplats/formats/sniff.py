@@ -2,219 +2,145 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import re
-import zlib
-from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO, Literal, cast
+from typing import Literal
 
-from meshsplats._foreign import foreign
+from meshsplats._foreign import foreign, foreign_archive
 from meshsplats.errors import FileFormatError
-from meshsplats.formats._gzipped import GzippedFile
-from meshsplats.formats._zipped import Archive, ZippedFile
-from meshsplats.formats.gltf.splats import has_splats
-from meshsplats.formats.ply.compressed_splats import is_compressed_splat
-from meshsplats.formats.ply.header import PlyHeader, read_header
-from meshsplats.formats.ply.splats import is_float_splat
-from meshsplats.formats.splats.dot_splat import is_dot_splat
-from meshsplats.formats.splats.spz import is_spz
+from meshsplats.formats import splat_formats
+from meshsplats.formats.content import Container, Content
+from meshsplats.formats.splat_formats import SplatFormat, listed, zipped_suffixes
 
-Container = Literal["ply", "zip", "glb", "usd", "json", "array", "gzip", "lfs", "html"]
-SplatFormat = Literal["ply", "compressed.ply", "splat", "spz", "sog", "streamed sog", "gltf"]
-
-_SIGNATURES: dict[Container, re.Pattern[bytes]] = {
-    "ply": re.compile(rb"ply[ \t]*[\r\n]"),
-    "zip": re.compile(rb"PK(\x03\x04|\x05\x06)"),
-    "glb": re.compile(rb"glTF"),
-    "usd": re.compile(rb"PXR-USDC|#usda"),
-    "json": re.compile(rb"(\xef\xbb\xbf)?\s*\{"),
-    "array": re.compile(rb"(\xef\xbb\xbf)?\s*\["),
-    "gzip": re.compile(rb"\x1f\x8b"),
-    "lfs": re.compile(rb"version https://git-lfs"),
-    "html": re.compile(rb"\s*<(!doctype html|html)", re.IGNORECASE),
-}
 _UNREAD: dict[Container | None, str] = {
     "gzip": "a gzip file, but not SPZ; unpack it first",
     "lfs": "a Git LFS pointer, not the file itself, which 'git lfs pull' brings",
 }
 _SPLATV = b"\x4b\x67\0\0"
-_SOG_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
-_EXPECTED = "a .ply (float or compressed), .splat, .spz, .sog or .glb file with splats"
 
 
 class UnreadSplats(FileFormatError):
     """Splats of a known kind that is not read, or a file in their place, such as a Git LFS pointer."""
 
 
-class Content:
-    """A file and the format of its first bytes."""
+def content_of(path: Path) -> Content:
+    """The content of a file; of a zip archive with a single file of splats, that of this file. To be closed.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        try:
-            with open(path, "rb") as file:
-                self.head = file.read(4096)
-        except PermissionError:
-            if path.is_dir():  # on Windows
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path)) from None
-            raise
-        self.container = _container(self.head)
-        self.member: str | None = None
-        """The name of the only file with splats in a zip archive; the content is then that of this file."""
-        if self.container == "zip" and (found := _only_member(path)) is not None:
-            self.member = found
-            with self.open() as inner:
-                self.head = inner.read(4096)
-            self.container = _container(self.head)
-
-    @cached_property
-    def ply_header(self) -> PlyHeader:
-        """The header of a PLY file. FileFormatError if it is broken."""
-        with self.open() as file:
-            return read_header(file, self.path)
-
-    @cached_property
-    def is_gzipped_ply(self) -> bool:
-        """Whether the file is a gzipped PLY file."""
-        if self.container != "gzip" or self.member is not None:
-            return False
-        try:
-            return _SIGNATURES["ply"].match(zlib.decompressobj(31).decompress(self.head, 64)) is not None
-        except zlib.error:
-            return False
-
-    def open(self) -> BinaryIO:
-        """The opened file; a gzipped PLY file, and one in a zip archive, is unpacked while it is read."""
-        if self.member is not None:
-            return cast(BinaryIO, ZippedFile(self.path, self.member))
-        return cast(BinaryIO, GzippedFile(self.path)) if self.is_gzipped_ply else open(self.path, "rb")
-
-    @property
-    def is_text(self) -> bool:
-        return b"\0" not in self.head
-
-    @property
-    def is_obj(self) -> bool:
-        """Whether the file is Wavefront `.obj`. The format has no signature: its name or a vertex decides."""
-        named = self.path.suffix.lower() == ".obj"
-        return self.is_text and (named or re.search(rb"(^|\n)v[ \t]+[-+.\d]", self.head) is not None)
-
-    def refuse_empty(self) -> None:
-        if not self.head:
-            raise FileFormatError(f"{self.path}: the file is empty")
-
-    def splat_format(self) -> SplatFormat:
-        """The splat format of the file; its reader may still refuse it, or find a mesh.
-
-        Raises:
-            UnreadSplats: the kind is known, but not read.
-            FileFormatError: the file is something else; the message says what, if that is clear.
-        """
-        path, name = self.path, (self.member or self.path.name).lower()
-        convert = f"convert it first: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
-        self.refuse_empty()
-        if self.container == "ply" or self.is_gzipped_ply:
-            # A mesh is left to the float reader, which says what is missing.
-            return "compressed.ply" if is_compressed_splat(self.ply_header) else "ply"
-        if is_spz(self.head):
-            return "spz"
-        if self.container == "zip":
-            return self._zip_format()
-        if self.container == "glb":
-            return "gltf"
-        if self.container == "json":
-            return self._json_format(convert)
-        if self.head[:4] == _SPLATV or name.endswith(".splatv"):
-            raise UnreadSplats(
-                f"{path}: .splatv files, of splats that move, are not read here; the .ply that they are made"
-                " of is (Spacetime Gaussians)"
-            )
-        if name.endswith(".ksplat"):
-            raise UnreadSplats(f"{path}: .ksplat files are not read here; {convert}")
-        with self.open() as file:
-            if is_dot_splat(file):
-                return "splat"
-        if name.endswith(".splat"):
-            raise UnreadSplats(
-                f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
-                f" (it has {path.stat().st_size:,} bytes)"
-            )
-        if self.container == "html":
-            raise UnreadSplats(f"{path}: {_page(path)}")
-        if self.container in _UNREAD:
-            raise UnreadSplats(f"{path}: {_UNREAD[self.container]}")
-        if not self.is_obj and (what := foreign(path, self.head)):
-            raise UnreadSplats(f"{path}: {what}")
-        raise FileFormatError(
-            f"{path}: not a splat file of a known format, it begins with {self.head[:8]!r};"
-            f" expected {_EXPECTED}"
-        )
-
-    def _zip_format(self) -> SplatFormat:
-        """The format of an archive without a single file of splats: SOG, if its meta.json is there."""
-        try:
-            archive = Archive(self.path)
-        except FileFormatError:  # broken: the reader says so
-            return "sog"
-        if archive.has_meta:
-            return "sog"
-        raise archive.refusal()
-
-    def _json_format(self, convert: str) -> SplatFormat:
-        """The format of a JSON file by the words in it; its reader parses it."""
-        with open(self.path, "rb") as file:
-            text = file.read(8 << 20)
-        if all(name in text for name in _SOG_SECTIONS):  # some name their generator in an asset, as glTF does
-            return "sog"
-        if b'"lodLevels"' in text:
-            return "streamed sog"
-        if b'"asset"' in text:
-            return "gltf"
-        named = self.path.suffix.lower() in (".lcc", ".lcc2")
-        if named or (b'"splats"' in text and b'"totalLevel"' in text):
-            raise UnreadSplats(f"{self.path}: .lcc scenes are not read here; {convert}")
-        if b'"means"' in text:
-            return "sog"
-        raise FileFormatError(f"{self.path}: a JSON file that is neither SOG nor glTF; expected {_EXPECTED}")
-
-
-def _container(head: bytes) -> Container | None:
-    return next((name for name, pattern in _SIGNATURES.items() if pattern.match(head)), None)
-
-
-def _only_member(path: Path) -> str | None:
-    """The only file with splats in a zip archive; None if it has none, or is of a format of its own.
-    FileFormatError if it has several."""
+    Raises UnreadSplats if there are several in the archive.
+    """
+    content = Content(path)
     try:
-        archive = Archive(path)
+        found = _members(content) if content.is_archive else []
+        if len(found) > 1:
+            some = ", ".join(found[:4]) + (", ..." if len(found) > 4 else "")
+            raise UnreadSplats(
+                f"{path}: {len(found)} files of splats in one archive ({some}): unpack it, and give one"
+            )
+        return content.inside(found[0]) if found else content
+    except BaseException:
+        content.close()
+        raise
+
+
+def _members(content: Content) -> list[str]:
+    """The files with splats in a zip archive; none if it is of a format of its own."""
+    try:
+        archive = content.archive
     except FileFormatError:  # broken: the reader says so
-        return None
+        return []
     if archive.has_meta:
-        return None
-    found = [name for name in archive.candidates() if _is_splats(path, name)]
-    if len(found) > 1:
-        some = ", ".join(found[:4]) + (", ..." if len(found) > 4 else "")
-        raise UnreadSplats(
-            f"{path}: {len(found)} files of splats in one archive ({some}): unpack it, and give one"
-        )
-    return found[0] if found else None
+        return []
+    return [name for name in archive.named(zipped_suffixes()) if _is_splats(content.inside(name))]
 
 
-def _is_splats(path: Path, name: str) -> bool:
+def _is_splats(content: Content) -> bool:
     """Whether a file in an archive is splats, or so broken that only its reader can tell."""
-    with ZippedFile(path, name) as zipped:
-        file = cast(BinaryIO, zipped)
-        head = file.read(4096)
-        file.seek(0)
-        if _container(head) != "ply":
-            return is_spz(head) or (name.lower().endswith(".splat") and is_dot_splat(file))
-        try:
-            header = read_header(file, path)
-        except FileFormatError:
-            return True
-        return is_compressed_splat(header) or is_float_splat(header)
+    for kind in splat_formats.FORMATS:
+        if kind.zipped and (kind.has_signature or content.name.endswith(kind.zipped)):
+            try:
+                if kind.reader.matches(content) and kind.reader.holds_splats(content):
+                    return True
+            except FileFormatError:
+                return True
+    return False
+
+
+def splat_format(content: Content) -> SplatFormat:
+    """The splat format of ``content``; its reader may still refuse it, or find a mesh.
+
+    Raises:
+        UnreadSplats: the kind is known, but not read.
+        FileFormatError: the file is something else; the message says what, if that is clear.
+    """
+    content.refuse_empty()
+    for kind in splat_formats.FORMATS:
+        if kind.has_signature and kind.reader.matches(content):
+            return kind
+    if content.is_archive:
+        raise _archive_refusal(content)
+    if what := _unread(content):
+        raise UnreadSplats(f"{content.path}: {what}")
+    if content.container == "json":
+        raise FileFormatError(
+            f"{content.path}: a JSON file that is neither SOG nor glTF; expected {_expected()}"
+        )
+    for kind in splat_formats.FORMATS:
+        if not kind.has_signature and kind.reader.matches(content):
+            return kind
+    raise _refusal(content)
+
+
+def _archive_refusal(content: Content) -> FileFormatError:
+    """The error for a zip archive in which nothing is read."""
+    names = content.archive.names
+    if what := foreign_archive(content.path, names):
+        return FileFormatError(f"{content.path}: {what}")
+    found = ", ".join(sorted(names)[:5])[:200] or "nothing"
+    return FileFormatError(
+        f"{content.path}: a zip archive without meta.json is no SOG file, and no"
+        f" {listed(zipped_suffixes())} is in it (it holds {found})"
+    )
+
+
+def _expected() -> str:
+    return f"a file of splats ({listed(splat_formats.splat_suffixes())})"
+
+
+def _unread(content: Content) -> str:
+    """What splats are of a known format that is not read, and what to do with them; empty for others."""
+    path, text = content.path, content.json_text
+    convert = f"convert it first: npx @playcanvas/splat-transform {path.name} {path.stem}.ply"
+    if content.head[:4] == _SPLATV or content.name.endswith(".splatv"):
+        return (
+            ".splatv files, of splats that move, are not read here; the .ply that they are made of is"
+            " (Spacetime Gaussians)"
+        )
+    if content.name.endswith(".ksplat"):
+        return f".ksplat files are not read here; {convert}"
+    if text and (
+        content.name.endswith((".lcc", ".lcc2")) or (b'"splats"' in text and b'"totalLevel"' in text)
+    ):
+        return f".lcc scenes are not read here; {convert}"
+    return ""
+
+
+def _refusal(content: Content) -> FileFormatError:
+    """The error for a file that is of no splat format."""
+    path = content.path
+    if content.name.endswith(".splat"):
+        return UnreadSplats(
+            f"{path}: named .splat, but not records of 32 bytes whose rotations are unit quaternions"
+            f" (it has {path.stat().st_size:,} bytes)"
+        )
+    if content.container == "html":
+        return UnreadSplats(f"{path}: {_page(path)}")
+    if content.container in _UNREAD:
+        return UnreadSplats(f"{path}: {_UNREAD[content.container]}")
+    if not content.is_obj and (what := foreign(path, content.head)):
+        return UnreadSplats(f"{path}: {what}")
+    return FileFormatError(
+        f"{path}: not a splat file of a known format, it begins with {content.head[:8]!r};"
+        f" expected {_expected()}"
+    )
 
 
 def _page(path: Path) -> str:
@@ -231,49 +157,47 @@ def _page(path: Path) -> str:
 def identify(path: Path) -> Literal["splats", "mesh", "cameras"]:
     """The kind of data at ``path``, by its content. Raises FileFormatError if it is none of the three.
 
-    Four kinds of file may hold either splats or a mesh: .ply, .glb and .gltf, and zip archives (.sog, .npz).
+    Some kinds of file may hold either splats or a mesh: .ply, .glb and .gltf, and zip archives (.sog, .npz).
     """
     if path.is_dir():
         return "splats"
-    content = Content(path)
-    try:
-        found: SplatFormat | None = content.splat_format()
-    except UnreadSplats:
-        raise
-    except FileFormatError:
-        found = None
-    if found == "ply":
-        return "splats" if is_float_splat(content.ply_header) else "mesh"
-    if content.container == "usd":
-        return "mesh"
-    if content.container == "zip":
-        if _holds_arrays(path):
+    with content_of(path) as content:
+        if content.member is None and content.is_archive and _holds_arrays(content):
             return "mesh"
-        if found is None:
-            content.splat_format()  # says what it is
-        return "splats"
-    if found == "gltf":
-        return "splats" if has_splats(path) else "mesh"
-    if content.is_obj:
+        try:
+            kind = splat_format(content)
+        except UnreadSplats:
+            raise
+        except FileFormatError:
+            return _without_splats(content)
+        if not kind.has_signature and (content.container == "usd" or content.is_obj):
+            return "mesh"
+        return "splats" if kind.reader.holds_splats(content) else "mesh"
+
+
+def _without_splats(content: Content) -> Literal["mesh", "cameras"]:
+    """As ``identify``, of a file that is of no splat format."""
+    if content.is_archive:
+        splat_format(content)  # says what it is
+    if content.container == "usd" or content.is_obj:
         return "mesh"
-    if found is not None:
-        return "splats"
     if content.is_text and content.container in ("json", "array"):
         return "cameras"
     content.refuse_empty()
-    if what := foreign(path, content.head):
-        raise FileFormatError(f"{path}: {what}")
+    if what := foreign(content.path, content.head):
+        raise FileFormatError(f"{content.path}: {what}")
     raise FileFormatError(
-        f"{path}: neither splats, a mesh nor cameras of a known format; it begins with {content.head[:8]!r}"
+        f"{content.path}: neither splats, a mesh nor cameras of a known format; it begins with"
+        f" {content.head[:8]!r}"
     )
 
 
-def _holds_arrays(path: Path) -> bool:
+def _holds_arrays(content: Content) -> bool:
     """Whether a zip archive is an .npz."""
-    if path.suffix.lower() == ".usdz":  # its reader says what to do
+    if content.path.suffix.lower() == ".usdz":  # its reader says what to do
         return True
     try:
-        return any(name.endswith(".npy") for name in Archive(path).names)
+        return any(name.endswith(".npy") for name in content.archive.names)
     except FileFormatError:
         # Broken: the name decides which reader says so.
-        return path.suffix.lower() == ".npz"
+        return content.path.suffix.lower() == ".npz"

@@ -8,95 +8,39 @@ quarter, and its geometric error says how far the merged ones lie from those of 
 from __future__ import annotations
 
 import json
-import math
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 
-from meshsplats._files.atomic import atomic_path, write_bytes, write_text
+from meshsplats._files.atomic import atomic_path
 from meshsplats._files.locks import locked
 from meshsplats._kinds import need, need_path
-from meshsplats._options import Range, check_options
 from meshsplats.camera import Camera
-from meshsplats.cameras.framing import DEFAULT_UP, unit_up, weighted_quantile
+from meshsplats.cameras.framing import DEFAULT_UP, unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cluster import Shared, Workers
-from meshsplats.conversion import Fans
-from meshsplats.conversion.budget import triangles_each
-from meshsplats.conversion.merging import FILTER_PX2, merge
-from meshsplats.conversion.options import ConversionOptions, Preset
-from meshsplats.conversion.streaming import ScenePixels, Survey, refuse_whole, survey, worth_drawing
+from meshsplats.conversion.driver import worth_drawing
+from meshsplats.conversion.options import ConversionOptions
+from meshsplats.conversion.streaming import Survey, survey
 from meshsplats.evaluation.viewers import SIDE, TRIANGLES, VIEWS, AlphaChoice, choose_by_views
-from meshsplats.formats.cutting import CUTOFF, cut_mesh
-from meshsplats.formats.gaussians import SplatStream
-from meshsplats.formats.gltf.writer import Alpha, change_alpha
-from meshsplats.formats.meshes import save_mesh
-from meshsplats.gaussians import GaussianCloud, Kernel
+from meshsplats.formats.gltf.writer import change_alpha
+from meshsplats.formats.streaming import SplatStream
 from meshsplats.mesh import SplatMesh
-from meshsplats.tiles.buckets import BUCKET, DEPTH, RECORD, Buckets, Cube, cloud_of, read_records, records_of
+from meshsplats.tiles.buckets import BUCKET, Buckets, Cube, records_of
 from meshsplats.tiles.drawing import choose_tiles, join_tiles
 from meshsplats.tiles.journal import Journal
-from meshsplats.tiles.tileset import Node, Tileset, tile_frame, tile_path, write_tilesets
+from meshsplats.tiles.making import SURVEY, TileWriter, build_cell, stored_survey
+from meshsplats.tiles.options import TileOptions
+from meshsplats.tiles.tileset import Node, Tileset, tile_path, write_tilesets
 
-TilesAlpha = Literal["auto", "blend", "mask", "opaque"]
-
-MAX_TRIANGLES = 1 << 16
-"""Triangles of a tile."""
-SHARE = 4
-"""Splats of the children for each one of an inner tile: surfaces, seen from twice as far, cover a quarter."""
-ERROR_SHARE = 0.99
-"""Share of the mass of an inner tile that its geometric error speaks for."""
 JOURNAL = Path("work", "journal.jsonl")
 """Inside the folder of an unfinished tileset."""
-SURVEY = "survey.npz"
-"""Beside the journal."""
-_MERGED = np.dtype([*RECORD.descr, ("spread", "<f8")])
-"""A splat of a tile; the variance of the centres of the file's splats around it, square scene units."""
-
-
-@dataclass(frozen=True)
-class TileOptions:
-    """Options of ``build_tiles``."""
-
-    max_triangles: Annotated[int, Range(1, math.inf)] = MAX_TRIANGLES
-    """Largest number of triangles of a tile."""
-    preset: Preset = "default"
-    """Preset of the conversion."""
-    conversion: ConversionOptions | None = None
-    """What to do otherwise than the preset does; not ``max_splats``, ``max_triangles``, ``detail='cameras'``,
-    ``colors='cameras'``, and of the footprints framing, distance and none."""
-    up: tuple[float, float, float] | None = None
-    """Direction that points up in the world frame. None: that of the splat files, where they name it, else
-    (0, -1, 0)."""
-    lit: bool = False
-    """A material that scene lights shade, instead of an unlit one."""
-    alpha: TilesAlpha = "auto"
-    """How viewers treat opacity, as in ``save_mesh``, the same in all tiles. auto: 'blend' or 'mask',
-    whichever is nearer to the sorted image in viewers that do not sort (``choose_alpha``), by images of the
-    tiles from around the scene."""
-    place: Literal["world", "local"] = "world"
-    """'world': the tileset stands at the origin of the splats, to which the transform of its root moves it;
-    'local': that transform is left out."""
-
-    def resolved(self) -> ConversionOptions:
-        """The checked options of the conversion. Raises ValueError."""
-        check_options(self)
-        chosen = (self.conversion or ConversionOptions()).resolved(self.preset, has_cameras=False)
-        refuse_whole(chosen)
-        if chosen.footprint == "filter":
-            raise ValueError("footprint='filter' is for this project's renderer, tiles are for others")
-        least = triangles_each(chosen)
-        if self.max_triangles < 8 * least:
-            raise ValueError(
-                f"max_triangles of a tile must be at least {8 * least}, got {self.max_triangles!r}"
-            )
-        return chosen
 
 
 @dataclass(frozen=True)
@@ -251,7 +195,7 @@ class _Build:
         for cell in done:
             ended(cell)
         todo = [(cell, buckets.paths(files)) for cell, files in cells.items() if cell not in done]
-        build = partial(_build_cell, self._tiles(self._workers.threads))
+        build = partial(build_cell, self._tiles(self._workers.threads))
         for i, count in self._workers.run(build, todo):
             cell = todo[i][0]
             done[cell] = count
@@ -317,8 +261,8 @@ class _Build:
         """Where the tileset stands in its world."""
         return self._source.origin if self._options.place == "world" else np.zeros(3)
 
-    def _tiles(self, threads: int | None) -> Shared[_Tiles]:
-        return Shared(partial(_Tiles, self._folder, self._options, threads))
+    def _tiles(self, threads: int | None) -> Shared[TileWriter]:
+        return Shared(partial(TileWriter, self._folder, self._options, threads))
 
     def _check_start(self) -> None:
         """Notes what the run is about, or refuses to resume another one."""
@@ -352,7 +296,7 @@ class _Build:
                 }
                 np.savez(temporary, **arrays)  # type: ignore[arg-type]
             self.journal.add("survey", kept=found.kept)
-        return _stored_survey(path)
+        return stored_survey(path)
 
     def _records(self) -> Iterator[np.ndarray]:
         passed = 0
@@ -362,206 +306,6 @@ class _Build:
             passed += len(block)
             if passed > np.iinfo(np.int32).max:
                 raise ValueError(f"{passed:,} splats are more than tiles can number")
-
-
-def _stored_survey(path: Path) -> Survey:
-    """The survey that a run has written."""
-    with np.load(path) as stored:
-        kept, step = (int(n) for n in stored["counts"])
-        low, high, origin = stored["bounds"]
-        kernel: Kernel = str(stored["kernel"])  # type: ignore[assignment]
-        return Survey(kept, kernel, low, high, cloud_of(stored["sample"], kernel), step, origin)
-
-
-def _build_cell(tiles: Shared[_Tiles], cell: tuple[str, list[Path]]) -> int:
-    """Writes the tiles of a cell of that key, with the splats of these files; their count."""
-    key, files = cell
-    records = read_records(files)
-    tiles.get().keep(key, *tiles.get().subtree(key, records))
-    return len(records)
-
-
-class _Tiles:
-    """Writes tiles into the folder of a run whose survey is done. Keeps nothing of them."""
-
-    def __init__(self, folder: Path, options: TileOptions, threads: int | None) -> None:
-        self._options, self._threads = options, threads
-        self._conversion = options.resolved()
-        self._work, self._out = folder / "work", folder / "tileset"
-        self._most = options.max_triangles // triangles_each(self._conversion)
-        self._up = unit_up(options.up or DEFAULT_UP)
-        self._frame = tile_frame(self._up)
-        scene = _stored_survey(self._work / SURVEY)
-        self._kernel = scene.kernel
-        self._pixels = ScenePixels(scene, self._conversion, None, self._up)
-        self._cube = Cube(scene.low, scene.high)
-
-    # -- cells in memory
-
-    def subtree(self, key: str, records: np.ndarray) -> tuple[list[Node], np.ndarray]:
-        """Writes the tiles of a cell; their nodes, its own last, and the splats that stand for it."""
-        codes = self._cube.codes(records["means"])
-        order = np.lexsort((records["row"], codes))
-        return self._tree(key, records[order], codes[order])
-
-    def _tree(self, key: str, records: np.ndarray, codes: np.ndarray) -> tuple[list[Node], np.ndarray]:
-        if len(records) <= self._most:
-            return self._leaf(key, records)
-        starts = self._starts(key, codes)
-        groups = self._groups(starts)
-        if len(groups) == 1:  # a cell with one child is that child
-            return self._tree(f"{key}{groups[0][0]}", records, codes)
-        nodes: list[Node] = []
-        children, parts = [], []
-        for octant, part in groups:
-            found, merged = self._tree(f"{key}{octant}", records[part], codes[part])
-            nodes += found
-            children.append(found[-1])
-            parts.append(merged)
-        node, merged = self._inner(key, children, parts)
-        return [*nodes, node], merged
-
-    def _groups(self, starts: np.ndarray) -> list[tuple[int, slice]]:
-        """The children of a cell: first octant and splats of each. Octants with few splats share a leaf."""
-        groups: list[tuple[int, slice]] = []
-        for octant in np.flatnonzero(np.diff(starts)):
-            begin, end = int(starts[octant]), int(starts[octant + 1])
-            if groups and end - groups[-1][1].start <= self._most:
-                groups[-1] = (groups[-1][0], slice(groups[-1][1].start, end))
-            else:
-                groups.append((int(octant), slice(begin, end)))
-        return groups
-
-    def _starts(self, key: str, codes: np.ndarray) -> np.ndarray:
-        """(9,) first splat of each octant of a cell whose ``codes`` are ascending, and their count."""
-        if len(key) >= DEPTH:
-            return np.arange(9) * len(codes) // 8
-        octants = (codes >> np.uint64(3 * (DEPTH - 1 - len(key)))) & np.uint64(7)
-        return np.searchsorted(octants, np.arange(9, dtype=np.uint64))
-
-    def _leaf(self, key: str, records: np.ndarray) -> tuple[list[Node], np.ndarray]:
-        records = records[np.argsort(records["row"], kind="stable")]
-        cloud = cloud_of(records, self._kernel)
-        node = self._write(key, cloud, records["row"], self._pixels.at(cloud.means), 0.0, [])
-        return [node], _merged_from(records)
-
-    def _inner(
-        self, key: str, children: Sequence[Node], parts: Sequence[np.ndarray]
-    ) -> tuple[Node, np.ndarray]:
-        """Writes the tile that stands for ``children``, which show the splats ``parts``."""
-        below = np.concatenate(list(parts))
-        below = below[np.argsort(below["row"], kind="stable")]
-        cloud = cloud_of(below, self._kernel)
-        count = max(1, min(self._most, -(-len(below) // SHARE)))
-        finest = max(child.error for child in children)
-        pixel = np.full(len(below), finest, np.float32)
-        if not finest:
-            own = self._pixels.at(cloud.means)
-            pixel = np.zeros_like(pixel) if own is None else own
-        result = merge(cloud, count, np.sqrt(FILTER_PX2) * pixel.astype(np.float64), threads=self._threads)
-        first = np.unique(result.group, return_index=True)[1]
-        rows = below["row"][first]
-        merged = _merged_from(records_of(result.cloud, rows))
-        weights, totals = _weights(result.group, result.masses)
-        away = np.square(cloud.means.astype(np.float64) - result.cloud.means[result.group]).sum(axis=1)
-        merged["spread"] = np.bincount(result.group, weights * (below["spread"] + away), len(rows))
-        apart = np.sqrt(merged["spread"])
-        # None counts for more than the whole tile: else one stray, of any size, would speak for all.
-        usual = np.quantile(cloud.means.astype(np.float64), (0.01, 0.99), axis=0)
-        totals = np.minimum(totals, float(np.ptp(usual, axis=0).max()) ** 2)
-        error = weighted_quantile(apart, totals, ERROR_SHARE) if totals.any() else float(apart.max())
-        error = max(error, finest)
-        size = None if self._pixels.is_none else np.full(len(rows), error, np.float32)
-        node = self._write(key, result.cloud, rows, size, error, [child.key for child in children], children)
-        return node, merged
-
-    def _write(
-        self,
-        key: str,
-        cloud: GaussianCloud,
-        rows: np.ndarray,
-        pixel: np.ndarray | None,
-        error: float,
-        children: list[str],
-        below: Sequence[Node] = (),
-    ) -> Node:
-        """Writes the mesh of a tile."""
-        fans = Fans.of(cloud, self._conversion, pixel)
-        vertices, faces, colors, owners = fans.build(cloud, rows, cloud.colors, self._conversion.compensation)
-        mesh = SplatMesh(vertices, faces, colors, face_splat=owners, up=self._up)
-        alpha: Alpha = "mask" if self._options.alpha == "auto" else self._options.alpha
-        if alpha == "opaque":
-            # A tile of nothing but fog keeps its densest part: glTF has no empty meshes.
-            mesh = cut_mesh(mesh, min(CUTOFF, 0.9 * float(colors[:, 3].max())))
-        path = self._out / tile_path(key)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lit = True if self._options.lit else None
-        save_mesh(mesh, path, lit=lit, alpha=None if alpha == "opaque" else alpha)
-        corners = mesh.vertices.astype(np.float64) @ self._frame.T
-        low = np.min([corners.min(axis=0), *(node.low for node in below)], axis=0)
-        high = np.max([corners.max(axis=0), *(node.high for node in below)], axis=0)
-        return Node(
-            key=key,
-            low=[float(x) for x in low],
-            high=[float(x) for x in high],
-            error=float(error),
-            splats=len(cloud),
-            triangles=len(mesh.faces),
-            vertices=len(mesh.vertices),
-            children=children,
-        )
-
-    # -- cells above those in memory
-
-    def keep(self, cell: str, nodes: list[Node], merged: np.ndarray) -> None:
-        """Files what is done of a cell, for the ones above it and for a resumed run."""
-        # Not by tofile, whose errors do not say that the disk is full.
-        write_bytes(self._merged(cell), merged.view(np.uint8).data)
-        write_text(
-            self._work / "done" / f"cell-{cell}.json", json.dumps([asdict(node) for node in nodes]) + "\n"
-        )
-
-    def _merged(self, cell: str) -> Path:
-        return self._work / "done" / f"cell-{cell}.merged"
-
-    def upper(self, cells: Sequence[str], journal: Journal) -> str:
-        """Writes the tiles above ``cells``, ascending; the cell that holds all of them."""
-        top = os.path.commonprefix(list(cells))  # noqa: RUF071 - a character is a level
-        if len(cells) == 1:
-            return top
-        parts = [
-            self.upper([cell for cell in cells if cell.startswith(top + octant)], journal)
-            for octant in sorted({cell[len(top)] for cell in cells})
-        ]
-        if top not in journal.keys("above"):
-            merged = [np.fromfile(self._merged(place), _MERGED) for place in parts]
-            node, own = self._inner(top, [self.root_of(place) for place in parts], merged)
-            self.keep(top, [node], own)
-            journal.add("above", key=top)
-        return top
-
-    def root_of(self, cell: str) -> Node:
-        """The uppermost tile of a cell that is done."""
-        nodes = json.loads((self._work / "done" / f"cell-{cell}.json").read_text(encoding="utf-8"))
-        return Node(**nodes[-1])
-
-
-def _merged_from(records: np.ndarray) -> np.ndarray:
-    """``records`` with a spread of 0."""
-    merged = np.zeros(len(records), _MERGED)
-    for name in RECORD.names or ():
-        merged[name] = records[name]
-    return merged
-
-
-def _weights(group: np.ndarray, masses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) share of each splat in the mass of its group, and (g,) masses of the groups. In a group without
-    mass, all members count alike."""
-    totals = np.bincount(group, masses)
-    sizes = np.bincount(group)
-    own = totals[group]
-    shares = np.divide(masses, own, out=np.zeros_like(masses), where=own > 0)
-    return np.where(own > 0, shares, 1 / sizes[group]), totals
 
 
 def _height(nodes: dict[str, Node], key: str) -> int:

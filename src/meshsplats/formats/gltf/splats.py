@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,14 @@ from meshsplats._origin import choose_origin, sampled, zero_origin
 from meshsplats.errors import DataWarning
 from meshsplats.formats._display import display_cloud, say_converted
 from meshsplats.formats._orientation import HALF_TURN_Z
+from meshsplats.formats.content import Content
 from meshsplats.formats.gltf.document import GltfDocument
 from meshsplats.formats.gltf.reader import objects_in
 from meshsplats.formats.gltf.scene import placed_meshes
+from meshsplats.formats.opened import Splats
+from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import CloudBuilder, joined_within
-from meshsplats.formats.splats.spz import read_spz
+from meshsplats.formats.splats.spz import spz_in_memory
 from meshsplats.gaussians import GaussianCloud
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -60,9 +64,40 @@ def read_splat_gltf(path: Path, *, strict: bool, origin: np.ndarray | None = Non
     return joined_within(clouds, document.budget)
 
 
-def has_splats(path: Path) -> bool:
+class _SplatGltf(Splats):
+    """The splats of a glTF file, which is read as a whole."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @cached_property
+    def _whole(self) -> GaussianCloud:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they come when it is read
+            return read_splat_gltf(self._path, strict=False)
+
+    def world_sample(self) -> np.ndarray:
+        return sampled(self._whole.means) + self._whole.origin
+
+    def chosen_origin(self) -> np.ndarray:
+        return self._whole.origin
+
+    def read(self, *, strict: bool, origin: np.ndarray | None = None) -> GaussianCloud:
+        return read_splat_gltf(self._path, strict=strict, origin=origin)
+
+    def blocks(self, size: int, *, strict: bool, origin: np.ndarray) -> Iterator[GaussianCloud]:
+        cloud = self.read(strict=strict, origin=origin).relative_to(origin)
+        for start in range(0, len(cloud), size):
+            yield cloud.take(np.arange(start, min(start + size, len(cloud))))
+
+
+def _matches(content: Content) -> bool:
+    return content.container == "glb" or b'"asset"' in content.json_text
+
+
+def _has_splats(content: Content) -> bool:
     """Whether a glTF file names the extension; a broken file raises FileFormatError."""
-    document = GltfDocument(path, also_known=_EXTENSIONS)
+    document = GltfDocument(content.path, also_known=_EXTENSIONS)
     return any(document.uses(name) for name in _EXTENSIONS)
 
 
@@ -80,8 +115,10 @@ def _cloud(document: GltfDocument, primitive: dict[str, Any], *, strict: bool) -
         if name in nested:
             view = _object(document, nested, name).get("bufferView")
             data, _ = document.view_bytes(view, name)
-            spz = read_spz(data, document.path, document.budget, strict=strict, origin=zero_origin())
-            return spz.cloud.transformed(HALF_TURN_Z @ spz.to_y_down)
+            spz = spz_in_memory(data, document.path, document.budget)
+            assert spz.to_y_down is not None  # every SPZ file has axes
+            cloud = spz.read(strict=strict, origin=zero_origin())
+            return cloud.transformed(HALF_TURN_Z @ spz.to_y_down)
     if (shape := splatting.get("kernel", "ellipse")) != "ellipse":
         warnings.warn(
             f"{document.path}: splats of the kernel {str(shape)[:40]!r}, which is not known here; they are"
@@ -139,3 +176,6 @@ def _object(document: GltfDocument, owner: dict[str, Any], key: str) -> dict[str
     if not isinstance(value, dict):
         raise document.error(f"{key} must be an object, got {str(value)[:40]}")
     return value
+
+
+READER = FormatReader(_matches, lambda content, _file, _reading: _SplatGltf(content.path), _has_splats)

@@ -15,9 +15,11 @@ import numpy as np
 
 from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.content import Content
 from meshsplats.formats.ply.header import Element, PlyHeader, origin_of_comments
-from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_of
+from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_in, up_of
 from meshsplats.formats.ply.table import RowReader
+from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
 from meshsplats.gaussians import SH_C0
 
@@ -36,8 +38,9 @@ def is_compressed_splat(header: PlyHeader) -> bool:
     return vertex is not None and "packed_position" in vertex.names
 
 
-def read_compressed_ply(file: BinaryIO, header: PlyHeader, where: object) -> SplatReader:
-    """The splats of an opened compressed .ply whose header has been read; errors as ``load_gaussians``."""
+def _open(content: Content, file: BinaryIO, _: Reading) -> SplatReader:
+    """The splats of an opened compressed .ply; errors as ``load_gaussians``."""
+    header, where = content.ply_header, content.path
     if header.encoding == "ascii":
         raise FileFormatError(f"{where}: compressed splats must be binary, this .ply is ASCII")
     vertex, chunk, sh = header.element("vertex"), header.element("chunk"), header.element("sh")
@@ -155,3 +158,10 @@ def _require(element: Element, names: Sequence[str], kind: str, where: object) -
                 f"{where}: compressed splats need the property {name!r} of type {_TYPES[kind]} in element"
                 f" {element.name!r}"
             )
+
+
+def _matches(content: Content) -> bool:
+    return content.is_ply and is_compressed_splat(content.ply_header)
+
+
+READER = FormatReader(_matches, _open, up=up_in)

@@ -20,6 +20,7 @@ from typing import BinaryIO
 import numpy as np
 
 from meshsplats.errors import DataWarning
+from meshsplats.formats.content import Content
 from meshsplats.formats.ply.header import PlyHeader
 from meshsplats.formats.ply.table import FloatTable
 from meshsplats.gaussians import Kernel
@@ -42,6 +43,12 @@ def kernel_of_comments(comments: tuple[str, ...]) -> Kernel:
         spelt[words] for c in comments if (words := " ".join(c.lower().replace(":", " ").split())) in spelt
     ]
     return found[-1] if found else "3dgs"
+
+
+def up_in(content: Content) -> np.ndarray | None:
+    """``up_of`` the file ``content``."""
+    with content.open() as file:
+        return up_of(file, content.ply_header, content.path)
 
 
 def up_of(file: BinaryIO, header: PlyHeader, where: object) -> np.ndarray | None:

@@ -25,11 +25,14 @@ from meshsplats._files.atomic import atomic_path
 from meshsplats._origin import zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats import _activation
+from meshsplats.formats.content import Content
 from meshsplats.formats.ply.activated import SAMPLE, Activated, harmonics_of, span_of, suspects, warn_of
+from meshsplats.formats.ply.compressed_splats import is_compressed_splat
 from meshsplats.formats.ply.header import Element, PlyHeader, origin_comments, origin_of_comments
 from meshsplats.formats.ply.motion import Motion, motion_of
-from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_of
+from meshsplats.formats.ply.notes import is_linear, kernel_of_comments, up_in, up_of
 from meshsplats.formats.ply.table import CHUNK_BYTES, POSITION, FloatTable
+from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
 from meshsplats.gaussians import GaussianCloud, Kernel
 
@@ -101,16 +104,10 @@ def is_float_splat(header: PlyHeader) -> bool:
     return bool(marks & set(element.names))
 
 
-def read_float_ply(
-    file: BinaryIO,
-    header: PlyHeader,
-    where: object,
-    *,
-    time: float | None = None,
-    activated: Sequence[Activated] = (),
-) -> SplatReader:
-    """The splats of an opened .ply whose header has been read; arguments, errors and warnings as
-    ``load_gaussians``."""
+def _open(content: Content, file: BinaryIO, reading: Reading) -> SplatReader:
+    """The splats of an opened .ply; errors and warnings as ``load_gaussians``."""
+    header, where = content.ply_header, content.path
+    time, activated = reading.time, reading.activated
     element = header.element("vertex")
     if element is None:
         raise FileFormatError(
@@ -127,13 +124,13 @@ def read_float_ply(
         instant = _instant(table, columns.motion, time, where)
     index = {name: i for i, name in enumerate(table.names)}
     spans = _spans(table, columns, activated)
-    reading = _Reading(columns, index, _Sample(element.count), tuple(activated), spans, instant)
+    values = _Layout(columns, index, _Sample(element.count), activated, spans, instant)
     return SplatReader(
         element.count,
         columns.coefficients,
         kernel,
         where,
-        partial(_chunks, table, reading, where),
+        partial(_chunks, table, values, where),
         table.sample,
         table.positions_are_float32,
         origin_of_comments(header.comments, where),
@@ -143,13 +140,15 @@ def read_float_ply(
     )
 
 
-def motion_in(file: BinaryIO, header: PlyHeader, where: object) -> tuple[str, float, float] | None:
+def _motion(content: Content) -> tuple[str, float, float] | None:
     """Name of the layout, first and last time of the splats that move in a .ply; None for splats at rest."""
+    header, where = content.ply_header, content.path
     element = header.element("vertex")
     motion = motion_of(element.names, where) if element is not None and is_float_splat(header) else None
     if element is None or motion is None:
         return None
-    times = _times(FloatTable(file, header, element, (motion.time,), where), motion, where)
+    with content.open() as file:
+        times = _times(FloatTable(file, header, element, (motion.time,), where), motion, where)
     return motion.name, float(times[0]), float(times[-1])
 
 
@@ -212,7 +211,7 @@ class _Sample:
 
 
 @dataclass(frozen=True)
-class _Reading:
+class _Layout:
     """How the columns of a file are read."""
 
     columns: _Columns
@@ -226,7 +225,7 @@ class _Reading:
 
 
 def _chunks(
-    table: FloatTable, reading: _Reading, where: object, origin: np.ndarray
+    table: FloatTable, reading: _Layout, where: object, origin: np.ndarray
 ) -> Iterator[tuple[int, Fill]]:
     table.origin = origin
     for chunk in table.chunks():
@@ -237,7 +236,7 @@ def _chunks(
     warn_of({name: span for name, span in found.items() if name not in reading.activated}, where)
 
 
-def _fill(chunk: np.ndarray, reading: _Reading, rows: SplatRows) -> None:
+def _fill(chunk: np.ndarray, reading: _Layout, rows: SplatRows) -> None:
     columns, index = reading.columns, reading.index
 
     def take(names: Sequence[str], out: np.ndarray) -> None:
@@ -372,3 +371,11 @@ def write_float_blocks(
             written += len(cloud)
         if written != count:
             raise ValueError(f"{path}: {written:,} splats came for a file of {count:,}")
+
+
+def _matches(content: Content) -> bool:
+    """Whether it is a .ply without packed splats. Of a mesh, the reader says what is missing."""
+    return content.is_ply and not is_compressed_splat(content.ply_header)
+
+
+READER = FormatReader(_matches, _open, lambda content: is_float_splat(content.ply_header), up_in, _motion)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from meshsplats._origin import choose_origin, zero_origin
 from meshsplats.errors import DataWarning, FileFormatError
 from meshsplats.formats._validation import Budget, warn_of_lost_detail
+from meshsplats.formats.opened import Splats
 from meshsplats.gaussians import GaussianCloud, Kernel
 
 
@@ -32,12 +33,13 @@ Chunks = Callable[[np.ndarray], Iterator[tuple[int, Fill]]]
 of each chunk, and what reads them."""
 
 
-@dataclass(frozen=True)
-class SplatReader:
-    """The splats of an opened file, ready to be read once, as a whole or in blocks.
+def _nothing() -> None:
+    pass
 
-    Origins are in the frame of the file.
-    """
+
+@dataclass(frozen=True)
+class SplatReader(Splats):
+    """Splats that are read chunk by chunk."""
 
     count: int
     """Count of the splats that the file declares."""
@@ -54,19 +56,23 @@ class SplatReader:
     origin: np.ndarray | None = None
     """The origin that the file names, which its positions are relative to."""
     up: np.ndarray | None = None
-    """(3,) direction that points up in the axes of the file, where it says so."""
     linear: bool = False
-    """Whether its colours are linear, not display values."""
     instant: float | None = None
-    """The time at which they are shown, of splats that move."""
+    to_y_down: np.ndarray | None = None
+    close_files: Callable[[], None] = _nothing
+    """Closes the files that ``chunks`` reads, where the reader has opened them."""
+
+    def close(self) -> None:
+        self.close_files()
+
+    def with_kernel(self, kernel: Kernel) -> SplatReader:
+        return replace(self, kernel=kernel)
 
     def world_sample(self) -> np.ndarray:
-        """``positions``, in the world."""
         return self.positions() if self.origin is None else self.positions() + self.origin
 
     def chosen_origin(self) -> np.ndarray:
-        """The origin of the file; else the one that suits its positions, with a DataWarning for a file that
-        has lost detail."""
+        """As in ``Splats``, with a DataWarning for a file that has lost detail."""
         if self.origin is not None:
             return self.origin
         if not self.count:
@@ -77,8 +83,6 @@ class SplatReader:
         return choose_origin(sample)
 
     def read(self, *, strict: bool, origin: np.ndarray | None = None) -> GaussianCloud:
-        """All splats, relative to ``origin``, by default ``chosen_origin``; errors and warnings as
-        ``load_gaussians``, which must be the caller."""
         origin = self.chosen_origin() if origin is None else origin
         builder = self._builder(origin)
         for m, fill in self.chunks(self._shift(origin)):
@@ -87,9 +91,7 @@ class SplatReader:
             builder.keep(rows)
         return builder.finish(self.kernel, strict=strict)
 
-    def blocks(self, size: int, *, strict: bool, origin: np.ndarray | None = None) -> Iterator[GaussianCloud]:
-        """The same splats in blocks of about ``size``."""
-        origin = self.chosen_origin() if origin is None else origin
+    def blocks(self, size: int, *, strict: bool, origin: np.ndarray) -> Iterator[GaussianCloud]:
         builder: CloudBuilder | None = None
         for m, fill in self.chunks(self._shift(origin)):
             if builder is None:

@@ -16,6 +16,8 @@ import numpy as np
 
 from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError
+from meshsplats.formats.content import Content
+from meshsplats.formats.reading import FormatReader, Reading
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows
 from meshsplats.gaussians import SH_C0
 
@@ -25,8 +27,13 @@ _RUN = 16
 """Records that lie together in a sample of positions."""
 
 
-def is_dot_splat(file: BinaryIO) -> bool:
+def _matches(content: Content) -> bool:
     """Whether the file can be `.splat`: whole records, and nine in ten of a sample have unit rotations."""
+    with content.open() as file:
+        return _is_dot_splat(file)
+
+
+def _is_dot_splat(file: BinaryIO) -> bool:
     size = file.seek(0, io.SEEK_END)
     if size == 0 or size % _RECORD.itemsize:
         return False
@@ -39,8 +46,9 @@ def is_dot_splat(file: BinaryIO) -> bool:
     return bool((np.abs(np.linalg.norm(rotations, axis=1) - 1) < 0.05).mean() >= 0.9)
 
 
-def read_dot_splat(file: BinaryIO, where: object) -> SplatReader:
-    """The splats of an opened file for which ``is_dot_splat`` holds; errors as ``load_gaussians``."""
+def _open(content: Content, file: BinaryIO, _: Reading) -> SplatReader:
+    """The splats of an opened file that ``_matches``; errors as ``load_gaussians``."""
+    where = content.path
     count = file.seek(0, io.SEEK_END) // _RECORD.itemsize
     positions = partial(_sample, file, count)
     return SplatReader(count, 1, "3dgs", where, partial(_chunks, file, count, where), positions)
@@ -79,3 +87,6 @@ def _fill(records: np.ndarray, origin: np.ndarray, rows: SplatRows) -> None:
 def _rotations(records: np.ndarray) -> np.ndarray:
     # Writers truncate 128 + 128 q to an integer: the middle of that step lies half a unit higher.
     return (records["rotation"] - np.float32(127.5)) / np.float32(127.5)
+
+
+READER = FormatReader(_matches, _open)

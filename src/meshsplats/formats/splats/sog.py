@@ -11,8 +11,7 @@ import io
 import os
 import re
 import warnings
-import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -20,17 +19,20 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from meshsplats._foreign import BROKEN_ZIP
 from meshsplats._json import json_object
 from meshsplats._origin import SAMPLE
 from meshsplats.errors import FileFormatError, MissingDependencyError
 from meshsplats.formats._validation import Budget
-from meshsplats.formats.sniff import Content
+from meshsplats.formats._zipped import Archive
+from meshsplats.formats.content import Content
+from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import Fill, SplatReader, SplatRows, decode_smallest_three
 from meshsplats.gaussians import Kernel
 
 T = TypeVar("T")
 _MAX_META_BYTES = 4 << 20
+_SECTIONS = (b'"means"', b'"quats"', b'"sh0"')
+"""Words of every meta.json."""
 _MAX_SPLATS = 1 << 28
 _AT_ONCE = 1 << 16
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
@@ -38,29 +40,41 @@ _PALETTE_COLUMNS = 64
 """Palette entries of harmonics in each row of their image."""
 
 
-def read_sog(path: Path, budget: Budget, ranges: Sequence[tuple[int, int]] | None = None) -> SplatReader:
-    """The splats of a `.sog` archive, or of the folder of the meta.json ``path``; errors as
-    ``load_gaussians``.
+def read_sog(
+    content: Content, budget: Budget, ranges: Sequence[tuple[int, int]] | None = None
+) -> SplatReader:
+    """The splats of a `.sog` archive, or of the folder of a meta.json; errors as ``load_gaussians``.
 
     Images are unpacked as a whole, 4 bytes for each splat and image. ``ranges`` selects splats by first and
     end; ranges may overlap. None selects all.
     """
-    return _opened(path, budget, lambda reader: reader.read(ranges))
+    return _reader(content, budget).read(ranges)
 
 
 def sog_corners(path: Path) -> np.ndarray:
     """(2, 3) float64: the least and the greatest coordinates of the splats that ``read_sog`` reads."""
-    return _opened(path, Budget(path), _Reader.corners)
+    with Content(path) as content:
+        return _reader(content, Budget(path)).corners()
 
 
-def _opened(path: Path, budget: Budget, read: Callable[[_Reader], T]) -> T:
-    if Content(path).container != "zip":
-        return read(_Reader(_Folder(path.parent, path, budget), path, budget))
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return read(_Reader(_Archive(archive, path), path, budget))
-    except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path}: a broken zip archive (truncated?): {error}") from None
+def _reader(content: Content, budget: Budget) -> _Reader:
+    path = content.path
+    files = _Archive(content.archive) if content.is_archive else _Folder(path.parent, path, budget)
+    return _Reader(files, path, budget)
+
+
+def _matches(content: Content) -> bool:
+    if content.is_archive:
+        try:
+            return content.archive.has_meta
+        except FileFormatError:  # broken: the reader says so
+            return True
+    text = content.json_text
+    if all(name in text for name in _SECTIONS):  # some name their generator in an asset, as glTF does
+        return True
+    return b'"means"' in text and not any(
+        name in text for name in (b'"lodLevels"', b'"asset"', b'"totalLevel"')
+    )
 
 
 class _Folder:
@@ -84,39 +98,28 @@ class _Folder:
 class _Archive:
     """Files in a zip archive, beside its meta.json."""
 
-    def __init__(self, archive: zipfile.ZipFile, path: Path) -> None:
-        self._archive, self._path = archive, path
-        self._names = set(archive.namelist())
+    def __init__(self, archive: Archive) -> None:
+        self._archive, self._names = archive, set(archive.names)
         metas = [n for n in self._names if n.rsplit("/", 1)[-1] == "meta.json"]
         if not metas:
             listed = ", ".join(sorted(self._names)[:5])[:200]
             raise FileFormatError(
-                f"{path}: a zip archive without meta.json is no SOG file (it holds {listed})"
+                f"{archive.path}: a zip archive without meta.json is no SOG file (it holds {listed})"
             )
         self._meta = min(metas, key=lambda n: (n.count("/"), n))
         # Images are compressed already: more than this is a decompression bomb.
-        self._limit = (16 << 20) + 4 * os.stat(path).st_size
+        self._limit = (16 << 20) + 4 * os.stat(archive.path).st_size
 
     def read_meta(self) -> bytes:
-        return self._bytes(self._meta, _MAX_META_BYTES)
+        return self._archive.bytes(self._meta, _MAX_META_BYTES)
 
     def read(self, name: str) -> bytes:
         full = self._meta[: -len("meta.json")] + name
         if full not in self._names:
             raise FileFormatError(
-                f"{self._path}: the file {name!r} that meta.json names is not in the archive"
+                f"{self._archive.path}: the file {name!r} that meta.json names is not in the archive"
             )
-        return self._bytes(full, self._limit)
-
-    def _bytes(self, name: str, limit: int) -> bytes:
-        try:
-            with self._archive.open(name) as file:
-                data = file.read(limit + 1)
-        except BROKEN_ZIP as e:
-            raise FileFormatError(f"{self._path}: cannot unpack {name[:60]!r}: {str(e)[:120]}") from None
-        if len(data) > limit:
-            raise FileFormatError(f"{self._path}: {name[:60]!r} unpacks to over {limit:,} bytes; refused")
-        return data
+        return self._archive.bytes(full, self._limit)
 
 
 class _Reader:
@@ -379,3 +382,6 @@ def _positions(images: Sequence[np.ndarray], ends: tuple[np.ndarray, np.ndarray]
 def _between(range_: tuple[np.ndarray, np.ndarray], pixels: np.ndarray) -> np.ndarray:
     least, most = range_
     return (least + (most - least) * (pixels / np.float64(255))).astype(np.float32)
+
+
+READER = FormatReader(_matches, lambda content, _file, _reading: read_sog(content, Budget(content.path)))

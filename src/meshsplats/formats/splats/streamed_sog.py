@@ -15,8 +15,12 @@ from typing import Any
 import numpy as np
 
 from meshsplats._json import json_object
+from meshsplats._origin import choose_origin
 from meshsplats.errors import FileFormatError
 from meshsplats.formats._validation import Budget
+from meshsplats.formats.content import Content
+from meshsplats.formats.opened import Splats
+from meshsplats.formats.reading import FormatReader
 from meshsplats.formats.splats._cloud_builder import SplatReader, joined_within
 from meshsplats.formats.splats.sog import read_sog, sog_corners
 from meshsplats.gaussians import GaussianCloud, Kernel
@@ -26,48 +30,60 @@ _MAX_DEPTH = 64
 _PATH = re.compile(r"[^/\\:\0]{1,255}(/[^/\\:\0]{1,255}){0,7}")
 
 
-def read_streamed_sog(path: Path, *, strict: bool, origin: np.ndarray) -> GaussianCloud:
-    """The splats of the index ``path`` at the finest level of each leaf, and those of its environment,
-    relative to ``origin``; errors as ``load_gaussians``."""
-    budget = Budget(path)
-    parts = []
-    for name, part, own in streamed_parts(path):
-        cloud = part.read(strict=strict, origin=origin)
-        budget.extend(own.file_bytes)
-        budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
-        parts.append(cloud)
-    return joined_within(parts, budget)
+class StreamedSog(Splats):
+    """The splats of the index ``path`` at the finest level of each leaf, and those of its environment."""
 
+    def __init__(self, path: Path) -> None:
+        self._path = path
 
-def streamed_corners(path: Path) -> np.ndarray:
-    """(2 n, 3) float64: the least and the greatest coordinates of each of the n parts; from their meta.json,
-    so that no image is unpacked. Parts that cannot be read are left out: reading them says why."""
-    found = [np.empty((0, 3))]
-    for name in _Index(path).parts():
-        with suppress(FileFormatError, FileNotFoundError):
-            found.append(sog_corners(path.parent / name))
-    return np.concatenate(found)
+    def world_sample(self) -> np.ndarray:
+        """(2 n, 3) float64: the least and the greatest coordinates of each of the n parts; from their
+        meta.json, so that no image is unpacked. Parts that cannot be read are left out: reading them says
+        why."""
+        found = [np.empty((0, 3))]
+        for name in _Index(self._path).parts():
+            with suppress(FileFormatError, FileNotFoundError):
+                found.append(sog_corners(self._path.parent / name))
+        return np.concatenate(found)
 
+    def chosen_origin(self) -> np.ndarray:
+        return choose_origin(self.world_sample())
 
-def streamed_parts(path: Path) -> Iterator[tuple[str, SplatReader, Budget]]:
-    """Name, splats and budget of each part of the index ``path``, at the finest level of each leaf; only one
-    part at a time is in memory. Errors as ``load_gaussians``."""
-    kernels: set[Kernel] = set()
-    for name, ranges in _Index(path).parts().items():
-        part = path.parent / name
-        if not part.is_file():
-            raise FileFormatError(f"{path}: the part {name!r} that it names is missing")
-        # Only the splats stay in memory after a part has been read.
-        own = Budget(part)
-        reader = read_sog(part, own, ranges)
-        kernels.add(reader.kernel)
-        if len(kernels) > 1:
-            raise FileFormatError(
-                f"{path}: its parts are of several kinds of splats: {', '.join(sorted(kernels))}"
-            )
-        yield name, reader, own
-    if not kernels:
-        raise FileFormatError(f"{path}: no splats, its tree has none")
+    def read(self, *, strict: bool, origin: np.ndarray | None = None) -> GaussianCloud:
+        origin = self.chosen_origin() if origin is None else origin
+        budget = Budget(self._path)
+        clouds = []
+        for name, part, own in self._parts():
+            cloud = part.read(strict=strict, origin=origin)
+            budget.extend(own.file_bytes)
+            budget.spend(4 * (11 + 3 * cloud.sh.shape[1]) * len(cloud), f"the splats of {name!r}")
+            clouds.append(cloud)
+        return joined_within(clouds, budget)
+
+    def blocks(self, size: int, *, strict: bool, origin: np.ndarray) -> Iterator[GaussianCloud]:
+        for _, part, _ in self._parts():
+            yield from part.blocks(size, strict=strict, origin=origin)
+
+    def _parts(self) -> Iterator[tuple[str, SplatReader, Budget]]:
+        """Name, splats and budget of each part; only one part at a time is in memory."""
+        path = self._path
+        kernels: set[Kernel] = set()
+        for name, ranges in _Index(path).parts().items():
+            part = path.parent / name
+            if not part.is_file():
+                raise FileFormatError(f"{path}: the part {name!r} that it names is missing")
+            # Only the splats stay in memory after a part has been read.
+            own = Budget(part)
+            with Content(part) as content:
+                reader = read_sog(content, own, ranges)
+            kernels.add(reader.kernel)
+            if len(kernels) > 1:
+                raise FileFormatError(
+                    f"{path}: its parts are of several kinds of splats: {', '.join(sorted(kernels))}"
+                )
+            yield name, reader, own
+        if not kernels:
+            raise FileFormatError(f"{path}: no splats, its tree has none")
 
 
 class _Index:
@@ -139,3 +155,9 @@ class _Index:
 
     def _error(self, message: str) -> FileFormatError:
         return FileFormatError(f"{self._path}: {message}")
+
+
+READER = FormatReader(
+    lambda content: b'"lodLevels"' in content.json_text,
+    lambda content, _file, _reading: StreamedSog(content.path),
+)

@@ -1,0 +1,152 @@
+"""The table of splat formats: whatever depends on which formats there are, follows from it.
+
+A new format is one module, with a ``READER`` (``reading.FormatReader``), and one line in ``FORMATS``. The
+modules are imported when they are first used, so that names alone cost nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from meshsplats.formats.reading import FormatReader
+
+
+@dataclass(frozen=True)
+class SplatFormat:
+    """A format of splat files."""
+
+    name: str
+    """As ``info`` and messages say it."""
+    suffixes: tuple[str, ...]
+    """How names of its files end; others may share them. The content decides when a file is read."""
+    module: str
+    """The module below ``meshsplats.formats`` that holds its ``READER``."""
+    description: str
+    """For the table in README.md."""
+    in_memory: str
+    """What of a file is in memory while it is read in blocks; for the table in docs/tiles.md."""
+    zipped: tuple[str, ...] = ()
+    """Suffixes that are looked for in zip archives."""
+    folder_file: str = ""
+    """Name of the file that a folder of this format is read by."""
+    y_up: bool = False
+    """Whether y points up in its files; ``half_turn`` then leads to y down."""
+    half_turn: Literal["x", "z"] = "x"
+    """Axis of the half turn from y up to y down."""
+    takes: tuple[str, ...] = ()
+    """Which of the options 'time' and 'activated' of ``load_gaussians`` have a meaning for it."""
+    has_signature: bool = True
+    """False: files without a mark, which are tried last."""
+
+    @cached_property
+    def reader(self) -> FormatReader:
+        """What reads its files."""
+        found: FormatReader = import_module(f"meshsplats.formats.{self.module}").READER
+        return found
+
+
+FORMATS: tuple[SplatFormat, ...] = (
+    SplatFormat(
+        "ply",
+        (".ply", ".ply.gz"),
+        "ply.splats",
+        "float `.ply` of 3DGS, 2DGS, SuGaR, GaMeS-flat, Mip-Splatting and others: any property order,"
+        " spherical harmonics of degree 0 to 3, ASCII or binary of either byte order, also gzipped; Spacetime"
+        " and 4D Gaussians at one instant",
+        "a block",
+        zipped=(".ply",),
+        takes=("activated", "time"),
+    ),
+    SplatFormat(
+        "compressed.ply",
+        (".compressed.ply", ".compressed.ply.gz"),
+        "ply.compressed_splats",
+        "PlayCanvas compressed `.ply`",
+        "a block",
+        zipped=(".ply",),
+    ),
+    SplatFormat(
+        "splat",
+        (".splat",),
+        "splats.dot_splat",
+        "`.splat`",
+        "a block",
+        zipped=(".splat",),
+        has_signature=False,
+    ),
+    SplatFormat(
+        "spz",
+        (".spz",),
+        "splats.spz",
+        "SPZ",
+        "a block; attributes lie one after the other and are unpacked side by side, in versions 1 to 3 twice",
+        zipped=(".spz",),
+        y_up=True,
+    ),
+    SplatFormat(
+        "sog",
+        (".sog",),
+        "splats.sog",
+        "SOG",
+        "24 bytes a splat: an image can only be unpacked as a whole",
+        folder_file="meta.json",
+    ),
+    SplatFormat(
+        "streamed sog",
+        (),
+        "splats.streamed_sog",
+        "streamed SOG (`lod-meta.json`, the finest level)",
+        "one part at a time",
+        folder_file="lod-meta.json",
+    ),
+    SplatFormat(
+        "gltf",
+        (".glb", ".gltf"),
+        "gltf.splats",
+        "glTF with KHR_gaussian_splatting",
+        "the whole file",
+        y_up=True,
+        half_turn="z",
+    ),
+)
+"""The formats, in the order of the documents. The first one that matches a file counts."""
+
+
+def splat_suffixes() -> tuple[str, ...]:
+    """How the names of splat files end, wherever names decide: which files of a folder are read."""
+    return _shortest([suffix for format_ in FORMATS for suffix in format_.suffixes])
+
+
+def zipped_suffixes() -> tuple[str, ...]:
+    """How the names of splat files in zip archives end."""
+    return _shortest([suffix for format_ in FORMATS for suffix in format_.zipped])
+
+
+def double_suffixes() -> tuple[str, ...]:
+    """Suffixes of two or more parts, such as '.ply.gz'."""
+    return tuple(suffix for format_ in FORMATS for suffix in format_.suffixes if suffix.count(".") > 1)
+
+
+def folder_files() -> tuple[str, ...]:
+    """Names of the files that folders are read by."""
+    return tuple(format_.folder_file for format_ in FORMATS if format_.folder_file)
+
+
+def listed(suffixes: tuple[str, ...], last: str = "or") -> str:
+    """'.ply, .spz or .splat'."""
+    return f"{', '.join(suffixes[:-1])} {last} {suffixes[-1]}" if len(suffixes) > 1 else "".join(suffixes)
+
+
+def y_up_suffixes() -> tuple[str, ...]:
+    """Suffixes of the formats whose y axis points up."""
+    return tuple(suffix for format_ in FORMATS if format_.y_up for suffix in format_.suffixes)
+
+
+def _shortest(suffixes: list[str]) -> tuple[str, ...]:
+    """``suffixes`` without repetitions and without those that end in another one."""
+    found = dict.fromkeys(suffixes)
+    return tuple(s for s in found if not any(s != other and s.endswith(other) for other in found))
