@@ -17,10 +17,10 @@ import pytest
 from _photographs import write_photographs
 
 import meshsplats
+from meshsplats import _toml as toml
 from meshsplats import cli, demo_scene
 from meshsplats._core import library
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import toml
 from meshsplats.errors import MissingDependencyError
 from meshsplats.formats.gaussians import load_gaussians
 from meshsplats.rendering import render_splats

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from _splats import few_splats
 
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.cli.batch import jobs
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare

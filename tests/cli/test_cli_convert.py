@@ -14,9 +14,10 @@ from conftest import make_link, words_of
 from PIL import Image
 
 import meshsplats
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import common, main, toml
+from meshsplats.cli import common, main
 from meshsplats.conversion import convert, simplify
 from meshsplats.evaluation.comparison import compare
 from meshsplats.evaluation.metrics import psnr

@@ -16,10 +16,11 @@ import pytest
 from _photographs import write_photographs
 from conftest import words_of
 
+from meshsplats import _toml as toml
 from meshsplats._files.locks import locked
 from meshsplats.cameras.files import load_cameras, save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.cli.finetune import Finetune
 from meshsplats.cli.targets import TargetOptions
 from meshsplats.conversion import convert

@@ -14,9 +14,10 @@ import urllib.request
 import numpy as np
 import pytest
 
+from meshsplats import _toml as toml
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
-from meshsplats.cli import main, toml, view
+from meshsplats.cli import main, view
 from meshsplats.conversion import convert
 from meshsplats.demo_scene import make_scene
 from meshsplats.formats.gaussians import save_gaussians

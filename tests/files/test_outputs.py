@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from _splats import few_splats
 
+from meshsplats import _toml as toml
 from meshsplats._files import atomic
 from meshsplats._files.atomic import (
     atomic_path,
@@ -31,7 +32,7 @@ from meshsplats._files.atomic import (
     write_bytes,
 )
 from meshsplats._files.locks import lock_of, locked
-from meshsplats.cli import main, toml
+from meshsplats.cli import main
 from meshsplats.demo_scene import make_scene
 from meshsplats.errors import DataWarning
 from meshsplats.formats.gaussians import save_gaussians

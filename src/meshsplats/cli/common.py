@@ -20,13 +20,13 @@ from meshsplats._arrays import subsample
 from meshsplats._core.library import processors
 from meshsplats._origin import in_words, lost_detail, sampled
 from meshsplats.camera import MAX_SIDE, Camera
-from meshsplats.cameras.files import load_cameras
-from meshsplats.cameras.framing import guess_up, warn_of_strays
+from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cameras.framing import guess_up, warn_of_strays_in
 from meshsplats.cameras.trajectories import dome, look_around, orbit
 from meshsplats.cli.messages import UsageError, flag, one_line, say, shown_path
 from meshsplats.cluster import Workers, open_workers
 from meshsplats.datasets.views import WHITE, Dataset
-from meshsplats.errors import DataWarning, FileFormatError
+from meshsplats.errors import FileFormatError
 from meshsplats.evaluation.backgrounds import Background
 from meshsplats.formats.sniff import identify
 from meshsplats.gaussians import GaussianCloud
@@ -91,29 +91,18 @@ class SplatOptions:
     strict: bool = False
     """Refuse files with splats that are not finite; by default these are left out with a warning."""
 
-    def load(
-        self,
-        path: Path,
-        origin: np.ndarray | None = None,
-        *,
-        up: str | None = None,
-        quiet: bool = False,
-    ) -> GaussianCloud:
-        """The splats of a file, relative to ``origin``. Says what its header names, unless ``quiet``; ``up``:
-        the option that counts in its place."""
+    def load(self, path: Path, origin: np.ndarray | None = None, *, up: str | None = None) -> GaussianCloud:
+        """The splats of a file, relative to ``origin``. Says what its header names; ``up``: the option that
+        counts in its place."""
         from meshsplats.formats.gaussians import load_gaussians
 
         try:
-            cloud = load_gaussians(path, origin=origin, **self._arguments)
+            cloud = load_gaussians(path, origin=origin, **self.arguments)
         except FileFormatError:
             if identify(path) == "mesh":
                 raise FileFormatError(f"{path}: a mesh, not splats") from None
             raise
-        if len(cloud):
-            size = float(cloud.scales.max())
-            warn_of_strays(cloud, cloud.means.min(axis=0), cloud.means.max(axis=0), size)
-        if quiet:
-            return cloud
+        warn_of_strays_in(cloud)
         if up is None and cloud.up is not None:
             say(f"up: {direction_in_words(cloud.up)}, from the file's header")
         if self.kernel == "auto" and cloud.kernel != "3dgs":
@@ -126,7 +115,7 @@ class SplatOptions:
         """The splats of a file, or of several, in blocks, relative to ``origin``; ``up`` as for ``load``."""
         from meshsplats.formats.gaussians import stream_gaussians
 
-        stream = stream_gaussians(path, origin=origin, **self._arguments)
+        stream = stream_gaussians(path, origin=origin, **self.arguments)
         if up is None and (told := stream.up) is not None:
             say(f"up: {direction_in_words(told)}, from the files' headers")
         return stream
@@ -143,7 +132,8 @@ class SplatOptions:
         return {f.name for f in fields(self) if getattr(self, f.name) != f.default}
 
     @property
-    def _arguments(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
+        """Those of ``load_gaussians``."""
         return {
             "strict": self.strict,
             "axes": self.axes,
@@ -407,20 +397,8 @@ def load_scene(path: Path, reading: SplatOptions, *, up: str | None = None) -> G
     from meshsplats.formats.meshes import load_mesh
 
     mesh = load_mesh(path)
-    if len(mesh.vertices):
-        warn_of_strays(mesh, mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), 0.0)
+    warn_of_strays_in(mesh)
     return mesh
-
-
-def cameras_beside(source: Path, origin: np.ndarray) -> list[Camera] | None:
-    """The training cameras in a model folder, relative to ``origin``, or None."""
-    if not (source / "cameras.json").is_file():
-        return None
-    try:
-        return load_cameras(source, origin=origin)
-    except FileFormatError as error:
-        warnings.warn(f"{error}; the cameras of the model folder are not used", DataWarning, stacklevel=2)
-        return None
 
 
 def chosen_background(

@@ -18,7 +18,7 @@ import tyro
 from meshsplats._arrays import subsample
 from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cameras.framing import unit_up
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli.arguments import Command, as_cli_options
@@ -35,7 +35,6 @@ from meshsplats.cli.common import (
     Text,
     alpha_in_words,
     alpha_record,
-    cameras_beside,
     draw_preview,
     parse_up,
     placed,

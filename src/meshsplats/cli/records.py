@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from meshsplats.cli import toml
+from meshsplats import _toml as toml
 from meshsplats.cli.arguments import INVOCATION, Command, options_of, relative_to
-from meshsplats.cli.messages import UsageError, flag, shown_path
+from meshsplats.cli.messages import flag, shown_path
 
 CONFIGURATION, CAMERAS, PREVIEW = "config.toml", "cameras.json", "preview.png"
 """Records. In a folder of results they have these names; ``beside`` a single file, its name before."""
@@ -58,7 +58,7 @@ def recorded_options(path: Path, name: str | None = None) -> dict[str, Any] | No
     try:
         record = toml.load(path)
         return dict(record["options"]) if name in (None, record["command"]) else None
-    except (OSError, UsageError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 

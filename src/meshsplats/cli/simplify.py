@@ -12,7 +12,7 @@ import tyro
 
 from meshsplats._files.atomic import together
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
@@ -23,7 +23,6 @@ from meshsplats.cli.common import (
     Origin,
     Output,
     SplatOptions,
-    cameras_beside,
     check_outputs,
     draw_preview,
     placed,

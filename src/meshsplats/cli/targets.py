@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 import tyro
 
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
-from meshsplats.cli.common import Count, File, Folder, Missing, Text, cameras_beside, parse_up
+from meshsplats.cameras.files import cameras_beside, load_cameras
+from meshsplats.cli.common import Count, File, Folder, Missing, Text, parse_up
 from meshsplats.cli.messages import UsageError, flag
 from meshsplats.datasets.folder import load_dataset
 from meshsplats.datasets.views import Dataset

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from meshsplats.camera import Camera
-from meshsplats.cameras.files import load_cameras
+from meshsplats.cameras.files import cameras_beside, load_cameras
 from meshsplats.cli.arguments import Command
 from meshsplats.cli.common import (
     Count,
@@ -21,7 +21,6 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     Text,
-    cameras_beside,
     check_outputs,
     chosen_background,
     load_scene,
