@@ -24,7 +24,7 @@ FLOORS = (
     ("evaluation",),
     ("finetuning", "viewer"),
     ("levels", "prior", "tiles", "training"),
-    ("blender", "frames", "inspection", "installation"),
+    ("blender", "chains", "frames", "inspection", "installation"),
     ("cli",),
     ("__main__",),
 )
