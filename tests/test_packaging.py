@@ -90,7 +90,8 @@ def test_every_module_imports():
 
 
 def test_package_holds_its_core_its_kernels_and_its_type_marker():
-    for name in ("common", "lists", "raster", "image", "tape", "gradients", "filter", "training"):
+    kernels = ("common", "lists", "sorting", "raster", "triangles", "image", "tape", "gradients", "filter")
+    for name in (*kernels, "training"):
         assert (Path(meshsplats.__file__).parent / "webgpu" / f"{name}.wgsl").is_file()
     assert library.library_path("baseline") is not None
     assert (Path(meshsplats.__file__).parent / "py.typed").is_file()
