@@ -24,7 +24,7 @@ FLOORS = (
     ("evaluation",),
     ("finetuning", "viewer"),
     ("levels", "prior", "tiles", "training"),
-    ("blender", "chains", "frames", "inspection", "installation"),
+    ("blender", "chains", "frames", "inspection", "installation", "jobs"),
     ("cli",),
     ("__main__",),
 )

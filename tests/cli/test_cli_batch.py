@@ -18,11 +18,11 @@ from meshsplats import _toml as toml
 from meshsplats.cameras.files import save_cameras
 from meshsplats.cameras.trajectories import orbit
 from meshsplats.cli import main
-from meshsplats.cli.batch import jobs
 from meshsplats.conversion import convert
 from meshsplats.evaluation.comparison import compare
 from meshsplats.formats.gaussians import load_gaussians, save_gaussians, subject_name
 from meshsplats.formats.meshes import load_mesh, save_mesh
+from meshsplats.jobs import jobs
 
 
 def run(*arguments) -> int:

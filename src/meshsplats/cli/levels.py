@@ -23,22 +23,17 @@ from meshsplats.cli.common import (
     Output,
     SplatOptions,
     Text,
-    check_outputs,
     parse_up,
     placed,
     say_origin,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, flag, say
-from meshsplats.cli.records import (
-    CONFIGURATION,
-    configuration,
-    recorded_options,
-    write_configuration,
-)
+from meshsplats.cli.records import configuration, write_configuration
 from meshsplats.cli.training import progress_display
 from meshsplats.errors import FileFormatError
 from meshsplats.finetuning import FinetuneConfig, Interrupted, Progress, make_config
+from meshsplats.formats.outputs import CONFIGURATION, check_outputs, recorded_options
 from meshsplats.formats.sniff import identify
 from meshsplats.levels import SAMPLES, Level
 from meshsplats.rendering.looks import comparison_in_words

@@ -24,10 +24,9 @@ from meshsplats.cli.common import (
     SplatOptions,
     ViewOptions,
     announce_cost,
-    check_outputs,
-    chosen_background,
     load_scene,
     open_tileset,
+    optional_color,
     parse_color,
     plural,
     size_of,
@@ -35,8 +34,10 @@ from meshsplats.cli.common import (
     view_names,
 )
 from meshsplats.cli.messages import UsageError
-from meshsplats.cli.records import CAMERAS, CONFIGURATION, beside, recorded_options, write_configuration
+from meshsplats.cli.records import write_configuration
 from meshsplats.errors import DataWarning
+from meshsplats.evaluation.backgrounds import choose_background
+from meshsplats.formats.outputs import CAMERAS, CONFIGURATION, beside, check_outputs, recorded_options
 from meshsplats.frames import FrameOptions, Scene, depth_unit, draw_frames
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
@@ -142,8 +143,13 @@ class Render(Command):
         color = (0.0, 0.0, 0.0)
         if not self.transparent:
             kind = "splats" if isinstance(scene, GaussianCloud) else "mesh"
-            background = chosen_background(
-                self.draw.background, photographs, {kind: scene}, self.input, self.draw.threads, whole=False
+            background = choose_background(
+                optional_color(self.draw.background),
+                photographs,
+                {kind: scene},
+                self.input,
+                self.draw.threads,
+                whole=False,
             )
             color = background.color
             result |= background.to_dict()

@@ -21,17 +21,18 @@ from meshsplats.cli.common import (
     PartOptions,
     SplatOptions,
     Text,
-    check_outputs,
-    chosen_background,
     load_scene,
+    optional_color,
     parse_color,
     parse_up,
     plural,
     size_of,
 )
 from meshsplats.cli.messages import UsageError, say, shown_path
-from meshsplats.cli.records import CONFIGURATION, beside, write_configuration
+from meshsplats.cli.records import write_configuration
 from meshsplats.datasets.views import Dataset
+from meshsplats.evaluation.backgrounds import choose_background
+from meshsplats.formats.outputs import CONFIGURATION, beside, check_outputs
 from meshsplats.gaussians import GaussianCloud
 from meshsplats.mesh import SplatMesh
 from meshsplats.viewer import content
@@ -192,8 +193,8 @@ class View(Command):
     def _page(self, shown: Content, photographs: Dataset | None, cameras: list[Camera]) -> Page:
         from meshsplats.viewer.page import PageOptions, make_page
 
-        background = chosen_background(
-            self.background,
+        background = choose_background(
+            optional_color(self.background),
             photographs,
             {"mesh": shown.mesh},
             self.input,
