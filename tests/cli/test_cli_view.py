@@ -248,13 +248,12 @@ def test_the_address_is_printed_and_answers_until_ctrl_c(folder):
 def test_a_machine_without_a_window_gets_the_address(folder, monkeypatch, capsys):
     import webbrowser
 
-    from meshsplats.cli import view
     from meshsplats.viewer import server
 
     asked: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda url: asked.append(url) or True)
     monkeypatch.setattr(server.PageServer, "serve_forever", lambda self: None)
-    monkeypatch.setattr(view.sys, "platform", "linux")
+    monkeypatch.setattr(server.sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert main(["view", str(folder / "mesh.npz")]) == 0
